@@ -1,0 +1,179 @@
+// The compiled physics of one instruction set. Included once by each cpu/isa_*.cpp, after PD_TARGET is set.
+#pragma once
+#include "cpu/fields.h"
+#include "cpu/stepper.h"
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+
+namespace pd::inline PD_TARGET {
+
+// Leaves the vector registers as code for older instructions expects them; the build keeps the compiler from doing so.
+struct CleanRegisters {
+  ~CleanRegisters() {
+#if PD_VECTOR_BYTES >= 32
+    _mm256_zeroupper();
+#endif
+  }
+};
+
+// Fewest environments for which lanes run over environments instead of elements.
+constexpr std::int64_t least_batch = 8;
+
+template <class Lanes, class T>
+void step_batches(const StepCall<T>& call, int threads) {
+  constexpr int W = Lanes::environments;
+  const std::int64_t groups = (call.batch + W - 1) / W;
+  std::atomic<std::int64_t> next{0};
+  run_team(int(std::min<std::int64_t>(threads, groups)), [&](const Team&) {
+    Workspace<Lanes> work(call);
+    Scratch<Lanes> scratch(call.plan.most_slots);
+    const Team alone;
+    for (std::int64_t g = next++; g < groups; g = next++)
+      Stepper<Lanes>(call, work, scratch, alone, g * W).roll();
+  });
+}
+
+// One environment after another by the whole team, or each by one thread when its patches are too few to share.
+template <class T>
+void step_singles(const StepCall<T>& call, int threads) {
+  using Lanes = Single<T>;
+  if (call.batch > 1 && call.plan.patches < 2 * threads) return step_batches<Lanes>(call, threads);
+  Workspace<Lanes> work(call);
+  run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
+    Scratch<Lanes> scratch(call.plan.most_slots);
+    for (std::int64_t e = 0; e < call.batch; ++e) {
+      Stepper<Lanes>(call, work, scratch, team, e).roll();
+      team.barrier();
+    }
+  });
+}
+
+template <class T>
+void step_any(const StepCall<T>& call, int threads) {
+  const CleanRegisters clean;
+  constexpr int wide = native_width<T>;
+  constexpr int narrow = wide > 4 ? wide / 2 : wide;
+  if (call.batch < least_batch) return step_singles(call, threads);
+  // half the lanes where full ones would leave a thread without work
+  const std::int64_t groups = (call.batch + wide - 1) / wide;
+  if (groups >= threads) return step_batches<Batch<T, wide>>(call, threads);
+  step_batches<Batch<T, narrow>>(call, threads);
+}
+
+template <class T>
+void field_any(const FieldCall<T>& call, int threads) {
+  const CleanRegisters clean;
+  using Lanes = Single<T>;
+  Workspace<Lanes> work(call);
+  run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
+    Scratch<Lanes> scratch(call.plan.most_slots);
+    FieldPass<T> pass(call, work, scratch, team);
+    for (std::int64_t e = 0; e < call.batch; ++e) pass.run(e);
+  });
+}
+
+template <class T, int W>
+Mat3<Pack<T, W>> load_matrices(const T* from, int count) {
+  Mat3<Pack<T, W>> r;
+  for (int lane = 0; lane < W; ++lane) {
+    const T* m = from + 9 * (lane < count ? lane : count - 1);
+    for (int a = 0; a < 3; ++a) {
+      r.row[a].x.v[lane] = m[3 * a];
+      r.row[a].y.v[lane] = m[3 * a + 1];
+      r.row[a].z.v[lane] = m[3 * a + 2];
+    }
+  }
+  return r;
+}
+
+// One Newton step on the group of rotations, then one Newton-Schulz step back onto it: the last bits.
+template <class R>
+Mat3<R> polished_rotation(const Mat3<R>& f) {
+  using T = scalar_of<R>;
+  const Invariants<R> i = invariants(f);
+  const auto good = trusted(i, largest_root(i));
+  const Mat3<R> r = nearest_rotation(f);
+  const Mat3<R> s = transpose(r) * f;
+  const Mat3<R> turn = cross_matrix(solve_turn(s, axis_of(s)));
+  Mat3<R> turned = r * turn;
+  for (int a = 0; a < 3; ++a) turned.row[a] = turned.row[a] + r.row[a];
+  const Mat3<R> metric = transpose(turned) * turned;
+  Mat3<R> schulz = R(T(-0.5)) * metric;
+  schulz.row[0].x = schulz.row[0].x + R(T(1.5));
+  schulz.row[1].y = schulz.row[1].y + R(T(1.5));
+  schulz.row[2].z = schulz.row[2].z + R(T(1.5));
+  Mat3<R> polished = turned * schulz;
+  for (int a = 0; a < 3; ++a) {
+    polished.row[a] = {select(good, polished.row[a].x, r.row[a].x),
+                       select(good, polished.row[a].y, r.row[a].y),
+                       select(good, polished.row[a].z, r.row[a].z)};
+  }
+  return polished;
+}
+
+template <class T>
+void rotation_range(const RotationCall<T>& call, std::int64_t begin, std::int64_t end) {
+  constexpr int W = native_width<T>;
+  for (std::int64_t first = begin; first < end; first += W) {
+    const int count = int(std::min<std::int64_t>(W, end - first));
+    const Mat3<Pack<T, W>> f = load_matrices<T, W>(call.matrices + 9 * first, count);
+    Mat3<Pack<T, W>> r = polished_rotation(f);
+    if (call.direction)
+      r = rotation_differential(f, r, load_matrices<T, W>(call.direction + 9 * first, count));
+    for (int lane = 0; lane < count; ++lane) {
+      T* to = call.out + 9 * (first + lane);
+      for (int a = 0; a < 3; ++a) {
+        to[3 * a] = r.row[a].x.v[lane];
+        to[3 * a + 1] = r.row[a].y.v[lane];
+        to[3 * a + 2] = r.row[a].z.v[lane];
+      }
+    }
+  }
+}
+
+template <class T>
+void rotation_any(const RotationCall<T>& call, int threads) {
+  const CleanRegisters clean;
+  constexpr std::int64_t least_share = 4096;
+  const int useful = int(std::min<std::int64_t>(threads, call.count / least_share + 1));
+  run_team(useful, [&](const Team& team) {
+    rotation_range(call, team.begin(call.count), team.end(call.count));
+  });
+}
+
+// A loop of independent multiply-adds: the arithmetic this processor can do, to compare speeds across machines.
+inline void multiply_add_loop(float* seconds, std::int64_t* operations) {
+  constexpr int W = native_width<float>, chains = 12, rounds = 2'000'000;
+  Pack<float, W> a[chains];
+  for (int c = 0; c < chains; ++c) a[c] = Pack<float, W>(1.0f + 0.001f * float(c));
+  const Pack<float, W> x(0.9999f), y(0.0001f);
+  const auto start = std::chrono::steady_clock::now();
+  for (int r = 0; r < rounds; ++r) {
+    for (int c = 0; c < chains; ++c) a[c] = multiply_add(a[c], x, y);
+  }
+  const auto stop = std::chrono::steady_clock::now();
+  Pack<float, W> sum = a[0];
+  for (int c = 1; c < chains; ++c) sum = sum + a[c];
+  volatile float keep = sum.v[0];
+  (void)keep;
+  *seconds = std::chrono::duration<float>(stop - start).count();
+  *operations = std::int64_t(rounds) * chains * W;
+}
+
+}  // namespace pd::inline PD_TARGET
+
+namespace pd {
+
+extern const Kernels PD_KERNELS;
+const Kernels PD_KERNELS = {PD_NAME,
+                            &step_any<float>,
+                            &step_any<double>,
+                            &field_any<float>,
+                            &field_any<double>,
+                            &rotation_any<float>,
+                            &rotation_any<double>,
+                            &multiply_add_loop};
+
+}  // namespace pd

@@ -1,0 +1,460 @@
+// Runner of solver/step.h on the CPU: one environment by a team of threads, or W environments by one thread.
+#pragma once
+#include "cpu/sweep.h"
+#include "math/chebyshev.h"
+#include "solver/step.h"
+#include "solver/vertex.h"
+
+namespace pd::inline PD_TARGET {
+
+template <class Lanes>
+class Stepper {
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Value = typename Lanes::Value;
+  using Wide = typename Lanes::Wide;
+  using Sum = Sums<Lanes>;
+  static constexpr int width = Lanes::environments;
+
+ public:
+  // `first` is the first environment; lanes past the batch repeat its last one and are not written back.
+  Stepper(const StepCall<T>& call, Workspace<Lanes>& work, Scratch<Lanes>& scratch,
+          const Team& team, std::int64_t first)
+      : call_(call),
+        plan_(call.plan),
+        set_(call.settings),
+        w_(work),
+        team_(team),
+        sweep_{plan_, work, scratch, team},
+        first_(first),
+        h_(T(set_.time_step)),
+        theta_(T(set_.relaxation)) {}
+
+  // All steps of the call, with a record every `set_.every`.
+  void roll() {
+    load();
+    weigh();
+    for (int t = 0; t < set_.steps; ++t) {
+      step(*this, set_);
+      if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
+      move_balls();
+    }
+  }
+
+  void predict() {
+    const Real none(T(0));
+    const Value origin = Lanes::value({none, none, none});
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.target[i] = target(i, none, origin);
+    }
+    team_.barrier();
+    if (team_.rank == 0)
+      each_pin([&](std::int64_t i, Real spring, bool hard, Value pin) {
+        const Value offset = pin - w_.x[i];
+        w_.target[i] = hard ? offset : target(i, spring, offset);
+      });
+    for (std::int64_t slot = team_.begin(plan_.slots); slot < team_.end(plan_.slots); ++slot) {
+      w_.origin[slot] =
+          w_.x[plan_.slot_vertex[slot]] - w_.x[plan_.slot_vertex[patch_of_slot(slot)]];
+    }
+    team_.barrier();
+  }
+
+  void start() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      Value u = set_.start == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
+      if (set_.start == StartKind::given) u = user_value(call_.start, i) - w_.x[i];
+      u = hold(i, w_.target[i], u);
+      w_.u[i] = w_.before[i] = contact(i, u, u);
+    }
+    const Wide friction = Lanes::widen(contacts_.friction());
+    for (int lane = 0; lane < width; ++lane) {
+      schedule_[lane] = Schedule(set_, least_[lane], Lanes::lane(friction, lane) > 0);
+      used_[lane] = 0;
+      done_[lane] = false;
+    }
+    team_.barrier();
+  }
+
+  // Exact minimum of E along the translation of every piece that nothing holds or touches: its momentum is then right
+  // however few iterations follow.
+  void translate() {
+    const bool given_first = set_.start == StartKind::given && used_[0] == 0;
+    if (plan_.groups == 0 || given_first) return;
+    if (team_.rank == 0) {
+      find_shifts();
+      if (!contacts_.empty()) drop_touching_shifts();
+      for (int i = 0; i < plan_.vertices; ++i) {
+        if (plan_.vertex_group[i] < 0) continue;
+        w_.u[i] = w_.u[i] + w_.shift[plan_.vertex_group[i]];
+        if (used_[0] == 0) w_.before[i] = w_.u[i];
+      }
+    }
+    team_.barrier();
+  }
+
+  void iterate(int k) {
+    for (int lane = 0; lane < width; ++lane) {
+      Lanes::set_lane(omega_, lane, T(schedule_[lane].next(k)));
+      Lanes::set_lane(active_, lane, T(done_[lane] ? 0 : 1));
+    }
+    const bool guard = schedule_[0].wants_energy(k);
+    if (guard) {
+      sweep_.run(k & 1, elastic_with_energy(), [&](std::int64_t i, const Value& force, Sum& sums) {
+        const Value offset = w_.u[i] - w_.target[i];
+        sums.energy = multiply_add(w_.inertia[i] * offset, offset, sums.energy);
+        update(i, force, sums);
+      });
+    } else {
+      sweep_.run(k & 1, elastic(),
+                 [&](std::int64_t i, const Value& force, Sum& sums) { update(i, force, sums); });
+    }
+    conclude(k, guard);
+  }
+
+  bool finished() const {
+    for (bool done : done_) {
+      if (!done) return false;
+    }
+    return true;
+  }
+
+  void measure_first() {
+    measure();
+    for (int lane = 0; lane < width; ++lane) first_residual_[lane] = Lanes::lane(residual_, lane);
+  }
+
+  void measure_last() { measure(); }
+
+  void finish() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.x[i] = w_.x[i] + w_.u[i];
+      w_.velocity[i] = Real(T(1) / h_) * w_.u[i];
+    }
+    team_.barrier();
+  }
+
+ private:
+  std::int64_t environment(int lane) const {
+    const std::int64_t e = first_ + lane;
+    return e < call_.batch ? e : call_.batch - 1;
+  }
+
+  Value user_value(const T* from, std::int64_t i) const {
+    Value r = {};
+    for (int lane = 0; lane < width; ++lane) {
+      const T* p = from + (environment(lane) * plan_.vertices + plan_.vertex_order[i]) * 3;
+      Lanes::set_lane(r, lane, p[0], p[1], p[2]);
+    }
+    return r;
+  }
+
+  Real number(const Values<T>& values, std::int64_t index) const {
+    Real r(T(0));
+    for (int lane = 0; lane < width; ++lane)
+      Lanes::set_lane(r, lane, values.of(environment(lane))[index]);
+    return r;
+  }
+
+  Value vector(const Values<T>& values, std::int64_t index) const {
+    Value r = {};
+    for (int lane = 0; lane < width; ++lane) {
+      const T* p = values.of(environment(lane)) + index;
+      Lanes::set_lane(r, lane, p[0], p[1], p[2]);
+    }
+    return r;
+  }
+
+  // the slot whose vertex is the origin of the patch that `slot` is in: positions near it keep their last bits anywhere
+  std::int64_t patch_of_slot(std::int64_t slot) const {
+    int low = 0, high = plan_.patches;
+    while (high - low > 1) {
+      const int middle = (low + high) / 2;
+      (plan_.patch_slot[middle] <= slot ? low : high) = middle;
+    }
+    return plan_.patch_slot[low];
+  }
+
+  // visit(vertex, spring, hard, target); a pin is hard in all environments or in none
+  template <class Visit>
+  void each_pin(Visit visit) {
+    for (int p = 0; p < plan_.pins; ++p) {
+      const Real spring = number(call_.material.pin_stiffness, p);
+      const bool hard = call_.material.pin_stiffness.of(0)[p] == T(HUGE_VAL);
+      visit(plan_.pin_vertex[p], spring, hard, vector(call_.material.pin_targets, 3 * p));
+    }
+  }
+
+  Value target(std::int64_t i, const Real& spring, const Value& pin) const {
+    const Real h(h_), mass = number(call_.material.masses, plan_.vertex_order[i]);
+    const Real weight = inertia_weight(mass, damping_, spring, h);
+    const Real none(T(0));
+    const Value force = call_.forces ? w_.force[i] : Lanes::value({none, none, none});
+    return inertia_target(weight, mass, w_.velocity[i], gravity_, force, spring, pin, h);
+  }
+
+  // `held` where the vertex does not move, `free` elsewhere
+  Value hold(std::int64_t i, const Value& held, const Value& free) const {
+    const auto moves = w_.inverse[i] > Real(T(0));
+    const Vec3<Real> a = Lanes::vec3(free), b = Lanes::vec3(held);
+    return Lanes::value(
+        {select(moves, a.x, b.x), select(moves, a.y, b.y), select(moves, a.z, b.z)});
+  }
+
+  Value contact(std::int64_t i, const Value& u, const Value& around) const {
+    if (contacts_.empty()) return u;
+    return hold(
+        i, u,
+        Lanes::value(contacts_.project(Lanes::vec3(w_.x[i]), Lanes::vec3(u), Lanes::vec3(around))));
+  }
+
+  void load() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.x[i] = user_value(call_.positions, i);
+      w_.velocity[i] = user_value(call_.velocities, i);
+      if (call_.forces) w_.force[i] = user_value(call_.forces, i);
+    }
+    gravity_ = vector(call_.material.gravity, 0);
+    damping_ = number(call_.material.damping, 0);
+    const Material<T>& material = call_.material;
+    contacts_ = {w_.planes, w_.balls, material.planes_count, material.spheres_count};
+    if (team_.rank == 0) {
+      for (int c = 0; c < material.planes_count; ++c) {
+        w_.planes[c] = {Lanes::vec3(vector(material.planes, 5 * c)),
+                        number(material.planes, 5 * c + 3), number(material.planes, 5 * c + 4)};
+      }
+      for (int c = 0; c < material.spheres_count; ++c) {
+        w_.balls[c] = {Lanes::vec3(vector(material.spheres, 8 * c)),
+                       Lanes::vec3(vector(material.spheres, 8 * c + 5)),
+                       number(material.spheres, 8 * c + 3), number(material.spheres, 8 * c + 4)};
+      }
+    }
+    team_.barrier();
+  }
+
+  void move_balls() {
+    if (team_.rank == 0) {
+      for (int c = 0; c < contacts_.ball_count; ++c)
+        w_.balls[c].center = w_.balls[c].center + w_.balls[c].motion;
+    }
+    if (contacts_.ball_count) team_.barrier();
+  }
+
+  // a and 1 / D of every vertex, w V of every element, and the smallest a / D
+  void weigh() {
+    const Real none(T(0)), one(T(1));
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.inertia[i] = inertia_weight(number(call_.material.masses, plan_.vertex_order[i]), damping_,
+                                     none, Real(h_));
+    }
+    team_.barrier();
+    if (team_.rank == 0)
+      each_pin([&](std::int64_t i, Real spring, bool hard, Value) {
+        w_.inertia[i] = hard ? none : w_.inertia[i] + spring;
+      });
+    set_weights(set_.weighted);
+    team_.barrier();
+    const auto diagonal = [](const auto&, const auto& rest, const auto& weight, auto& force,
+                             auto&) {
+      std::remove_cvref_t<decltype(weight)> d[4];
+      solid_diagonal(rest, weight, d);
+      for (int c = 0; c < 4; ++c) force[c] = {d[c], d[c], d[c]};
+    };
+    sweep_.run(0, diagonal, [&](std::int64_t i, const Value& force, Sum& sums) {
+      const Real a = w_.inertia[i];
+      const auto moves = a > none;
+      const Real inverse = one / (a + Lanes::vec3(force).x);
+      w_.inverse[i] = select(moves, inverse, none);
+      sums.least = lesser(sums.least, select(moves, a * inverse, sums.least));
+    });
+    Real least = Real(T(HUGE_VAL));
+    for (int part = 0; part < w_.part_count; ++part) least = lesser(least, w_.parts[0][part].least);
+    for (int lane = 0; lane < width; ++lane) least_[lane] = Lanes::lane(Lanes::widen(least), lane);
+    team_.barrier();
+    set_weights(false);
+    team_.barrier();
+  }
+
+  // w V, times l_e when `bounded`
+  void set_weights(bool bounded) {
+    const int lanes = w_.shared_weight ? 1 : width;
+    const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;
+    for (std::int64_t e = team_.begin(elements); e < team_.end(elements); ++e) {
+      const T volume = plan_.tet_volume[e] * (bounded ? plan_.tet_bound[e] : T(1));
+      for (int lane = 0; lane < lanes; ++lane) {
+        w_.weight[e * lanes + lane] =
+            volume * call_.material.stiffness.of(environment(lane))[plan_.tet_order[e]];
+      }
+    }
+  }
+
+  static auto elastic() {
+    return [](const auto& x, const auto& rest, const auto& weight, auto& force, auto&) {
+      solid_gradient(x[0], rest, weight, force);
+    };
+  }
+  static auto elastic_with_energy() {
+    return [](const auto& x, const auto& rest, const auto& weight, auto& force, auto& energy) {
+      using R = std::remove_cvref_t<decltype(weight)>;
+      energy = multiply_add(R(0.5) * weight, solid_gradient(x[0], rest, weight, force), energy);
+    };
+  }
+
+  void update(std::int64_t i, const Value& force, Sum& sums) {
+    const Value u = w_.u[i], before = w_.before[i];
+    const Value gradient = multiply_add(w_.inertia[i], u - w_.target[i], force);
+    Value next =
+        contact(i, accelerate(u, before, gradient, Real(theta_) * w_.inverse[i], omega_), u);
+    if (set_.tolerance > 0) {
+      next = freeze(u, next);
+      const Value change = next - u;
+      sums.first = multiply_add(change, change, sums.first);
+      sums.second = multiply_add(next, next, sums.second);
+    }
+    w_.before[i] = u;
+    w_.u[i] = next;
+  }
+
+  // environments that are done keep their iterate
+  Value freeze(const Value& u, const Value& next) const {
+    const auto active = active_ > Real(T(0));
+    const Vec3<Real> a = Lanes::vec3(next), b = Lanes::vec3(u);
+    return Lanes::value(
+        {select(active, a.x, b.x), select(active, a.y, b.y), select(active, a.z, b.z)});
+  }
+
+  typename Workspace<Lanes>::Part total(int parity) const {
+    typename Workspace<Lanes>::Part sum = w_.parts[parity][0];
+    for (int part = 1; part < w_.part_count; ++part) {
+      sum.energy = sum.energy + w_.parts[parity][part].energy;
+      sum.first = sum.first + w_.parts[parity][part].first;
+      sum.second = sum.second + w_.parts[parity][part].second;
+    }
+    return sum;
+  }
+
+  // every thread adds up the same parts in the same order, so all come to the same decisions
+  void conclude(int k, bool guard) {
+    const bool soft = set_.tolerance > 0;
+    for (int lane = 0; lane < width; ++lane) used_[lane] += done_[lane] ? 0 : 1;
+    if (!guard && !soft) return;
+    const auto sum = total(k & 1);
+    for (int lane = 0; lane < width; ++lane) {
+      if (done_[lane]) continue;
+      if (guard) schedule_[lane].check(Lanes::lane(sum.energy, lane));
+      const double change = Lanes::lane(sum.first, lane), length = Lanes::lane(sum.second, lane);
+      if (soft && change <= set_.tolerance * set_.tolerance * length) done_[lane] = true;
+    }
+  }
+
+  // |grad E| without what contacts balance, and E
+  void measure() {
+    team_.barrier();
+    sweep_.run(0, elastic_with_energy(), [&](std::int64_t i, const Value& force, Sum& sums) {
+      const Value offset = w_.u[i] - w_.target[i];
+      sums.energy = multiply_add(w_.inertia[i] * offset, offset, sums.energy);
+      const Value residual = unbalanced(i, multiply_add(w_.inertia[i], offset, force));
+      sums.first = multiply_add(residual, residual, sums.first);
+    });
+    const auto sum = total(0);
+    energy_ = sum.energy;
+    residual_ = sum.first;
+    team_.barrier();
+  }
+
+  Value unbalanced(std::int64_t i, const Value& gradient) const {
+    const Real none(T(0));
+    const Value zero = Lanes::value({none, none, none});
+    if (contacts_.empty()) return hold(i, zero, gradient);
+    const Real inverse = w_.inverse[i],
+               diagonal = Real(T(1)) / select(inverse > none, inverse, Real(T(1)));
+    return hold(
+        i, zero,
+        diagonal * (w_.u[i] - contact(i, subtract_product(w_.u[i], inverse, gradient), w_.u[i])));
+  }
+
+  void find_shifts() {
+    for (int g = 0; g < plan_.groups; ++g) {
+      w_.group_weight[g] = Wide(0.0);
+      for (int c = 0; c < 3; ++c) w_.group_moment[3 * g + c] = Wide(0.0);
+    }
+    for (int i = 0; i < plan_.vertices; ++i) {
+      const int g = plan_.vertex_group[i];
+      if (g < 0) continue;
+      const Wide a = Lanes::widen(w_.inertia[i]);
+      const Vec3<Real> lag = Lanes::vec3(w_.target[i] - w_.u[i]);
+      w_.group_weight[g] = w_.group_weight[g] + a;
+      w_.group_moment[3 * g] = w_.group_moment[3 * g] + a * Lanes::widen(lag.x);
+      w_.group_moment[3 * g + 1] = w_.group_moment[3 * g + 1] + a * Lanes::widen(lag.y);
+      w_.group_moment[3 * g + 2] = w_.group_moment[3 * g + 2] + a * Lanes::widen(lag.z);
+    }
+    for (int g = 0; g < plan_.groups; ++g) {
+      const auto mean = [&](int c) {
+        return Lanes::narrow(w_.group_moment[3 * g + c] / w_.group_weight[g]);
+      };
+      w_.shift[g] = Lanes::value({mean(0), mean(1), mean(2)});
+    }
+  }
+
+  // a piece that the shift would leave touching a contact gets none
+  void drop_touching_shifts() {
+    const Real none(T(0)), one(T(1));
+    for (int g = 0; g < plan_.groups; ++g) w_.group_weight[g] = Wide(1.0);
+    for (int i = 0; i < plan_.vertices; ++i) {
+      const int g = plan_.vertex_group[i];
+      if (g < 0) continue;
+      const Real least = contacts_.least_gap(Lanes::vec3((w_.x[i] + w_.u[i]) + w_.shift[g]));
+      w_.group_weight[g] = w_.group_weight[g] * Lanes::widen(select(least > none, one, none));
+    }
+    for (int g = 0; g < plan_.groups; ++g)
+      w_.shift[g] = Lanes::narrow(w_.group_weight[g]) * w_.shift[g];
+  }
+
+  void store(int record) {
+    const std::int64_t first_row = record * call_.batch;
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      for (int lane = 0; lane < width && first_ + lane < call_.batch; ++lane) {
+        const std::int64_t at =
+            ((first_row + first_ + lane) * plan_.vertices + plan_.vertex_order[i]) * 3;
+        write(call_.out_positions + at, Lanes::get_lane(w_.x[i], lane));
+        write(call_.out_velocities + at, Lanes::get_lane(w_.velocity[i], lane));
+      }
+    }
+    if (!call_.info || team_.rank != 0) return;
+    for (int lane = 0; lane < width && first_ + lane < call_.batch; ++lane) {
+      double* row = call_.info + (first_row + first_ + lane) * info_count;
+      const double last = Lanes::lane(residual_, lane), start = first_residual_[lane];
+      row[info_residual] = !set_.report ? NAN : start > 0 ? sqrt(last / start) : 0.0;
+      row[info_energy] = set_.report ? Lanes::lane(energy_, lane) : NAN;
+      row[info_iterations] = used_[lane];
+      row[info_restarts] = schedule_[lane].restarts;
+      row[info_converged] = done_[lane];
+      row[info_rho] = schedule_[lane].rho;
+    }
+  }
+
+  static void write(T* to, const Vec3<T>& v) {
+    to[0] = v.x;
+    to[1] = v.y;
+    to[2] = v.z;
+  }
+
+  const StepCall<T>& call_;
+  const Plan<T>& plan_;
+  const Settings& set_;
+  Workspace<Lanes>& w_;
+  const Team& team_;
+  Sweep<Lanes> sweep_;
+  std::int64_t first_;
+  T h_, theta_;
+  Contacts<Real> contacts_;
+  Value gravity_ = {};
+  Real damping_{T(0)}, omega_{T(1)}, active_{T(1)};
+  Wide energy_ = Wide(0.0), residual_ = Wide(0.0);
+  double least_[width] = {}, first_residual_[width] = {};
+  Schedule schedule_[width];
+  int used_[width] = {};
+  bool done_[width] = {};
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,21 @@
+// Every standard header that the kernels use. Included before the instruction set changes, so that none of the inline
+// functions in them is compiled for instructions that the machine may lack.
+#pragma once
+#include <algorithm>
+#include <atomic>
+#include <cfloat>
+#include <chrono>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <new>
+#include <type_traits>
+
+#include "cpu/team.h"
+#include "plan/views.h"
+#include "solver/step.h"
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif

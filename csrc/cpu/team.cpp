@@ -1,0 +1,26 @@
+#include "cpu/team.h"
+
+#if defined(_OPENMP)
+#include <omp.h>
+#endif
+
+namespace pd {
+
+void run_team(int threads, void (*work)(void*, const Team&), void* context) {
+#if defined(_OPENMP)
+  if (threads > 1 && !omp_in_parallel()) {
+    Barrier barrier;
+    // the runtime may grant fewer threads than asked for: the team counts those that came
+#pragma omp parallel num_threads(threads)
+    {
+      const int size = omp_get_num_threads();
+      work(context, Team{omp_get_thread_num(), size, size > 1 ? &barrier : nullptr});
+    }
+    return;
+  }
+#endif
+  (void)threads;
+  work(context, Team{});
+}
+
+}  // namespace pd

@@ -1,0 +1,94 @@
+// Memory of one running step: the state of one environment, or of W side by side.
+#pragma once
+#include "cpu/lanes.h"
+#include "effects/contact.h"
+
+#include <cstdint>
+#include <memory>
+#include <new>
+
+namespace pd::inline PD_TARGET {
+
+struct FreeAligned {
+  void operator()(std::byte* p) const { ::operator delete[](p, std::align_val_t{64}); }
+};
+using Storage = std::unique_ptr<std::byte[], FreeAligned>;
+
+// Zeroed, because the unused fourth component of a quad is read along.
+inline Storage allocate_zeroed(std::size_t bytes) {
+  return Storage(new (std::align_val_t{64}) std::byte[bytes]());
+}
+
+constexpr int shared_chunk = 256;  // shared vertices that one sum covers
+
+template <class Lanes>
+struct Workspace {
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Value = typename Lanes::Value;
+  using Wide = typename Lanes::Wide;
+
+  // sums of one part (a patch, or a chunk of shared vertices) over an iteration
+  struct Part {
+    Wide energy, first, second;
+    Real least;
+  };
+
+  Value *x, *velocity, *force, *target, *u, *before;  // [vertices]
+  Real *inertia, *inverse;                            // [vertices] a, 1 / D (0: does not move)
+  Value *origin, *shared_force;                       // [slots]
+  Part* parts[2];  // iterations alternate, so that nobody overwrites what others read
+  Value* shift;    // [groups]
+  Wide *group_moment, *group_weight;  // [3 groups], [groups]
+  Plane<Real>* planes;
+  Ball<Real>* balls;
+  T* weight;  // [elements], or [elements, W] when stiffness differs between environments
+  int part_count;
+  bool shared_weight;
+
+  explicit Workspace(const StepCall<T>& call)
+      : Workspace(call.plan, call.material, call.material.stiffness.stride == 0,
+                  call.forces != nullptr) {}
+
+  explicit Workspace(const FieldCall<T>& call) : Workspace(call.plan, {}, true, false) {}
+
+ private:
+  static constexpr std::size_t alignment = 64;
+
+  Workspace(const Plan<T>& plan, const Material<T>& material, bool same_stiffness, bool forces) {
+    shared_weight = Lanes::environments == 1 || same_stiffness;
+    part_count = plan.patches + (plan.shared + shared_chunk - 1) / shared_chunk;
+    arrange(plan, material, forces, nullptr);
+    storage_ = allocate_zeroed(size_);
+    arrange(plan, material, forces, storage_.get());
+  }
+
+  template <class Item>
+  void place(Item*& array, std::int64_t count, std::byte* base) {
+    array = reinterpret_cast<Item*>(base + size_);
+    size_ += (count * sizeof(Item) + alignment - 1) / alignment * alignment;
+  }
+
+  void arrange(const Plan<T>& plan, const Material<T>& material, bool forces, std::byte* base) {
+    size_ = 0;
+    for (Value** array : {&x, &velocity, &target, &u, &before}) place(*array, plan.vertices, base);
+    place(force, forces ? plan.vertices : 0, base);
+    for (Real** array : {&inertia, &inverse}) place(*array, plan.vertices, base);
+    place(origin, plan.slots, base);
+    place(shared_force, plan.shared ? plan.slots : 0, base);
+    for (Part*& array : parts) place(array, part_count, base);
+    place(shift, plan.groups, base);
+    place(group_moment, 3 * plan.groups, base);
+    place(group_weight, plan.groups, base);
+    place(planes, material.planes_count, base);
+    place(balls, material.spheres_count, base);
+    place(weight,
+          std::int64_t(plan.blocks) * block_lanes * (shared_weight ? 1 : Lanes::environments),
+          base);
+  }
+
+  std::size_t size_ = 0;
+  Storage storage_;
+};
+
+}  // namespace pd::inline PD_TARGET

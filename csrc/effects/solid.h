@@ -1,0 +1,72 @@
+// Elastic solid: one tetrahedron keeps its rest shape up to a rotation.
+//
+//   E = w V / 2 |F - R|^2,   F = Ds Dm^-1,   R = nearest rotation to F       (Vyatkin and Dolgovesov 2023; st = w / 2)
+//   dE/dx_c = w V (F - R) grad N_c,   grad N_c = row c-1 of Dm^-1 for c > 0, minus their sum for c = 0
+//
+// R is constant in the gradient: it maximises tr(R^T F), so its own change does no first-order work.
+#pragma once
+#include "math/rotation.h"
+
+namespace pd::inline PD_TARGET {
+
+template <class R>
+PD_HD Mat3<R> deformation_gradient(const Vec3<R> (&x)[4], const Mat3<R>& rest_inverse) {
+  return from_columns(x[1] - x[0], x[2] - x[0], x[3] - x[0]) * rest_inverse;
+}
+
+// grad N_c of the four corners [1/m]
+template <class R>
+PD_HD void shape_gradients(const Mat3<R>& rest_inverse, Vec3<R> (&n)[4]) {
+  for (int c = 0; c < 3; ++c) n[c + 1] = rest_inverse.row[c];
+  n[0] = -((n[1] + n[2]) + n[3]);
+}
+
+// P grad N_c of the four corners, for a stress P
+template <class R>
+PD_HD void corner_forces(const Mat3<R>& stress, const Mat3<R>& rest_inverse, Vec3<R> (&g)[4]) {
+  for (int c = 0; c < 3; ++c) g[c + 1] = stress * rest_inverse.row[c];
+  g[0] = -((g[1] + g[2]) + g[3]);
+}
+
+// F - R: how far the element is from its rest shape
+template <class R>
+PD_HD Mat3<R> strain(const Vec3<R> (&x)[4], const Mat3<R>& rest_inverse) {
+  const Mat3<R> f = deformation_gradient(x, rest_inverse);
+  return f - nearest_rotation(f);
+}
+
+// Gradient on the four corners; returns |F - R|^2. `weight` is w V [J].
+template <class R>
+PD_HD R solid_gradient(const Vec3<R> (&x)[4], const Mat3<R>& rest_inverse, const R& weight,
+                       Vec3<R> (&g)[4]) {
+  const Mat3<R> d = strain(x, rest_inverse);
+  corner_forces(weight * d, rest_inverse, g);
+  return frobenius(d, d);
+}
+
+// Second derivative of the energy along `dx`, on the four corners: w V (dF - dR) grad N_c.
+template <class R>
+PD_HD void solid_hessian_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
+                                 const Mat3<R>& rest_inverse, const R& weight, Vec3<R> (&g)[4]) {
+  const Mat3<R> f = deformation_gradient(x, rest_inverse),
+                df = deformation_gradient(dx, rest_inverse);
+  const Mat3<R> dr = rotation_differential(f, nearest_rotation(f), df);
+  corner_forces(weight * (df - dr), rest_inverse, g);
+}
+
+// Derivative of the energy along `dx`: w V (F - R) : dF
+template <class R>
+PD_HD R element_energy_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
+                               const Mat3<R>& rest_inverse, const R& weight) {
+  return weight * frobenius(strain(x, rest_inverse), deformation_gradient(dx, rest_inverse));
+}
+
+// Diagonal of the majoriser on the four corners: l_e w V |grad N_c|^2, `weight` being l_e w V.
+template <class R>
+PD_HD void solid_diagonal(const Mat3<R>& rest_inverse, const R& weight, R (&d)[4]) {
+  Vec3<R> n[4];
+  shape_gradients(rest_inverse, n);
+  for (int c = 0; c < 4; ++c) d[c] = weight * dot(n[c], n[c]);
+}
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,67 @@
+// The weights omega of the semi-iterative method, one environment, and when they start afresh.
+//
+// classic   omega = 1 for k < S;  2 / (2 - rho^2) at k = S;  4 / (4 - rho^2 omega) after     (Wang 2015, eq. 14)
+// guarded   omega = 1 + min(b, n / (n + 3)), b = ((1 - sqrt(1 - rho^2)) / rho)^2 the limit of the classic sequence,
+//           n counted from the last restart; a restart whenever the energy rose between two checks. With n = 0 the step
+//           is plain descent on the weighted diagonal, which never raises the energy.
+#pragma once
+#include "math/scalar.h"
+#include "plan/views.h"
+
+namespace pd::inline PD_TARGET {
+
+constexpr int guard_period = 4;       // iterations from one look at the energy to the next
+constexpr double guard_slack = 1e-5;  // relative rise that rounding may cause
+constexpr double guard_slack_friction =
+    1e-2;  // the energy lacks the work of friction, and may rise by it
+constexpr double largest_rho = 0.99999;
+
+struct Schedule {
+  ScheduleKind kind;
+  double rho;
+  int delay;
+  double slack = guard_slack;
+  double limit = 0, omega = 1, last_energy = HUGE_VAL;
+  int momentum = 0, restarts = 0;
+
+  PD_HD Schedule() = default;
+
+  // `mu` is the smallest ratio of inertia to diagonal; 1 - theta mu bounds the spectral radius from below.
+  PD_HD Schedule(const Settings& settings, double mu, bool friction)
+      : kind(settings.schedule),
+        rho(settings.rho),
+        delay(settings.delay),
+        slack(friction ? guard_slack_friction : guard_slack) {
+    if (!(rho > 0)) rho = 1 - settings.relaxation * mu;
+    rho = rho < largest_rho ? rho : largest_rho;
+    rho = rho > 0 ? rho : 0;
+    const double ratio = rho > 0 ? (1 - sqrt(1 - rho * rho)) / rho : 0;
+    limit = ratio * ratio;
+  }
+
+  PD_HD double next(int k) {
+    if (kind == ScheduleKind::classic) {
+      if (k == delay) omega = 2 / (2 - rho * rho);
+      if (k > delay) omega = 4 / (4 - rho * rho * omega);
+    } else if (kind == ScheduleKind::guarded) {
+      const double ramp = momentum / (momentum + 3.0);
+      omega = 1 + (ramp < limit ? ramp : limit);
+      ++momentum;
+    }
+    return omega;
+  }
+
+  PD_HD bool wants_energy(int k) const {
+    return kind == ScheduleKind::guarded && k % guard_period == 0;
+  }
+
+  PD_HD void check(double energy) {
+    if (energy > last_energy + slack * absolute(last_energy)) {
+      momentum = 0;
+      ++restarts;
+    }
+    last_energy = energy;
+  }
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,141 @@
+// The local step of projective dynamics: the rotation nearest to a deformation gradient.
+//
+// R = argmax over rotations of tr(R^T F). Its value is the largest root of Davenport's quartic (Markley 1993, FOAM)
+//   p(l) = (l^2 - |F|^2)^2 - 8 det(F) l - 4 |cof F|^2,
+// found from above (sqrt(3) |F| >= the sum of the singular values) by Newton's method, then in closed form
+//   R = ((k + |F|^2) F - F F^T F + l cof F) / (k l - det F),   k = (l^2 - |F|^2) / 2,
+// because every invariant of F F^T is one of F's. det R = +1, so an inverted element resists. No state, no trigonometry.
+// Where two roots nearly meet (s_2 + s_3 ~ 0 with the sign of det F on s_3) the rotation is ill-defined: SVD.
+#pragma once
+#include "math/mat.h"
+#include "math/scalar.h"
+#include "math/svd.h"
+
+namespace pd::inline PD_TARGET {
+
+template <class R>
+struct Invariants {
+  R norm2, cofactor2, det;
+};
+
+template <class R>
+PD_HD Invariants<R> invariants(const Mat3<R>& f) {
+  const Mat3<R> c = cofactor(f);
+  return {frobenius(f, f), frobenius(c, c), dot(f.row[0], c.row[0])};
+}
+
+template <class R>
+struct Root {
+  R value, slope, change;  // l, p'(l) before the last step, size of the last step
+};
+
+template <class R>
+PD_HD Root<R> newton(const Invariants<R>& i, const R& l) {
+  const R det8 = R(8) * i.det;
+  const R u = multiply_subtract(l, l, i.norm2);
+  const R p = multiply_subtract(u, u, multiply_add(det8, l, R(4) * i.cofactor2));
+  const R slope = multiply_subtract(R(4) * l, u, det8);
+  const R change = p * rough_reciprocal(slope);
+  return {l - change, slope, change};
+}
+
+// Newton's error after a step of relative size t is about 2 t^2: these leave it below the rounding.
+template <class T>
+PD_HD constexpr T newton_tolerance() {
+  return sizeof(T) == 4 ? T(1e-4) : T(3e-9);
+}
+
+// Three steps serve strains up to 0.3; lanes that need more go on alone, so that no lane depends on its neighbours.
+template <class R>
+PD_HD Root<R> largest_root(const Invariants<R>& i) {
+  using T = scalar_of<R>;
+  constexpr int first = sizeof(T) == 4 ? 3 : 4;
+  Root<R> root = {square_root(R(3) * i.norm2), R(0), R(0)};
+  for (int step = 0; step < first; ++step) root = newton(i, root.value);
+  auto far = root.change > R(newton_tolerance<T>()) * root.value;
+  for (int step = 0; step < 8 && any(far); ++step) {
+    const Root<R> next = newton(i, root.value);
+    root = {select(far, next.value, root.value), select(far, next.slope, root.slope),
+            select(far, next.change, root.change)};
+    far = root.change > R(newton_tolerance<T>()) * root.value;
+  }
+  return root;
+}
+
+template <class R>
+PD_HD Mat3<R> rotation_from_root(const Mat3<R>& f, const Invariants<R>& i, const R& l) {
+  const R k = R(0.5) * multiply_subtract(l, l, i.norm2);
+  const R scale = reciprocal(multiply_subtract(k, l, i.det));
+  const R diagonal = (k + i.norm2) * scale, twist = l * scale;
+  const R xy = -scale * dot(f.row[0], f.row[1]);
+  const R xz = -scale * dot(f.row[0], f.row[2]);
+  const R yz = -scale * dot(f.row[1], f.row[2]);
+  // S = diagonal I - scale F F^T
+  const Mat3<R> s = {{{subtract_product(diagonal, scale, dot(f.row[0], f.row[0])), xy, xz},
+                      {xy, subtract_product(diagonal, scale, dot(f.row[1], f.row[1])), yz},
+                      {xz, yz, subtract_product(diagonal, scale, dot(f.row[2], f.row[2]))}}};
+  const Mat3<R> c = cofactor(f);
+  Mat3<R> r;
+  for (int a = 0; a < 3; ++a) r.row[a] = multiply_add(twist, c.row[a], s.row[a] * f);
+  return r;
+}
+
+// The closed form can be trusted while p'(l) is not small against |F|^2 l (7.1 at rest, 0 at a double root).
+template <class R>
+PD_HD auto trusted(const Invariants<R>& i, const Root<R>& root) {
+  using T = scalar_of<R>;
+  return root.slope > R(T(0.1)) * i.norm2 * root.value && i.norm2 > R(T(1e-12)) &&
+         i.norm2 < R(T(1e12));
+}
+
+PD_HD void repair_rotation(const Mat3<float>& f, bool, Mat3<float>& r) { r = rotation_by_svd(f); }
+PD_HD void repair_rotation(const Mat3<double>& f, bool, Mat3<double>& r) { r = rotation_by_svd(f); }
+
+template <class R>
+PD_HD Mat3<R> nearest_rotation(const Mat3<R>& f) {
+  const Invariants<R> i = invariants(f);
+  const Root<R> root = largest_root(i);
+  Mat3<R> r = rotation_from_root(f, i, root.value);
+  const auto good = trusted(i, root);
+  if (any(!good)) [[unlikely]] {
+    repair_rotation(f, good, r);
+  }
+  return r;
+}
+
+// (tr(S) I - S) x = axis for the symmetric part of S: how a small turn of R answers a torque.
+template <class R>
+PD_HD Vec3<R> solve_turn(const Mat3<R>& s, const Vec3<R>& axis) {
+  const R trace = s.row[0].x + s.row[1].y + s.row[2].z;
+  const R minus_half(scalar_of<R>(-0.5));
+  const R xy = minus_half * (s.row[0].y + s.row[1].x);
+  const R xz = minus_half * (s.row[0].z + s.row[2].x);
+  const R yz = minus_half * (s.row[1].z + s.row[2].y);
+  const Mat3<R> h = {
+      {{trace - s.row[0].x, xy, xz}, {xy, trace - s.row[1].y, yz}, {xz, yz, trace - s.row[2].z}}};
+  const Mat3<R> c = cofactor(h);
+  return (R(scalar_of<R>(1)) / dot(h.row[0], c.row[0])) * (c * axis);
+}
+
+// the vector of A - A^T
+template <class R>
+PD_HD Vec3<R> axis_of(const Mat3<R>& a) {
+  return {a.row[2].y - a.row[1].z, a.row[0].z - a.row[2].x, a.row[1].x - a.row[0].y};
+}
+
+template <class R>
+PD_HD Mat3<R> cross_matrix(const Vec3<R>& a) {
+  const R none(scalar_of<R>(0));
+  return {{{none, -a.z, a.y}, {a.z, none, -a.x}, {-a.y, a.x, none}}};
+}
+
+// Derivative of the nearest rotation along dF: dR = R [h]_x with (tr(S) I - S) h = axis(R^T dF), S = R^T F symmetric,
+// axis(A) the vector of A - A^T. The map is self-adjoint, so it serves jvp and vjp alike. It is infinite where
+// s_2 + s_3 = 0 (sign of det F on s_3): there the nearest rotation jumps.
+template <class R>
+PD_HD Mat3<R> rotation_differential(const Mat3<R>& f, const Mat3<R>& r, const Mat3<R>& df) {
+  const Mat3<R> rt = transpose(r);
+  return r * cross_matrix(solve_turn(rt * f, axis_of(rt * df)));
+}
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,67 @@
+// The few functions that the physics needs of a number, for float and double. Packs bring their own.
+#pragma once
+#include "math/config.h"
+
+#include <cfloat>
+#include <cmath>
+
+namespace pd::inline PD_TARGET {
+
+PD_HD float square_root(float a) { return sqrtf(a); }
+PD_HD double square_root(double a) { return sqrt(a); }
+PD_HD float absolute(float a) { return fabsf(a); }
+PD_HD double absolute(double a) { return fabs(a); }
+PD_HD float reciprocal(float a) { return 1.0f / a; }
+PD_HD double reciprocal(double a) { return 1.0 / a; }
+// a b + c, c - a b and a b - c, rounded once where the processor can. Said outright, and the compiler told to fuse nothing by
+// itself, because whether it fuses depends on the surroundings, and the same bits are wanted from every path.
+#if defined(PD_NO_FMA)
+PD_HD float multiply_add(float a, float b, float c) { return a * b + c; }
+PD_HD double multiply_add(double a, double b, double c) { return a * b + c; }
+#else
+PD_HD float multiply_add(float a, float b, float c) { return fmaf(a, b, c); }
+PD_HD double multiply_add(double a, double b, double c) { return fma(a, b, c); }
+#endif
+PD_HD float subtract_product(float c, float a, float b) { return multiply_add(-a, b, c); }
+PD_HD double subtract_product(double c, double a, double b) { return multiply_add(-a, b, c); }
+PD_HD float multiply_subtract(float a, float b, float c) { return multiply_add(a, b, -c); }
+PD_HD double multiply_subtract(double a, double b, double c) { return multiply_add(a, b, -c); }
+
+PD_HD float rough_reciprocal(float a) { return 1.0f / a; }
+PD_HD double rough_reciprocal(double a) { return 1.0 / a; }
+PD_HD float lesser(float a, float b) { return b < a ? b : a; }
+PD_HD double lesser(double a, double b) { return b < a ? b : a; }
+PD_HD float select(bool take, float a, float b) { return take ? a : b; }
+PD_HD double select(bool take, double a, double b) { return take ? a : b; }
+PD_HD bool any(bool a) { return a; }
+
+template <class T>
+PD_HD constexpr T epsilon() {
+  return sizeof(T) == 4 ? T(FLT_EPSILON) : T(DBL_EPSILON);
+}
+template <class T>
+PD_HD constexpr T smallest() {
+  return sizeof(T) == 4 ? T(FLT_MIN) : T(DBL_MIN);
+}
+template <class T>
+PD_HD constexpr T biggest() {
+  return sizeof(T) == 4 ? T(FLT_MAX) : T(DBL_MAX);
+}
+
+// The scalar behind a pack: float for Pack<float, 16>.
+template <class R>
+struct ScalarOf {
+  using type = typename R::scalar;
+};
+template <>
+struct ScalarOf<float> {
+  using type = float;
+};
+template <>
+struct ScalarOf<double> {
+  using type = double;
+};
+template <class R>
+using scalar_of = typename ScalarOf<R>::type;
+
+}  // namespace pd::inline PD_TARGET

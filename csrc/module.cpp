@@ -1,0 +1,137 @@
+// `torchpd._C`: mesh work on NumPy arrays, the tables, what was built. Loading it also registers the ops.
+#include "cpu/dispatch.h"
+#include "plan/build.h"
+
+#include <pybind11/functional.h>
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include <map>
+
+namespace py = pybind11;
+
+namespace {
+
+using Doubles = py::array_t<double, py::array::c_style>;
+using Indices = py::array_t<std::int64_t, py::array::c_style>;
+
+template <class T>
+py::array_t<T> as_array(const std::vector<T>& numbers, py::ssize_t width) {
+  const auto rows = py::ssize_t(numbers.size()) / width;
+  py::array_t<T> array(width > 1 ? std::vector<py::ssize_t>{rows, width}
+                                 : std::vector<py::ssize_t>{rows});
+  std::copy(numbers.begin(), numbers.end(), array.mutable_data());
+  return array;
+}
+
+void check_mesh(const Doubles& positions, const Indices& tets) {
+  if (positions.ndim() != 2 || positions.shape(1) != 3)
+    throw py::value_error("positions must be float64 [vertices, 3]");
+  if (tets.ndim() != 2 || tets.shape(1) != 4 || tets.shape(0) == 0)
+    throw py::value_error("tets must be int64 [count > 0, 4]");
+  const std::int64_t count = positions.shape(0), *t = tets.data();
+  for (py::ssize_t i = 0; i < tets.size(); ++i) {
+    if (t[i] < 0 || t[i] >= count)
+      throw py::index_error("tets refer to vertices that positions does not have");
+  }
+  // numbers are 32-bit, with 144 of them a block of 16
+  if (tets.shape(0) > (std::int64_t(1) << 30) || count > (std::int64_t(1) << 30)) {
+    throw py::value_error("a mesh may have up to 2^30 vertices and tetrahedra");
+  }
+}
+
+py::dict build_plan(const Doubles& positions, const Indices& tets, int patch_size,
+                    const std::function<void(double)>& progress) {
+  check_mesh(positions, tets);
+  if (patch_size < 16 || patch_size > 8192)
+    throw py::value_error("patch_size must lie in 16..8192");
+  const auto plan = pd::build_plan(positions.data(), positions.shape(0), tets.data(), tets.shape(0),
+                                   patch_size, progress);
+  py::dict arrays;
+  std::map<std::string, int> widths;
+#define X(name, type, width, rows, meaning) widths[#name] = width;
+#include "plan/plan.def"
+#undef X
+  const auto add = [&](const char* name, const auto& numbers) {
+    arrays[name] = as_array(numbers, widths.at(name));
+  };
+  add("vertex_order", plan.vertex_order);
+  add("tet_order", plan.tet_order);
+  add("tet_rest", plan.tet_rest);
+  add("tet_volume", plan.tet_volume);
+  add("tet_bound", plan.tet_bound);
+  add("tet_corner", plan.tet_corner);
+  add("patch_block", plan.patch_block);
+  add("patch_vertex", plan.patch_vertex);
+  add("patch_slot", plan.patch_slot);
+  add("slot_vertex", plan.slot_vertex);
+  add("shared_start", plan.shared_start);
+  add("shared_slot", plan.shared_slot);
+  return arrays;
+}
+
+py::list plan_table() {
+  py::list rows;
+#define X(name, type, width, rows_, meaning) \
+  rows.append(py::make_tuple(#name, #type, width, #rows_, meaning));
+#include "plan/plan.def"
+#undef X
+  return rows;
+}
+
+py::list material_table() {
+  py::list rows;
+#define X(name, width, rows_, meaning) rows.append(py::make_tuple(#name, width, #rows_, meaning));
+#include "plan/material.def"
+#undef X
+  return rows;
+}
+
+py::dict build_info() {
+  py::dict info;
+  info["simd"] = pd::kernels().name;
+  info["simd_available"] = pd::supported_simd();
+#if defined(_OPENMP)
+  info["openmp"] = _OPENMP;
+#else
+  info["openmp"] = 0;
+#endif
+#if defined(TORCHPD_CUDA)
+  info["cuda"] = true;
+#else
+  info["cuda"] = false;
+#endif
+#if defined(__clang__)
+  info["compiler"] = "clang " __clang_version__;
+#else
+  info["compiler"] = "gcc " __VERSION__;
+#endif
+  info["cxx"] = long(__cplusplus);
+  return info;
+}
+
+// float32 multiply-adds per second that one thread of this processor does
+double multiply_adds_per_second() {
+  float seconds = 0;
+  std::int64_t operations = 0;
+  pd::kernels().flops(&seconds, &operations);
+  return double(operations) / seconds;
+}
+
+}  // namespace
+
+PYBIND11_MODULE(_C, m) {
+  m.doc() =
+      "Mesh work, tables and build information of torchpd; loading it registers the ops "
+      "torchpd::*.";
+  m.def("build_plan", &build_plan, py::arg("positions"), py::arg("tets"), py::arg("patch_size"),
+        py::arg("progress"));
+  m.def("plan_table", &plan_table,
+        "Rows (name, type, width, rows, meaning) of the constant arrays, in op order.");
+  m.def("material_table", &material_table,
+        "Rows (name, width, rows, meaning) of the differentiable arrays, in op order.");
+  m.def("build_info", &build_info, "What this build can do on this machine.");
+  m.def("multiply_adds_per_second", &multiply_adds_per_second,
+        "float32, one thread, widest SIMD: for comparing machines.");
+}

@@ -1,0 +1,117 @@
+// What a kernel sees: plain structs of pointers, made from the tables. Knows neither torch nor a device.
+#pragma once
+
+#include <cstdint>
+
+namespace pd {
+
+using int16 = std::int16_t;
+using int32 = std::int32_t;
+
+template <class T>
+struct Plan {
+  using real = T;
+#define X(name, type, width, rows, meaning) const type* name = nullptr;
+#include "plan/plan.def"
+#undef X
+  int vertices = 0, tets = 0, pins = 0, blocks = 0, patches = 0, slots = 0, shared = 0, groups = 0;
+  int most_slots = 0;  // of any patch
+};
+
+// One array of the material: the same for all environments when stride is 0.
+template <class T>
+struct Values {
+  const T* data = nullptr;
+  std::int64_t stride = 0;  // numbers from one environment to the next
+
+  const T* of(std::int64_t environment) const { return data + environment * stride; }
+};
+
+template <class T>
+struct Material {
+#define X(name, width, rows, meaning) Values<T> name;
+#include "plan/material.def"
+#undef X
+  int planes_count = 0, spheres_count = 0;
+};
+
+enum class ScheduleKind : int { jacobi = 0, classic = 1, guarded = 2 };
+enum class StartKind : int { velocity = 0, inertial = 1, given = 2 };
+
+struct Settings {
+  int steps = 1, every = 1;  // steps to take, and how many of them lie between two records
+  int iterations = 64;
+  ScheduleKind schedule = ScheduleKind::guarded;
+  StartKind start = StartKind::velocity;
+  double time_step = 0;   // s
+  double relaxation = 1;  // theta
+  double rho = 0;         // spectral radius; 0: derived from the weights of the step
+  double tolerance = 0;   // relative change that ends an environment's iterations; 0: never
+  int delay = 0;          // iterations before the classic schedule accelerates
+  bool weighted = true;   // the diagonal that cannot diverge, else the plain one
+  bool report = false;    // residual and energy cost two more local steps
+};
+
+// Numbers of an info row, double each.
+enum InfoField : int {
+  info_residual,
+  info_energy,
+  info_iterations,
+  info_restarts,
+  info_converged,
+  info_rho,
+  info_count
+};
+
+// Everything one call of step or rollout works on. Positions in the user's order, [batch, vertices, 3].
+template <class T>
+struct StepCall {
+  Plan<T> plan;
+  Material<T> material;
+  Settings settings;
+  std::int64_t batch = 0;
+  const T* positions = nullptr;
+  const T* velocities = nullptr;
+  const T* forces = nullptr;   // may be null
+  const T* start = nullptr;    // first iterate, with StartKind::given
+  T* out_positions = nullptr;  // [records, batch, vertices, 3]
+  T* out_velocities = nullptr;
+  double* info = nullptr;  // [records, batch, info_count], may be null
+};
+
+// Elastic energy and its derivatives at given positions.
+enum class Field : int { gradient, hessian_product, element_energy, element_energy_product };
+
+template <class T>
+struct FieldCall {
+  Plan<T> plan;
+  Field field = Field::gradient;
+  Values<T> stiffness;
+  std::int64_t batch = 0;
+  const T* positions = nullptr;  // [batch, vertices, 3]
+  const T* direction = nullptr;  // [batch, vertices, 3], by the products
+  T* out = nullptr;              // [batch, vertices, 3], or [batch, tets] of the element energies
+};
+
+template <class T>
+struct RotationCall {
+  std::int64_t count = 0;
+  const T* matrices = nullptr;  // [count, 3, 3] F
+  const T* direction =
+      nullptr;       // [count, 3, 3]; null: the rotations, else their derivative along it
+  T* out = nullptr;  // [count, 3, 3]
+};
+
+// One instruction set's compiled physics.
+struct Kernels {
+  const char* name;
+  void (*step32)(const StepCall<float>&, int threads);
+  void (*step64)(const StepCall<double>&, int threads);
+  void (*field32)(const FieldCall<float>&, int threads);
+  void (*field64)(const FieldCall<double>&, int threads);
+  void (*rotation32)(const RotationCall<float>&, int threads);
+  void (*rotation64)(const RotationCall<double>&, int threads);
+  void (*flops)(float* seconds, std::int64_t* operations);  // multiply-add loop, for calibration
+};
+
+}  // namespace pd

@@ -1,0 +1,32 @@
+// One time step of implicit Euler by projective dynamics, as an algorithm. A runner supplies the loops.
+//
+//   E(u) = sum_i a_i / 2 |u_i - s_i|^2 + sum_e w_e V_e / 2 |F_e(x + u) - R_e|^2        u: displacement since the step's start
+//
+// Why it cannot diverge. R_e maximises tr(R^T F_e), so for any fixed rotations Q_e the quadratic
+// q(u) = sum a/2 |u - s|^2 + sum w V / 2 |F_e - Q_e|^2 lies above E and touches it where Q_e = R_e(u). Its matrix is the
+// constant A. With K_e = grad N grad N^T and l_e = lambda_max(diag(K_e)^-1/2 K_e diag(K_e)^-1/2): K_e <= l_e diag(K_e), so
+// A <= D = diag(a_i + sum_e l_e w_e V_e |grad N_i|^2). Hence E(u - theta D^-1 g) <= E(u) - theta (1 - theta/2) g^T D^-1 g:
+// no step with 0 < theta < 2 and omega = 1 raises E, for any mesh, state, stiffness and time step, inverted elements
+// included. Projection onto convex contacts keeps this, since D is one number a vertex.
+#pragma once
+#include "plan/views.h"
+
+namespace pd {
+
+template <class Runner>
+void step(Runner& run, const Settings& settings) {
+  run.predict();    // targets s: where inertia, forces and springs would take each vertex
+  run.start();      // first iterate, on the pins and out of the contacts
+  run.translate();  // free pieces: exact along their translation
+  if (settings.report) run.measure_first();
+  for (int k = 0; k < settings.iterations; ++k) {
+    // local step on every element, then one Jacobi iteration on every vertex, accelerated and projected
+    run.iterate(k);
+    if (run.finished()) break;
+  }
+  run.translate();
+  if (settings.report) run.measure_last();
+  run.finish();  // new positions and velocities
+}
+
+}  // namespace pd

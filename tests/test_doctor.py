@@ -1,0 +1,102 @@
+"""The doctor tells what is there, and what is wrong with the remedy, also when the extension cannot be loaded."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from torchpd import doctor
+from torchpd.toolkit import Toolkit, choose_toolkit
+from torchpd.version import __version__
+
+BUILD = {
+    "simd": "avx2",
+    "simd_available": ["avx2", "portable"],
+    "openmp": 201511,
+    "cuda": False,
+    "compiler": "g++ 13.2.0",
+    "cxx": 202002,
+}
+
+
+@pytest.fixture
+def built(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_load_build", lambda: (BUILD, ""))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+
+def test_versions_are_those_of_the_process(built: None) -> None:
+    lines = [line.split() for line in doctor.report().splitlines()]
+    for name, version in {
+        "torchpd": __version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+    }.items():
+        assert [name, version] in lines
+
+
+def test_build_facts_are_shown(built: None) -> None:
+    text = doctor.report()
+    for fact in ("avx2, portable", "g++ 13.2.0", "No problem found."):
+        assert fact in text
+    assert doctor.problems() == []
+
+
+def test_missing_extension_is_a_problem_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torchpd._C", None)
+    (problem,) = doctor.problems()
+    assert "torchpd._C" in problem
+    assert "make setup" in problem
+    assert f"Problem: {problem}" in doctor.report()
+
+
+def test_gpu_without_cuda_build_is_a_problem(built: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(doctor, "find_toolkit", lambda: Toolkit(None, "12.4", "nvcc is CUDA 12.4 but ..."))
+    (problem,) = doctor.problems()
+    assert "not built: nvcc is CUDA 12.4" in problem
+
+
+def test_missing_packages_are_named_as_pip_names_them(built: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_installed", lambda package: package.module not in {"pxr", "scipy"})
+    text = doctor.report()
+    assert "pip install usd-core" in text
+    assert doctor.problems() == ["scipy is missing: pip install scipy"]
+
+
+@pytest.mark.parametrize(
+    ("home", "release", "torch_cuda", "reason"),
+    [
+        ("/usr/local/cuda", "13.0", None, "CPU build"),
+        (None, "", "13.0", "set CUDA_HOME"),
+        ("/usr/local/cuda", "", "13.0", "no working nvcc in /usr/local/cuda/bin"),
+        ("/usr/local/cuda", "12.8", "13.0", "nvcc is CUDA 12.8 but torch is built for CUDA 13.0"),
+    ],
+)
+def test_cuda_is_left_out_for_a_stated_reason(
+    home: str | None, release: str, torch_cuda: str | None, reason: str
+) -> None:
+    toolkit = choose_toolkit(home, release, torch_cuda)
+    assert toolkit.home is None
+    assert reason in toolkit.reason
+
+
+def test_cuda_is_used_when_the_major_versions_agree() -> None:
+    assert choose_toolkit("/opt/cuda", "13.2", "13.0") == Toolkit("/opt/cuda", "13.2", "")
+
+
+def test_command_works_without_the_extension() -> None:
+    program = (
+        "import runpy, sys; sys.modules['torchpd._C'] = None; sys.argv = ['torchpd', 'doctor']; "
+        "runpy.run_module('torchpd', run_name='__main__')"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert result.returncode == 1, result.stderr
+    assert "Problem: the extension torchpd._C cannot be loaded" in result.stdout
+    assert "Traceback" not in result.stderr

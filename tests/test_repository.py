@@ -1,0 +1,92 @@
+"""What the repository promises: one version, a documented public API, pins that match the declared dependencies."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.metadata
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+import torchpd
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE_FILES = sorted((ROOT / "torchpd").glob("*.py"))
+PLACEHOLDERS = re.compile(r"\b(" + "|".join(["TO" + "DO", "FIX" + "ME", "raise NotImplemented" + "Error"]) + r")\b")
+TEXT_SUFFIXES = {".py", ".pyi", ".h", ".cuh", ".cpp", ".cu", ".inl", ".def", ".md", ".toml"}
+TEXT_FOLDERS = ("torchpd", "csrc", "tests", "examples", "benchmarks", "tools")
+
+
+def requirement_names(lines: list[str]) -> set[str]:
+    """Distribution names of requirement lines, in the normal form of package indexes."""
+    names = (re.match(r"[A-Za-z0-9._-]+", line) for line in lines)
+    return {name.group().lower().replace("_", "-") for name in names if name}
+
+
+def pinned(file: str) -> list[str]:
+    lines = (ROOT / "requirements" / file).read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def test_version_is_stated_once() -> None:
+    assert torchpd.__version__ == importlib.metadata.version("torchpd")
+    stated = re.compile(rf"(?<![\d.]){re.escape(torchpd.__version__)}(?![\d.])")
+    sources = [*PACKAGE_FILES, ROOT / "setup.py", ROOT / "pyproject.toml", ROOT / "CITATION.cff"]
+    assert [path.name for path in sources if stated.search(path.read_text(encoding="utf-8"))] == ["version.py"]
+
+
+def test_public_names_exist_and_are_documented() -> None:
+    for name in torchpd.__all__:
+        value = getattr(torchpd, name)
+        if inspect.isclass(value) or inspect.isroutine(value) or inspect.ismodule(value):
+            assert value.__doc__, f"torchpd.{name} has no docstring"
+
+
+@pytest.mark.parametrize("path", PACKAGE_FILES, ids=lambda path: path.stem)
+def test_module_is_documented_and_lists_its_names(path: Path) -> None:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    assert ast.get_docstring(tree), f"{path.name} has no docstring"
+    if path.stem == "__main__":
+        return
+    module = importlib.import_module("torchpd" if path.stem == "__init__" else f"torchpd.{path.stem}")
+    assert [name for name in module.__all__ if not hasattr(module, name)] == []
+
+
+def test_types_of_the_extension_name_what_it_has() -> None:
+    stub = ast.parse((ROOT / "torchpd" / "_C.pyi").read_text(encoding="utf-8"))
+    extension = importlib.import_module("torchpd._C")
+    declared = {node.name for node in stub.body if isinstance(node, ast.FunctionDef)}
+    assert declared == {name for name in vars(extension) if not name.startswith("_")}
+
+
+def test_every_declared_dependency_is_pinned() -> None:
+    declared = importlib.metadata.requires("torchpd") or []
+    wanted = [line for line in declared if "extra == 'tetwild'" not in line.replace('"', "'")]
+    missing = requirement_names(wanted) - requirement_names(pinned("dev.txt")) - {"torchpd"}
+    assert missing == set()
+
+
+@pytest.mark.parametrize("file", ["dev.txt", "lock.txt"])
+def test_requirements_are_exact_and_fit_any_build_of_torch(file: str) -> None:
+    for line in pinned(file):
+        version = re.fullmatch(r"[A-Za-z0-9-]+==(\S+)( ; python_version (<|>=) \"3\.11\")?", line)
+        assert version, f"{file}: {line}"
+        assert "+" not in version.group(1), f"{file}: {line} names one build, which other machines may not have"
+
+
+def test_nothing_is_left_unfinished() -> None:
+    files = [path for folder in TEXT_FOLDERS for path in (ROOT / folder).glob("**/*")]
+    texts = [path for path in files if path.suffix in TEXT_SUFFIXES]
+    assert texts
+    found = [str(path.relative_to(ROOT)) for path in texts if PLACEHOLDERS.search(path.read_text(encoding="utf-8"))]
+    assert found == []
+
+
+def test_execution_headers_know_no_torch_and_no_cuda() -> None:
+    foreign = re.compile(r'#include\s*[<"](torch|ATen|c10|cuda|cub|pybind11)')
+    headers = [path for folder in ("math", "effects", "solver") for path in (ROOT / "csrc" / folder).glob("**/*.h")]
+    assert headers
+    assert [path.name for path in headers if foreign.search(path.read_text(encoding="utf-8"))] == []

@@ -1,0 +1,57 @@
+"""torchpd: elastic bodies by projective dynamics, as PyTorch operators."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from . import shapes
+from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from .embedding import Embedding, embed
+from .extension import extension_error, load_extension
+from .mesh import MeshWarning, TetMesh, TriMesh
+from .scene import Scene
+from .solvers import Chebyshev, Jacobi
+from .state import Info, State, Track
+from .tetrahedralize import tetrahedralize
+from .version import __version__
+
+if load_extension()[0] is not None:
+    from .ops import nearest_rotation
+    from .plan import Plan, compile_plan
+    from .simulator import Simulator
+    from .spectrum import estimate_rho
+else:  # meshes, scenes and the doctor work without it
+
+    def __getattr__(name: str) -> Any:
+        if name in __all__:
+            raise extension_error(name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+__all__ = [
+    "Chebyshev",
+    "Damping",
+    "Embedding",
+    "Gravity",
+    "Ground",
+    "Info",
+    "Jacobi",
+    "MeshWarning",
+    "Pin",
+    "Plan",
+    "Scene",
+    "Simulator",
+    "Solid",
+    "Sphere",
+    "State",
+    "TetMesh",
+    "Track",
+    "TriMesh",
+    "__version__",
+    "compile_plan",
+    "embed",
+    "estimate_rho",
+    "nearest_rotation",
+    "shapes",
+    "tetrahedralize",
+]

@@ -1,0 +1,71 @@
+"""Checks at the boundary: each names the argument, the contract and what came."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+__all__ = ["as_array", "check_finite", "check_positive", "check_scalar", "check_shape", "check_vector"]
+
+
+def as_array(name: str, value: Any, dtype: Any = None) -> NDArray[Any]:
+    """A private contiguous copy of numbers, sequences, arrays or tensors as a NumPy array."""
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu().numpy()
+    try:
+        array = np.array(value)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{name} must be numbers in a regular array: {error}") from None
+    if array.dtype == np.object_ or array.dtype.kind not in "biuf":
+        raise TypeError(f"{name} must hold real numbers, got {array.dtype}")
+    return np.ascontiguousarray(array, dtype=dtype) if array.ndim else array.astype(dtype or array.dtype)
+
+
+def check_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...], meaning: str) -> None:
+    """Shape must match, None standing for any length."""
+    matches = array.ndim == len(shape) and all(
+        want is None or have == want for have, want in zip(array.shape, shape, strict=True)
+    )
+    if not matches:
+        want = ", ".join("n" if length is None else str(length) for length in shape)
+        raise ValueError(f"{name} must be [{want}] ({meaning}), got {list(array.shape)}")
+
+
+def check_finite(name: str, array: NDArray[Any]) -> None:
+    """No NaN, no infinity."""
+    bad = np.flatnonzero(~np.isfinite(array).reshape(-1))
+    if bad.size:
+        where = [int(i) for i in np.unravel_index(bad[0], array.shape)] if array.ndim else []
+        raise ValueError(f"{name} must be finite, got {array.reshape(-1)[bad[0]]} at {where} ({bad.size} in all)")
+
+
+def check_positive(name: str, array: NDArray[Any], *, unit: str) -> None:
+    """Every value > 0."""
+    bad = np.flatnonzero(~(array > 0))
+    if bad.size:
+        raise ValueError(f"{name} must be positive [{unit}], got {array[bad[0]]} at {int(bad[0])} ({bad.size} in all)")
+
+
+def check_scalar(name: str, value: Any, *, minimum: float | None = None) -> float:
+    """One finite number, as a float."""
+    array = as_array(name, value, np.float64)
+    if array.size != 1:
+        raise ValueError(f"{name} must be one number, got {list(array.shape)}")
+    number = float(array.reshape(()))
+    if not np.isfinite(number):
+        raise ValueError(f"{name} must be finite, got {number}")
+    if minimum is not None and number < minimum:
+        raise ValueError(f"{name} must be >= {minimum:g}, got {number}")
+    return number
+
+
+def check_vector(name: str, value: Any) -> NDArray[np.float64]:
+    """Three finite numbers, read-only."""
+    array = as_array(name, value, np.float64)
+    check_shape(name, array, (3,), "a vector")
+    check_finite(name, array)
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,155 @@
+"""How fast the solvers come near the converged step: error against iterations, measured and drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from .effects import Ground, Sphere
+from .scene import Part, Scene
+from .simulator import Simulator
+from .solvers import Chebyshev, Jacobi, Solver
+from .spectrum import estimate_rho
+from .state import State
+
+__all__ = ["ConvergenceCurve", "compare_solvers", "measure_convergence", "plot_convergence"]
+
+_REFERENCE_ITERATIONS = 4000
+# Okabe and Ito's palette, told apart with every kind of colour vision.
+_COLORS = ("#8a8d93", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
+
+
+@dataclass(frozen=True)
+class ConvergenceCurve:
+    """Error of one solver in one time step, |x - x*| / |x_0 - x*|: x* the converged step, x_0 the first iterate."""
+
+    solver: Solver
+    iterations: tuple[int, ...]
+    errors: tuple[float, ...]  # inf where the iteration left the range of numbers
+
+
+@torch.no_grad()
+def measure_convergence(
+    sim: Simulator, state: State, solvers: Mapping[str, Solver], *, iterations: int = 256, progress: bool = False
+) -> dict[str, ConvergenceCurve]:
+    """Error against iterations of each solver in one step from `state`, in float64 and without friction.
+
+    Where vertices stick, every position inside the cone of friction is a solution, and each solver stops at another
+    one: their distance would say nothing about either.
+
+    Args:
+        sim: the scene and its time step; its own solver and precision do not matter.
+        state: where the step starts, [1, V, 3].
+        solvers: by the name that they shall have in the answer.
+        iterations: up to how many, at about thirty counts.
+        progress: show a bar.
+    """
+    if len(state.positions) != 1:
+        raise ValueError(f"measure_convergence: state must hold one environment, got {len(state.positions)}")
+    study, start = _study(sim, Chebyshev()), _double(state)
+    counts = np.unique(np.geomspace(1, max(iterations, 1), 30).round().astype(int)).tolist()
+
+    def after(solver: Solver, count: int) -> torch.Tensor:
+        study.solver, study.iterations = solver, count
+        after_step: State = study(start)
+        return after_step.positions
+
+    solution = after(Chebyshev(), max(_REFERENCE_ITERATIONS, 4 * iterations))
+    scale = float((after(Chebyshev(), 0) - solution).norm())
+    if scale == 0.0:
+        raise ValueError("measure_convergence: the first iterate solves this step already, nothing is left to measure")
+    curves = {}
+    with tqdm(total=len(solvers) * len(counts), desc="convergence", disable=not progress, leave=False) as bar:
+        for name, solver in solvers.items():
+            errors = []
+            for count in counts:
+                error = float((after(solver, count) - solution).norm()) / scale
+                errors.append(error if np.isfinite(error) else np.inf)
+                bar.update(1)
+            curves[name] = ConvergenceCurve(solver, tuple(counts), tuple(errors))
+    return curves
+
+
+def compare_solvers(
+    sim: Simulator, state: State, *, iterations: int = 256, progress: bool = False
+) -> dict[str, ConvergenceCurve]:
+    """`measure_convergence` of Jacobi, classic Chebyshev with the paper's two-stage rho, and guarded Chebyshev."""
+    rho = estimate_rho(_study(sim, Jacobi(diagonal="plain")), _double(state), method="two-stage")
+    solvers: dict[str, Solver] = {
+        "Jacobi": Jacobi(diagonal="plain"),
+        f"classic Chebyshev, rho = {rho:.4f}": Chebyshev("classic", rho=rho),
+        "guarded Chebyshev (default)": Chebyshev(),
+    }
+    return measure_convergence(sim, state, solvers, iterations=iterations, progress=progress)
+
+
+def _study(sim: Simulator, solver: Solver) -> Simulator:
+    """The same scene without friction, in float64."""
+    parts: list[Part] = []
+    for part in sim.scene.parts:
+        if isinstance(part, Ground):
+            parts.append(Ground(part.height, part.normal))
+        elif isinstance(part, Sphere):
+            parts.append(Sphere(part.center, part.radius))
+        else:
+            parts.append(part)
+    study = Simulator(Scene(*parts), sim.time_step, solver=solver, dtype=torch.float64, progress=False)
+    return study.to(sim.device)
+
+
+def _double(state: State) -> State:
+    return State(state.positions.double(), state.velocities.double())
+
+
+def plot_convergence(
+    curves: Mapping[str, ConvergenceCurve], path: str | Path, *, title: str, mark: int | None = None
+) -> Path:
+    """Draw the curves into a picture file.
+
+    Args:
+        curves: from `measure_convergence`; the last one is drawn strongest.
+        path: of the picture.
+        title: one line above the plot.
+        mark: number of iterations to mark by a vertical line, for example those of a run.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ModuleNotFoundError("plots need matplotlib: pip install torchpd[demo]") from None
+    figure = Figure(figsize=(8.0, 5.0), dpi=150, layout="constrained")
+    axes = figure.add_subplot()
+    lowest = min(min(curve.errors) for curve in curves.values())
+    for number, (name, curve) in enumerate(curves.items()):
+        last = number == len(curves) - 1
+        errors = np.minimum(curve.errors, 30.0)  # a diverging curve leaves through the top of the plot
+        axes.plot(
+            (0, *curve.iterations),
+            (1.0, *errors),
+            color=_COLORS[number % len(_COLORS)],
+            linewidth=2.6 if last else 1.8,
+            solid_capstyle="round",
+            label=name,
+        )
+    most = max(curve.iterations[-1] for curve in curves.values())
+    axes.set_yscale("log")
+    axes.set_xlim(0, most)
+    axes.set_ylim(max(10.0 ** np.floor(np.log10(max(lowest, 1e-15))), 1e-10), 3.0)
+    if mark is not None and mark <= most:
+        axes.axvline(mark, color="#3e4046", linewidth=1.0, linestyle=(0, (2, 3)))
+        axes.annotate(
+            f" {mark} iterations", (mark, 1.0), xycoords=("data", "axes fraction"), xytext=(2, -12),
+            textcoords="offset points", color="#3e4046", fontsize=9,
+        )  # fmt: skip
+    axes.set_xlabel("iterations of one time step")
+    axes.set_ylabel(r"error  $|x - x^*|\;/\;|x_0 - x^*|$")
+    axes.set_title(title, loc="left", fontsize=11, color="#3e4046")
+    axes.grid(which="major", color="#e4e5e8", linewidth=0.8)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(frameon=False, loc="outside lower center", ncols=3)
+    figure.savefig(path)
+    return Path(path)

@@ -1,0 +1,202 @@
+"""The whole path in one command: a mesh is filled, dropped, stepped, drawn, and its error measured."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from . import shapes
+from .animation import write_film, write_surface
+from .convergence import compare_solvers, plot_convergence
+from .doctor import OPTIONAL, missing_packages
+from .effects import Gravity, Ground, Solid
+from .mesh import TetMesh, TriMesh
+from .render import Studio, contact_sheet
+from .scene import Scene
+from .simulator import Simulator
+from .state import State, Track
+from .tetrahedralize import tetrahedralize
+
+__all__ = ["DemoOptions", "run_demo"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+TIME_STEP = 1 / 60  # s
+DROP_HEIGHT = 0.25  # m under the lowest vertex
+_DRAWING = ("mitsuba", "PIL", "imageio_ffmpeg", "pxr", "matplotlib")
+_VOLUME_SUFFIXES = (".mesh", ".msh", ".vtk", ".vtu")
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """What `python -m torchpd demo` takes."""
+
+    mesh: Path | None = None  # surface or tetrahedral mesh; None takes shapes.octopus()
+    cells: int = 24  # of the lattice along the longest side; a tetrahedral mesh needs none
+    steps: int = 120  # of 1/60 s
+    youngs: float = 2e4  # Pa
+    iterations: int = 64  # of a step
+    device: str = "cpu"
+    out: Path = Path("out")
+    quick: bool = False  # fewer and smaller pictures
+
+
+class _Pictures(NamedTuple):
+    """How the motion is drawn."""
+
+    sheet_frames: int
+    sheet_columns: int
+    sheet_size: tuple[int, int]
+    sheet_samples: int
+    film_size: tuple[int, int]
+    film_samples: int
+    film_every: int  # steps from one picture of the film to the next
+
+
+_GOOD = _Pictures(12, 4, (480, 360), 16, (400, 300), 4, 2)
+_QUICK = _Pictures(6, 3, (240, 180), 9, (160, 120), 4, 6)
+
+
+class _Motion(NamedTuple):
+    """What the simulation gave."""
+
+    start: State
+    track: Track
+    seconds: float  # of wall time
+    frames: Array  # [1 + steps, n, 3] of the drawn surface, the start first
+    triangles: Index  # of the drawn surface
+
+
+def run_demo(options: DemoOptions) -> str:
+    """Write pictures, films and the convergence plot to `options.out`; the report to print."""
+    missing = missing_packages(package for package in OPTIONAL if package.module in _DRAWING)
+    if missing:  # said before the work, not after it
+        names = ", ".join(package.pip_name for package in missing)
+        raise ModuleNotFoundError(f"the demo draws with {names}, not installed: pip install torchpd[demo]")
+    device = _device(options.device)
+    name = options.mesh.name if options.mesh else "octopus"
+    mesh = _place(_load(options.mesh), options.cells)
+    scene = Scene(Solid(mesh, youngs=options.youngs, density=1000.0), Gravity(), Ground(friction=0.5))
+    sim = Simulator(scene, TIME_STEP, iterations=options.iterations).to(device)
+    options.out.mkdir(parents=True, exist_ok=True)
+
+    motion = _simulate(sim, mesh, options.steps)
+    files = _draw(motion, options.out, _QUICK if options.quick else _GOOD)
+    hardest = _hardest_step(motion.track)
+    before = motion.start if hardest == 0 else motion.track.state(hardest - 1)
+    curves = compare_solvers(sim, before, iterations=64 if options.quick else 256, progress=True)
+    title = f"{name}, {len(mesh.tets):,} tets, the step of highest energy (t = {hardest * TIME_STEP:.2f} s)"
+    files.append(plot_convergence(curves, options.out / "convergence.png", title=title, mark=options.iterations))
+    return _report(name, mesh, sim, motion, files)
+
+
+def _device(name: str) -> torch.device:
+    kind = name.split(":")[0]
+    if kind not in ("cpu", "cuda"):
+        raise ValueError(f"--device must be cpu or cuda, got {name}")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: torch sees no CUDA device here; python -m torchpd doctor says more")
+    return torch.device(name)
+
+
+def _load(path: Path | None) -> TetMesh | TriMesh:
+    if path is None:
+        return shapes.octopus()
+    return TetMesh.from_file(path) if path.suffix.lower() in _VOLUME_SUFFIXES else TriMesh.from_file(path)
+
+
+def _place(shape: TetMesh | TriMesh, cells: int) -> TetMesh:
+    """One metre long, tilted so that it lands on an edge and bends, its lowest vertex above the ground."""
+    low, high = shape.bounds
+    placed = shape.translated(-(low + high) / 2.0).scaled(1.0 / float((high - low).max())).transformed(_tilt())
+    mesh = placed if isinstance(placed, TetMesh) else tetrahedralize(placed, cells=cells, progress=True)
+    return mesh.translated((0.0, DROP_HEIGHT - float(mesh.bounds[0, 1]), 0.0))
+
+
+def _tilt() -> Array:
+    """Turns of 25 degrees about z, 20 about x and, towards the camera, 25 about y, one after another."""
+    x, y, z = np.radians(20.0), np.radians(25.0), np.radians(25.0)
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(x), -np.sin(x)], [0.0, np.sin(x), np.cos(x)]])
+    about_y = np.array([[np.cos(y), 0.0, np.sin(y)], [0.0, 1.0, 0.0], [-np.sin(y), 0.0, np.cos(y)]])
+    about_z = np.array([[np.cos(z), -np.sin(z), 0.0], [np.sin(z), np.cos(z), 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(about_y @ about_x @ about_z)
+
+
+def _simulate(sim: Simulator, mesh: TetMesh, steps: int) -> _Motion:
+    start = sim.rest_state()
+    sim.step_(State(*(part.clone() for part in start)))  # the first step also allocates its workspace
+    begin = time.perf_counter()
+    track = sim.rollout(start, steps, return_info=True, progress=True)
+    seconds = time.perf_counter() - begin  # reading the residuals below would wait for a GPU; the copy here does
+    positions = torch.cat([start.positions, track.positions[:, 0]]).double().cpu().numpy()
+    if not np.isfinite(positions).all():
+        raise ValueError("the motion left the range of numbers; a larger Young's modulus may help (--youngs)")
+    if mesh.embedding is None:
+        return _Motion(start, track, seconds, positions, mesh.boundary())
+    return _Motion(start, track, seconds, mesh.embedding.apply(positions), mesh.embedding.surface.triangles)
+
+
+def _hardest_step(track: Track) -> int:
+    """The step whose objective is highest: elastic energy and sudden braking together."""
+    return int(track.info.energy[:, 0].argmax())
+
+
+def _draw(motion: _Motion, out: Path, pictures: _Pictures) -> list[Path]:
+    """Contact sheet, moving surface and films."""
+    frames, triangles = motion.frames, motion.triangles
+    # the floor is drawn where the surface comes to lie: a lattice around it touches the ground a little earlier
+    sheet_studio, film_studio = (
+        Studio(frames, triangles, ground=None, size=size, samples=samples)
+        for size, samples in (
+            (pictures.sheet_size, pictures.sheet_samples),
+            (pictures.film_size, pictures.film_samples),
+        )
+    )
+    chosen = np.unique(np.linspace(0, len(frames) - 1, pictures.sheet_frames).round().astype(int))
+    shown = range(0, len(frames), pictures.film_every)
+    with tqdm(total=len(chosen) + len(shown), desc="pictures", unit="picture", leave=False) as bar:
+        sheet, film = [], []
+        for number in chosen:
+            sheet.append(sheet_studio.render(frames[number]))
+            bar.update(1)
+        for number in shown:
+            film.append(film_studio.render(frames[number]))
+            bar.update(1)
+    captions = [f"{number * TIME_STEP:.2f} s" for number in chosen]
+    contact_sheet(sheet, columns=pictures.sheet_columns, captions=captions, path=out / "contact_sheet.png")
+    rate = 1.0 / TIME_STEP
+    return [
+        out / "contact_sheet.png",
+        *(
+            write_film(out / f"animation{e}", film, frames_per_second=rate / pictures.film_every)
+            for e in (".gif", ".mp4")
+        ),
+        *(write_surface(out / f"animation{e}", frames, triangles, frames_per_second=rate) for e in (".glb", ".usdc")),
+    ]
+
+
+def _report(name: str, mesh: TetMesh, sim: Simulator, motion: _Motion, files: list[Path]) -> str:
+    steps = len(motion.track.positions)
+    milliseconds = 1e3 * motion.seconds / steps
+    rows = [
+        ("mesh", name),
+        ("vertices", f"{len(mesh.vertices):,}"),
+        ("tets", f"{len(mesh.tets):,}"),
+        ("device", str(sim.device)),
+        ("steps", f"{steps} of {1e3 * TIME_STEP:.1f} ms"),
+        ("iterations", f"{sim.iterations} a step"),
+        ("time per step", f"{milliseconds:.2f} ms"),
+        ("real-time factor", f"{1e3 * TIME_STEP / milliseconds:.1f}"),
+        ("final residual", f"{float(motion.track.info.residual[-1, 0]):.1e}"),
+    ]
+    width = max(len(key) for key, _ in rows)
+    table = [f"{key:<{width}}  {value}" for key, value in rows]
+    return "\n".join([*table, "", "written:", *(f"  {file}" for file in files)])

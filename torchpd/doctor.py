@@ -1,0 +1,147 @@
+"""What this installation is made of and what is wrong with it: `python -m torchpd doctor`.
+
+Works without the compiled extension, because its absence is the first thing to find out.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import torch
+
+from .extension import BUILD_COMMAND, load_extension
+from .toolkit import Toolkit, find_toolkit
+from .version import __version__
+
+__all__ = ["Package", "missing_packages", "problems", "report"]
+
+
+class Package(NamedTuple):
+    """A package that torchpd can use."""
+
+    module: str
+    pip_name: str
+    purpose: str
+
+
+REQUIRED = (
+    Package("torch", "torch", ""),
+    Package("numpy", "numpy", ""),
+    Package("scipy", "scipy", ""),
+    Package("trimesh", "trimesh", ""),
+    Package("meshio", "meshio", ""),
+    Package("safetensors", "safetensors", ""),
+    Package("tqdm", "tqdm", ""),
+)
+OPTIONAL = (
+    Package("mitsuba", "mitsuba", "pictures"),
+    Package("matplotlib", "matplotlib", "plots"),
+    Package("PIL", "pillow", "pictures"),
+    Package("imageio", "imageio", "GIF"),
+    Package("imageio_ffmpeg", "imageio-ffmpeg", "MP4"),
+    Package("pygltflib", "pygltflib", "glTF files"),
+    Package("pxr", "usd-core", "USD files"),
+    Package("pytetwild", "pytetwild", 'tetrahedralize(method="tetwild")'),
+)
+
+
+def _load_build() -> tuple[Mapping[str, Any] | None, str]:
+    """Build facts of torchpd._C, or None and the reason."""
+    extension, reason = load_extension()
+    return (None, reason) if extension is None else (extension.build_info(), "")
+
+
+def _installed(package: Package) -> bool:
+    return importlib.util.find_spec(package.module) is not None
+
+
+def missing_packages(packages: Iterable[Package]) -> list[Package]:
+    """Those of the packages that cannot be imported."""
+    return [package for package in packages if not _installed(package)]
+
+
+def _version(package: Package) -> str:
+    try:
+        return importlib.metadata.version(package.pip_name)
+    except importlib.metadata.PackageNotFoundError:
+        return "present, version unknown" if _installed(package) else "missing"
+
+
+def _devices() -> list[tuple[str, str]]:
+    """Every device that torch sees."""
+    rows = [("cpu", f"{os.cpu_count()} logical cores, {torch.get_num_threads()} threads in use")]
+    for index in range(torch.cuda.device_count()):
+        device = torch.cuda.get_device_properties(index)
+        capability = f"sm_{device.major}{device.minor}"
+        rows.append((f"cuda:{index}", f"{device.name}, {capability}, {device.total_memory / 2**30:.0f} GiB"))
+    return rows
+
+
+def _cuda_state(build: Mapping[str, Any] | None, toolkit: Toolkit) -> str:
+    """What the extension has, and what building it now would give where that differs."""
+    built = build is not None and bool(build["cuda"])
+    if built and toolkit.home is not None:
+        return f"built; toolkit {toolkit.release} in {toolkit.home}"
+    if built:
+        return f"built, but a build now would go without: {toolkit.reason}"
+    if toolkit.home is not None:
+        return f"not built, although toolkit {toolkit.release} in {toolkit.home} matches: rebuild with {BUILD_COMMAND}"
+    return f"not built: {toolkit.reason}"
+
+
+def problems() -> list[str]:
+    """What keeps torchpd from working, each with its remedy; empty when all is well."""
+    found = [f"{package.pip_name} is missing: pip install {package.pip_name}" for package in missing_packages(REQUIRED)]
+    build, reason = _load_build()
+    if build is None:
+        found.append(f"the extension torchpd._C cannot be loaded ({reason}): build it with {BUILD_COMMAND}")
+    elif torch.cuda.is_available() and not build["cuda"]:
+        found.append(f"a GPU is there, but CUDA is {_cuda_state(build, find_toolkit())}")
+    return found
+
+
+def _section(title: str, rows: Iterable[tuple[str, str]]) -> list[str]:
+    return [title, *(f"  {name:<16} {value}" for name, value in rows), ""]
+
+
+def _build_rows() -> list[tuple[str, str]]:
+    build, reason = _load_build()
+    cuda = ("CUDA", _cuda_state(build, find_toolkit()))
+    if build is None:
+        return [("torchpd._C", f"not built ({reason})"), cuda]
+    return [
+        ("torchpd._C", "built"),
+        ("compiler", f"{build['compiler']}, {build['cxx']}"),
+        ("SIMD in use", str(build["simd"])),
+        ("SIMD available", ", ".join(build["simd_available"])),
+        ("OpenMP", str(build["openmp"] or "none: one thread")),
+        cuda,
+    ]
+
+
+def _optional_row(package: Package) -> tuple[str, str]:
+    if _installed(package):
+        return package.pip_name, f"{_version(package)} ({package.purpose})"
+    return package.pip_name, f"missing; for {package.purpose}: pip install {package.pip_name}"
+
+
+def report() -> str:
+    """The whole report as text, problems last."""
+    system = [
+        ("torchpd", __version__),
+        ("python", platform.python_version()),
+        ("platform", f"{platform.platform()}, {platform.machine()}"),
+        ("torch CUDA", torch.version.cuda or "none (a CPU build)"),
+    ]
+    lines = _section("Versions", [*system, *((package.pip_name, _version(package)) for package in REQUIRED)])
+    lines += _section("Devices", _devices())
+    lines += _section("Build", _build_rows())
+    lines += _section("Optional packages", map(_optional_row, OPTIONAL))
+    found = problems()
+    lines += [f"Problem: {problem}" for problem in found] or ["No problem found."]
+    return "\n".join(lines)

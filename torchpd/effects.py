@@ -1,0 +1,196 @@
+"""The parts of a scene: values only, no work. Each part is a frozen description that `Scene` gathers.
+
+All quantities are in SI units. Scalars and per-element tensors are accepted alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from .checks import as_array, check_finite, check_positive, check_scalar, check_shape, check_vector
+from .mesh import TetMesh
+
+__all__ = ["Damping", "Gravity", "Ground", "Pin", "Solid", "Sphere"]
+
+Array = NDArray[np.float64]
+ArrayLike = float | Sequence[float] | Array | torch.Tensor
+
+
+def _set(part: object, **values: Any) -> None:
+    """Store checked values in a frozen part."""
+    for name, value in values.items():
+        object.__setattr__(part, name, value)
+
+
+def _per_element(name: str, value: ArrayLike, count: int, *, unit: str) -> Array:
+    array = as_array(name, value, np.float64)
+    if array.ndim == 0:
+        array = np.full(count, float(array))
+    check_shape(name, array, (count,), f"one value per tetrahedron or a scalar [{unit}]")
+    check_finite(name, array)
+    check_positive(name, array, unit=unit)
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """An elastic body: tetrahedra that resist every departure from their rest shape.
+
+    Energy per tetrahedron, with F the deformation gradient and R its nearest rotation:
+    w V / 2 |F - R|^2, w = Young's modulus at Poisson ratio 0 (Vyatkin and Dolgovesov 2023, where st = w / 2).
+
+    Args:
+        mesh: the rest shape.
+        youngs: Young's modulus [Pa], a scalar or one value per tetrahedron, positive.
+        density: [kg/m^3], a scalar or one value per tetrahedron, positive.
+    """
+
+    mesh: TetMesh
+    youngs: Array
+    density: Array
+
+    def __init__(self, mesh: TetMesh, youngs: ArrayLike, density: ArrayLike = 1000.0) -> None:
+        if not isinstance(mesh, TetMesh):
+            raise TypeError(
+                f"Solid: mesh must be a TetMesh, got {type(mesh).__name__}; "
+                "turn a surface into tetrahedra with torchpd.tetrahedralize(surface, cells=...)"
+            )
+        count = len(mesh.tets)
+        _set(
+            self,
+            mesh=mesh,
+            youngs=_per_element("Solid.youngs", youngs, count, unit="Pa"),
+            density=_per_element("Solid.density", density, count, unit="kg/m^3"),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Pin:
+    """Holds vertices of a solid at targets: at their rest positions, or where `targets` of a step puts them.
+
+    Args:
+        solid: the body whose vertices are held.
+        vertices: vertex numbers of that body [P], or a boolean mask over all of its vertices.
+        stiffness: None holds them exactly (hard); a positive number or [P] is a spring k / 2 |x - target|^2 [N/m].
+    """
+
+    solid: Solid
+    vertices: NDArray[np.int64]
+    stiffness: Array | None
+
+    def __init__(
+        self, solid: Solid, vertices: Sequence[int] | NDArray[Any] | torch.Tensor, stiffness: ArrayLike | None = None
+    ) -> None:
+        if not isinstance(solid, Solid):
+            raise TypeError(f"Pin: solid must be a Solid of the scene, got {type(solid).__name__}")
+        count = len(solid.mesh.vertices)
+        chosen = as_array("Pin.vertices", vertices)
+        if chosen.dtype == np.bool_:
+            check_shape("Pin.vertices", chosen, (count,), "a mask over the vertices of the body")
+            chosen = np.flatnonzero(chosen)
+        if chosen.size == 0:
+            raise ValueError("Pin.vertices must name at least one vertex, got none")
+        if chosen.ndim != 1 or not np.issubdtype(chosen.dtype, np.integer):
+            raise ValueError(
+                f"Pin.vertices must be integers [P] or a boolean mask [{count}], "
+                f"got {chosen.dtype} {list(chosen.shape)}"
+            )
+        if chosen.min() < 0 or chosen.max() >= count:
+            bad = int(chosen[(chosen < 0) | (chosen >= count)][0])
+            raise IndexError(f"Pin.vertices must lie in 0..{count - 1} (vertices of the body), got {bad}")
+        if len(np.unique(chosen)) != len(chosen):
+            raise ValueError("Pin.vertices must not name a vertex twice")
+        springs = None
+        if stiffness is not None:
+            springs = as_array("Pin.stiffness", stiffness, np.float64)
+            springs = np.full(len(chosen), float(springs)) if springs.ndim == 0 else springs
+            check_shape("Pin.stiffness", springs, (len(chosen),), "a scalar or one value per pinned vertex [N/m]")
+            check_finite("Pin.stiffness", springs)
+            check_positive("Pin.stiffness", springs, unit="N/m")
+        _set(self, solid=solid, vertices=chosen.astype(np.int64), stiffness=springs)
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """A uniform acceleration [m/s^2] of everything."""
+
+    vector: Array
+
+    def __init__(self, vector: ArrayLike = (0.0, -9.81, 0.0)) -> None:
+        _set(self, vector=check_vector("Gravity.vector", vector))
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """A plane that vertices cannot pass: normal . x >= height, with Coulomb friction.
+
+    Args:
+        height: of the plane along its normal [m].
+        normal: towards the free side; normalised here.
+        friction: Coulomb's coefficient, >= 0.
+    """
+
+    height: float
+    normal: Array
+    friction: float
+
+    def __init__(self, height: float = 0.0, normal: ArrayLike = (0.0, 1.0, 0.0), friction: float = 0.0) -> None:
+        direction = check_vector("Ground.normal", normal)
+        length = float(np.linalg.norm(direction))
+        if length == 0.0:
+            raise ValueError("Ground.normal must not be the zero vector")
+        _set(
+            self,
+            height=check_scalar("Ground.height", height),
+            normal=direction / length,
+            friction=check_scalar("Ground.friction", friction, minimum=0.0),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """A ball that vertices cannot enter, with Coulomb friction. `targets` of a step may move its centre.
+
+    Args:
+        center: [3] in m.
+        radius: [m], positive.
+        friction: Coulomb's coefficient, >= 0.
+    """
+
+    center: Array
+    radius: float
+    friction: float
+
+    def __init__(self, center: ArrayLike, radius: float, friction: float = 0.0) -> None:
+        size = check_scalar("Sphere.radius", radius)
+        if size <= 0.0:
+            raise ValueError(f"Sphere.radius must be positive [m], got {size}")
+        _set(
+            self,
+            center=check_vector("Sphere.center", center),
+            radius=size,
+            friction=check_scalar("Sphere.friction", friction, minimum=0.0),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Damping:
+    """Drag proportional to mass: every velocity decays as dv/dt = -rate v.
+
+    Implicit: energy rate m / (2 h) |x - x_t|^2, so that a free motion is divided by 1 + rate h in a step.
+
+    Args:
+        rate: [1/s], >= 0.
+    """
+
+    rate: float
+
+    def __init__(self, rate: float) -> None:
+        _set(self, rate=check_scalar("Damping.rate", rate, minimum=0.0))

@@ -1,0 +1,134 @@
+"""A surface that rides in a tetrahedral mesh: every surface vertex is a fixed combination of one tet's corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any, overload
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .mesh import TetMesh, TriMesh
+from .quality import shape_gradients
+
+__all__ = ["Embedding", "embed", "embed_triangles"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# How many of the nearest tets compete for a point that lies in none.
+_NEAREST = 32
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Embedding:
+    """Carries a surface with a tetrahedral mesh: surface vertex i is sum_a weights[i, a] x[corners[i, a]].
+
+    Weights add up to 1, so every affine motion of the mesh is carried exactly.
+    """
+
+    surface: TriMesh  # the surface at rest: its triangles and texture coordinates stay valid for `apply`
+    tets: Index  # [n] the tet that carries each surface vertex
+    weights: Array  # [n, 4] barycentric; not negative where the vertex lies inside its tet
+    corners: Index  # [n, 4] rows `tets` of the mesh: the vertices that the weights belong to
+    vertex_count: int  # vertices of the mesh
+
+    def __post_init__(self) -> None:
+        count = len(self.surface.vertices)
+        for name, shape in (("tets", (count,)), ("weights", (count, 4)), ("corners", (count, 4))):
+            array = getattr(self, name)
+            if array.shape != shape:
+                raise ValueError(f"Embedding.{name} must be {list(shape)} (surface vertices), got {list(array.shape)}")
+            array.setflags(write=False)
+
+    @overload
+    def apply(self, positions: NDArray[Any]) -> NDArray[Any]: ...
+    @overload
+    def apply(self, positions: torch.Tensor) -> torch.Tensor: ...
+
+    def apply(self, positions: NDArray[Any] | torch.Tensor) -> NDArray[Any] | torch.Tensor:
+        """Positions of the surface vertices [..., n, 3] for mesh positions [..., V, 3].
+
+        Arrays and tensors keep their precision; tensors keep their device and are differentiated through.
+        """
+        if tuple(positions.shape[-2:]) != (self.vertex_count, 3):
+            raise ValueError(
+                f"Embedding.apply: positions must be [..., {self.vertex_count}, 3] (the vertices of the mesh), "
+                f"got {list(positions.shape)}; one body of a scene is positions[..., scene.vertex_range(solid), :]"
+            )
+        if isinstance(positions, torch.Tensor):
+            return self._apply_tensor(positions)
+        array = np.asarray(positions)
+        weights = self.weights.astype(array.dtype if array.dtype.kind == "f" else np.float64)
+        parts = (array[..., self.corners[:, a], :] * weights[:, a, None] for a in range(4))
+        return np.asarray(sum(parts))
+
+    def _apply_tensor(self, positions: torch.Tensor) -> torch.Tensor:
+        if not positions.is_floating_point():
+            raise TypeError(f"Embedding.apply: positions must be floating point, got {positions.dtype}")
+        weights = torch.tensor(self.weights, dtype=positions.dtype, device=positions.device)
+        corners = torch.tensor(self.corners, device=positions.device)
+        carried = positions.index_select(-2, corners[:, 0]) * weights[:, 0, None]
+        for a in range(1, 4):
+            carried = carried + positions.index_select(-2, corners[:, a]) * weights[:, a, None]
+        return carried
+
+    def transformed(self, matrix: Any, corners: Sequence[int] = (0, 1, 2, 3)) -> Embedding:
+        """The embedding in the transformed mesh, whose tets list their corners in another order."""
+        order = list(corners)
+        return Embedding(
+            surface=self.surface.transformed(matrix),
+            tets=self.tets,
+            weights=self.weights[:, order],
+            corners=self.corners[:, order],
+            vertex_count=self.vertex_count,
+        )
+
+    def __repr__(self) -> str:
+        return f"Embedding({self.surface} in {self.vertex_count} mesh vertices)"
+
+
+def _weights(points: Array, origins: Array, gradients: Array) -> Array:
+    """Barycentric coordinates [P, 4] of points, each in its own tet: w_a = grad N_a . (p - x_0), w_0 the rest to 1."""
+    weights = np.einsum("pak,pk->pa", gradients, points - origins)
+    weights[:, 0] = 1.0 - weights[:, 1:].sum(axis=1)
+    return np.asarray(weights)
+
+
+def embed(surface: TriMesh, mesh: TetMesh) -> Embedding:
+    """Embed a surface in any tetrahedral mesh: each vertex in the tet that contains it, or else the least distant one.
+
+    A vertex outside of the mesh is extrapolated, with negative weights.
+    """
+    points, corners = surface.vertices, mesh.vertices[mesh.tets]
+    gradients, _ = shape_gradients(mesh.vertices, mesh.tets)
+    centres = corners.mean(axis=1)
+    radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+    # A tet contains only points of the ball around its centre through its farthest corner (widened for rounding).
+    found = cKDTree(points).query_ball_point(centres, radii * (1.0 + 1e-9))
+    sizes = np.fromiter(map(len, found), dtype=np.int64, count=len(found))
+    which = np.fromiter(chain.from_iterable(found), dtype=np.int64, count=int(sizes.sum()))
+    tets = np.repeat(np.arange(len(centres)), sizes)
+    # Points outside of every tet compete among their nearest tets.
+    near = cKDTree(centres).query(points, k=min(_NEAREST, len(centres)))[1].reshape(len(points), -1)
+    which = np.concatenate([which, np.repeat(np.arange(len(points)), near.shape[1])])
+    tets = np.concatenate([tets, near.reshape(-1)])
+    # The signed distance to the plane of face a is w_a / |grad N_a|: the best tet has the largest minimum over a.
+    weights = _weights(points[which], corners[tets, 0], gradients[tets])
+    depth = (weights / np.linalg.norm(gradients[tets], axis=2)).min(axis=1)
+    order = np.lexsort((tets, -depth, which))
+    best = order[np.unique(which[order], return_index=True)[1]]
+    chosen = tets[best]
+    return Embedding(surface, chosen, weights[best], mesh.tets[chosen], len(mesh.vertices))
+
+
+def embed_triangles(mesh: TetMesh, triangles: Index) -> Embedding:
+    """A surface whose corners are vertices of the mesh itself: each has weight 1 at that vertex, in its first tet."""
+    used, numbers = np.unique(triangles, return_inverse=True)
+    surface = TriMesh(mesh.vertices[used], numbers.reshape(-1, 3))
+    tets, corner = np.divmod(np.unique(mesh.tets.reshape(-1), return_index=True)[1][used], 4)
+    return Embedding(surface, tets, np.eye(4)[corner], mesh.tets[tets], len(mesh.vertices))

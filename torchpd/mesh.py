@@ -1,0 +1,338 @@
+"""Meshes: frozen vertices and indices that have been checked, so that nothing behind them has to check again.
+
+`TetMesh` is what bodies are made of; `TriMesh` is a surface to be carried along, drawn, or filled with tetrahedra.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .checks import as_array, check_finite, check_shape
+from .mesh_checks import (
+    MeshWarning,
+    Numbers,
+    affine,
+    check_elements,
+    check_points,
+    compact,
+    determinants,
+    has_repeated_corner,
+    is_flat,
+    refuse,
+    scaling,
+    store,
+    translation,
+    warn,
+)
+from .quality import MeshQuality, measure_quality
+
+if TYPE_CHECKING:
+    from .embedding import Embedding
+
+__all__ = ["MeshWarning", "TetMesh", "TriMesh"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+PathLike = str | os.PathLike[str]
+
+# Face k lies opposite corner k; seen from outside its corners run counter-clockwise when the tet has positive volume.
+TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+
+
+_MESHIO_SUFFIXES = {".mesh", ".msh", ".vtk", ".vtu"}
+
+
+def _existing(path: PathLike) -> Path:
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"no such mesh file: {file}")
+    return file
+
+
+def _read_cells(owner: str, file: Path) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
+    """Points, and the corner numbers of each type of cell in a file that meshio reads."""
+    import meshio
+
+    try:
+        content = meshio.read(file)
+    except (meshio.ReadError, SystemExit) as error:  # meshio exits the process on files that it cannot read
+        raise ValueError(f"{owner} cannot read {file.name} through meshio: {error}") from error
+    types = {block.type for block in content.cells if len(block.data)}
+    cells = {kind: np.concatenate([b.data for b in content.cells if b.type == kind and len(b.data)]) for kind in types}
+    return content.points, cells
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TriMesh:
+    """A triangle surface, open or closed, of one or many pieces. Triangles without area are accepted.
+
+    Args:
+        vertices: positions [V, 3] in m.
+        triangles: vertex numbers [T, 3], counter-clockwise seen from outside.
+        uvs: texture coordinates [V, 2], or None.
+        drop_unreferenced: leave out vertices that no triangle uses (otherwise an error).
+        drop_degenerate: leave out triangles that name a vertex twice (otherwise an error).
+    """
+
+    vertices: Array
+    triangles: Index
+    uvs: Array | None
+
+    def __init__(
+        self,
+        vertices: Numbers,
+        triangles: Numbers,
+        *,
+        uvs: Numbers | None = None,
+        drop_unreferenced: bool = False,
+        drop_degenerate: bool = False,
+    ) -> None:
+        points = check_points("TriMesh.vertices", vertices)
+        elements = check_elements("TriMesh.triangles", triangles, 3, len(points))
+        bad = has_repeated_corner(elements)
+        if drop_degenerate and bad.any():
+            warn(f"TriMesh: {int(bad.sum())} of {len(bad)} triangles name a vertex twice and were left out")
+            elements, bad = elements[~bad], bad[~bad]
+            if not len(elements):
+                raise ValueError("TriMesh.triangles: no triangle has three different corners")
+        refuse("TriMesh.triangles", bad, elements, "corners must differ", "pass drop_degenerate=True to leave them out")
+        coordinates = None
+        if uvs is not None:
+            coordinates = as_array("TriMesh.uvs", uvs, np.float64)
+            check_shape("TriMesh.uvs", coordinates, (len(points), 2), "texture coordinates of every vertex")
+            check_finite("TriMesh.uvs", coordinates)
+        kept, elements = compact("TriMesh", elements, len(points), drop=drop_unreferenced)
+        store(
+            self,
+            vertices=points[kept],
+            triangles=elements,
+            uvs=None if coordinates is None else coordinates[kept],
+        )
+
+    @classmethod
+    def from_trimesh(cls, surface: Any) -> TriMesh:
+        """From a trimesh.Trimesh, or from a trimesh.Scene with all its geometry in place."""
+        import trimesh
+
+        if isinstance(surface, trimesh.Scene):
+            surface = surface.to_mesh()
+        if not isinstance(surface, trimesh.Trimesh):
+            raise TypeError(f"TriMesh.from_trimesh: surface must be a Trimesh or a Scene, got {type(surface).__name__}")
+        return cls(
+            surface.vertices,
+            surface.faces,
+            uvs=getattr(surface.visual, "uv", None),
+            drop_unreferenced=True,
+            drop_degenerate=True,
+        )
+
+    @classmethod
+    def from_file(cls, path: PathLike) -> TriMesh:
+        """Read any surface that trimesh reads (.obj, .ply, .stl, .glb, ...); polygons become triangles.
+
+        Of a volume mesh (.mesh, .msh, .vtk, .vtu) the triangles are read, through meshio.
+        """
+        import trimesh
+
+        file = _existing(path)
+        if file.suffix.lower() in _MESHIO_SUFFIXES:
+            points, cells = _read_cells("TriMesh.from_file", file)
+            if "triangle" not in cells:
+                raise ValueError(f"TriMesh.from_file: {file.name} holds no triangles")
+            # The vertices inside are no part of the surface: that they are left out is nothing to report.
+            used, numbers = np.unique(cells["triangle"], return_inverse=True)
+            return cls(points[used], numbers.reshape(-1, 3), drop_unreferenced=True, drop_degenerate=True)
+        try:
+            # process=False: vertices keep the order of the file.
+            surface = trimesh.load(file, process=False)
+        except (NotImplementedError, ValueError) as error:
+            raise ValueError(f"TriMesh.from_file cannot read {file.name}: {error}") from error
+        if isinstance(surface, trimesh.Scene) and not surface.geometry:
+            raise ValueError(f"TriMesh.from_file: {file.name} holds no triangles")
+        return cls.from_trimesh(surface)
+
+    def to_trimesh(self) -> Any:
+        """A trimesh.Trimesh with the same vertices, faces and texture coordinates."""
+        import trimesh
+
+        surface: Any = trimesh.Trimesh(self.vertices, self.triangles, process=False)
+        if self.uvs is not None:
+            visual: Any = trimesh.visual.TextureVisuals
+            surface.visual = visual(uv=self.uvs)
+        return surface
+
+    def to_file(self, path: PathLike) -> None:
+        """Write in the format of the file's suffix, through trimesh."""
+        self.to_trimesh().export(Path(path))
+
+    @property
+    def bounds(self) -> Array:
+        """Lower and upper corner of the bounding box [2, 3]."""
+        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def volume(self) -> float:
+        """Enclosed volume by the divergence theorem; meaningful when the surface is closed."""
+        corners = self.vertices[self.triangles]
+        return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
+
+    def transformed(self, matrix: Numbers) -> TriMesh:
+        """The surface under x -> A x + b, from a 3x3 or 4x4 matrix; a reflection turns the triangles round."""
+        linear, offset = affine("TriMesh.transformed: matrix", matrix)
+        triangles = self.triangles[:, ::-1] if np.linalg.det(linear) < 0 else self.triangles
+        return TriMesh(self.vertices @ linear.T + offset, triangles, uvs=self.uvs)
+
+    def translated(self, offset: Numbers) -> TriMesh:
+        """The surface moved by a vector [m]."""
+        return self.transformed(translation("TriMesh.translated: offset", offset))
+
+    def scaled(self, factor: float | Numbers) -> TriMesh:
+        """The surface scaled about the origin, by one positive factor or one per axis."""
+        return self.transformed(scaling("TriMesh.scaled: factor", factor))
+
+    def __repr__(self) -> str:
+        uvs = "" if self.uvs is None else ", uvs"
+        return f"TriMesh({len(self.vertices)} vertices, {len(self.triangles)} triangles{uvs})"
+
+
+def match_faces(tets: Index) -> tuple[Index, NDArray[np.bool_]]:
+    """All 4 E faces (4 e + k is face k of tet e), equal ones side by side, and where a new one begins."""
+    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
+    order = np.lexsort((faces[:, 2], faces[:, 0] * (int(tets.max()) + 1) + faces[:, 1]))
+    faces = faces[order]
+    begins = np.ones(len(faces), dtype=bool)
+    begins[1:] = (faces[1:] != faces[:-1]).any(axis=1)
+    return order, begins
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TetMesh:
+    """A tetrahedral mesh. Every tet has positive volume: det(x1 - x0, x2 - x0, x3 - x0) > 0.
+
+    Tets that come with the opposite winding are turned (their last two corners change places), which is reported by a
+    `MeshWarning` and counted in `flipped`.
+
+    Args:
+        vertices: positions [V, 3] in m.
+        tets: vertex numbers [E, 4].
+        drop_unreferenced: leave out vertices that no tet uses (otherwise an error).
+        drop_degenerate: leave out tets whose volume is zero within rounding, or that name a vertex twice (otherwise
+            an error).
+    """
+
+    vertices: Array
+    tets: Index
+    embedding: Embedding | None
+    flipped: int
+
+    def __init__(
+        self, vertices: Numbers, tets: Numbers, *, drop_unreferenced: bool = False, drop_degenerate: bool = False
+    ) -> None:
+        points = check_points("TetMesh.vertices", vertices)
+        elements = check_elements("TetMesh.tets", tets, 4, len(points))
+        fix = "pass drop_degenerate=True to leave them out"
+        if not drop_degenerate:
+            refuse("TetMesh.tets", has_repeated_corner(elements), elements, "corners must differ", fix)
+        with np.errstate(over="ignore", invalid="ignore"):
+            signed = determinants(points, elements)
+            flat = is_flat(points, elements, signed)
+        if drop_degenerate and flat.any():
+            warn(f"TetMesh: {int(flat.sum())} of {len(flat)} tets have no volume and were left out")
+            elements, signed, flat = elements[~flat], signed[~flat], flat[~flat]
+            if not len(elements):
+                raise ValueError("TetMesh.tets: no tet has a volume; are all vertices in one plane?")
+        refuse("TetMesh.tets", flat, elements, "volumes must not vanish (compared with rounding of the vertices)", fix)
+        inverted = signed < 0
+        flipped = int(inverted.sum())
+        if flipped:
+            elements[inverted] = elements[inverted][:, [0, 1, 3, 2]]
+            warn(f"TetMesh: {flipped} of {len(elements)} tets had inverted winding and were turned")
+        kept, elements = compact("TetMesh", elements, len(points), drop=drop_unreferenced)
+        store(self, vertices=points[kept], tets=elements, embedding=None, flipped=flipped)
+
+    @classmethod
+    def from_file(cls, path: PathLike, *, drop_degenerate: bool = False) -> TetMesh:
+        """Read the tets of a volume mesh (.mesh, .msh, .vtk, .vtu, ...) through meshio.
+
+        Triangles of the file, the outer surface or another one inside, are carried along as `embedding`. Vertices that
+        no tet uses are left out with a `MeshWarning`, and the triangles with them.
+        """
+        from .embedding import embed_triangles
+
+        file = _existing(path)
+        points, cells = _read_cells("TetMesh.from_file", file)
+        if "tetra" not in cells:
+            raise ValueError(
+                f"TetMesh.from_file: {file.name} must hold tetrahedra (cells of type tetra), "
+                f"got {', '.join(sorted(cells)) or 'nothing'}; "
+                "turn a surface into tetrahedra with torchpd.tetrahedralize(path, cells=...)"
+            )
+        mesh = cls(points, cells["tetra"], drop_unreferenced=True, drop_degenerate=drop_degenerate)
+        triangles = cells.get("triangle", np.empty((0, 3), dtype=np.int64)).astype(np.int64)
+        triangles = triangles[~has_repeated_corner(triangles)]
+        if not len(triangles) or len(mesh.vertices) != len(points):
+            return mesh
+        return mesh.with_embedding(embed_triangles(mesh, triangles))
+
+    def to_file(self, path: PathLike) -> None:
+        """Write in the format of the file's suffix (.mesh, .msh, .vtk, .vtu, ...) through meshio."""
+        import meshio
+
+        meshio.Mesh(self.vertices, [("tetra", self.tets)]).write(Path(path))
+
+    @property
+    def bounds(self) -> Array:
+        """Lower and upper corner of the bounding box [2, 3]."""
+        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def boundary(self) -> Index:
+        """The faces that belong to one tet only, int64 [T, 3] into `vertices`, counter-clockwise seen from outside."""
+        order, begins = match_faces(self.tets)
+        ends = np.append(begins[1:], True)
+        return np.asarray(self.tets[:, TET_FACES].reshape(-1, 3)[np.sort(order[begins & ends])])
+
+    def quality(self) -> MeshQuality:
+        """Volumes, dihedral angles and element bounds l_e of every tet; print it for a summary."""
+        return measure_quality(self.vertices, self.tets)
+
+    def with_embedding(self, embedding: Embedding | None) -> TetMesh:
+        """The same mesh carrying another surface along (or none)."""
+        if embedding is not None and not (
+            embedding.vertex_count == len(self.vertices)
+            and embedding.tets.max(initial=-1) < len(self.tets)
+            and np.array_equal(embedding.corners, self.tets[embedding.tets])
+        ):
+            raise ValueError(
+                "TetMesh.with_embedding: the embedding must belong to this mesh (its corners are the rows of tets that "
+                "it names); make one with torchpd.embed(surface, mesh)"
+            )
+        mesh: TetMesh = object.__new__(TetMesh)
+        store(mesh, vertices=self.vertices, tets=self.tets, embedding=embedding, flipped=self.flipped)
+        return mesh
+
+    def transformed(self, matrix: Numbers) -> TetMesh:
+        """The mesh and its embedded surface under x -> A x + b, from a 3x3 or 4x4 matrix; it may reflect."""
+        linear, offset = affine("TetMesh.transformed: matrix", matrix)
+        # A reflection inverts every tet: two corners change places, and with them their weights.
+        corners = [0, 1, 3, 2] if np.linalg.det(linear) < 0 else [0, 1, 2, 3]
+        mesh = TetMesh(self.vertices @ linear.T + offset, self.tets[:, corners])
+        if self.embedding is None:
+            return mesh
+        return mesh.with_embedding(self.embedding.transformed(matrix, corners))
+
+    def translated(self, offset: Numbers) -> TetMesh:
+        """The mesh and its embedded surface moved by a vector [m]."""
+        return self.transformed(translation("TetMesh.translated: offset", offset))
+
+    def scaled(self, factor: float | Numbers) -> TetMesh:
+        """The mesh and its embedded surface scaled about the origin, by one positive factor or one per axis."""
+        return self.transformed(scaling("TetMesh.scaled: factor", factor))
+
+    def __repr__(self) -> str:
+        carried = "" if self.embedding is None else f", carrying {self.embedding.surface}"
+        return f"TetMesh({len(self.vertices)} vertices, {len(self.tets)} tets{carried})"

@@ -1,0 +1,175 @@
+"""What a mesh must fulfil, checked once on its way in, and the repairs that are offered."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from .checks import as_array, check_finite, check_shape
+
+__all__ = [
+    "MeshWarning",
+    "Numbers",
+    "affine",
+    "check_elements",
+    "check_points",
+    "compact",
+    "determinants",
+    "has_repeated_corner",
+    "is_flat",
+    "refuse",
+    "scaling",
+    "store",
+    "translation",
+    "warn",
+]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Numbers = Sequence[Any] | NDArray[Any] | torch.Tensor
+
+_ROUNDOFF = float(np.finfo(np.float64).eps) / 2
+
+
+class MeshWarning(UserWarning):
+    """A mesh was repaired on its way in; the message says what was done and how often."""
+
+
+def warn(message: str) -> None:
+    warnings.warn(message, MeshWarning, stacklevel=4)
+
+
+def store(part: object, **values: Any) -> None:
+    """Set fields of a frozen value; arrays become read-only."""
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            value = np.ascontiguousarray(value)
+            value.setflags(write=False)
+        object.__setattr__(part, name, value)
+
+
+def check_points(name: str, value: Numbers) -> Array:
+    """Vertices as float64 [V, 3]."""
+    array = as_array(name, value)
+    if array.size == 0:
+        raise ValueError(f"{name} must hold at least one vertex, got none")
+    check_shape(name, array, (None, 3), "positions [m]")
+    if array.dtype.kind == "b":
+        raise TypeError(f"{name} must hold real numbers, got {array.dtype}")
+    check_finite(name, array)
+    return np.asarray(array, dtype=np.float64)
+
+
+def check_elements(name: str, value: Numbers, corners: int, count: int) -> Index:
+    """Corner numbers as int64 [E, corners], each an existing vertex."""
+    array = as_array(name, value)
+    if array.size == 0:
+        raise ValueError(f"{name} must hold at least one element, got none")
+    check_shape(name, array, (None, corners), f"{corners} vertex numbers each")
+    if array.dtype.kind not in "iu":
+        raise TypeError(f"{name} must hold integers (vertex numbers), got {array.dtype}")
+    outside = (array < 0) | (array >= count)
+    if outside.any():
+        row = int(np.flatnonzero(outside.any(axis=1))[0])
+        raise IndexError(
+            f"{name} must lie in 0..{count - 1} (there are {count} vertices), "
+            f"got {array[row].tolist()} at {row} ({int(outside.sum())} numbers in all)"
+        )
+    return np.asarray(array, dtype=np.int64)
+
+
+def has_repeated_corner(elements: Index) -> NDArray[np.bool_]:
+    ordered = np.sort(elements, axis=1)
+    return np.asarray((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
+
+
+def determinants(points: Array, tets: Index) -> Array:
+    """Six times the signed volume."""
+    origin = points[tets[:, 0]]
+    a, b, c = (points[tets[:, k]] - origin for k in (1, 2, 3))
+    return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)))
+
+
+def is_flat(points: Array, tets: Index, values: Array) -> NDArray[np.bool_]:
+    """Which tets have a volume that float64 rounding alone could make out of a flat tet.
+
+    In a bounding box that reaches to M from the origin a coordinate is off by up to u M, a vertex by sqrt(3) u M. The
+    determinant changes by twice the opposite area for each, and the four areas add up to at most sqrt(3) l^2 (l the
+    longest edge): 6 u M l^2. Its evaluation adds less than 10 u l^3 (8 roundings of at most 1.16 l^3, the permanent).
+    """
+    reach = float(np.abs(points).max())
+
+    def noise(longest: Any) -> Any:
+        return _ROUNDOFF * (6.0 * reach + 10.0 * longest) * longest**2
+
+    # No edge is longer than the diagonal: look closer only at what could be flat by that.
+    # Not `<=`: a determinant that overflows to NaN is no volume either.
+    flat = ~(np.abs(values) > noise(float(np.linalg.norm(np.ptp(points, axis=0)))))
+    suspects = np.flatnonzero(flat)
+    corners = points[tets[suspects]]
+    edges = corners[:, [1, 2, 3, 2, 3, 3]] - corners[:, [0, 0, 0, 1, 1, 2]]
+    longest = np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0)
+    flat[suspects] = ~(np.abs(values[suspects]) > noise(longest))
+    return np.asarray(flat)
+
+
+def refuse(name: str, bad: NDArray[np.bool_], elements: Index, fault: str, fix: str) -> None:
+    """Raise for the first bad element, if there is one."""
+    rows = np.flatnonzero(bad)
+    if rows.size:
+        raise ValueError(
+            f"{name}: {fault}, got {elements[rows[0]].tolist()} at {int(rows[0])} ({rows.size} in all); {fix}"
+        )
+
+
+def compact(owner: str, elements: Index, count: int, *, drop: bool) -> tuple[Index, Index]:
+    """The referenced vertices, and the elements renumbered to them. Unreferenced vertices are refused unless dropped.
+
+    A vertex without an element has no mass: nothing would determine its motion.
+    """
+    used = np.zeros(count, dtype=bool)
+    used[elements] = True
+    kept = np.flatnonzero(used)
+    if len(kept) == count:
+        return kept, elements
+    lost = count - len(kept)
+    if not drop:
+        raise ValueError(
+            f"{owner}.vertices: every vertex must belong to an element, got {lost} of {count} that do not "
+            f"(the first is {int(np.argmin(used))}); pass drop_unreferenced=True to leave them out and renumber"
+        )
+    warn(f"{owner}: {lost} of {count} vertices belong to no element and were left out; the others are renumbered")
+    return kept, (np.cumsum(used) - 1)[elements]
+
+
+def affine(name: str, matrix: Numbers) -> tuple[Array, Array]:
+    """The linear part and the offset of a 3x3 or an affine 4x4 matrix."""
+    array = as_array(name, matrix, np.float64)
+    if array.shape not in ((3, 3), (4, 4)):
+        raise ValueError(f"{name} must be [3, 3] or [4, 4] (acting on columns), got {list(array.shape)}")
+    check_finite(name, array)
+    if array.shape == (3, 3):
+        return array, np.zeros(3)
+    if not np.array_equal(array[3], [0.0, 0.0, 0.0, 1.0]):
+        raise ValueError(f"{name} must be affine: its last row must be [0, 0, 0, 1], got {array[3].tolist()}")
+    return array[:3, :3], array[:3, 3]
+
+
+def translation(name: str, offset: Numbers) -> Array:
+    matrix = np.eye(4)
+    vector = as_array(name, offset, np.float64)
+    check_shape(name, vector, (3,), "a vector [m]")
+    matrix[:3, 3] = vector
+    return matrix
+
+
+def scaling(name: str, factor: float | Numbers) -> Array:
+    factors = as_array(name, factor, np.float64)
+    if factors.shape not in ((), (1,), (3,)) or not np.all(np.isfinite(factors)) or not np.all(factors > 0):
+        raise ValueError(f"{name} must be one positive number or three (x, y, z), got {factor}")
+    return np.diag(np.broadcast_to(factors, 3))

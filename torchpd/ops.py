@@ -1,0 +1,302 @@
+"""Python side of the ops: fake kernels, derivatives, vmap. Importing this module loads the extension.
+
+Every op takes a native leading batch, so that the rules for vmap only merge dimensions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from . import _C
+
+__all__ = ["INFO_WIDTH", "MATERIAL_TABLE", "nearest_rotation"]
+
+INFO_WIDTH = 6
+MATERIAL_TABLE: tuple[tuple[str, int, str, str], ...] = tuple(_C.material_table())
+# dimensions of each material array without a batch
+_MATERIAL_DIMS = tuple((rows != "one") + (width > 1) for _, width, rows, _ in MATERIAL_TABLE)
+
+_ops = torch.ops.torchpd
+
+
+def nearest_rotation(F: Tensor) -> Tensor:
+    """The rotation R nearest to each matrix: argmax of tr(R^T F) over det R = +1.
+
+    Safe for inverted, rank-deficient, huge and tiny matrices: zero gives the identity, a matrix with NaN or infinity
+    gives NaN. Differentiable, infinitely steep where the two smallest singular values cancel (with the sign of det F on
+    the smallest): there the nearest rotation jumps.
+
+    Largest root of Davenport's quartic (Markley 1993), closed form, one Newton polish; signed SVD where roots meet.
+
+    Args:
+        F: float32 or float64 [..., 3, 3].
+
+    Returns:
+        [..., 3, 3].
+    """
+    result: Tensor = _ops.nearest_rotation(F)
+    return result
+
+
+# ---- fake kernels: shapes, types and devices only
+
+
+@torch.library.register_fake("torchpd::step")
+def _(positions: Tensor, velocities: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
+    info = positions.new_empty((positions.shape[0], INFO_WIDTH), dtype=torch.float64)
+    return positions.new_empty(positions.shape), positions.new_empty(velocities.shape), info
+
+
+@torch.library.register_fake("torchpd::step_")
+def _(*_: Any, **__: Any) -> None:
+    return None
+
+
+@torch.library.register_fake("torchpd::rollout")
+def _(positions: Tensor, *_: Any, steps: int, every: int, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
+    shape = (steps // every, *positions.shape)
+    info = positions.new_empty((*shape[:2], INFO_WIDTH), dtype=torch.float64)
+    return positions.new_empty(shape), positions.new_empty(shape), info
+
+
+@torch.library.register_fake("torchpd::gradient")
+def _(positions: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty(positions.shape)
+
+
+@torch.library.register_fake("torchpd::hessian_product")
+def _(positions: Tensor, direction: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty(positions.shape)
+
+
+@torch.library.register_fake("torchpd::element_energy")
+def _(positions: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty((positions.shape[0], stiffness.shape[-1]))
+
+
+@torch.library.register_fake("torchpd::element_energy_product")
+def _(positions: Tensor, direction: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty((positions.shape[0], stiffness.shape[-1]))
+
+
+@torch.library.register_fake("torchpd::nearest_rotation")
+def _(matrices: Tensor) -> Tensor:
+    return matrices.new_empty(matrices.shape)
+
+
+@torch.library.register_fake("torchpd::rotation_differential")
+def _(matrices: Tensor, direction: Tensor) -> Tensor:
+    return matrices.new_empty(matrices.shape)
+
+
+# ---- derivatives: each is another op
+
+
+def _save(*names: str) -> Callable[..., None]:
+    """A setup_context that saves the named inputs: by position, tensors first, the plan last."""
+
+    def setup(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.save_for_backward(*inputs[: len(names)])
+        ctx.plan = inputs[len(names)] if len(inputs) > len(names) else None
+
+    return setup
+
+
+def _like_stiffness(per_environment: Tensor, stiffness: Tensor) -> Tensor:
+    """The derivative for a stiffness that all environments share is the sum over them."""
+    return per_environment.sum(0) if stiffness.dim() == 1 else per_environment.sum_to_size(stiffness.shape)
+
+
+def _unit(stiffness: Tensor) -> Tensor:
+    return torch.ones_like(stiffness)
+
+
+def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    positions, stiffness = ctx.saved_tensors
+    x = w = None
+    if ctx.needs_input_grad[0]:
+        x = _ops.gradient(positions, grad * stiffness, ctx.plan)
+    if ctx.needs_input_grad[1]:
+        w = _like_stiffness(grad * _ops.element_energy(positions, _unit(stiffness), ctx.plan), stiffness)
+    return x, w, None
+
+
+def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    positions, stiffness = ctx.saved_tensors
+    x = w = None
+    if ctx.needs_input_grad[0]:
+        x = _ops.hessian_product(positions, grad, stiffness, ctx.plan)
+    if ctx.needs_input_grad[1]:
+        w = _like_stiffness(_ops.element_energy_product(positions, grad, _unit(stiffness), ctx.plan), stiffness)
+    return x, w, None
+
+
+def _element_energy_product_backward(
+    ctx: Any, grad: Tensor
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, None]:
+    positions, direction, stiffness = ctx.saved_tensors
+    x = d = w = None
+    if ctx.needs_input_grad[0]:
+        x = _ops.hessian_product(positions, direction, grad * stiffness, ctx.plan)
+    if ctx.needs_input_grad[1]:
+        d = _ops.gradient(positions, grad * stiffness, ctx.plan)
+    if ctx.needs_input_grad[2]:
+        product = _ops.element_energy_product(positions, direction, _unit(stiffness), ctx.plan)
+        w = _like_stiffness(grad * product, stiffness)
+    return x, d, w, None
+
+
+def _hessian_product_backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor | None, None, None]:
+    if ctx.needs_input_grad[0] or ctx.needs_input_grad[2]:
+        raise RuntimeError(
+            "torchpd: third derivatives of the elastic energy are not provided; detach positions and stiffness before "
+            "differentiating a Hessian-vector product"
+        )
+    positions, _, stiffness = ctx.saved_tensors
+    return None, _ops.hessian_product(positions, grad, stiffness, ctx.plan), None, None
+
+
+def _rotation_differential(F: Tensor, direction: Tensor) -> Tensor:
+    """dR along dF from torch operations, R [h]_x with (tr(S) I - S) h = axis(R^T dF): differentiable once more."""
+    R = nearest_rotation(F)
+    S = R.mT @ F
+    A = R.mT @ direction
+    axis = torch.stack((A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]), dim=-1)
+    S = 0.5 * (S + S.mT)
+    trace = S.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    x, y, z = torch.linalg.solve(trace * torch.eye(3, dtype=F.dtype, device=F.device) - S, axis).unbind(-1)
+    zero = torch.zeros_like(x)
+    turn = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
+    result: Tensor = R @ turn
+    return result
+
+
+def _rotation_backward(ctx: Any, grad: Tensor) -> Tensor:
+    (F,) = ctx.saved_tensors
+    result: Tensor = _ops.rotation_differential(F, grad)
+    return result
+
+
+def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+    with torch.enable_grad():
+        inputs = [saved.detach().requires_grad_() for saved in ctx.saved_tensors]
+        grads: tuple[Tensor | None, ...] = torch.autograd.grad(_rotation_differential(*inputs), inputs, grad)
+    return grads
+
+
+for _name, _backward, _inputs in (
+    ("element_energy", _element_energy_backward, ("positions", "stiffness")),
+    ("gradient", _gradient_backward, ("positions", "stiffness")),
+    ("element_energy_product", _element_energy_product_backward, ("positions", "direction", "stiffness")),
+    ("hessian_product", _hessian_product_backward, ("positions", "direction", "stiffness")),
+    ("nearest_rotation", _rotation_backward, ("matrices",)),
+    ("rotation_differential", _rotation_differential_backward, ("matrices", "direction")),
+):
+    torch.library.register_autograd(f"torchpd::{_name}", _backward, setup_context=_save(*_inputs))
+
+
+# ---- vmap: the mapped dimension joins the batch
+
+
+def _join(tensor: Tensor, dim: int | None, size: int, batch: int, own: int) -> Tensor:
+    """Merge a mapped dimension into the leading batch of an array that has `own` dimensions without one.
+
+    Shared arrays stay shared; an array for each of `batch` environments is repeated for each of the `size` maps.
+    """
+    if dim is None:
+        return tensor if tensor.dim() == own else tensor.repeat(size, *[1] * own)
+    tensor = tensor.movedim(dim, 0)
+    if tensor.dim() == own + 1:
+        return tensor.repeat_interleave(batch, 0)
+    return tensor.expand(size, batch, *tensor.shape[2:]).flatten(0, 1)
+
+
+def _split(tensor: Tensor, size: int, dim: int = 0) -> Tensor:
+    result: Tensor = tensor.unflatten(dim, (size, -1))
+    return result
+
+
+def _check_plan(dims: Any) -> None:
+    if any(dim is not None for dim in dims):
+        raise ValueError("torchpd: the plan cannot be mapped by vmap; it is the same for all environments")
+
+
+def _field_vmap(op: Any) -> Callable[..., tuple[Tensor, int]]:
+    def rule(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
+        *tensors, plan = args
+        *dims, plan_dims = in_dims
+        _check_plan(plan_dims)
+        size = info.batch_size
+        batch = tensors[0].shape[1 if dims[0] == 0 else 0]
+        own = (*[2] * (len(tensors) - 1), 1)
+        joined = [_join(t, d, size, batch, n) for t, d, n in zip(tensors, dims, own, strict=True)]
+        return _split(op(*joined, plan), size), 0
+
+    return rule
+
+
+def _rotation_vmap(op: Any) -> Callable[..., tuple[Tensor, int]]:
+    def rule(info: Any, in_dims: tuple[int | None, ...], *matrices: Tensor) -> tuple[Tensor, int]:
+        moved = [
+            m.movedim(d, 0) if d is not None else m.expand(info.batch_size, *m.shape)
+            for m, d in zip(matrices, in_dims, strict=True)
+        ]
+        return op(*moved), 0
+
+    return rule
+
+
+def _join_step(info: Any, dims: Sequence[Any], tensors: Sequence[Any]) -> tuple[list[Any], list[Tensor]]:
+    """Joined (positions, velocities, forces, start) and material."""
+    *state, material = tensors
+    *state_dims, material_dims = dims
+    size = info.batch_size
+    batch = state[0].shape[1 if state_dims[0] == 0 else 0]
+    joined = [None if t is None else _join(t, d, size, batch, 2) for t, d in zip(state, state_dims, strict=True)]
+    values = [_join(t, d, size, batch, own) for t, d, own in zip(material, material_dims, _MATERIAL_DIMS, strict=True)]
+    return joined, values
+
+
+@torch.library.register_vmap("torchpd::step")
+def _step_vmap(
+    info: Any,
+    in_dims: tuple[Any, ...],
+    positions: Tensor,
+    velocities: Tensor,
+    forces: Tensor | None,
+    start: Tensor | None,
+    material: list[Tensor],
+    plan: list[Tensor],
+    **numbers: Any,
+) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    _check_plan(in_dims[5])
+    state, values = _join_step(info, in_dims[:5], (positions, velocities, forces, start, material))
+    out = _ops.step(*state, values, plan, **numbers)
+    return tuple(_split(t, info.batch_size) for t in out), (0, 0, 0)
+
+
+@torch.library.register_vmap("torchpd::rollout")
+def _rollout_vmap(
+    info: Any,
+    in_dims: tuple[Any, ...],
+    positions: Tensor,
+    velocities: Tensor,
+    forces: Tensor | None,
+    material: list[Tensor],
+    plan: list[Tensor],
+    **numbers: Any,
+) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    _check_plan(in_dims[4])
+    state, values = _join_step(info, in_dims[:4], (positions, velocities, forces, material))
+    out = _ops.rollout(*state, values, plan, **numbers)
+    return tuple(_split(t, info.batch_size, 1) for t in out), (1, 1, 1)
+
+
+for _name in ("gradient", "hessian_product", "element_energy", "element_energy_product"):
+    torch.library.register_vmap(f"torchpd::{_name}", _field_vmap(getattr(_ops, _name)))
+for _name in ("nearest_rotation", "rotation_differential"):
+    torch.library.register_vmap(f"torchpd::{_name}", _rotation_vmap(getattr(_ops, _name)))

@@ -1,0 +1,137 @@
+"""The plan: everything about a scene that does not change from step to step, compiled once into flat tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from . import _C
+from .scene import SceneValues
+
+__all__ = ["Plan", "PlanRow", "compile_plan"]
+
+_WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
+
+
+class PlanRow(NamedTuple):
+    """One line of the table in csrc/plan/plan.def."""
+
+    name: str
+    type: str
+    width: int
+    rows: str
+    meaning: str
+
+
+PLAN_TABLE = tuple(PlanRow(*row) for row in _C.plan_table())
+_POSITION = {row.name: number for number, row in enumerate(PLAN_TABLE)}
+_TYPES = {"int32": torch.int32, "int16": torch.int16}
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Constant arrays of a scene in the order of the table that C++ declares, also by name: `plan.vertex_order`."""
+
+    arrays: tuple[Tensor, ...]
+
+    def __getattr__(self, name: str) -> Tensor:
+        if name in _POSITION:
+            return self.arrays[_POSITION[name]]
+        raise AttributeError(f"Plan has no array {name!r}; it has {', '.join(_POSITION)}")
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the real arrays."""
+        return self.tet_rest.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where the arrays are."""
+        return self.tet_rest.device
+
+    @property
+    def vertices(self) -> int:
+        """Vertices of all bodies."""
+        return len(self.vertex_order)
+
+    @property
+    def patches(self) -> int:
+        """Pieces of the mesh that the CPU works on one at a time."""
+        return len(self.patch_block) - 1
+
+    @property
+    def bytes(self) -> int:
+        """Memory of all arrays."""
+        return sum(array.numel() * array.element_size() for array in self.arrays)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Plan:
+        """A plan with `function` applied to every array; the integer types are kept."""
+        return Plan(
+            tuple(self._keep_type(row, function(array)) for row, array in zip(PLAN_TABLE, self.arrays, strict=True))
+        )
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Plan:
+        """A copy on another device or in another precision. Widening brings no digits back: compile again."""
+        return self.map(lambda array: array.to(device=device, dtype=dtype if array.is_floating_point() else None))
+
+    @staticmethod
+    def _keep_type(row: PlanRow, array: Tensor) -> Tensor:
+        return array.to(_TYPES[row.type]) if row.type in _TYPES else array
+
+
+def _advance(bar: tqdm[Any], done: float) -> None:
+    bar.update(int(100 * done) - bar.n)
+
+
+def _patch_size(tets: int) -> int:
+    """Tetrahedra a patch: small enough for the first-level cache, and a few patches even in a small mesh."""
+    return int(np.clip(tets // 8 // 16 * 16, 128, 1024))
+
+
+def _free_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Number of the unpinned piece that each vertex belongs to (-1: pinned), and the size of each such piece."""
+    pieces = int(values.component.max()) + 1
+    free = np.ones(pieces, dtype=bool)
+    free[values.component[values.pin_vertices]] = False
+    number = np.where(free, np.cumsum(free) - 1, -1)
+    group = number[values.component].astype(np.int32)
+    return group, np.bincount(group[group >= 0], minlength=int(free.sum())).astype(np.int32)
+
+
+def compile_plan(
+    values: SceneValues, *, dtype: torch.dtype = torch.float32, patch_size: int | None = None, progress: bool = True
+) -> Plan:
+    """Order, partition and weigh a scene for the kernels. On the CPU; move it with `Plan.to`.
+
+    Args:
+        values: the flat arrays of `Scene.values`.
+        dtype: torch.float32 or torch.float64.
+        patch_size: tetrahedra a patch, 16 to 8192; None chooses by the size of the mesh.
+        progress: show a bar when the mesh is large.
+    """
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+    tets = len(values.tets)
+    with tqdm(total=100, desc="compiling the scene", leave=False, disable=not progress or tets < _WORTH_A_BAR) as bar:
+        arrays: dict[str, NDArray[Any]] = _C.build_plan(
+            values.rest_positions,
+            values.tets,
+            patch_size or _patch_size(tets),
+            lambda done: _advance(bar, done),
+        )
+    order = arrays["vertex_order"]
+    internal = np.empty_like(order)
+    internal[order] = np.arange(len(order), dtype=order.dtype)
+    group, group_size = _free_pieces(values)
+    arrays["vertex_group"] = group[order]
+    arrays["group_size"] = group_size
+    arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
+    tensors = (torch.from_numpy(np.ascontiguousarray(arrays[row.name])) for row in PLAN_TABLE)
+    return Plan(tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors))

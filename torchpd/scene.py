@@ -1,0 +1,146 @@
+"""A scene: bodies and effects, values only, and the flat arrays in the user's order that they amount to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+
+__all__ = ["Part", "Scene", "SceneValues"]
+
+Part = Solid | Pin | Gravity | Ground | Sphere | Damping
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SceneValues:
+    """Everything that a scene says, flat, float64, in the user's order: bodies one after another."""
+
+    rest_positions: Array  # [V, 3] m
+    tets: Index  # [E, 4]
+    stiffness: Array  # [E] Young's modulus, Pa
+    density: Array  # [E] kg/m^3
+    masses: Array  # [V] kg, lumped: density * volume / 4 to each corner
+    pin_vertices: Index  # [P]
+    pin_stiffness: Array  # [P] N/m, inf where the pin is hard
+    pin_targets: Array  # [P, 3] m
+    gravity: Array  # [3] m/s^2
+    planes: Array  # [C, 5] unit normal, height, friction
+    spheres: Array  # [S, 5] center, radius, friction
+    damping: float  # 1/s
+    component: Index  # [V] number of the connected piece of mesh that a vertex belongs to
+
+
+def _lumped_masses(positions: Array, tets: Index, density: Array) -> Array:
+    corners = positions[tets]
+    edges = corners[:, 1:] - corners[:, :1]
+    share = density * np.linalg.det(edges) / 24.0
+    masses: Array = np.bincount(tets.reshape(-1), weights=np.repeat(share, 4), minlength=len(positions))
+    return masses
+
+
+def _components(count: int, tets: Index) -> Index:
+    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].reshape(-1)
+    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+class Scene:
+    """Bodies and effects, in any order. Compiled once by `Simulator`.
+
+    Args:
+        parts: `Solid`, `Pin`, `Gravity`, `Ground`, `Sphere`, `Damping`. At least one `Solid`; at most one `Gravity`
+            and one `Damping`; a `Pin` holds a `Solid` of this scene, and no vertex is pinned twice.
+    """
+
+    def __init__(self, *parts: Part) -> None:
+        for part in parts:
+            if not isinstance(part, Part):
+                raise TypeError(f"Scene: parts are bodies and effects of torchpd, got {type(part).__name__}")
+        self.parts: tuple[Part, ...] = parts
+        if not self.solids:
+            raise ValueError("Scene needs at least one body, for example Solid(mesh, youngs=1e5, density=1000.0)")
+        if len({id(part) for part in parts}) != len(parts):
+            raise ValueError("Scene: the same part is given twice")
+        for kind in (Gravity, Damping):
+            if len(self._all(kind)) > 1:
+                raise ValueError(f"Scene takes at most one {kind.__name__}, got {len(self._all(kind))}")
+        solids = {id(solid) for solid in self.solids}
+        for pin in self.pins:
+            if id(pin.solid) not in solids:
+                raise ValueError("Scene: a Pin holds a Solid that is not a part of this scene; pass both")
+
+    def _all(self, kind: type) -> tuple[Any, ...]:
+        return tuple(part for part in self.parts if isinstance(part, kind))
+
+    @property
+    def solids(self) -> tuple[Solid, ...]:
+        return self._all(Solid)
+
+    @property
+    def pins(self) -> tuple[Pin, ...]:
+        return self._all(Pin)
+
+    @property
+    def grounds(self) -> tuple[Ground, ...]:
+        return self._all(Ground)
+
+    @property
+    def spheres(self) -> tuple[Sphere, ...]:
+        return self._all(Sphere)
+
+    def vertex_range(self, solid: Solid) -> slice:
+        """Where the vertices of one body lie in positions [B, V, 3]."""
+        start = 0
+        for other in self.solids:
+            if other is solid:
+                return slice(start, start + len(other.mesh.vertices))
+            start += len(other.mesh.vertices)
+        raise ValueError("Scene.vertex_range: this Solid is not a part of the scene")
+
+    def pin_range(self, pin: Pin) -> slice:
+        """Where the targets of one pin lie in pin_targets [P, 3]."""
+        start = 0
+        for other in self.pins:
+            if other is pin:
+                return slice(start, start + len(other.vertices))
+            start += len(other.vertices)
+        raise ValueError("Scene.pin_range: this Pin is not a part of the scene")
+
+    def values(self) -> SceneValues:
+        """The flat arrays of the scene, in the user's order."""
+        positions = np.concatenate([solid.mesh.vertices for solid in self.solids])
+        starts = [self.vertex_range(solid).start for solid in self.solids]
+        tets = np.concatenate([s.mesh.tets + start for s, start in zip(self.solids, starts, strict=True)])
+        density = np.concatenate([solid.density for solid in self.solids])
+        pinned = [self.vertex_range(pin.solid).start + pin.vertices for pin in self.pins]
+        pin_vertices = np.concatenate([np.zeros(0, dtype=np.int64), *pinned])
+        if len(np.unique(pin_vertices)) != len(pin_vertices):
+            raise ValueError("Scene: two pins hold the same vertex")
+        springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
+        gravity, damping = self._all(Gravity), self._all(Damping)
+        return SceneValues(
+            rest_positions=positions,
+            tets=tets,
+            stiffness=np.concatenate([solid.youngs for solid in self.solids]),
+            density=density,
+            masses=_lumped_masses(positions, tets, density),
+            pin_vertices=pin_vertices,
+            pin_stiffness=np.concatenate([np.zeros(0), *springs]),
+            pin_targets=positions[pin_vertices],
+            gravity=gravity[0].vector if gravity else np.zeros(3),
+            planes=np.array([[*g.normal, g.height, g.friction] for g in self.grounds]).reshape(-1, 5),
+            spheres=np.array([[*s.center, s.radius, s.friction] for s in self.spheres]).reshape(-1, 5),
+            damping=damping[0].rate if damping else 0.0,
+            component=_components(len(positions), tets),
+        )
+
+    def __repr__(self) -> str:
+        return f"Scene({', '.join(type(part).__name__ for part in self.parts)})"

@@ -1,0 +1,90 @@
+"""Smooth normals of a moving surface: shared where it bends gently, split where it has an edge."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from .checks import as_array, check_finite, check_shape
+
+__all__ = ["SmoothSurface"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class SmoothSurface:
+    """Triangles whose vertices are split at creases, so that one normal per vertex shades them well.
+
+    Two triangles share the normals along an edge when the angle between them is below `crease` in the shape given
+    here. The split is kept while the surface moves: a fold that opens or closes does not flicker. Vertices at the
+    same place count as one (files double them at texture seams), wherever in the list they stand.
+
+    Attributes:
+        source: [S] which of the given vertices each split vertex follows.
+        triangles: [T, 3] into the split vertices.
+    """
+
+    def __init__(self, vertices: Any, triangles: Any, *, crease: float = 40.0) -> None:
+        positions = as_array("vertices", vertices, np.float64)
+        check_shape("vertices", positions, (None, 3), "positions [m]")
+        check_finite("vertices", positions)
+        faces = as_array("triangles", triangles)
+        check_shape("triangles", faces, (None, 3), "vertex numbers")
+        if faces.size == 0 or not np.issubdtype(faces.dtype, np.integer):
+            raise ValueError(f"triangles must be integers, at least one row, got {faces.dtype} {list(faces.shape)}")
+        if faces.min() < 0 or faces.max() >= len(positions):
+            raise IndexError(f"triangles must lie in 0..{len(positions) - 1}, got {faces.min()}..{faces.max()}")
+        faces = faces.astype(np.int64)
+        corner_group = _smoothing_groups(positions, faces, crease)
+        self.triangles: Index = corner_group.reshape(-1, 3)
+        self.source: Index = np.empty(int(corner_group.max()) + 1, dtype=np.int64)
+        self.source[corner_group] = faces.reshape(-1)
+
+    def split(self, vertices: Array) -> Array:
+        """Positions [..., n, 3] of the given vertices as positions [..., S, 3] of the split ones."""
+        return vertices[..., self.source, :]
+
+    def normals(self, split_vertices: Array) -> Array:
+        """Unit normals [S, 3], weighted by area; +y where the triangles around a vertex cancel out."""
+        face_normals = _face_normals(split_vertices, self.triangles)
+        normals = np.zeros_like(split_vertices)
+        for corner in range(3):
+            np.add.at(normals, self.triangles[:, corner], face_normals)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.where(length > 0.0, normals / np.where(length > 0.0, length, 1.0), [0.0, 1.0, 0.0])
+
+
+def _face_normals(vertices: Array, triangles: Index) -> Array:
+    """Normals of twice the triangles' area."""
+    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
+
+
+def _smoothing_groups(vertices: Array, triangles: Index, crease: float) -> Index:
+    """The number [3T] of the split vertex that each corner of a triangle belongs to."""
+    place = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[triangles]
+    normals = _face_normals(vertices, triangles)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals / np.where(length > 0.0, length, 1.0)
+
+    # half-edges sorted by their two places: those of one edge stand in a row, neighbours in that row are paired
+    ends = np.stack([place, np.roll(place, -1, axis=1)], axis=2).reshape(-1, 2)
+    swapped = ends[:, 0] > ends[:, 1]
+    corner = np.arange(triangles.size)
+    other = (corner // 3) * 3 + (corner + 1) % 3
+    low, high = np.where(swapped, other, corner), np.where(swapped, corner, other)
+    order = np.lexsort((ends.max(axis=1), ends.min(axis=1)))
+    key = np.sort(ends, axis=1)[order]
+    paired = np.flatnonzero((key[1:] == key[:-1]).all(axis=1))
+    first, second = order[paired], order[paired + 1]
+    gentle = np.einsum("ij,ij->i", normals[first // 3], normals[second // 3]) > np.cos(np.radians(crease))
+    first, second = first[gentle], second[gentle]
+
+    rows, columns = np.concatenate([low[first], high[first]]), np.concatenate([low[second], high[second]])
+    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(triangles.size, triangles.size))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)

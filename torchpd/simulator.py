@@ -1,0 +1,479 @@
+"""The simulator: a compiled scene as an `nn.Module` that steps states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from .effects import Pin, Sphere
+from .ops import INFO_WIDTH, MATERIAL_TABLE
+from .plan import Plan, compile_plan
+from .scene import Scene, SceneValues
+from .solvers import Chebyshev, Jacobi, Solver
+from .state import Info, State, Track
+from .summary import describe
+
+__all__ = ["Simulator", "Targets"]
+
+Targets = Tensor | Mapping[Pin | Sphere, Tensor]
+PerStep = Callable[[int], Any]
+
+_ops = torch.ops.torchpd
+_ROWS_OF = {name: (width, rows) for name, width, rows, _ in MATERIAL_TABLE}
+_BARS = 50  # how often a progress bar moves during a rollout
+
+
+def _material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
+    spheres = np.pad(values.spheres, ((0, 0), (0, 3)))
+    arrays = {
+        "stiffness": values.stiffness,
+        "masses": values.masses,
+        "gravity": values.gravity,
+        "damping": values.damping,
+        "pin_stiffness": values.pin_stiffness,
+        "pin_targets": values.pin_targets,
+        "planes": values.planes,
+        "spheres": spheres,
+    }
+    return {name: torch.tensor(arrays[name], dtype=dtype) for name, *_ in MATERIAL_TABLE}
+
+
+class Simulator(nn.Module):
+    """Steps a scene through time by implicit Euler, solved approximately by projective dynamics.
+
+    The values that training may change are parameters (without gradient until asked), for all environments or, with a
+    leading batch, for each: `stiffness` [E] Pa, `masses` [V] kg, `gravity` [3] m/s^2, `damping` [] 1/s,
+    `pin_stiffness` [P] N/m, `pin_targets` [P, 3] m, `planes` [C, 5], `spheres` [S, 8]. `set_material` replaces
+    them.
+
+    Args:
+        scene: what there is.
+        time_step: h [s], positive.
+        iterations: local and global steps of one time step, at most.
+        solver: `Chebyshev()` or `Jacobi()`.
+        dtype: precision, torch.float32 or torch.float64.
+        tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
+        progress: show a bar while a large scene compiles.
+    """
+
+    rest_positions: Tensor
+    stiffness: Tensor
+    masses: Tensor
+    gravity: Tensor
+    damping: Tensor
+    pin_stiffness: Tensor
+    pin_targets: Tensor
+    planes: Tensor
+    spheres: Tensor
+
+    def __init__(
+        self,
+        scene: Scene,
+        time_step: float = 1 / 60,
+        iterations: int = 64,
+        solver: Solver | None = None,
+        dtype: torch.dtype = torch.float32,
+        *,
+        tolerance: float = 0.0,
+        progress: bool = True,
+    ) -> None:
+        super().__init__()
+        if not isinstance(scene, Scene):
+            raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
+        self.scene = scene
+        self.time_step = _positive("time_step", time_step, "s")
+        self.iterations = _whole("iterations", iterations, 0)
+        self.solver = Chebyshev() if solver is None else solver
+        if not isinstance(self.solver, Jacobi | Chebyshev):
+            raise TypeError(f"Simulator: solver must be Jacobi or Chebyshev, got {type(solver).__name__}")
+        self.tolerance = float(tolerance)
+        if not 0.0 <= self.tolerance < 1.0:
+            raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
+        values = scene.values()
+        self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
+        self._pins = {pin: scene.pin_range(pin) for pin in scene.pins}
+        self._spheres = {sphere: number for number, sphere in enumerate(scene.spheres)}
+        self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
+        for name, value in _material_of(values, dtype).items():
+            self.register_parameter(name, nn.Parameter(value, requires_grad=False))
+
+    # ---- what a simulation is made of
+
+    @property
+    def vertices(self) -> int:
+        """Vertices of all bodies."""
+        return self.plan.vertices
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of states."""
+        return self.plan.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where states have to be."""
+        return self.plan.device
+
+    def material(self) -> list[Tensor]:
+        """The differentiable arrays in the order of the ops."""
+        return [getattr(self, name) for name, *_ in MATERIAL_TABLE]
+
+    def set_material(self, **arrays: Tensor | float) -> None:
+        """Replace differentiable arrays, for all environments or with a leading batch for each.
+
+        Args:
+            arrays: by name, see the class. Shapes, positive stiffness and masses are checked here, once.
+        """
+        for name, value in arrays.items():
+            if name not in _ROWS_OF:
+                raise TypeError(f"set_material: no array {name!r}; there are {', '.join(_ROWS_OF)}")
+            own = getattr(self, name)
+            tensor = torch.as_tensor(value, dtype=self.dtype, device=self.device)
+            tensor = tensor.expand(own.shape) if tensor.dim() == 0 else tensor
+            shape = tuple(own.shape[own.dim() - self._own_dims(name) :])
+            if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
+                raise ValueError(
+                    f"set_material: {name} must be {list(shape)}, or with a batch in front, got {list(tensor.shape)}"
+                )
+            _check_material(name, tensor)
+            trains = own.requires_grad
+            setattr(self, name, nn.Parameter(tensor.detach().clone().contiguous(), requires_grad=trains))
+
+    @staticmethod
+    def _own_dims(name: str) -> int:
+        width, rows = _ROWS_OF[name]
+        return (rows != "one") + (width > 1)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        moved = self.plan.map(fn)
+        if moved.dtype != self.plan.dtype:
+            # digits that float32 has lost do not come back by widening: compile for the new precision
+            moved = compile_plan(self.scene.values(), dtype=moved.dtype, progress=False).to(moved.device)
+        self.plan = moved
+        return self
+
+    def extra_repr(self) -> str:
+        return describe(self)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(\n  {self.extra_repr()}\n)"
+
+    # ---- states
+
+    def rest_state(self, batch: int = 1) -> State:
+        """Everything at rest, [batch, V, 3]."""
+        shape = (_whole("batch", batch, 0), -1, -1)
+        positions = self.rest_positions.expand(shape).clone()
+        return State(positions, torch.zeros_like(positions))
+
+    def forward(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        return_info: bool = False,
+    ) -> State | tuple[State, Info]:
+        """One time step.
+
+        Args:
+            state: positions and velocities [B, V, 3] [m, m/s].
+            forces: on the vertices [B, V, 3] [N], constant during the step.
+            targets: where pins and spheres are at the end of the step [m]: by part, or one tensor [P, 3] or [B, P, 3]
+                for all pins together. A sphere takes its centre [3] or [B, 3], and with its velocity [6] or [B, 6],
+                which friction then drags vertices along with.
+            start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
+            return_info: also how the solve went; costs two more local steps, no synchronisation.
+
+        Returns:
+            The next state, or (state, info).
+        """
+        given, inertial = _first_iterate(start)
+        positions, velocities, rows = _ops.step(
+            state[0],
+            state[1],
+            forces,
+            given,
+            self._material_at(targets, state[0].shape[0]),
+            list(self.plan.arrays),
+            **self._numbers(inertial=inertial, report=return_info),
+        )
+        after = State(positions, velocities)
+        return (after, Info.from_rows(rows)) if return_info else after
+
+    @torch.no_grad()
+    def step_(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        *,
+        info: Tensor | None = None,
+    ) -> None:
+        """One time step that overwrites the state, without gradients. Arguments as in `forward`.
+
+        Args:
+            info: rows [B, 6] float64 to fill in, see `Info.from_rows`; None leaves out residual and energy.
+        """
+        given, inertial = _first_iterate(start)
+        rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
+        _ops.step_(
+            state[0],
+            state[1],
+            rows,
+            forces,
+            given,
+            self._material_at(targets, state[0].shape[0]),
+            list(self.plan.arrays),
+            **self._numbers(inertial=inertial, report=info is not None),
+        )
+
+    def rollout(
+        self,
+        state: State,
+        steps: int,
+        every: int = 1,
+        *,
+        forces: Tensor | PerStep | None = None,
+        targets: Targets | PerStep | None = None,
+        start: str = "velocity",
+        return_info: bool = False,
+        progress: bool = False,
+    ) -> Track:
+        """Many time steps.
+
+        Args:
+            state: where to start.
+            steps: how many.
+            every: steps from one record to the next; the track has steps // every records.
+            forces: constant, or a function of the step number.
+            targets: constant, or a function of the step number; moving spheres then drag along what they touch.
+            start: first iterate of every step, "velocity" or "inertial".
+            return_info: fill in residual and energy of the recorded steps.
+            progress: show a bar.
+
+        Returns:
+            Track of the recorded states.
+        """
+        steps, every = _whole("steps", steps, 0), _whole("every", every, 1)
+        if start not in ("velocity", "inertial"):
+            raise ValueError(f'rollout: start must be "velocity" or "inertial", got {start!r}')
+        with tqdm(total=steps, desc="simulating", unit="step", disable=not progress, leave=False) as bar:
+            if callable(forces) or callable(targets) or self._tracks_gradient(state, forces, targets):
+                return self._rollout_one_by_one(state, steps, every, forces, targets, start, return_info, bar)
+            # in pieces, so that the bar moves
+            piece = max(every, steps // _BARS // every * every) if progress else max(steps, 1)
+            tracks = []
+            for first in range(0, max(steps, 1), piece):
+                count = min(piece, steps - first)
+                tracks.append(self._rollout_piece(state, count, every, forces, targets, start, return_info))
+                state = tracks[-1].state() if count >= every else state
+                bar.update(count)
+        return _join_tracks(tracks)
+
+    def _rollout_piece(
+        self, state: State, steps: int, every: int, forces: Any, targets: Any, start: str, report: bool
+    ) -> Track:
+        positions, velocities, rows = _ops.rollout(
+            state[0],
+            state[1],
+            forces,
+            self._material_at(targets, state[0].shape[0]),
+            list(self.plan.arrays),
+            steps=steps,
+            every=every,
+            **self._numbers(inertial=start == "inertial", report=report),
+        )
+        return Track(positions, velocities, Info.from_rows(rows))
+
+    def _rollout_one_by_one(
+        self, state: State, steps: int, every: int, forces: Any, targets: Any, start: str, report: bool, bar: Any
+    ) -> Track:
+        states, infos = [], []
+        last_centres = {sphere: self.spheres[..., number, :3] for sphere, number in self._spheres.items()}
+        for step in range(steps):
+            now = targets(step) if callable(targets) else targets
+            if isinstance(now, Mapping):
+                now, last_centres = self._with_velocities(now, last_centres)
+            recorded = (step + 1) % every == 0
+            pushed = forces(step) if callable(forces) else forces
+            out = self(state, pushed, now, start, return_info=True) if report and recorded else None
+            state = out[0] if out else self(state, pushed, now, start)
+            if recorded:
+                states.append(state)
+                infos.append(out[1] if out else Info.from_rows(state[0].new_full((len(state[0]), INFO_WIDTH), 0.0)))
+            bar.update(1)
+        if not states:
+            return self._rollout_piece(state, 0, every, None, None, start, False)
+        info = Info(*(torch.stack(column) for column in zip(*infos, strict=True)))
+        return Track(torch.stack([s[0] for s in states]), torch.stack([s[1] for s in states]), info)
+
+    def _with_velocities(
+        self, targets: Mapping[Any, Tensor], last: dict[Sphere, Tensor]
+    ) -> tuple[dict[Any, Tensor], dict[Sphere, Tensor]]:
+        """Adds to the centres of spheres how fast they came there since the last step."""
+        filled, last = dict(targets), dict(last)
+        for part, value in targets.items():
+            if isinstance(part, Sphere) and value.shape[-1] == 3:
+                velocity = (value - last[part]) / self.time_step
+                filled[part] = torch.cat([value.expand(velocity.shape), velocity], dim=-1)
+                last[part] = value
+        return filled, last
+
+    def _tracks_gradient(self, state: State, forces: Any, targets: Any) -> bool:
+        if not torch.is_grad_enabled():
+            return False
+        given = targets.values() if isinstance(targets, Mapping) else [targets]
+        tensors = [*state, forces, *given, *self.material()]
+        return any(isinstance(tensor, Tensor) and tensor.requires_grad for tensor in tensors)
+
+    # ---- energies
+
+    def energy(self, state: State | Tensor, targets: Targets | None = None) -> Tensor:
+        """Mechanical energy of each environment [B] [J], differentiable twice.
+
+        Elastic energy, springs of soft pins, weight (zero at the origin) and, for a `State`, kinetic energy.
+
+        Args:
+            state: a `State`, or positions [B, V, 3] alone.
+            targets: of pins, as in `forward`.
+        """
+        positions = state if isinstance(state, Tensor) else state[0]
+        material = dict(zip(_ROWS_OF, self._material_at(targets, positions.shape[0]), strict=True))
+        energy = cast(Tensor, _ops.element_energy(positions, material["stiffness"], list(self.plan.arrays))).sum(-1)
+        weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
+        energy = energy - (material["masses"] * weight).sum(-1)
+        if self._pins:
+            energy = energy + self._spring_energy(positions, material["pin_stiffness"], material["pin_targets"])
+        if not isinstance(state, Tensor):
+            energy = energy + 0.5 * (material["masses"] * state[1].square().sum(-1)).sum(-1)
+        return energy
+
+    def _spring_energy(self, positions: Tensor, stiffness: Tensor, targets: Tensor) -> Tensor:
+        vertices = self.plan.vertex_order[self.plan.pin_vertex.long()].long()
+        soft = torch.where(torch.isinf(stiffness), torch.zeros_like(stiffness), stiffness)
+        return 0.5 * (soft * (positions[:, vertices] - targets).square().sum(-1)).sum(-1)
+
+    def gradient(self, positions: Tensor) -> Tensor:
+        """Gradient of the elastic energy [B, V, 3] [N]: minus the elastic forces."""
+        result: Tensor = _ops.gradient(positions, self.stiffness, list(self.plan.arrays))
+        return result
+
+    # ---- files
+
+    def save(self, path: str | Path) -> None:
+        """Write scene, settings and material to one file: safetensors with JSON metadata, no pickle."""
+        from .io import save_simulation
+
+        save_simulation(self, path)
+
+    @staticmethod
+    def load(path: str | Path) -> Simulator:
+        """Read what `save` wrote, on the CPU."""
+        from .io import load_simulation
+
+        return load_simulation(path)
+
+    # ---- arguments of the ops
+
+    def _numbers(self, *, inertial: bool, report: bool) -> dict[str, Any]:
+        return {
+            **self.solver.numbers(),
+            "iterations": self.iterations,
+            "time_step": self.time_step,
+            "tolerance": self.tolerance,
+            "inertial": inertial,
+            "report": report,
+        }
+
+    def _material_at(self, targets: Targets | None, batch: int) -> list[Tensor]:
+        """The material with pins and spheres where `targets` puts them."""
+        if targets is None:
+            return self.material()
+        pins, spheres = self.pin_targets, self.spheres
+        if isinstance(targets, Tensor):
+            pins = self._checked_targets("targets", targets, batch, len(self.plan.pin_vertex), (3,))
+        else:
+            for part, value in targets.items():
+                if part in self._pins:
+                    where = self._pins[part]
+                    value = self._checked_targets("targets of a Pin", value, batch, where.stop - where.start, (3,))
+                    pins = _overwrite(pins, where, value)
+                elif part in self._spheres:
+                    number = self._spheres[part]
+                    value = self._checked_targets("targets of a Sphere", value.unsqueeze(-2), batch, 1, (3, 6))
+                    spheres = _overwrite(spheres, slice(number, number + 1), self._sphere_row(number, value))
+                else:
+                    raise KeyError(f"targets: {type(part).__name__} is not a Pin or Sphere of this scene")
+        replaced = {"pin_targets": pins, "spheres": spheres}
+        return [replaced.get(name, getattr(self, name)).contiguous() for name in _ROWS_OF]
+
+    def _checked_targets(self, name: str, value: Tensor, batch: int, rows: int, widths: tuple[int, ...]) -> Tensor:
+        shape = tuple(value.shape)
+        if shape[-2:-1] != (rows,) or shape[-1] not in widths or shape[:-2] not in ((), (1,), (batch,)):
+            wanted = " or ".join(f"[{rows}, {width}]" for width in widths)
+            raise ValueError(f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(shape)}")
+        if value.dtype != self.dtype or value.device != self.device:
+            raise TypeError(f"{name} must be {self.dtype} on {self.device}, got {value.dtype} on {value.device}")
+        return value
+
+    def _sphere_row(self, number: int, value: Tensor) -> Tensor:
+        """Centre at the end of the step, radius, friction, motion during the step."""
+        own = self.spheres[..., number : number + 1, 3:5]
+        motion = value[..., 3:] * self.time_step if value.shape[-1] == 6 else torch.zeros_like(value)
+        lead = torch.broadcast_shapes(own.shape[:-1], value.shape[:-1])
+        return torch.cat([value[..., :3].expand(*lead, 3), own.expand(*lead, 2), motion.expand(*lead, 3)], dim=-1)
+
+
+def _overwrite(array: Tensor, rows: slice, value: Tensor) -> Tensor:
+    """`array` [.., n, k] with some rows replaced, batched when either is."""
+    lead = torch.broadcast_shapes(array.shape[:-2], value.shape[:-2])
+    parts = (array[..., : rows.start, :], value, array[..., rows.stop :, :])
+    return torch.cat([part.expand(*lead, *part.shape[-2:]) for part in parts], dim=-2)
+
+
+def _join_tracks(tracks: list[Track]) -> Track:
+    if len(tracks) == 1:
+        return tracks[0]
+    info = Info(*(torch.cat(column) for column in zip(*(track.info for track in tracks), strict=True)))
+    return Track(torch.cat([t.positions for t in tracks]), torch.cat([t.velocities for t in tracks]), info)
+
+
+def _first_iterate(start: str | Tensor) -> tuple[Tensor | None, bool]:
+    if isinstance(start, Tensor):
+        return start, False
+    if start not in ("velocity", "inertial"):
+        raise ValueError(f'start must be "velocity", "inertial" or positions [B, V, 3], got {start!r}')
+    return None, start == "inertial"
+
+
+def _positive(name: str, value: float, unit: str) -> float:
+    number = float(value)
+    if not 0.0 < number < float("inf"):
+        raise ValueError(f"{name} must be positive and finite [{unit}], got {value}")
+    return number
+
+
+def _whole(name: str, value: int, least: int) -> int:
+    if isinstance(value, bool) or int(value) != value or value < least:
+        raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+    return int(value)
+
+
+def _check_material(name: str, tensor: Tensor) -> None:
+    if name in ("stiffness", "masses", "pin_stiffness"):
+        good = bool((tensor > 0).all()) and (name == "pin_stiffness" or bool(tensor.isfinite().all()))
+        if not good:
+            raise ValueError(f"set_material: {name} must be positive{'' if name == 'pin_stiffness' else ' and finite'}")
+    elif not bool(tensor.isfinite().all()):
+        raise ValueError(f"set_material: {name} must be finite")
+    if name == "damping" and bool((tensor < 0).any()):
+        raise ValueError("set_material: damping must be >= 0")

@@ -1,0 +1,121 @@
+"""How the global step iterates: values only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypedDict
+
+from .checks import check_scalar
+
+__all__ = ["Chebyshev", "Jacobi", "Solver", "SolverNumbers"]
+
+Diagonal = Literal["weighted", "plain"]
+
+
+class SolverNumbers(TypedDict):
+    """A solver as the keyword arguments of the ops."""
+
+    schedule: int
+    relaxation: float
+    rho: float
+    delay: int
+    weighted: bool
+
+
+def _check_relaxation(name: str, value: float) -> None:
+    if not 0.0 < check_scalar(name, value) < 2.0:
+        raise ValueError(f"{name} must lie in (0, 2): a step of theta / D descends only there; got {value}")
+
+
+def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
+
+
+@dataclass(frozen=True)
+class Jacobi:
+    """Plain Jacobi iterations, without acceleration.
+
+    Args:
+        relaxation: theta of x - theta D^-1 grad E, in (0, 2).
+        diagonal: "weighted" never raises the energy, on any mesh; "plain" is the diagonal of the matrix of projective
+            dynamics, as in the literature, and diverges where its spectral radius exceeds 2 / theta.
+    """
+
+    relaxation: float = 1.0
+    diagonal: Diagonal = "weighted"
+
+    def __post_init__(self) -> None:
+        _check_relaxation("Jacobi.relaxation", self.relaxation)
+        _check_choice("Jacobi.diagonal", self.diagonal, ("weighted", "plain"))
+
+    def numbers(self) -> SolverNumbers:
+        """The keyword arguments of the ops."""
+        return {
+            "schedule": 0,
+            "relaxation": float(self.relaxation),
+            "rho": 0.0,
+            "delay": 0,
+            "weighted": self.diagonal == "weighted",
+        }
+
+
+@dataclass(frozen=True)
+class Chebyshev:
+    """Jacobi iterations accelerated by the Chebyshev semi-iterative method (Wang 2015; Vyatkin and Dolgovesov 2023).
+
+    "guarded" needs no tuning: rho comes from the weights of the step, and the momentum starts afresh whenever the energy
+    rose between two checks, four iterations apart. "classic" is the recurrence of the papers: it needs `rho`
+    (`torchpd.estimate_rho`) and may diverge.
+
+    Args:
+        schedule: "guarded" or "classic".
+        rho: spectral radius of the Jacobi iteration, in (0, 1). Guarded: None derives it from the step.
+        delay: S of the classic schedule, iterations without acceleration; 10 when None. Guarded has none.
+        relaxation: theta, in (0, 2). None: 1.9 guarded, 1 classic.
+        diagonal: "weighted" or "plain", see `Jacobi`. None: weighted when guarded, plain when classic.
+    """
+
+    schedule: Literal["guarded", "classic"] = "guarded"
+    rho: float | None = None
+    delay: int | None = None
+    relaxation: float | None = None
+    diagonal: Diagonal | None = None
+
+    def __post_init__(self) -> None:
+        _check_choice("Chebyshev.schedule", self.schedule, ("guarded", "classic"))
+        if self.rho is not None and not 0.0 < check_scalar("Chebyshev.rho", self.rho) < 1.0:
+            raise ValueError(f"Chebyshev.rho must lie in (0, 1), got {self.rho}")
+        if self.relaxation is not None:
+            _check_relaxation("Chebyshev.relaxation", self.relaxation)
+        if self.diagonal is not None:
+            _check_choice("Chebyshev.diagonal", self.diagonal, ("weighted", "plain"))
+        if self.schedule == "classic":
+            if self.rho is None:
+                raise ValueError(
+                    'Chebyshev(schedule="classic") needs rho; torchpd.estimate_rho(sim, state) measures it, '
+                    'or take schedule="guarded", which needs none'
+                )
+            if self.delay is not None and (self.delay < 0 or int(self.delay) != self.delay):
+                raise ValueError(f"Chebyshev.delay must be a whole number >= 0, got {self.delay}")
+        else:
+            if self.delay is not None:
+                raise ValueError(f'Chebyshev.delay belongs to schedule="classic"; guarded has none, got {self.delay}')
+            if self.diagonal == "plain":
+                raise ValueError(
+                    'Chebyshev.diagonal must be "weighted" when guarded: its descent rests on that diagonal'
+                )
+
+    def numbers(self) -> SolverNumbers:
+        """The keyword arguments of the ops."""
+        guarded = self.schedule == "guarded"
+        return {
+            "schedule": 2 if guarded else 1,
+            "relaxation": float(self.relaxation if self.relaxation is not None else (1.9 if guarded else 1.0)),
+            "rho": float(self.rho or 0.0),
+            "delay": 10 if self.delay is None else int(self.delay),
+            "weighted": (self.diagonal or ("weighted" if guarded else "plain")) == "weighted",
+        }
+
+
+Solver = Jacobi | Chebyshev

@@ -1,0 +1,45 @@
+"""What goes into a step and what comes out: named tuples of tensors, so they are pytrees."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+__all__ = ["Info", "State", "Track"]
+
+
+class State(NamedTuple):
+    """Where everything is and how fast it moves, vertices in the user's order, bodies one after another."""
+
+    positions: Tensor  # [B, V, 3] m
+    velocities: Tensor  # [B, V, 3] m/s
+
+
+class Info(NamedTuple):
+    """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it."""
+
+    residual: Tensor  # |grad E| / |grad E at the first iterate|, less what contacts balance; NaN unless asked for
+    energy: Tensor  # objective of the step at the last iterate [J]; NaN unless asked for
+    iterations: Tensor  # used
+    restarts: Tensor  # of the acceleration, because the energy rose
+    converged: Tensor  # bool: the tolerance was met before the iterations ran out
+    rho: Tensor  # spectral radius that the schedule used
+
+    @classmethod
+    def from_rows(cls, rows: Tensor) -> Info:
+        """From the rows [..., 6] that the ops return."""
+        residual, energy, iterations, restarts, converged, rho = rows.unbind(-1)
+        return cls(residual, energy, iterations.long(), restarts.long(), converged.bool(), rho)
+
+
+class Track(NamedTuple):
+    """States along a rollout; the start is not among them."""
+
+    positions: Tensor  # [T, B, V, 3] m
+    velocities: Tensor  # [T, B, V, 3] m/s
+    info: Info  # [T, B], of the last step before each record
+
+    def state(self, record: int = -1) -> State:
+        """One record as a state to go on from."""
+        return State(self.positions[record], self.velocities[record])

@@ -1,0 +1,190 @@
+"""Fill a surface with tetrahedra: a lattice around any triangle soup, or fTetWild through the package pytetwild."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from tqdm import tqdm
+
+from .checks import check_scalar
+from .embedding import Embedding, embed
+from .lattice import Lattice
+from .mesh import TET_FACES, TetMesh, TriMesh, match_faces
+
+__all__ = ["tetrahedralize"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Vertices closer than this many cells count as one where the surface is searched for holes.
+_SEAM = 0.25
+
+
+def tetrahedralize(
+    surface: Any,
+    cells: int = 20,
+    method: Literal["lattice", "tetwild"] = "lattice",
+    progress: bool = False,
+    *,
+    fill_holes: bool = True,
+) -> TetMesh:
+    """A tetrahedral mesh around a surface, which carries the surface along as `mesh.embedding`.
+
+    "lattice" takes any triangles: open, in pieces, self-intersecting, with either winding. It keeps the tets of a
+    body-centred cubic lattice that the surface touches or encloses. All tets are alike and well shaped; the mesh
+    reaches beyond the surface by up to one cell, and parts less than about a cell apart grow together. Cavities are
+    filled. Parts of the mesh that would hang together by an edge or a vertex alone are separated there.
+
+    "tetwild" follows the surface closely with tets of varying shape; it needs the package pytetwild.
+
+    Args:
+        surface: a TriMesh, a trimesh.Trimesh or trimesh.Scene, or the path of a file that trimesh reads.
+        cells: cells along the longest side of the bounding box; for "tetwild" the aim is edges as long as a cell.
+        method: "lattice" or "tetwild".
+        progress: show a progress bar.
+        fill_holes: "lattice" counts what lies behind a hole as inside, up to a cone of triangles over the open edges.
+            False leaves whatever can be reached from outside empty: an open surface becomes a shell.
+    """
+    triangles = _as_surface(surface)
+    if check_scalar("tetrahedralize: cells", cells, minimum=1) != int(cells):
+        raise ValueError(f"tetrahedralize: cells must be a whole number, got {cells}")
+    low, high = triangles.bounds
+    if not (high - low).max() > 0:
+        raise ValueError("tetrahedralize: surface must have an extent, got all vertices in one point")
+    if method == "lattice":
+        return _fill_lattice(triangles, Lattice.around(low, high, int(cells)), progress=progress, fill_holes=fill_holes)
+    if method == "tetwild":
+        return _fill_tetwild(triangles, float((high - low).max()) / int(cells))
+    raise ValueError(f'tetrahedralize: method must be "lattice" or "tetwild", got {method!r}')
+
+
+def _as_surface(surface: Any) -> TriMesh:
+    if isinstance(surface, TriMesh):
+        return surface
+    if isinstance(surface, (str, os.PathLike)):
+        return TriMesh.from_file(Path(surface))
+    if isinstance(surface, TetMesh):
+        raise TypeError("tetrahedralize: surface must be a surface, got a TetMesh, which is filled already")
+    import trimesh
+
+    if isinstance(surface, (trimesh.Trimesh, trimesh.Scene)):
+        return TriMesh.from_trimesh(surface)
+    raise TypeError(
+        "tetrahedralize: surface must be a TriMesh, a trimesh.Trimesh or Scene, or a path, "
+        f"got {type(surface).__name__}"
+    )
+
+
+def _fill_lattice(surface: TriMesh, lattice: Lattice, *, progress: bool, fill_holes: bool) -> TetMesh:
+    def report(kinds: Iterable[int]) -> Iterable[int]:
+        return tqdm(kinds, desc="tetrahedralize", disable=not progress, leave=False)
+
+    walls = lattice.touched(surface.vertices[surface.triangles], report)
+    if fill_holes:
+        caps = _hole_caps(surface, _SEAM * lattice.spacing)
+        if len(caps):
+            walls |= lattice.touched(caps)
+    kept = np.flatnonzero(walls | lattice.enclosed(walls))
+    vertices, tets = lattice.mesh(kept)
+    source, tets = _split_hinges(tets)
+    mesh = TetMesh(vertices[source], tets)
+    # Every surface vertex lies in a tet that its triangles touch, so it is found among the kept ones.
+    numbers, weights = lattice.locate(surface.vertices)
+    chosen = np.searchsorted(kept, numbers)
+    return mesh.with_embedding(Embedding(surface, chosen, weights, mesh.tets[chosen], len(mesh.vertices)))
+
+
+def _hole_caps(surface: TriMesh, tolerance: float) -> Array:
+    """Triangles [C, 3, 3] that close every hole: a cone over each connected piece of the open edges.
+
+    Open are the edges with an odd number of triangles, once vertices closer than `tolerance` count as one (files
+    repeat vertices along seams). They always form closed curves, and the cone from the mean of a curve closes it.
+    """
+    cells = np.floor(surface.vertices / tolerance + 0.5).astype(np.int64)
+    merged = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    ends = surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    keys = np.sort(merged[ends], axis=1)
+    real = keys[:, 0] != keys[:, 1]
+    ends, keys = ends[real], keys[real]
+    count = int(merged.max()) + 1
+    _, first, uses = np.unique(keys[:, 0] * count + keys[:, 1], return_index=True, return_counts=True)
+    open_edges = first[uses % 2 == 1]
+    if not len(open_edges):
+        return np.empty((0, 3, 3))
+    ends, keys = ends[open_edges], keys[open_edges]
+    graph = coo_array((np.ones(len(keys), dtype=np.int8), (keys[:, 0], keys[:, 1])), shape=(count, count))
+    piece = connected_components(graph, directed=False)[1][keys[:, 0]]
+    _, piece = np.unique(piece, return_inverse=True)
+    points = surface.vertices[ends]
+    sums = np.stack([np.bincount(piece, weights=points[:, :, k].mean(axis=1)) for k in range(3)], axis=1)
+    apexes = sums / np.bincount(piece)[:, None]
+    return np.concatenate([points, apexes[piece][:, None]], axis=1)
+
+
+def _split_hinges(tets: Index) -> tuple[Index, Index]:
+    """Give every fan of tets around a vertex a vertex of its own: a fan hangs together by faces.
+
+    Returns the old vertex of each new one, and the tets with new corners. Parts that met in an edge or a vertex alone,
+    a joint without stiffness, come apart; all other vertices keep their order. Only vertices of boundary faces can be
+    such joints.
+    """
+    order, begins = match_faces(tets)
+    shared = np.flatnonzero(~begins)
+    lone = begins & np.append(begins[1:], True)
+    corners = tets[:, TET_FACES].reshape(-1, 3)
+    outer = np.zeros(int(tets.max()) + 1, dtype=bool)
+    outer[corners[order[lone]]] = True
+    # Nodes are (tet, corner); a shared face joins the nodes of its three vertices across it.
+    nodes = (4 * np.arange(len(tets))[:, None, None] + TET_FACES).reshape(-1, 3)
+    sides = []
+    for face in (order[shared - 1], order[shared]):
+        by_vertex = np.argsort(corners[face], axis=1)
+        sides.append(np.take_along_axis(nodes[face], by_vertex, axis=1).reshape(-1))
+    vertex = tets.reshape(-1)
+    at_boundary = outer[vertex[sides[0]]]
+    rows, columns = sides[0][at_boundary], sides[1][at_boundary]
+    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(tets.size, tets.size))
+    fan = connected_components(graph, directed=False)[1].astype(np.int64)
+    # Inner vertices are one fan by themselves: key every fan by its vertex first, which also keeps the order.
+    fan[~outer[vertex]] = 0
+    keys = vertex * tets.size + fan
+    _, first, renumbered = np.unique(keys, return_index=True, return_inverse=True)
+    return vertex[first], renumbered.reshape(tets.shape)
+
+
+def _fill_tetwild(surface: TriMesh, edge_length: float) -> TetMesh:
+    try:
+        pytetwild = import_module("pytetwild")
+    except ImportError as error:
+        raise ImportError(
+            'tetrahedralize(method="tetwild") needs the optional package pytetwild: pip install "pytetwild[all]" '
+            f'(import failed: {error}); method="lattice" needs nothing'
+        ) from error
+    low, high = surface.bounds
+    # fTetWild leaves a file of this name in the working directory: take it away, unless it was there before.
+    leftover = Path("__tracked_surface.stl")
+    is_ours = not leftover.exists()
+    try:
+        vertices, tets = pytetwild.tetrahedralize(
+            surface.vertices.copy(),
+            surface.triangles.astype(np.int32),
+            edge_length_fac=edge_length / float(np.linalg.norm(high - low)),
+        )
+    finally:
+        if is_ours:
+            leftover.unlink(missing_ok=True)
+    # fTetWild lists corners in either order; turning them here is no repair to be reported.
+    edges = vertices[tets[:, 1:]] - vertices[tets[:, :1]]
+    inverted = np.linalg.det(edges) < 0
+    tets = tets.astype(np.int64)
+    tets[inverted] = tets[inverted][:, [0, 1, 3, 2]]
+    mesh = TetMesh(vertices, tets, drop_unreferenced=True, drop_degenerate=True)
+    return mesh.with_embedding(embed(surface, mesh))

@@ -1,0 +1,70 @@
+"""Which CUDA toolkit a build uses, or why it uses none. `setup.py` and the doctor both ask here.
+
+Stands alone (no import from the package), because `setup.py` runs it before the package can be imported.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+
+__all__ = ["CUDA_ARCHITECTURES", "NVCC_FLAGS", "Toolkit", "choose_toolkit", "find_toolkit"]
+
+# torch asks a visible GPU when TORCH_CUDA_ARCH_LIST is unset, which fails on a build machine without one.
+# The PTX of the last architecture lets newer devices compile it when they load it.
+CUDA_ARCHITECTURES = "8.0;9.0+PTX"
+NVCC_FLAGS = ("-std=c++20", "-O3", "--expt-relaxed-constexpr")
+
+
+class Toolkit(NamedTuple):
+    """A CUDA toolkit, or the reason why a build goes without."""
+
+    home: str | None  # folder that holds bin/nvcc; None when CUDA is left out
+    release: str  # of nvcc, such as "13.0"; empty when there is none
+    reason: str  # why CUDA is left out; empty when it is used
+
+
+def _nvcc_release(home: str) -> str:
+    """The release that nvcc states, such as "13.0"; empty when it cannot be run."""
+    nvcc = Path(home) / "bin" / "nvcc"
+    try:
+        answer = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    found = re.search(r"release (\d+\.\d+)", answer.stdout)
+    return found.group(1) if found else ""
+
+
+def choose_toolkit(home: str | None, release: str, torch_cuda: str | None) -> Toolkit:
+    """Decide from the facts alone; whether a GPU is visible is not one of them.
+
+    Args:
+        home: folder of the toolkit, None when there is none.
+        release: of its nvcc, empty when it cannot be run.
+        torch_cuda: `torch.version.cuda`, None for a CPU build of torch.
+    """
+    if torch_cuda is None:
+        return Toolkit(None, release, "this torch is a CPU build (torch.version.cuda is None)")
+    if home is None:
+        return Toolkit(None, "", f"no CUDA toolkit found: install CUDA {torch_cuda} or set CUDA_HOME")
+    if not release:
+        return Toolkit(None, "", f"no working nvcc in {home}/bin")
+    if release.split(".")[0] != torch_cuda.split(".")[0]:
+        return Toolkit(None, release, f"nvcc is CUDA {release} but torch is built for CUDA {torch_cuda}")
+    return Toolkit(home, release, "")
+
+
+def find_toolkit() -> Toolkit:
+    """The toolkit that a build started now would use. TORCHPD_CUDA=0 in the environment leaves CUDA out."""
+    import torch
+
+    if os.environ.get("TORCHPD_CUDA") == "0":
+        return Toolkit(None, "", "switched off by TORCHPD_CUDA=0")
+    try:
+        from torch.utils.cpp_extension import CUDA_HOME
+    except ImportError as error:
+        return Toolkit(None, "", f"torch cannot build extensions here: {error}")
+    return choose_toolkit(CUDA_HOME, _nvcc_release(CUDA_HOME) if CUDA_HOME else "", torch.version.cuda)
