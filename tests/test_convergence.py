@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 import torchpd as pd
-from torchpd.convergence import compare_solvers, measure_convergence, plot_convergence
+from torchpd.convergence import SolvedAlreadyError, compare_solvers, measure_convergence, plot_convergence
 
 
 def _pressed_beam(friction: float) -> tuple[pd.Simulator, pd.State]:
@@ -61,6 +61,13 @@ def test_diverging_solver_is_measured_and_drawn(tmp_path: Path) -> None:
     assert picture.shape[1] >= 1000
     assert (picture == 255).mean() > 0.5  # mostly paper
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+
+
+def test_free_fall_has_nothing_to_measure() -> None:
+    sim, state = _pressed_beam(0.0)
+    falling = pd.State(state.positions + torch.tensor([0.0, 5.0, 0.0]), state.velocities)
+    with pytest.raises(SolvedAlreadyError, match="first iterate solves this step"):
+        measure_convergence(sim, falling, {"guarded": pd.Chebyshev()}, iterations=8)
 
 
 def test_bad_requests_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -50,6 +50,21 @@ def test_flat_triangles_have_a_normal() -> None:
     assert np.array_equal(surface.normals(surface.split(line)), np.tile([0.0, 1.0, 0.0], (3, 1)))
 
 
+def test_normals_face_an_eye_that_sees_their_triangles() -> None:
+    coarse = trimesh.creation.icosphere(subdivisions=1)
+    surface = SmoothSurface(coarse.vertices, coarse.faces)
+    split = surface.split(np.asarray(coarse.vertices))
+    eye = np.array([0.3, 0.5, 4.0])
+    towards = (eye - split) / np.linalg.norm(eye - split, axis=1, keepdims=True)
+    seen_faces = np.einsum("ij,ij->i", coarse.face_normals, eye - coarse.triangles[:, 0]) > 0.0
+    seen = np.unique(surface.triangles[seen_faces])
+    plain, bent = surface.normals(split), surface.normals_seen_from(eye, split)
+    assert (np.einsum("ij,ij->i", plain, towards)[seen] < 0.0).any()  # what the bending is for
+    assert (np.einsum("ij,ij->i", bent, towards)[seen] > 0.0).all()
+    facing = np.einsum("ij,ij->i", plain, towards) > 0.1
+    assert np.abs(bent - plain)[facing].max() < 1e-15
+
+
 @pytest.mark.parametrize(
     ("vertices", "triangles", "message"),
     [

@@ -54,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("mesh", nargs="?", type=Path, metavar="MESH", help="file of a surface or a tetrahedral mesh")
     demo.add_argument("--cells", type=_whole, default=24, help="lattice cells along the longest side (%(default)s)")
     demo.add_argument("--steps", type=_whole, default=120, help="time steps of 1/60 s (%(default)s)")
-    demo.add_argument("--youngs", type=_positive, default=2e4, help="Young's modulus in Pa (%(default)g)")
+    demo.add_argument("--youngs", type=_positive, default=3e4, help="Young's modulus in Pa (%(default)g)")
     demo.add_argument("--iterations", type=_whole, default=64, help="iterations of a time step (%(default)s)")
     demo.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
     demo.add_argument("--out", type=Path, default=Path("out"), help="folder for the files (%(default)s)")

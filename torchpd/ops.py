@@ -11,14 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import _C
+from .adjoint import AdjointCall, step_adjoint
+from .tables import MATERIAL_TABLE
 
-__all__ = ["INFO_WIDTH", "MATERIAL_TABLE", "nearest_rotation"]
+__all__ = ["INFO_WIDTH", "nearest_rotation"]
 
 INFO_WIDTH = 6
-MATERIAL_TABLE: tuple[tuple[str, int, str, str], ...] = tuple(_C.material_table())
-# dimensions of each material array without a batch
-_MATERIAL_DIMS = tuple((rows != "one") + (width > 1) for _, width, rows, _ in MATERIAL_TABLE)
 
 _ops = torch.ops.torchpd
 
@@ -188,6 +186,65 @@ def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | No
     return grads
 
 
+@torch.library.custom_op("torchpd::step_vjp", mutates_args=())
+def step_vjp(
+    grad_positions: Tensor,
+    grad_velocities: Tensor,
+    after: Tensor,
+    positions: Tensor,
+    velocities: Tensor,
+    material: Sequence[Tensor],
+    plan: Sequence[Tensor],
+    time_step: float,
+) -> list[Tensor]:
+    """The adjoint of a step: gradients for positions, velocities, forces and every material array."""
+    call = AdjointCall(positions, velocities, after, list(material), list(plan), time_step)
+    return step_adjoint(call, grad_positions, grad_velocities)
+
+
+@step_vjp.register_fake
+def _(
+    grad_positions: Tensor,
+    grad_velocities: Tensor,
+    after: Tensor,
+    positions: Tensor,
+    velocities: Tensor,
+    material: Sequence[Tensor],
+    plan: Sequence[Tensor],
+    time_step: float,
+) -> list[Tensor]:
+    state = [positions.new_empty(positions.shape) for _ in range(3)]
+    return [*state, *(array.new_empty(array.shape) for array in material)]
+
+
+def _step_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
+    positions, velocities, _, _, material, plan = inputs
+    ctx.save_for_backward(positions, velocities, output[0], *material, *plan)
+    ctx.time_step = keyword_only_inputs["time_step"]
+
+
+def _step_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _: Tensor) -> tuple[Any, ...]:
+    wanted = ctx.needs_input_grad
+    contacts = [
+        row.name for row, needed in zip(MATERIAL_TABLE, wanted[4], strict=True) if needed and row.name in _CONTACTS
+    ]
+    if contacts:
+        raise RuntimeError(f"torchpd: a step has no derivative for {' and '.join(contacts)}; detach them")
+    if wanted[3]:
+        raise RuntimeError("torchpd: a step has no derivative for its first iterate; detach start")
+    positions, velocities, after, *rest = ctx.saved_tensors
+    material, plan = rest[: len(MATERIAL_TABLE)], rest[len(MATERIAL_TABLE) :]
+    grads = _ops.step_vjp(
+        grad_positions.contiguous(), grad_velocities.contiguous(), after, positions, velocities, material, plan,
+        ctx.time_step,
+    )  # fmt: skip
+    x, v, f, *values = grads
+    return x, v, f if wanted[2] else None, None, values, [None] * len(plan)
+
+
+_CONTACTS = ("planes", "spheres")
+torch.library.register_autograd("torchpd::step", _step_backward, setup_context=_step_setup)
+
 for _name, _backward, _inputs in (
     ("element_energy", _element_energy_backward, ("positions", "stiffness")),
     ("gradient", _gradient_backward, ("positions", "stiffness")),
@@ -257,7 +314,9 @@ def _join_step(info: Any, dims: Sequence[Any], tensors: Sequence[Any]) -> tuple[
     size = info.batch_size
     batch = state[0].shape[1 if state_dims[0] == 0 else 0]
     joined = [None if t is None else _join(t, d, size, batch, 2) for t, d in zip(state, state_dims, strict=True)]
-    values = [_join(t, d, size, batch, own) for t, d, own in zip(material, material_dims, _MATERIAL_DIMS, strict=True)]
+    values = [
+        _join(t, d, size, batch, row.dims) for t, d, row in zip(material, material_dims, MATERIAL_TABLE, strict=True)
+    ]
     return joined, values
 
 

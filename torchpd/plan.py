@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,23 +14,13 @@ from tqdm import tqdm
 
 from . import _C
 from .scene import SceneValues
+from .tables import PLAN_TABLE, PlanRow
 
-__all__ = ["Plan", "PlanRow", "compile_plan"]
+__all__ = ["Plan", "compile_plan"]
 
 _WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
 
 
-class PlanRow(NamedTuple):
-    """One line of the table in csrc/plan/plan.def."""
-
-    name: str
-    type: str
-    width: int
-    rows: str
-    meaning: str
-
-
-PLAN_TABLE = tuple(PlanRow(*row) for row in _C.plan_table())
 _POSITION = {row.name: number for number, row in enumerate(PLAN_TABLE)}
 _TYPES = {"int32": torch.int32, "int16": torch.int16}
 

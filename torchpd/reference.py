@@ -233,7 +233,7 @@ class StepProblem:
             guess = self.shift_momentum(self._hold(guesses[start]))
         else:
             guess = self._hold(np.asarray(start, dtype=np.float64) - self.positions)
-        return self.project(guess)
+        return self.project(guess, guess)
 
     def _hold(self, displacement: Array) -> Array:
         return np.where(self.free[:, None], displacement, self.target)
@@ -287,11 +287,11 @@ class StepProblem:
             moved = _push_out(moved, normals, gaps, motion, float(sphere[4]))
         return np.where(self.free[:, None], moved, displacement)
 
-    def residual(self, displacement: Array) -> Array:
-        """Dbar (u - P(u - g / Dbar)) [V, 3] in N: zero at a solution, grad E where nothing touches."""
-        diagonal = self.weighted_diagonal[:, None]
-        stepped = displacement - self.gradient(displacement) / diagonal
-        return np.asarray(diagonal * (displacement - self.project(stepped, displacement)))
+    def residual(self, displacement: Array, diagonal: Array | None = None) -> Array:
+        """D (u - P(u - g / D)) [V, 3] in N: zero at a solution, grad E where nothing touches; D is Dbar by default."""
+        scale = (self.weighted_diagonal if diagonal is None else diagonal)[:, None]
+        stepped = displacement - self.gradient(displacement) / scale
+        return np.asarray(scale * (displacement - self.project(stepped, displacement)))
 
 
 def _push_out(displacement: Array, normals: Array, gaps: Array, motion: Array, friction: float) -> Array:

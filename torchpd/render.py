@@ -154,7 +154,7 @@ class Studio:
         check_shape("vertices", frame, (self._count, 3), "positions of the vertices that the studio was made for [m]")
         check_finite("vertices", frame)
         positions = self.surface.split(frame)
-        normals = self.surface.normals(positions)
+        normals = self.surface.normals_seen_from(np.array(self.camera.origin), positions)
         with _mitsuba() as mi:
             scene = mi.load_dict(self._scene(mi, positions, normals))
             radiance = np.array(mi.render(scene, spp=self.samples))

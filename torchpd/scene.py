@@ -42,8 +42,8 @@ def _lumped_masses(positions: Array, tets: Index, density: Array) -> Array:
     corners = positions[tets]
     edges = corners[:, 1:] - corners[:, :1]
     share = density * np.linalg.det(edges) / 24.0
-    masses: Array = np.bincount(tets.reshape(-1), weights=np.repeat(share, 4), minlength=len(positions))
-    return masses
+    masses = np.bincount(tets.reshape(-1), weights=np.repeat(share, 4), minlength=len(positions))
+    return masses.astype(np.float64, copy=False)
 
 
 def _components(count: int, tets: Index) -> Index:

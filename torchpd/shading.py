@@ -16,6 +16,8 @@ __all__ = ["SmoothSurface"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+_GRAZING = 0.03  # least cosine between a normal and the direction to the eye
+
 
 class SmoothSurface:
     """Triangles whose vertices are split at creases, so that one normal per vertex shades them well.
@@ -29,7 +31,7 @@ class SmoothSurface:
         triangles: [T, 3] into the split vertices.
     """
 
-    def __init__(self, vertices: Any, triangles: Any, *, crease: float = 40.0) -> None:
+    def __init__(self, vertices: Any, triangles: Any, *, crease: float = 60.0) -> None:
         positions = as_array("vertices", vertices, np.float64)
         check_shape("vertices", positions, (None, 3), "positions [m]")
         check_finite("vertices", positions)
@@ -57,6 +59,24 @@ class SmoothSurface:
             np.add.at(normals, self.triangles[:, corner], face_normals)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.where(length > 0.0, normals / np.where(length > 0.0, length, 1.0), [0.0, 1.0, 0.0])
+
+    def normals_seen_from(self, eye: Array, split_vertices: Array) -> Array:
+        """The normals [S, 3], where need be bent until they face the eye on every side of a triangle that does.
+
+        Along the silhouette of a coarse surface an averaged normal may look away although its triangle is seen, and
+        a path tracer paints such a place black.
+        """
+        normals = self.normals(split_vertices)
+        towards = eye - split_vertices
+        towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+        face_normals = _face_normals(split_vertices, self.triangles)
+        seen_faces = np.einsum("ij,ij->i", face_normals, eye - split_vertices[self.triangles[:, 0]]) > 0.0
+        seen = np.zeros(len(normals), dtype=bool)
+        seen[self.triangles[seen_faces]] = True
+        side = np.where(seen, 1.0, -1.0)  # a vertex of hidden triangles alone is seen from behind, if at all
+        lacking = np.maximum(0.0, _GRAZING - side * np.einsum("ij,ij->i", normals, towards))
+        bent = normals + (side * lacking)[:, None] * towards
+        return np.asarray(bent / np.linalg.norm(bent, axis=1, keepdims=True))
 
 
 def _face_normals(vertices: Array, triangles: Index) -> Array:

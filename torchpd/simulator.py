@@ -12,12 +12,13 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from .effects import Pin, Sphere
-from .ops import INFO_WIDTH, MATERIAL_TABLE
+from .ops import INFO_WIDTH
 from .plan import Plan, compile_plan
 from .scene import Scene, SceneValues
 from .solvers import Chebyshev, Jacobi, Solver
 from .state import Info, State, Track
 from .summary import describe
+from .tables import MATERIAL_TABLE
 
 __all__ = ["Simulator", "Targets"]
 
@@ -25,7 +26,7 @@ Targets = Tensor | Mapping[Pin | Sphere, Tensor]
 PerStep = Callable[[int], Any]
 
 _ops = torch.ops.torchpd
-_ROWS_OF = {name: (width, rows) for name, width, rows, _ in MATERIAL_TABLE}
+_ROWS = {row.name: row for row in MATERIAL_TABLE}
 _BARS = 50  # how often a progress bar moves during a rollout
 
 
@@ -41,7 +42,7 @@ def _material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
         "planes": values.planes,
         "spheres": spheres,
     }
-    return {name: torch.tensor(arrays[name], dtype=dtype) for name, *_ in MATERIAL_TABLE}
+    return {name: torch.tensor(arrays[name], dtype=dtype) for name in _ROWS}
 
 
 class Simulator(nn.Module):
@@ -122,7 +123,7 @@ class Simulator(nn.Module):
 
     def material(self) -> list[Tensor]:
         """The differentiable arrays in the order of the ops."""
-        return [getattr(self, name) for name, *_ in MATERIAL_TABLE]
+        return [getattr(self, name) for name in _ROWS]
 
     def set_material(self, **arrays: Tensor | float) -> None:
         """Replace differentiable arrays, for all environments or with a leading batch for each.
@@ -131,12 +132,12 @@ class Simulator(nn.Module):
             arrays: by name, see the class. Shapes, positive stiffness and masses are checked here, once.
         """
         for name, value in arrays.items():
-            if name not in _ROWS_OF:
-                raise TypeError(f"set_material: no array {name!r}; there are {', '.join(_ROWS_OF)}")
+            if name not in _ROWS:
+                raise TypeError(f"set_material: no array {name!r}; there are {', '.join(_ROWS)}")
             own = getattr(self, name)
             tensor = torch.as_tensor(value, dtype=self.dtype, device=self.device)
             tensor = tensor.expand(own.shape) if tensor.dim() == 0 else tensor
-            shape = tuple(own.shape[own.dim() - self._own_dims(name) :])
+            shape = tuple(own.shape[own.dim() - _ROWS[name].dims :])
             if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
                 raise ValueError(
                     f"set_material: {name} must be {list(shape)}, or with a batch in front, got {list(tensor.shape)}"
@@ -144,11 +145,6 @@ class Simulator(nn.Module):
             _check_material(name, tensor)
             trains = own.requires_grad
             setattr(self, name, nn.Parameter(tensor.detach().clone().contiguous(), requires_grad=trains))
-
-    @staticmethod
-    def _own_dims(name: str) -> int:
-        width, rows = _ROWS_OF[name]
-        return (rows != "one") + (width > 1)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
@@ -347,7 +343,7 @@ class Simulator(nn.Module):
             targets: of pins, as in `forward`.
         """
         positions = state if isinstance(state, Tensor) else state[0]
-        material = dict(zip(_ROWS_OF, self._material_at(targets, positions.shape[0]), strict=True))
+        material = dict(zip(_ROWS, self._material_at(targets, positions.shape[0]), strict=True))
         energy = cast(Tensor, _ops.element_energy(positions, material["stiffness"], list(self.plan.arrays))).sum(-1)
         weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
         energy = energy - (material["masses"] * weight).sum(-1)
@@ -414,7 +410,7 @@ class Simulator(nn.Module):
                 else:
                     raise KeyError(f"targets: {type(part).__name__} is not a Pin or Sphere of this scene")
         replaced = {"pin_targets": pins, "spheres": spheres}
-        return [replaced.get(name, getattr(self, name)).contiguous() for name in _ROWS_OF]
+        return [replaced.get(name, getattr(self, name)).contiguous() for name in _ROWS]
 
     def _checked_targets(self, name: str, value: Tensor, batch: int, rows: int, widths: tuple[int, ...]) -> Tensor:
         shape = tuple(value.shape)

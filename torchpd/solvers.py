@@ -64,8 +64,8 @@ class Jacobi:
 class Chebyshev:
     """Jacobi iterations accelerated by the Chebyshev semi-iterative method (Wang 2015; Vyatkin and Dolgovesov 2023).
 
-    "guarded" needs no tuning: rho comes from the weights of the step, and the momentum starts afresh whenever the energy
-    rose between two checks, four iterations apart. "classic" is the recurrence of the papers: it needs `rho`
+    "guarded" needs no tuning: rho comes from the weights of the step, and the momentum starts afresh whenever the
+    energy rose between two checks, four iterations apart. "classic" is the recurrence of the papers: it needs `rho`
     (`torchpd.estimate_rho`) and may diverge.
 
     Args:

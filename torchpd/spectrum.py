@@ -9,47 +9,27 @@ from typing import TYPE_CHECKING, Literal, cast
 import torch
 from torch import Tensor
 
+from .diagonal import step_diagonal
 from .solvers import Chebyshev, Jacobi
 from .state import State
 
 if TYPE_CHECKING:
     from .simulator import Simulator
 
-__all__ = ["estimate_rho", "jacobi_diagonal"]
+__all__ = ["estimate_rho"]
 
 _LARGEST = 0.99999
 _ops = torch.ops.torchpd
 
 
-def jacobi_diagonal(sim: Simulator, *, weighted: bool = True) -> tuple[Tensor, Tensor]:
-    """Inertia a and diagonal D of every vertex, [V] or [B, V], in N/m; D is infinite on hard pins.
-
-    D_i = a_i + sum_e l_e w_e V_e |grad N_i|^2, a_i = m_i / h^2 (1 + damping h) + k_i; l_e = 1 when not weighted.
-    """
-    plan = sim.plan
-    lanes = plan.tet_rest.unflatten(1, (3, 3, 16)).permute(0, 3, 1, 2).reshape(-1, 3, 3)
-    gradients = torch.cat([-lanes.sum(1, keepdim=True), lanes], dim=1).square().sum(-1)
-    volume = plan.tet_volume.reshape(-1) * (plan.tet_bound.reshape(-1) if weighted else 1.0)
-    stiffness = sim.stiffness[..., plan.tet_order.reshape(-1).long()]
-    share = (stiffness * volume).unsqueeze(-1) * gradients
-    blocks_of = plan.patch_block.diff().long()
-    first_slot = plan.patch_slot[:-1].repeat_interleave(blocks_of)
-    slots = plan.tet_corner.unflatten(1, (4, 16)).transpose(1, 2).int() + first_slot[:, None, None]
-    vertex = plan.vertex_order[plan.slot_vertex[slots.reshape(-1).long()].long()].long()
-
-    springs = torch.zeros(*sim.pin_stiffness.shape[:-1], sim.vertices, dtype=sim.dtype, device=sim.device)
-    pinned = plan.vertex_order[plan.pin_vertex.long()].long()
-    springs = springs.index_copy(-1, pinned, sim.pin_stiffness)
-    h = sim.time_step
-    inertia = sim.masses / h**2 * (1 + sim.damping.unsqueeze(-1) * h) + springs
-    elastic = torch.zeros(*share.shape[:-2], sim.vertices, dtype=sim.dtype, device=sim.device)
-    elastic = elastic.index_add(-1, vertex, share.flatten(-2))
-    return inertia, inertia + elastic
+def _diagonal(sim: Simulator) -> tuple[Tensor, Tensor]:
+    weighted = sim.solver.numbers()["weighted"]
+    return step_diagonal(sim.plan.arrays, sim.material(), sim.time_step, weighted=weighted)
 
 
 def _bound(sim: Simulator) -> float:
     numbers = sim.solver.numbers()
-    inertia, diagonal = jacobi_diagonal(sim, weighted=numbers["weighted"])
+    inertia, diagonal = _diagonal(sim)
     ratio = torch.where(torch.isinf(inertia), torch.ones_like(inertia), inertia / diagonal)
     return 1.0 - numbers["relaxation"] * float(ratio.min())
 
@@ -57,7 +37,7 @@ def _bound(sim: Simulator) -> float:
 def _power(sim: Simulator, state: State, iterations: int) -> float:
     """Largest |eigenvalue| of I - theta D^-1 H at the state, H the Hessian of the step's objective."""
     numbers = sim.solver.numbers()
-    inertia, diagonal = (t.unsqueeze(-1) for t in jacobi_diagonal(sim, weighted=numbers["weighted"]))
+    inertia, diagonal = (t.unsqueeze(-1) for t in _diagonal(sim))
     free = torch.isfinite(inertia)
     inertia = torch.where(free, inertia, torch.zeros_like(inertia))
     generator = torch.Generator().manual_seed(0)

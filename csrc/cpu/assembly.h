@@ -24,25 +24,27 @@ PD_HD Mat3<R> read_matrix(Read read) {
   return {{{read(0), read(1), read(2)}, {read(3), read(4), read(5)}, {read(6), read(7), read(8)}}};
 }
 
-// Corner of W elements, from vertices stored as quads.
+// Corner of W elements, from vertices stored as quads: loads and shuffles beat the gather instructions.
 template <class T, int W>
 PD_HD Vec3<Pack<T, W>> gather_corner(const Quad<T>* x, const int16* slot) {
 #if PD_VECTOR_BYTES == 64
   if constexpr (W == 16 && sizeof(T) == 4) {
-    const float* from = reinterpret_cast<const float*>(x);
-    const __m512i offset =
-        _mm512_slli_epi32(_mm512_cvtepu16_epi32(_mm256_loadu_si256((const __m256i*)slot)), 2);
+    // row[j] holds the quads of lanes j, j + 4, j + 8, j + 12; then 4x4 transposes
+    __m512 row[4];
+    for (int j = 0; j < 4; ++j) {
+      const auto quad = [&](int lane) { return (__m128)x[slot[lane]].q.v; };
+      row[j] = _mm512_castps128_ps512(quad(j));
+      row[j] = _mm512_insertf32x4(row[j], quad(j + 4), 1);
+      row[j] = _mm512_insertf32x4(row[j], quad(j + 8), 2);
+      row[j] = _mm512_insertf32x4(row[j], quad(j + 12), 3);
+    }
     using V = typename Pack<T, W>::Vector;
-    return {V(_mm512_i32gather_ps(offset, from, 4)), V(_mm512_i32gather_ps(offset, from + 1, 4)),
-            V(_mm512_i32gather_ps(offset, from + 2, 4))};
-  }
-  if constexpr (W == 8 && sizeof(T) == 8) {
-    const double* from = reinterpret_cast<const double*>(x);
-    const __m256i offset =
-        _mm256_slli_epi32(_mm256_cvtepu16_epi32(_mm_loadu_si128((const __m128i*)slot)), 2);
-    using V = typename Pack<T, W>::Vector;
-    return {V(_mm512_i32gather_pd(offset, from, 8)), V(_mm512_i32gather_pd(offset, from + 1, 8)),
-            V(_mm512_i32gather_pd(offset, from + 2, 8))};
+    const __m512d xy01 = _mm512_castps_pd(_mm512_unpacklo_ps(row[0], row[1]));
+    const __m512d xy23 = _mm512_castps_pd(_mm512_unpacklo_ps(row[2], row[3]));
+    const __m512d zw01 = _mm512_castps_pd(_mm512_unpackhi_ps(row[0], row[1]));
+    const __m512d zw23 = _mm512_castps_pd(_mm512_unpackhi_ps(row[2], row[3]));
+    return {V(_mm512_castpd_ps(_mm512_unpacklo_pd(xy01, xy23))), V(_mm512_castpd_ps(_mm512_unpackhi_pd(xy01, xy23))),
+            V(_mm512_castpd_ps(_mm512_unpacklo_pd(zw01, zw23)))};
   }
 #endif
   Vec3<Pack<T, W>> r;
@@ -97,49 +99,7 @@ PD_HD void scatter_corners(Quad<T>* g, const BlockPart<T>& part,
   }
 }
 
-// element(corners of each field, rest_inverse, weight, force, position in the block), for every pack of elements of a patch.
-template <int Fields, class T, class Element>
-PD_HD void each_element(Single<T>, const Plan<T>& plan, int patch,
-                        const Quad<T>* const (&field)[Fields], const T* weight, bool, Quad<T>* g,
-                        Element element) {
-  constexpr int W = native_width<T>;
-  using R = Pack<T, W>;
-  for (int block = plan.patch_block[patch]; block < plan.patch_block[patch + 1]; ++block) {
-    for (int first = 0; first < block_lanes; first += W) {
-      const BlockPart<T> part = {&plan, block, first};
-      Vec3<R> corner[Fields][4], force[4];
-      for (int f = 0; f < Fields; ++f) {
-        for (int c = 0; c < 4; ++c) corner[f][c] = gather_corner<T, W>(field[f], part.corner(c));
-      }
-      const Mat3<R> rest = read_matrix<R>([&](int entry) { return R::load(part.rest(entry)); });
-      element(corner, rest, R::load(weight + part.element()), force, first / W);
-      scatter_corners<T, W>(g, part, force);
-    }
-  }
-}
-
-template <int Fields, class T, int W, class Element>
-PD_HD void each_element(Batch<T, W>, const Plan<T>& plan, int patch,
-                        const Vec3<Pack<T, W>>* const (&field)[Fields], const T* weight,
-                        bool shared_weight, Vec3<Pack<T, W>>* g, Element element) {
-  using R = Pack<T, W>;
-  for (int block = plan.patch_block[patch]; block < plan.patch_block[patch + 1]; ++block) {
-    for (int lane = 0; lane < block_lanes; ++lane) {
-      const BlockPart<T> part = {&plan, block, lane};
-      if (plan.tet_volume[part.element()] == T(0)) continue;
-      Vec3<R> corner[Fields][4], force[4];
-      for (int f = 0; f < Fields; ++f) {
-        for (int c = 0; c < 4; ++c) corner[f][c] = field[f][*part.corner(c)];
-      }
-      const Mat3<R> rest = read_matrix<R>([&](int entry) { return R(*part.rest(entry)); });
-      const R w = shared_weight ? R(weight[part.element()]) : R::load(weight + part.element() * W);
-      element(corner, rest, w, force, lane);
-      for (int c = 0; c < 4; ++c) g[*part.corner(c)] = g[*part.corner(c)] + force[c];
-    }
-  }
-}
-
-// Numbers that each_element's `position` counts: one a lane of the block, whichever way lanes run.
+// One sum a lane of the blocks, whichever way lanes run: the total has the same bits.
 template <class Lanes>
 struct LaneSums;
 template <class T>
@@ -171,5 +131,109 @@ struct LaneSums<Batch<T, W>> {
     return sum;
   }
 };
+
+// What an element functor sees of the packs of elements that it works on at once, `s` counting them: elements of one
+// environment across lanes.
+template <int Fields, class T>
+struct ElementsAcross {
+  static constexpr int W = native_width<T>, parts = block_lanes / W;
+  using R = Pack<T, W>;
+
+  const Plan<T>& plan;
+  const Quad<T>* const (&field)[Fields];
+  const T* weights;
+  Quad<T>* forces;
+  LaneSums<Single<T>>& sums;
+  int first;  // pack, from the first block of the plan
+
+  ElementsAcross(const Plan<T>& p, const Quad<T>* const (&f)[Fields], const T* w, bool, Quad<T>* g,
+                 LaneSums<Single<T>>& all)
+      : plan(p), field(f), weights(w), forces(g), sums(all), first(0) {}
+
+  static int packs(int blocks) { return blocks * parts; }
+  PD_HD BlockPart<T> part(int s) const { return {&plan, (first + s) / parts, (first + s) % parts * W}; }
+  PD_HD void corners(int s, int f, Vec3<R> (&x)[4]) const {
+    for (int c = 0; c < 4; ++c) x[c] = gather_corner<T, W>(field[f], part(s).corner(c));
+  }
+  PD_HD Mat3<R> rest(int s) const {
+    return read_matrix<R>([&](int entry) { return R::load(part(s).rest(entry)); });
+  }
+  PD_HD R weight(int s) const { return R::load(weights + part(s).element()); }
+  PD_HD R& sum(int s) const { return sums.part[(first + s) % parts]; }
+  PD_HD void add(int s, const Vec3<R> (&g)[4]) const { scatter_corners<T, W>(forces, part(s), g); }
+};
+
+// The same for one element of W environments.
+template <int Fields, class T, int W>
+struct EnvironmentsAcross {
+  using R = Pack<T, W>;
+
+  const Plan<T>& plan;
+  const Vec3<R>* const (&field)[Fields];
+  const T* weights;
+  bool shared_weight;
+  Vec3<R>* forces;
+  LaneSums<Batch<T, W>>& sums;
+  int first;  // element, padding counted
+
+  EnvironmentsAcross(const Plan<T>& p, const Vec3<R>* const (&f)[Fields], const T* w, bool shared, Vec3<R>* g,
+                     LaneSums<Batch<T, W>>& all)
+      : plan(p), field(f), weights(w), shared_weight(shared), forces(g), sums(all), first(0) {}
+
+  static int packs(int blocks) { return blocks * block_lanes; }
+  PD_HD BlockPart<T> part(int s) const { return {&plan, (first + s) / block_lanes, (first + s) % block_lanes}; }
+  PD_HD void corners(int s, int f, Vec3<R> (&x)[4]) const {
+    for (int c = 0; c < 4; ++c) x[c] = field[f][*part(s).corner(c)];
+  }
+  PD_HD Mat3<R> rest(int s) const {
+    return read_matrix<R>([&](int entry) { return R(*part(s).rest(entry)); });
+  }
+  PD_HD R weight(int s) const {
+    const std::int64_t e = part(s).element();
+    return shared_weight ? R(weights[e]) : R::load(weights + e * W);
+  }
+  PD_HD R& sum(int s) const { return sums.part[(first + s) % block_lanes]; }
+  PD_HD void add(int s, const Vec3<R> (&g)[4]) const {
+    for (int c = 0; c < 4; ++c) forces[*part(s).corner(c)] = forces[*part(s).corner(c)] + g[c];
+  }
+};
+
+template <int Fields, class Lanes>
+struct ElementsOf;
+template <int Fields, class T>
+struct ElementsOf<Fields, Single<T>> {
+  using type = ElementsAcross<Fields, T>;
+};
+template <int Fields, class T, int W>
+struct ElementsOf<Fields, Batch<T, W>> {
+  using type = EnvironmentsAcross<Fields, T, W>;
+};
+
+// element.run<N>(elements) on every pack of elements of a patch, Element::strip at a time.
+template <class T, class Elements, class Element>
+PD_HD void each_element(const Plan<T>& plan, int patch, Elements elements, const Element& element) {
+  const int end = Elements::packs(plan.patch_block[patch + 1]);
+  elements.first = Elements::packs(plan.patch_block[patch]);
+  for (; elements.first + Element::strip <= end; elements.first += Element::strip) {
+    element.template run<Element::strip>(elements);
+  }
+  for (; elements.first < end; ++elements.first) element.template run<1>(elements);
+}
+
+// A functor of one pack of elements, element(elements, s).
+template <class Function>
+struct OneByOne {
+  static constexpr int strip = 1;
+  Function function;
+
+  template <int N, class Elements>
+  PD_HD void run(const Elements& elements) const {
+    for (int s = 0; s < N; ++s) function(elements, s);
+  }
+};
+template <class Function>
+OneByOne<Function> one_by_one(Function function) {
+  return {function};
+}
 
 }  // namespace pd::inline PD_TARGET

@@ -100,13 +100,13 @@ class Stepper {
     }
     const bool guard = schedule_[0].wants_energy(k);
     if (guard) {
-      sweep_.run(k & 1, elastic_with_energy(), [&](std::int64_t i, const Value& force, Sum& sums) {
+      sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
         const Value offset = w_.u[i] - w_.target[i];
         sums.energy = multiply_add(w_.inertia[i] * offset, offset, sums.energy);
         update(i, force, sums);
       });
     } else {
-      sweep_.run(k & 1, elastic(),
+      sweep_.run(k & 1, SolidGradient<false>{},
                  [&](std::int64_t i, const Value& force, Sum& sums) { update(i, force, sums); });
     }
     conclude(k, guard);
@@ -254,12 +254,13 @@ class Stepper {
       });
     set_weights(set_.weighted);
     team_.barrier();
-    const auto diagonal = [](const auto&, const auto& rest, const auto& weight, auto& force,
-                             auto&) {
-      std::remove_cvref_t<decltype(weight)> d[4];
-      solid_diagonal(rest, weight, d);
-      for (int c = 0; c < 4; ++c) force[c] = {d[c], d[c], d[c]};
-    };
+    const auto diagonal = one_by_one([](const auto& elements, int s) {
+      using R = typename std::remove_cvref_t<decltype(elements)>::R;
+      R d[4];
+      solid_diagonal(elements.rest(s), elements.weight(s), d);
+      const Vec3<R> g[4] = {{d[0], d[0], d[0]}, {d[1], d[1], d[1]}, {d[2], d[2], d[2]}, {d[3], d[3], d[3]}};
+      elements.add(s, g);
+    });
     sweep_.run(0, diagonal, [&](std::int64_t i, const Value& force, Sum& sums) {
       const Real a = w_.inertia[i];
       const auto moves = a > none;
@@ -286,18 +287,6 @@ class Stepper {
             volume * call_.material.stiffness.of(environment(lane))[plan_.tet_order[e]];
       }
     }
-  }
-
-  static auto elastic() {
-    return [](const auto& x, const auto& rest, const auto& weight, auto& force, auto&) {
-      solid_gradient(x[0], rest, weight, force);
-    };
-  }
-  static auto elastic_with_energy() {
-    return [](const auto& x, const auto& rest, const auto& weight, auto& force, auto& energy) {
-      using R = std::remove_cvref_t<decltype(weight)>;
-      energy = multiply_add(R(0.5) * weight, solid_gradient(x[0], rest, weight, force), energy);
-    };
   }
 
   void update(std::int64_t i, const Value& force, Sum& sums) {
@@ -350,7 +339,7 @@ class Stepper {
   // |grad E| without what contacts balance, and E
   void measure() {
     team_.barrier();
-    sweep_.run(0, elastic_with_energy(), [&](std::int64_t i, const Value& force, Sum& sums) {
+    sweep_.run(0, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
       const Value offset = w_.u[i] - w_.target[i];
       sums.energy = multiply_add(w_.inertia[i] * offset, offset, sums.energy);
       const Value residual = unbalanced(i, multiply_add(w_.inertia[i], offset, force));

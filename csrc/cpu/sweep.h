@@ -63,17 +63,13 @@ struct Sweep {
                                 sums.least};
   }
 
-  // element(corners of x and, with two fields, of the direction, rest, weight, force, sum of the lane);
-  // visit(vertex, force, sums)
+  // element: see each_element; the second field is the direction. visit(vertex, force, sums)
   template <int Fields = 1, class Element, class Visit>
   void run(int parity, Element element, Visit visit) {
     for (int patch = team.begin(plan.patches); patch < team.end(plan.patches); ++patch) {
       LaneSums<Lanes> lanes;
       lanes.clear();
-      elements_of<Fields>(
-          patch, [&](const auto& x, const auto& rest, const auto& weight, auto& force, int lane) {
-            element(x, rest, weight, force, lanes.part[lane]);
-          });
+      elements_of<Fields>(patch, lanes, element);
       Sums<Lanes> sums = no_sums();
       visit_interior(patch, visit, sums);
       record(parity, patch, sums, lanes.total());
@@ -101,7 +97,7 @@ struct Sweep {
 
  private:
   template <int Fields, class Element>
-  void elements_of(int patch, Element element) {
+  void elements_of(int patch, LaneSums<Lanes>& lanes, const Element& element) {
     gather_slots<Fields>(patch);
     const int count = plan.patch_slot[patch + 1] - plan.patch_slot[patch];
     const Real zero(T(0));
@@ -111,8 +107,8 @@ struct Sweep {
     fields[0] = scratch.x;
     if constexpr (Fields == 2) fields[1] = scratch.direction;
     const auto& corners = const_cast<const Value* const(&)[Fields]>(fields);
-    each_element(Lanes{}, plan, patch, corners, work.weight, work.shared_weight, scratch.force,
-                 element);
+    using Elements = typename ElementsOf<Fields, Lanes>::type;
+    each_element(plan, patch, Elements(plan, corners, work.weight, work.shared_weight, scratch.force, lanes), element);
   }
 
   template <class Visit>

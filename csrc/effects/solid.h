@@ -35,14 +35,37 @@ PD_HD Mat3<R> strain(const Vec3<R> (&x)[4], const Mat3<R>& rest_inverse) {
   return f - nearest_rotation(f);
 }
 
-// Gradient on the four corners; returns |F - R|^2. `weight` is w V [J].
-template <class R>
-PD_HD R solid_gradient(const Vec3<R> (&x)[4], const Mat3<R>& rest_inverse, const R& weight,
-                       Vec3<R> (&g)[4]) {
-  const Mat3<R> d = strain(x, rest_inverse);
-  corner_forces(weight * d, rest_inverse, g);
-  return frobenius(d, d);
-}
+// Gradient on the four corners of every element, and with `Energy` the energy. Phase by phase over N packs of elements,
+// so that their chains of dependent operations overlap.
+template <bool Energy>
+struct SolidGradient {
+  static constexpr int strip = 4;
+
+  template <int N, class Elements>
+  PD_HD void run(const Elements& elements) const {
+    using R = typename Elements::R;
+    Mat3<R> f[N];
+    Invariants<R> i[N];
+    Root<R> root[N];
+    for (int s = 0; s < N; ++s) {
+      Vec3<R> x[4];
+      elements.corners(s, 0, x);
+      f[s] = deformation_gradient(x, elements.rest(s));
+      i[s] = invariants(f[s]);
+    }
+    for (int s = 0; s < N; ++s) root[s] = largest_root(i[s]);
+    for (int s = 0; s < N; ++s) {
+      const R weight = elements.weight(s);
+      const Mat3<R> d = f[s] - finish_rotation(f[s], i[s], root[s]);
+      if constexpr (Energy) {
+        elements.sum(s) = multiply_add(R(scalar_of<R>(0.5)) * weight, frobenius(d, d), elements.sum(s));
+      }
+      Vec3<R> g[4];
+      corner_forces(weight * d, elements.rest(s), g);
+      elements.add(s, g);
+    }
+  }
+};
 
 // Second derivative of the energy along `dx`, on the four corners: w V (dF - dR) grad N_c.
 template <class R>

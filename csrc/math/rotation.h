@@ -91,16 +91,21 @@ PD_HD auto trusted(const Invariants<R>& i, const Root<R>& root) {
 PD_HD void repair_rotation(const Mat3<float>& f, bool, Mat3<float>& r) { r = rotation_by_svd(f); }
 PD_HD void repair_rotation(const Mat3<double>& f, bool, Mat3<double>& r) { r = rotation_by_svd(f); }
 
+// The last phase: closed form, checked.
 template <class R>
-PD_HD Mat3<R> nearest_rotation(const Mat3<R>& f) {
-  const Invariants<R> i = invariants(f);
-  const Root<R> root = largest_root(i);
+PD_HD Mat3<R> finish_rotation(const Mat3<R>& f, const Invariants<R>& i, const Root<R>& root) {
   Mat3<R> r = rotation_from_root(f, i, root.value);
   const auto good = trusted(i, root);
   if (any(!good)) [[unlikely]] {
     repair_rotation(f, good, r);
   }
   return r;
+}
+
+template <class R>
+PD_HD Mat3<R> nearest_rotation(const Mat3<R>& f) {
+  const Invariants<R> i = invariants(f);
+  return finish_rotation(f, i, largest_root(i));
 }
 
 // (tr(S) I - S) x = axis for the symmetric part of S: how a small turn of R answers a torque.

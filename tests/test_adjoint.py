@@ -1,0 +1,156 @@
+"""Gradients through a step against central differences, in float64."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import torchpd as pd
+
+# A central difference with relative step 1e-5 errs by about 1e-10 (truncation) and 1e-16 / 1e-5 (rounding), relative to
+# the largest terms; sums that cancel lose some digits more.
+TOLERANCE = 1e-6
+
+
+def body(*extra: pd.scene.Part, iterations: int = 600) -> tuple[pd.Simulator, pd.State]:
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (4, 2, 2))
+    solid = pd.Solid(mesh, youngs=2e4, density=1000.0)
+    parts = [
+        pd.Pin(solid, mesh.vertices[:, 0] == 0.0),
+        pd.Pin(solid, mesh.vertices[:, 0] == 1.0, stiffness=50.0),
+        pd.Gravity(),
+        pd.Damping(0.5),
+    ]
+    sim = pd.Simulator(pd.Scene(solid, *parts, *extra), 1 / 30, iterations, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    noise = [torch.randn(sim.rest_state(2).positions.shape, generator=generator, dtype=torch.float64) for _ in range(2)]
+    state = sim.rest_state(2)
+    return sim, pd.State(state.positions + 0.01 * noise[0], 0.3 * noise[1])
+
+
+def check(loss, tensor: torch.Tensor, seed: int = 1) -> None:
+    """One random direction of one input."""
+    generator = torch.Generator().manual_seed(seed)
+    direction = torch.randn(tensor.shape, generator=generator, dtype=tensor.dtype)
+    tensor.requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(), tensor)
+    with torch.no_grad():
+        size = 1e-5 * max(float(tensor.abs().max()), 1e-2)
+        tensor += size * direction
+        above = float(loss())
+        tensor -= 2 * size * direction
+        below = float(loss())
+        tensor += size * direction
+    tensor.requires_grad_(False)
+    expected = (above - below) / (2 * size)
+    scale = float((gradient * direction).abs().sum())
+    assert abs(float((gradient * direction).sum()) - expected) <= TOLERANCE * scale
+
+
+def weighted_loss(sim: pd.Simulator, state: pd.State, forces: torch.Tensor):
+    generator = torch.Generator().manual_seed(2)
+    weights = [torch.randn(state[0].shape, generator=generator, dtype=torch.float64) for _ in range(2)]
+
+    def loss() -> torch.Tensor:
+        after = sim(state, forces=forces)
+        return (weights[0] * after.positions).sum() + 0.02 * (weights[1] * after.velocities).sum()
+
+    return loss
+
+
+@pytest.mark.parametrize("name", ["positions", "velocities", "forces"])
+def test_inputs_of_the_step(name: str) -> None:
+    sim, state = body()
+    forces = torch.randn(state[0].shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    tensor = forces if name == "forces" else getattr(state, name)
+    check(weighted_loss(sim, state, forces), tensor)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+@pytest.mark.parametrize("name", ["stiffness", "masses", "gravity", "damping", "pin_targets"])
+def test_material(name: str, batched: bool) -> None:
+    sim, state = body()
+    if batched:
+        own = getattr(sim, name)
+        sim.set_material(**{name: torch.stack([own, 1.1 * own])})
+    check(weighted_loss(sim, state, torch.zeros_like(state[0])), getattr(sim, name))
+
+
+def test_stiffness_of_soft_pins() -> None:
+    sim, state = body()
+    loss = weighted_loss(sim, state, torch.zeros_like(state[0]))
+    soft = torch.isfinite(sim.pin_stiffness)
+    sim.pin_stiffness.requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(), sim.pin_stiffness)
+    sim.pin_stiffness.requires_grad_(False)
+
+    def difference(size: float) -> float:
+        values = []
+        for change in (size, -size):
+            sim.set_material(pin_stiffness=torch.where(soft, 50.0 + change, torch.inf))
+            values.append(float(loss()))
+        return (values[0] - values[1]) / (2.0 * size)
+
+    # so small an effect wants long intervals: Richardson's extrapolation removes their truncation
+    expected = (4.0 * difference(1.0) - difference(2.0)) / 3.0
+    assert float(gradient.sum()) == pytest.approx(expected, rel=TOLERANCE)
+    assert torch.equal(gradient != 0.0, soft)
+
+
+def test_resting_contact() -> None:
+    # a block pressed on the ground: the vertices that touch do not move along the normal
+    mesh = pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2))
+    sim = pd.Simulator(
+        pd.Scene(pd.Solid(mesh, youngs=2e4), pd.Gravity(), pd.Ground()), 1 / 60, 3000, dtype=torch.float64
+    )
+    state = sim.rest_state()
+    generator = torch.Generator().manual_seed(0)
+    noise = 1e-3 * torch.randn(state[0].shape, generator=generator, dtype=torch.float64)
+    noise[0, mesh.vertices[:, 1] == 0.0] = 0.0  # they start on the ground
+    state = pd.State(state.positions + noise, state.velocities - 0.1)
+    check(weighted_loss(sim, state, torch.zeros_like(state[0])), state.velocities)
+
+
+def test_rollout_is_differentiable() -> None:
+    sim, state = body()
+    sim.stiffness.requires_grad_()
+    track = sim.rollout(state, 3)
+    (gradient,) = torch.autograd.grad(track.positions[-1].square().sum(), sim.stiffness)
+    after = state
+    for _ in range(3):
+        after = sim(after)
+    (expected,) = torch.autograd.grad(after.positions.square().sum(), sim.stiffness)
+    assert torch.equal(gradient, expected)
+    assert float(gradient.abs().max()) > 0.0
+
+
+def test_unsolved_step_warns() -> None:
+    # one iteration leaves the body crumpled far from equilibrium, where the Hessian is not positive
+    sim, state = body(iterations=1)
+    crumpled = (
+        0.02 * torch.randn(state[0].shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    ).requires_grad_()
+    with pytest.warns(UserWarning, match="adjoint of a step"):
+        sim(pd.State(crumpled, state.velocities)).positions.sum().backward()
+
+
+def test_what_has_no_derivative_says_so() -> None:
+    sim, state = body(pd.Ground(-10.0))
+    start = state.positions.clone().requires_grad_()
+    with pytest.raises(RuntimeError, match="first iterate"):
+        sim(state, start=start).positions.sum().backward()
+    sim.planes.requires_grad_()
+    with pytest.raises(RuntimeError, match="planes"):
+        sim(state).positions.sum().backward()
+
+
+def test_compiles_with_its_backward() -> None:
+    sim, state = body(iterations=100)
+    x = state.positions.clone().requires_grad_()
+
+    def step(x: torch.Tensor) -> torch.Tensor:
+        return sim(pd.State(x, state.velocities)).positions.square().sum()
+
+    (expected,) = torch.autograd.grad(step(x), x)
+    (compiled,) = torch.autograd.grad(torch.compile(step, fullgraph=True, backend="aot_eager")(x), x)
+    assert torch.equal(compiled, expected)

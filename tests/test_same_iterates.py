@@ -1,0 +1,142 @@
+"""Every iterate is the one that the reference computes, with every effect, solver and precision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from cases import Case, box, contact_block, sliver_mesh
+from runs import arguments_of, displacement, reference_run, rounded_problem, simulator, state_of
+
+import torchpd as pd
+from torchpd.reference import StepProblem
+from torchpd.reference_solvers import Iterates
+
+pytestmark = pytest.mark.usefixtures("poisoned")
+
+SOLVERS = {
+    "jacobi": pd.Jacobi(relaxation=0.9),
+    "plain": pd.Jacobi(diagonal="plain"),
+    "classic": pd.Chebyshev("classic", rho=0.97, delay=3),
+    "classic, weighted": pd.Chebyshev("classic", rho=0.9, delay=0, relaxation=1.5, diagonal="weighted"),
+    "guarded": pd.Chebyshev(),
+    "guarded, given rho": pd.Chebyshev(rho=0.9, relaxation=1.2),
+}
+COUNTS = (1, 2, 5, 20)
+
+
+def stirred(case: Case, *, seed: int = 0, size: float = 0.01) -> Case:
+    """The case from a deformed, moving state."""
+    rng = np.random.default_rng(seed)
+    x, v = (
+        array + scale * rng.standard_normal(array.shape)
+        for array, scale in ((case.positions, size), (case.velocities, 30 * size))
+    )
+    return Case(case.scene, x, v, case.time_step, start=case.start, extras=case.extras)
+
+
+def pinned(start: str) -> Case:
+    """Slivers of random stiffness with hard and soft pins whose targets move, drag, gravity and forces."""
+    rng = np.random.default_rng(1)
+    mesh = sliver_mesh((5, 3, 3))
+    body = pd.Solid(mesh, youngs=10.0 ** rng.uniform(4.0, 6.0, len(mesh.tets)))
+    hard, soft = pd.Pin(body, mesh.vertices[:, 0] < 0.05), pd.Pin(body, [60, 70, 71], stiffness=[1e3, 2e4, 3e5])
+    scene = pd.Scene(hard, body, soft, pd.Gravity((1.0, -9.8, 0.5)), pd.Damping(3.0))
+    held = scene.values().pin_targets
+    extras = {
+        "forces": rng.standard_normal(mesh.vertices.shape),
+        "pin_targets": held + 0.01 * rng.standard_normal(held.shape),
+    }
+    return stirred(Case(scene, mesh.vertices, 0.0 * mesh.vertices, 1.0 / 60.0, start, extras))
+
+
+def guessed() -> Case:
+    """A first iterate of the caller's."""
+    case = pinned("velocity")
+    guess = case.positions + 0.03 * np.random.default_rng(2).standard_normal(case.positions.shape)
+    return Case(case.scene, case.positions, case.velocities, case.time_step, guess, case.extras)
+
+
+def two_bodies() -> Case:
+    """A held body and a free one, each in one piece; only the free one is shifted to its momentum."""
+    vertices, tets = box((0.3, 0.2, 0.2), (3, 2, 2))
+    held, free = (pd.Solid(pd.TetMesh(vertices + [0.0, y, 0.0], tets), 3e5) for y in (0.0, 1.0))
+    scene = pd.Scene(held, free, pd.Pin(held, [0, 1, 2]), pd.Gravity((0.0, -9.8, 0.0)))
+    x = scene.values().rest_positions
+    return stirred(Case(scene, x, 0.0 * x, 1.0 / 60.0))
+
+
+def on_ground(friction: float) -> Case:
+    """Sunk a little into a tilted ground, moving down and along it."""
+    ground = pd.Ground(height=0.02, normal=(0.1, 1.0, 0.0), friction=friction)
+    return stirred(contact_block(ground, velocity=(1.0, -2.0, 0.0)))
+
+
+def on_ball(friction: float, motion: float) -> Case:
+    case = contact_block(pd.Sphere((0.15, -0.2, 0.15), 0.21, friction), velocity=(0.0, -1.0, 0.0))
+    centre = case.scene.values().spheres[:, :3]
+    extras = {"sphere_centers": centre + [motion, 0.5 * motion, 0.0], "sphere_starts": centre}
+    return stirred(Case(case.scene, case.positions, case.velocities, case.time_step, extras=extras))
+
+
+def in_a_corner() -> Case:
+    """Two planes and two balls, one body free and in the air, so that it is shifted and the other is not."""
+    vertices, tets = box((0.3, 0.2, 0.2), (3, 2, 2))
+    low, high = (pd.Solid(pd.TetMesh(vertices + [0.0, y, 0.0], tets), 3e5) for y in (0.0, 3.0))
+    scene = pd.Scene(
+        low, high, pd.Gravity((0.0, -9.8, 0.0)), pd.Ground(0.01, friction=0.4), pd.Ground(0.01, normal=(1.0, 0.0, 0.0)),
+        pd.Sphere((0.3, 0.2, 0.1), 0.05), pd.Sphere((0.15, -0.1, 0.0), 0.12, friction=0.2),
+    )  # fmt: skip
+    x = scene.values().rest_positions
+    return stirred(Case(scene, x, np.tile([-1.0, -1.0, 0.0], (len(x), 1)), 1.0 / 60.0))
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "pins, velocity start": lambda: pinned("velocity"),
+    "pins, inertial start": lambda: pinned("inertial"),
+    "given start": guessed,
+    "two bodies": two_bodies,
+    "ground": lambda: on_ground(0.0),
+    "ground, friction": lambda: on_ground(0.6),
+    "ball": lambda: on_ball(0.0, 0.0),
+    "ball, friction": lambda: on_ball(0.5, 0.0),
+    "moving ball, friction": lambda: on_ball(0.5, 0.01),
+    "corner": in_a_corner,
+}
+# Rounding of an iterate: some fifty operations an iteration, and the extrapolation (omega < 2) lets differences grow like
+# k^2 at worst, 400 for 20 iterations. The largest strains (random, of order one) divide by sums of singular values near 0.2.
+TOLERANCE = {torch.float64: 1e-12, torch.float32: 2e-5}
+
+
+@pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_iterates_are_those_of_the_reference(
+    case: Callable[[], Case], solver: pd.Jacobi | pd.Chebyshev, dtype: torch.dtype, device: torch.device
+) -> None:
+    scene = case()
+    problem = rounded_problem(scene, dtype)
+    first = problem.first_iterate(scene.start)
+    sim = simulator(scene, dtype, device, solver=solver)
+    for sim.iterations in COUNTS:
+        expected = reference_run(problem, first, solver, sim.iterations)
+        for batch in (1, 9):  # lanes run over elements, and over environments
+            after, info = sim(state_of(scene, sim, batch), **arguments_of(scene, sim, batch), return_info=True)
+            check_iterate(problem, expected, sim, after, info, item=batch - 1)
+
+
+def check_iterate(
+    problem: StepProblem, expected: Iterates, sim: pd.Simulator, after: pd.State, info: pd.Info, *, item: int
+) -> None:
+    tolerance = TOLERANCE[sim.dtype]
+    u = displacement(sim, after, item)
+    assert np.abs(u - expected.displacement).max() <= tolerance * np.abs(expected.displacement).max(), sim.iterations
+    x = after.positions[item].double().cpu().numpy()
+    # one more rounding, of the sum x + u
+    assert np.abs(x - problem.positions - u).max() <= 2 * torch.finfo(sim.dtype).eps * np.abs(x).max()
+    assert int(info.restarts[item]) == len(expected.restarts)
+    assert int(info.iterations[item]) == sim.iterations
+    # E and |r|^2 are sums of squares that the iterate moves by its own relative error; |r| / |r_0| >= 1e-3 in these cases
+    assert float(info.energy[item]) == pytest.approx(problem.energy(expected.displacement), rel=4 * tolerance)
+    assert float(info.residual[item]) == pytest.approx(expected.residual, rel=1e3 * tolerance)

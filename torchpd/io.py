@@ -1,0 +1,252 @@
+"""Simulations as files: one safetensors file, whose metadata says in JSON what the tensors mean. Nothing is executed.
+
+The scene comes back as it was described, with the material of the simulator beside it, so that a loaded simulation
+takes the same steps bit for bit. Tensors are named after their part: `part.0.youngs`, `mesh.0.tets`,
+`material.stiffness`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from .embedding import Embedding
+from .mesh import TetMesh, TriMesh
+from .mesh_checks import store
+from .scene import Part, Scene
+from .simulator import Simulator
+from .solvers import Chebyshev, Jacobi, Solver
+from .tables import MATERIAL_TABLE
+from .version import __version__
+
+__all__ = ["FORMAT_VERSION", "load_simulation", "save_simulation"]
+
+FORMAT_VERSION = 1
+_KEY = "torchpd"  # of the metadata, beside which others may write theirs
+_KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in (Solid, Pin, Gravity, Ground, Sphere, Damping)}
+_SOLVERS: dict[str, type[Jacobi] | type[Chebyshev]] = {"Jacobi": Jacobi, "Chebyshev": Chebyshev}
+_DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in (torch.float32, torch.float64)}
+
+Record = dict[str, Any]
+
+
+def save_simulation(sim: Simulator, path: str | Path) -> None:
+    """Write scene, settings and current material of a simulator to one file.
+
+    Args:
+        sim: to be written, on any device.
+        path: of the file; an existing one is replaced. Any ending will do, `.safetensors` is usual.
+    """
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"save: there is no folder {target.parent} for {target.name}")
+    meshes = _distinct_meshes(sim.scene)
+    tensors: dict[str, Tensor] = {}
+    for number, mesh in enumerate(meshes):
+        tensors.update(_tensors(f"mesh.{number}", _mesh_arrays(mesh)))
+    for number, part in enumerate(sim.scene.parts):
+        tensors.update(_tensors(f"part.{number}", _part_arrays(part)))
+    material = dict(zip((name for name, *_ in MATERIAL_TABLE), sim.material(), strict=True))
+    tensors.update({f"material.{name}": value.detach().cpu().contiguous() for name, value in material.items()})
+    record: Record = {
+        "format": FORMAT_VERSION,
+        "written_by": f"torchpd {__version__}",
+        "time_step": sim.time_step,
+        "iterations": sim.iterations,
+        "tolerance": sim.tolerance,
+        "dtype": str(sim.dtype).removeprefix("torch."),
+        "solver": {"kind": type(sim.solver).__name__, **dataclasses.asdict(sim.solver)},
+        "meshes": [{"flipped": mesh.flipped} for mesh in meshes],
+        "parts": [_part_record(part, sim.scene, meshes) for part in sim.scene.parts],
+        "trained": [name for name, value in material.items() if value.requires_grad],
+    }
+    save_file(tensors, target, metadata={_KEY: json.dumps(record)})
+
+
+def load_simulation(path: str | Path) -> Simulator:
+    """Read what `save_simulation` wrote, on the CPU. The scene is compiled anew.
+
+    Pins and spheres are new objects, `sim.scene.pins` and `sim.scene.spheres`, in the order in which they were given.
+    """
+    record, tensors = _read(Path(path))
+    try:
+        return _build(record, tensors)
+    except _MissingTensorError as missing:
+        raise ValueError(f"{path} is damaged: the tensor {missing.args[0]!r} is missing") from None
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged: {type(error).__name__}: {error}") from error
+
+
+# ---- writing
+
+
+def _distinct_meshes(scene: Scene) -> list[TetMesh]:
+    """Every mesh once, however many bodies share it."""
+    return list({id(solid.mesh): solid.mesh for solid in scene.solids}.values())
+
+
+def _mesh_arrays(mesh: TetMesh) -> dict[str, NDArray[Any]]:
+    arrays = {"vertices": mesh.vertices, "tets": mesh.tets}
+    if mesh.embedding is not None:
+        surface = mesh.embedding.surface
+        arrays["embedding.tets"] = mesh.embedding.tets
+        arrays["embedding.weights"] = mesh.embedding.weights
+        arrays["surface.vertices"] = surface.vertices
+        arrays["surface.triangles"] = surface.triangles
+        if surface.uvs is not None:
+            arrays["surface.uvs"] = surface.uvs
+    return arrays
+
+
+def _part_arrays(part: Part) -> dict[str, NDArray[Any]]:
+    """The fields of a part that are arrays."""
+    fields = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+    return {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
+
+
+def _part_record(part: Part, scene: Scene, meshes: list[TetMesh]) -> Record:
+    """The fields of a part that are no arrays: numbers as they are, other objects by their number."""
+    record: Record = {"kind": type(part).__name__}
+    if isinstance(part, Solid):
+        record["mesh"] = next(number for number, mesh in enumerate(meshes) if mesh is part.mesh)
+    elif isinstance(part, Pin):
+        record["solid"] = next(number for number, other in enumerate(scene.parts) if other is part.solid)
+        record["hard"] = part.stiffness is None
+    else:
+        fields = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+        record.update({name: value for name, value in fields.items() if isinstance(value, float)})
+    return record
+
+
+def _tensors(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Iterator[tuple[str, Tensor]]:
+    for name, array in arrays.items():
+        yield f"{prefix}.{name}", torch.tensor(array)
+
+
+# ---- reading
+
+
+class _MissingTensorError(Exception):
+    """The record speaks of a tensor that the file does not hold."""
+
+
+class _Tensors:
+    """The tensors of a file, by name."""
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        self._tensors = tensors
+
+    def has(self, name: str) -> bool:
+        return name in self._tensors
+
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self._tensors:
+            raise _MissingTensorError(name)
+        return self._tensors[name]
+
+    def array(self, name: str) -> NDArray[Any]:
+        """A copy: tensors may be mapped into the file, which may be written over while the simulation lives."""
+        return self[name].numpy().copy()
+
+
+def _read(path: Path) -> tuple[Record, _Tensors]:
+    if not path.is_file():
+        raise FileNotFoundError(f"no such simulation file: {path}")
+    try:
+        with safe_open(path, framework="pt") as file:
+            record = _record(path, file.metadata())
+            return record, _Tensors({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+    except SafetensorError as error:
+        raise ValueError(f"{path} is not a simulation: not a safetensors file ({error})") from None
+
+
+def _record(path: Path, metadata: Mapping[str, str] | None) -> Record:
+    if not metadata or _KEY not in metadata:
+        raise ValueError(f"{path} is not a simulation that Simulator.save wrote: its metadata has no {_KEY!r}")
+    try:
+        record = json.loads(metadata[_KEY])
+        version = int(record["format"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is damaged: its metadata {_KEY!r} cannot be read ({error})") from None
+    if version > FORMAT_VERSION:
+        writer = record.get("written_by", "a newer torchpd")
+        raise ValueError(
+            f"{path} has format {version}, written by {writer}; torchpd {__version__} reads formats up to "
+            f"{FORMAT_VERSION}: install a newer torchpd"
+        )
+    return dict(record)
+
+
+def _build(record: Record, tensors: _Tensors) -> Simulator:
+    meshes = [_mesh(number, mesh, tensors) for number, mesh in enumerate(record["meshes"])]
+    sim = Simulator(
+        Scene(*_parts(record["parts"], meshes, tensors)),
+        time_step=record["time_step"],
+        iterations=record["iterations"],
+        solver=_solver(record["solver"]),
+        dtype=_DTYPES[record["dtype"]],
+        tolerance=record["tolerance"],
+    )
+    sim.set_material(**{name: tensors[f"material.{name}"] for name, *_ in MATERIAL_TABLE})
+    for name in record["trained"]:
+        getattr(sim, name).requires_grad_()
+    return sim
+
+
+def _solver(record: Record) -> Solver:
+    return _SOLVERS[record["kind"]](**{name: value for name, value in record.items() if name != "kind"})
+
+
+def _mesh(number: int, record: Record, tensors: _Tensors) -> TetMesh:
+    prefix = f"mesh.{number}"
+    mesh = TetMesh(tensors.array(f"{prefix}.vertices"), tensors.array(f"{prefix}.tets"))
+    # what was turned when the mesh was made is not inverted any more
+    store(mesh, flipped=record["flipped"])
+    if not tensors.has(f"{prefix}.embedding.tets"):
+        return mesh
+    uvs = tensors.array(f"{prefix}.surface.uvs") if tensors.has(f"{prefix}.surface.uvs") else None
+    surface = TriMesh(
+        tensors.array(f"{prefix}.surface.vertices"), tensors.array(f"{prefix}.surface.triangles"), uvs=uvs
+    )
+    tets = tensors.array(f"{prefix}.embedding.tets")
+    weights = tensors.array(f"{prefix}.embedding.weights")
+    return mesh.with_embedding(Embedding(surface, tets, weights, mesh.tets[tets], len(mesh.vertices)))
+
+
+def _parts(records: list[Record], meshes: list[TetMesh], tensors: _Tensors) -> list[Part]:
+    """The parts in their order; a pin may stand before the body that it holds."""
+    parts: dict[int, Part] = {}
+    for pins in (False, True):
+        for number, record in enumerate(records):
+            if (record["kind"] == "Pin") == pins:
+                parts[number] = _part(number, record, meshes, parts, tensors)
+    return [parts[number] for number in range(len(records))]
+
+
+def _part(number: int, record: Record, meshes: list[TetMesh], parts: Mapping[int, Part], tensors: _Tensors) -> Part:
+    kind = _KINDS[record["kind"]]
+    fields = {name: value for name, value in record.items() if name not in ("kind", "hard")}
+    if kind is Solid:
+        fields["mesh"] = meshes[record["mesh"]]
+    if kind is Pin:
+        fields["solid"] = parts[record["solid"]]
+    for field in dataclasses.fields(kind):
+        hard = field.name == "stiffness" and record.get("hard", False)
+        if field.name not in fields and not hard:
+            fields[field.name] = tensors.array(f"part.{number}.{field.name}")
+    part: Part = kind(**fields)
+    if isinstance(part, Ground):
+        # a unit vector divided by its length may lose its last bit
+        store(part, normal=fields["normal"])
+    return part

@@ -1,0 +1,37 @@
+"""The tables that C++ declares, as Python sees them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from . import _C
+
+__all__ = ["MATERIAL_TABLE", "PLAN_TABLE", "MaterialRow", "PlanRow"]
+
+
+class PlanRow(NamedTuple):
+    """One line of csrc/plan/plan.def: a constant array."""
+
+    name: str
+    type: str
+    width: int
+    rows: str
+    meaning: str
+
+
+class MaterialRow(NamedTuple):
+    """One line of csrc/plan/material.def: an array that training may change."""
+
+    name: str
+    width: int
+    rows: str
+    meaning: str
+
+    @property
+    def dims(self) -> int:
+        """Dimensions without a batch."""
+        return (self.rows != "one") + (self.width > 1)
+
+
+PLAN_TABLE = tuple(PlanRow(*row) for row in _C.plan_table())
+MATERIAL_TABLE = tuple(MaterialRow(*row) for row in _C.material_table())
