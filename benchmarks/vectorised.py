@@ -1,8 +1,8 @@
 """The same time step in plain vectorised torch: what a careful user would write without the compiled kernels.
 
-Gather and scatter are two products with sparse CSR matrices (all environments at once), every number of a tetrahedron is
-a plane [tets, batch], and rotations come from the same quartic as in the kernels: FOAM (Markley 1993), a fixed count of
-Newton steps from above and the closed form. No fallback for degenerate elements, no contacts, no residual.
+Gather and scatter are two products with sparse CSR matrices (all environments at once), every number of a tetrahedron
+is a plane [tets, batch], and rotations come from the same quartic as in the kernels: FOAM (Markley 1993), a fixed count
+of Newton steps from above and the closed form. No fallback for degenerate elements, no contacts, no residual.
 """
 
 from __future__ import annotations

@@ -43,8 +43,27 @@ PD_HD Vec3<Pack<T, W>> gather_corner(const Quad<T>* x, const int16* slot) {
     const __m512d xy23 = _mm512_castps_pd(_mm512_unpacklo_ps(row[2], row[3]));
     const __m512d zw01 = _mm512_castps_pd(_mm512_unpackhi_ps(row[0], row[1]));
     const __m512d zw23 = _mm512_castps_pd(_mm512_unpackhi_ps(row[2], row[3]));
-    return {V(_mm512_castpd_ps(_mm512_unpacklo_pd(xy01, xy23))), V(_mm512_castpd_ps(_mm512_unpackhi_pd(xy01, xy23))),
+    return {V(_mm512_castpd_ps(_mm512_unpacklo_pd(xy01, xy23))),
+            V(_mm512_castpd_ps(_mm512_unpackhi_pd(xy01, xy23))),
             V(_mm512_castpd_ps(_mm512_unpacklo_pd(zw01, zw23)))};
+  }
+  if constexpr (W == 8 && sizeof(T) == 8) {
+    // row[j] holds the quads of lanes j and j + 4; then 4x4 transposes
+    __m512d row[4];
+    for (int j = 0; j < 4; ++j) {
+      row[j] = _mm512_castpd256_pd512((__m256d)x[slot[j]].q.v);
+      row[j] = _mm512_insertf64x4(row[j], (__m256d)x[slot[j + 4]].q.v, 1);
+    }
+    using V = typename Pack<T, W>::Vector;
+    const __m512d xz01 = _mm512_unpacklo_pd(row[0], row[1]),
+                  xz23 = _mm512_unpacklo_pd(row[2], row[3]);
+    const __m512d yw01 = _mm512_unpackhi_pd(row[0], row[1]),
+                  yw23 = _mm512_unpackhi_pd(row[2], row[3]);
+    // 128-bit pieces of lanes 0-1, 2-3 of x, then of z
+    const __m512i low = _mm512_setr_epi64(0, 1, 8, 9, 4, 5, 12, 13);
+    const __m512i high = _mm512_setr_epi64(2, 3, 10, 11, 6, 7, 14, 15);
+    return {V(_mm512_permutex2var_pd(xz01, low, xz23)), V(_mm512_permutex2var_pd(yw01, low, yw23)),
+            V(_mm512_permutex2var_pd(xz01, high, xz23))};
   }
 #endif
   Vec3<Pack<T, W>> r;
@@ -77,6 +96,23 @@ PD_HD void store_quads(const Vec3<Pack<T, W>>& a, Quad<T> (&quads)[W]) {
       quads[j + 4].q.v = (typename Pack<T, 4>::Vector)_mm512_extractf32x4_ps(column[j], 1);
       quads[j + 8].q.v = (typename Pack<T, 4>::Vector)_mm512_extractf32x4_ps(column[j], 2);
       quads[j + 12].q.v = (typename Pack<T, 4>::Vector)_mm512_extractf32x4_ps(column[j], 3);
+    }
+    return;
+  }
+  if constexpr (W == 8 && sizeof(T) == 8) {
+    const __m512d x = (__m512d)a.x.v, y = (__m512d)a.y.v, z = (__m512d)a.z.v,
+                  w = _mm512_setzero_pd();
+    const __m512d xy_even = _mm512_unpacklo_pd(x, y), xy_odd = _mm512_unpackhi_pd(x, y);
+    const __m512d zw_even = _mm512_unpacklo_pd(z, w), zw_odd = _mm512_unpackhi_pd(z, w);
+    const __m512i first = _mm512_setr_epi64(0, 1, 8, 9, 4, 5, 12, 13);
+    const __m512i second = _mm512_setr_epi64(2, 3, 10, 11, 6, 7, 14, 15);
+    const __m512d column[4] = {_mm512_permutex2var_pd(xy_even, first, zw_even),
+                               _mm512_permutex2var_pd(xy_odd, first, zw_odd),
+                               _mm512_permutex2var_pd(xy_even, second, zw_even),
+                               _mm512_permutex2var_pd(xy_odd, second, zw_odd)};
+    for (int j = 0; j < 4; ++j) {
+      quads[j].q.v = (typename Pack<T, 4>::Vector)_mm512_extractf64x4_pd(column[j], 0);
+      quads[j + 4].q.v = (typename Pack<T, 4>::Vector)_mm512_extractf64x4_pd(column[j], 1);
     }
     return;
   }
@@ -151,7 +187,9 @@ struct ElementsAcross {
       : plan(p), field(f), weights(w), forces(g), sums(all), first(0) {}
 
   static int packs(int blocks) { return blocks * parts; }
-  PD_HD BlockPart<T> part(int s) const { return {&plan, (first + s) / parts, (first + s) % parts * W}; }
+  PD_HD BlockPart<T> part(int s) const {
+    return {&plan, (first + s) / parts, (first + s) % parts * W};
+  }
   PD_HD void corners(int s, int f, Vec3<R> (&x)[4]) const {
     for (int c = 0; c < 4; ++c) x[c] = gather_corner<T, W>(field[f], part(s).corner(c));
   }
@@ -176,12 +214,14 @@ struct EnvironmentsAcross {
   LaneSums<Batch<T, W>>& sums;
   int first;  // element, padding counted
 
-  EnvironmentsAcross(const Plan<T>& p, const Vec3<R>* const (&f)[Fields], const T* w, bool shared, Vec3<R>* g,
-                     LaneSums<Batch<T, W>>& all)
+  EnvironmentsAcross(const Plan<T>& p, const Vec3<R>* const (&f)[Fields], const T* w, bool shared,
+                     Vec3<R>* g, LaneSums<Batch<T, W>>& all)
       : plan(p), field(f), weights(w), shared_weight(shared), forces(g), sums(all), first(0) {}
 
   static int packs(int blocks) { return blocks * block_lanes; }
-  PD_HD BlockPart<T> part(int s) const { return {&plan, (first + s) / block_lanes, (first + s) % block_lanes}; }
+  PD_HD BlockPart<T> part(int s) const {
+    return {&plan, (first + s) / block_lanes, (first + s) % block_lanes};
+  }
   PD_HD void corners(int s, int f, Vec3<R> (&x)[4]) const {
     for (int c = 0; c < 4; ++c) x[c] = field[f][*part(s).corner(c)];
   }

@@ -258,7 +258,8 @@ class Stepper {
       using R = typename std::remove_cvref_t<decltype(elements)>::R;
       R d[4];
       solid_diagonal(elements.rest(s), elements.weight(s), d);
-      const Vec3<R> g[4] = {{d[0], d[0], d[0]}, {d[1], d[1], d[1]}, {d[2], d[2], d[2]}, {d[3], d[3], d[3]}};
+      const Vec3<R> g[4] = {
+          {d[0], d[0], d[0]}, {d[1], d[1], d[1]}, {d[2], d[2], d[2]}, {d[3], d[3], d[3]}};
       elements.add(s, g);
     });
     sweep_.run(0, diagonal, [&](std::int64_t i, const Value& force, Sum& sums) {

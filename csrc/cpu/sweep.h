@@ -108,7 +108,9 @@ struct Sweep {
     if constexpr (Fields == 2) fields[1] = scratch.direction;
     const auto& corners = const_cast<const Value* const(&)[Fields]>(fields);
     using Elements = typename ElementsOf<Fields, Lanes>::type;
-    each_element(plan, patch, Elements(plan, corners, work.weight, work.shared_weight, scratch.force, lanes), element);
+    each_element(plan, patch,
+                 Elements(plan, corners, work.weight, work.shared_weight, scratch.force, lanes),
+                 element);
   }
 
   template <class Visit>

@@ -58,7 +58,8 @@ struct SolidGradient {
       const R weight = elements.weight(s);
       const Mat3<R> d = f[s] - finish_rotation(f[s], i[s], root[s]);
       if constexpr (Energy) {
-        elements.sum(s) = multiply_add(R(scalar_of<R>(0.5)) * weight, frobenius(d, d), elements.sum(s));
+        elements.sum(s) =
+            multiply_add(R(scalar_of<R>(0.5)) * weight, frobenius(d, d), elements.sum(s));
       }
       Vec3<R> g[4];
       corner_forces(weight * d, elements.rest(s), g);
