@@ -25,9 +25,10 @@ def state_of(case: Case, sim: pd.Simulator, batch: int = 1) -> pd.State:
     return pd.State(*(tensor_of(array, sim, batch) for array in (case.positions, case.velocities)))
 
 
-def tensor_of(array: Array, sim: pd.Simulator, batch: int = 1) -> torch.Tensor:
-    """[batch, ...] of the simulator's type, the same array for every environment."""
-    return torch.tensor(array, dtype=sim.dtype, device=sim.device).expand(batch, *array.shape).clone()
+def tensor_of(array: Array, sim: pd.Simulator, batch: int | None = None) -> torch.Tensor:
+    """The array in the simulator's type; with a batch [batch, ...], the same for every environment."""
+    tensor = torch.tensor(array, dtype=sim.dtype, device=sim.device)
+    return tensor if batch is None else tensor.expand(batch, *tensor.shape).clone()
 
 
 def arguments_of(case: Case, sim: pd.Simulator, batch: int = 1) -> dict[str, Any]:

@@ -124,7 +124,7 @@ def test_one_breathing_tetrahedron(dtype: torch.dtype, device: torch.device) -> 
     body = pd.Solid(pd.TetMesh(vertices, [[0, 1, 2, 3]]), youngs=1e4, density=600.0)
     scale, rate, h = 0.8, -2.0, 0.05
     case = Case(pd.Scene(body), scale * vertices, rate * vertices, h)
-    sim = simulator(case, dtype, device, iterations=200)
+    sim = simulator(case, dtype, device, iterations=400)
     after = sim(state_of(case, sim))
     volume = 8.0 / 3.0
     inertia, spring = 600.0 * volume * 3.0 / h**2, 3.0 * 1e4 * volume
@@ -241,7 +241,7 @@ def test_slope_at_its_critical_angle(share: float, dtype: torch.dtype, device: t
 
 def cloud(*parts: Any) -> Case:
     """Four vertices so softly tied that each moves as a point."""
-    return Case(one_tet(*parts, youngs=1e-6).scene, TET, 0.0 * TET, 0.1)
+    return Case(one_tet(*parts, youngs=1e-9).scene, TET, 0.0 * TET, 0.1)
 
 
 def points_after(case: Case, positions: Array, velocities: Array, dtype: torch.dtype, device: torch.device) -> Array:
@@ -257,7 +257,6 @@ def test_points_meet_a_tilted_plane(dtype: torch.dtype, device: torch.device) ->
     along = np.array([0.8, -0.6, 0.0])
     case = cloud(pd.Ground(0.0, normal=(3.0, 4.0, 0.0), friction=0.5))
     start = TET @ np.stack([along, [0, 0, 1], normal]) + 0.05 * normal  # heights 0.05, 0.05, 0.05, 1.05
-    start = start[[0, 1, 2, 3]]
     speed = np.array([[-1.0, 2.0], [-1.0, 0.1], [-0.4, 1.0], [-1.0, 1.0]])  # along the normal, along the slope
     velocity = speed[:, :1] * normal + speed[:, 1:] * along
     x = points_after(case, start, velocity, dtype, device)
@@ -266,7 +265,7 @@ def test_points_meet_a_tilted_plane(dtype: torch.dtype, device: torch.device) ->
     slip = 0.1 * speed[:, 1]
     slip = np.maximum(slip - 0.5 * depth, 0.0)  # the second point sticks: 0.01 < 0.025
     expected = start + (0.1 * speed[:, :1] + depth[:, None]) * normal + slip[:, None] * along
-    # elasticity of 1e-6 Pa against 2.5e3 N/m of inertia: 1e-10
+    # elasticity of 1e-9 Pa against 2.5e3 N/m of inertia: 1e-12
     np.testing.assert_allclose(x, expected, atol=1e-9 + 20 * ULP[dtype], rtol=0)
 
 

@@ -61,7 +61,7 @@ class _Pictures(NamedTuple):
     film_every: int  # steps from one picture of the film to the next
 
 
-_GOOD = _Pictures(12, 4, (480, 360), 16, (400, 300), 4, 2)
+_GOOD = _Pictures(12, 4, (480, 360), 9, (400, 300), 4, 2)
 _QUICK = _Pictures(6, 3, (240, 180), 9, (160, 120), 4, 6)
 
 

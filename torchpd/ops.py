@@ -113,29 +113,34 @@ def _unit(stiffness: Tensor) -> Tensor:
     return torch.ones_like(stiffness)
 
 
-def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+def _for_plan(ctx: Any) -> list[None]:
+    """The plan has no derivative; autograd wants to hear so for every array of it."""
+    return [None] * len(ctx.plan)
+
+
+def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, list[None]]:
     positions, stiffness = ctx.saved_tensors
     x = w = None
     if ctx.needs_input_grad[0]:
         x = _ops.gradient(positions, grad * stiffness, ctx.plan)
     if ctx.needs_input_grad[1]:
         w = _like_stiffness(grad * _ops.element_energy(positions, _unit(stiffness), ctx.plan), stiffness)
-    return x, w, None
+    return x, w, _for_plan(ctx)
 
 
-def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, list[None]]:
     positions, stiffness = ctx.saved_tensors
     x = w = None
     if ctx.needs_input_grad[0]:
         x = _ops.hessian_product(positions, grad, stiffness, ctx.plan)
     if ctx.needs_input_grad[1]:
         w = _like_stiffness(_ops.element_energy_product(positions, grad, _unit(stiffness), ctx.plan), stiffness)
-    return x, w, None
+    return x, w, _for_plan(ctx)
 
 
 def _element_energy_product_backward(
     ctx: Any, grad: Tensor
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, None]:
+) -> tuple[Tensor | None, Tensor | None, Tensor | None, list[None]]:
     positions, direction, stiffness = ctx.saved_tensors
     x = d = w = None
     if ctx.needs_input_grad[0]:
@@ -145,17 +150,17 @@ def _element_energy_product_backward(
     if ctx.needs_input_grad[2]:
         product = _ops.element_energy_product(positions, direction, _unit(stiffness), ctx.plan)
         w = _like_stiffness(grad * product, stiffness)
-    return x, d, w, None
+    return x, d, w, _for_plan(ctx)
 
 
-def _hessian_product_backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor | None, None, None]:
+def _hessian_product_backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor | None, None, list[None]]:
     if ctx.needs_input_grad[0] or ctx.needs_input_grad[2]:
         raise RuntimeError(
             "torchpd: third derivatives of the elastic energy are not provided; detach positions and stiffness before "
             "differentiating a Hessian-vector product"
         )
     positions, _, stiffness = ctx.saved_tensors
-    return None, _ops.hessian_product(positions, grad, stiffness, ctx.plan), None, None
+    return None, _ops.hessian_product(positions, grad, stiffness, ctx.plan), None, _for_plan(ctx)
 
 
 def _rotation_differential(F: Tensor, direction: Tensor) -> Tensor:

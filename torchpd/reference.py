@@ -235,6 +235,11 @@ class StepProblem:
             guess = self._hold(np.asarray(start, dtype=np.float64) - self.positions)
         return self.project(guess, guess)
 
+    def course(self) -> Array:
+        """h v, on the pins and out of the contacts: where residuals are measured from."""
+        guess = self._hold(self.time_step * self.velocities)
+        return self.project(guess, guess)
+
     def _hold(self, displacement: Array) -> Array:
         return np.where(self.free[:, None], displacement, self.target)
 

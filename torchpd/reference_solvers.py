@@ -35,7 +35,7 @@ class Iterates:
     """The end of an iteration and what it went through."""
 
     displacement: Array  # [V, 3] u_K, momentum shifted where the start was
-    residual: float  # |r(u_K)| / |r(u_0)|, with the diagonal of the iteration
+    residual: float  # |r(u_K)| / |r(x + h v)|, with the diagonal of the iteration
     iterations: int  # carried out
     restarts: list[int] = field(default_factory=list)  # iterations k whose check found the energy risen
     energies: list[tuple[int, float]] = field(default_factory=list)  # (k, E(u_k)) at every check
@@ -124,7 +124,7 @@ def _iterate(
             result.converged = True
             break
     result.displacement = problem.shift_momentum(current)
-    scale = float(np.linalg.norm(problem.residual(first, diagonal)))
+    scale = float(np.linalg.norm(problem.residual(problem.course(), diagonal)))
     last = float(np.linalg.norm(problem.residual(result.displacement, diagonal)))
     result.residual = last / scale if scale > 0.0 else 0.0
     return result

@@ -150,8 +150,11 @@ class Simulator(nn.Module):
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         moved = self.plan.map(fn)
         if moved.dtype != self.plan.dtype:
-            # digits that float32 has lost do not come back by widening: compile for the new precision
-            moved = compile_plan(self.scene.values(), dtype=moved.dtype, progress=False).to(moved.device)
+            # digits that float32 has lost do not come back by widening: compile for the new precision. The material may
+            # have been trained, and keeps the digits it has.
+            values = self.scene.values()
+            moved = compile_plan(values, dtype=moved.dtype, progress=False).to(moved.device)
+            self.rest_positions = torch.tensor(values.rest_positions, dtype=moved.dtype, device=moved.device)
         self.plan = moved
         return self
 

@@ -19,7 +19,7 @@ class State(NamedTuple):
 class Info(NamedTuple):
     """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it."""
 
-    residual: Tensor  # |grad E| / |grad E at the first iterate|, less what contacts balance; NaN unless asked for
+    residual: Tensor  # |grad E| / |grad E at x + h v|, less what contacts balance; NaN unless asked for
     energy: Tensor  # objective of the step at the last iterate [J]; NaN unless asked for
     iterations: Tensor  # used
     restarts: Tensor  # of the acceleration, because the energy rose

@@ -1,6 +1,8 @@
 // Runner of solver/step.h on the CPU: one environment by a team of threads, or W environments by one thread.
 #pragma once
+#include "cpu/inputs.h"
 #include "cpu/sweep.h"
+#include "cpu/translation.h"
 #include "math/chebyshev.h"
 #include "solver/step.h"
 #include "solver/vertex.h"
@@ -26,7 +28,7 @@ class Stepper {
         w_(work),
         team_(team),
         sweep_{plan_, work, scratch, team},
-        first_(first),
+        in_{call, first},
         h_(T(set_.time_step)),
         theta_(T(set_.relaxation)) {}
 
@@ -49,7 +51,7 @@ class Stepper {
     }
     team_.barrier();
     if (team_.rank == 0)
-      each_pin([&](std::int64_t i, Real spring, bool hard, Value pin) {
+      in_.each_pin([&](std::int64_t i, Real spring, bool hard, Value pin) {
         const Value offset = pin - w_.x[i];
         w_.target[i] = hard ? offset : target(i, spring, offset);
       });
@@ -63,7 +65,7 @@ class Stepper {
   void start() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
       Value u = set_.start == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
-      if (set_.start == StartKind::given) u = user_value(call_.start, i) - w_.x[i];
+      if (set_.start == StartKind::given) u = in_.at_vertex(call_.start, i) - w_.x[i];
       u = hold(i, w_.target[i], u);
       w_.u[i] = w_.before[i] = contact(i, u, u);
     }
@@ -82,8 +84,8 @@ class Stepper {
     const bool given_first = set_.start == StartKind::given && used_[0] == 0;
     if (plan_.groups == 0 || given_first) return;
     if (team_.rank == 0) {
-      find_shifts();
-      if (!contacts_.empty()) drop_touching_shifts();
+      find_shifts(plan_, w_);
+      if (!contacts_.empty()) drop_touching_shifts(plan_, w_, contacts_);
       for (int i = 0; i < plan_.vertices; ++i) {
         if (plan_.vertex_group[i] < 0) continue;
         w_.u[i] = w_.u[i] + w_.shift[plan_.vertex_group[i]];
@@ -119,12 +121,30 @@ class Stepper {
     return true;
   }
 
-  void measure_first() {
+  // The gradient on the straight course x + h v is what residuals are relative to, whatever the first iterate.
+  void measure_course() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      const Value u = hold(i, w_.target[i], Real(h_) * w_.velocity[i]);
+      w_.u[i] = contact(i, u, u);
+    }
     measure();
-    for (int lane = 0; lane < width; ++lane) first_residual_[lane] = Lanes::lane(residual_, lane);
+    for (int lane = 0; lane < width; ++lane) course_[lane] = Lanes::lane(residual_, lane);
   }
 
-  void measure_last() { measure(); }
+  // |grad E|^2 without what contacts balance, and E
+  void measure() {
+    team_.barrier();
+    sweep_.run(0, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
+      const Value offset = w_.u[i] - w_.target[i];
+      sums.energy = multiply_add(w_.inertia[i] * offset, offset, sums.energy);
+      const Value residual = unbalanced(i, multiply_add(w_.inertia[i], offset, force));
+      sums.first = multiply_add(residual, residual, sums.first);
+    });
+    const auto sum = total(0);
+    energy_ = sum.energy;
+    residual_ = sum.first;
+    team_.barrier();
+  }
 
   void finish() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
@@ -135,36 +155,6 @@ class Stepper {
   }
 
  private:
-  std::int64_t environment(int lane) const {
-    const std::int64_t e = first_ + lane;
-    return e < call_.batch ? e : call_.batch - 1;
-  }
-
-  Value user_value(const T* from, std::int64_t i) const {
-    Value r = {};
-    for (int lane = 0; lane < width; ++lane) {
-      const T* p = from + (environment(lane) * plan_.vertices + plan_.vertex_order[i]) * 3;
-      Lanes::set_lane(r, lane, p[0], p[1], p[2]);
-    }
-    return r;
-  }
-
-  Real number(const Values<T>& values, std::int64_t index) const {
-    Real r(T(0));
-    for (int lane = 0; lane < width; ++lane)
-      Lanes::set_lane(r, lane, values.of(environment(lane))[index]);
-    return r;
-  }
-
-  Value vector(const Values<T>& values, std::int64_t index) const {
-    Value r = {};
-    for (int lane = 0; lane < width; ++lane) {
-      const T* p = values.of(environment(lane)) + index;
-      Lanes::set_lane(r, lane, p[0], p[1], p[2]);
-    }
-    return r;
-  }
-
   // the slot whose vertex is the origin of the patch that `slot` is in: positions near it keep their last bits anywhere
   std::int64_t patch_of_slot(std::int64_t slot) const {
     int low = 0, high = plan_.patches;
@@ -175,18 +165,8 @@ class Stepper {
     return plan_.patch_slot[low];
   }
 
-  // visit(vertex, spring, hard, target); a pin is hard in all environments or in none
-  template <class Visit>
-  void each_pin(Visit visit) {
-    for (int p = 0; p < plan_.pins; ++p) {
-      const Real spring = number(call_.material.pin_stiffness, p);
-      const bool hard = call_.material.pin_stiffness.of(0)[p] == T(HUGE_VAL);
-      visit(plan_.pin_vertex[p], spring, hard, vector(call_.material.pin_targets, 3 * p));
-    }
-  }
-
   Value target(std::int64_t i, const Real& spring, const Value& pin) const {
-    const Real h(h_), mass = number(call_.material.masses, plan_.vertex_order[i]);
+    const Real h(h_), mass = in_.number(call_.material.masses, plan_.vertex_order[i]);
     const Real weight = inertia_weight(mass, damping_, spring, h);
     const Real none(T(0));
     const Value force = call_.forces ? w_.force[i] : Lanes::value({none, none, none});
@@ -210,23 +190,25 @@ class Stepper {
 
   void load() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      w_.x[i] = user_value(call_.positions, i);
-      w_.velocity[i] = user_value(call_.velocities, i);
-      if (call_.forces) w_.force[i] = user_value(call_.forces, i);
+      w_.x[i] = in_.at_vertex(call_.positions, i);
+      w_.velocity[i] = in_.at_vertex(call_.velocities, i);
+      if (call_.forces) w_.force[i] = in_.at_vertex(call_.forces, i);
     }
-    gravity_ = vector(call_.material.gravity, 0);
-    damping_ = number(call_.material.damping, 0);
+    gravity_ = in_.vector(call_.material.gravity, 0);
+    damping_ = in_.number(call_.material.damping, 0);
     const Material<T>& material = call_.material;
     contacts_ = {w_.planes, w_.balls, material.planes_count, material.spheres_count};
     if (team_.rank == 0) {
       for (int c = 0; c < material.planes_count; ++c) {
-        w_.planes[c] = {Lanes::vec3(vector(material.planes, 5 * c)),
-                        number(material.planes, 5 * c + 3), number(material.planes, 5 * c + 4)};
+        w_.planes[c] = {Lanes::vec3(in_.vector(material.planes, 5 * c)),
+                        in_.number(material.planes, 5 * c + 3),
+                        in_.number(material.planes, 5 * c + 4)};
       }
       for (int c = 0; c < material.spheres_count; ++c) {
-        w_.balls[c] = {Lanes::vec3(vector(material.spheres, 8 * c)),
-                       Lanes::vec3(vector(material.spheres, 8 * c + 5)),
-                       number(material.spheres, 8 * c + 3), number(material.spheres, 8 * c + 4)};
+        w_.balls[c] = {Lanes::vec3(in_.vector(material.spheres, 8 * c)),
+                       Lanes::vec3(in_.vector(material.spheres, 8 * c + 5)),
+                       in_.number(material.spheres, 8 * c + 3),
+                       in_.number(material.spheres, 8 * c + 4)};
       }
     }
     team_.barrier();
@@ -244,12 +226,12 @@ class Stepper {
   void weigh() {
     const Real none(T(0)), one(T(1));
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      w_.inertia[i] = inertia_weight(number(call_.material.masses, plan_.vertex_order[i]), damping_,
-                                     none, Real(h_));
+      w_.inertia[i] = inertia_weight(in_.number(call_.material.masses, plan_.vertex_order[i]),
+                                     damping_, none, Real(h_));
     }
     team_.barrier();
     if (team_.rank == 0)
-      each_pin([&](std::int64_t i, Real spring, bool hard, Value) {
+      in_.each_pin([&](std::int64_t i, Real spring, bool hard, Value) {
         w_.inertia[i] = hard ? none : w_.inertia[i] + spring;
       });
     set_weights(set_.weighted);
@@ -285,7 +267,7 @@ class Stepper {
       const T volume = plan_.tet_volume[e] * (bounded ? plan_.tet_bound[e] : T(1));
       for (int lane = 0; lane < lanes; ++lane) {
         w_.weight[e * lanes + lane] =
-            volume * call_.material.stiffness.of(environment(lane))[plan_.tet_order[e]];
+            volume * call_.material.stiffness.of(in_.environment(lane))[plan_.tet_order[e]];
       }
     }
   }
@@ -337,21 +319,6 @@ class Stepper {
     }
   }
 
-  // |grad E| without what contacts balance, and E
-  void measure() {
-    team_.barrier();
-    sweep_.run(0, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
-      const Value offset = w_.u[i] - w_.target[i];
-      sums.energy = multiply_add(w_.inertia[i] * offset, offset, sums.energy);
-      const Value residual = unbalanced(i, multiply_add(w_.inertia[i], offset, force));
-      sums.first = multiply_add(residual, residual, sums.first);
-    });
-    const auto sum = total(0);
-    energy_ = sum.energy;
-    residual_ = sum.first;
-    team_.barrier();
-  }
-
   Value unbalanced(std::int64_t i, const Value& gradient) const {
     const Real none(T(0));
     const Value zero = Lanes::value({none, none, none});
@@ -363,58 +330,21 @@ class Stepper {
         diagonal * (w_.u[i] - contact(i, subtract_product(w_.u[i], inverse, gradient), w_.u[i])));
   }
 
-  void find_shifts() {
-    for (int g = 0; g < plan_.groups; ++g) {
-      w_.group_weight[g] = Wide(0.0);
-      for (int c = 0; c < 3; ++c) w_.group_moment[3 * g + c] = Wide(0.0);
-    }
-    for (int i = 0; i < plan_.vertices; ++i) {
-      const int g = plan_.vertex_group[i];
-      if (g < 0) continue;
-      const Wide a = Lanes::widen(w_.inertia[i]);
-      const Vec3<Real> lag = Lanes::vec3(w_.target[i] - w_.u[i]);
-      w_.group_weight[g] = w_.group_weight[g] + a;
-      w_.group_moment[3 * g] = w_.group_moment[3 * g] + a * Lanes::widen(lag.x);
-      w_.group_moment[3 * g + 1] = w_.group_moment[3 * g + 1] + a * Lanes::widen(lag.y);
-      w_.group_moment[3 * g + 2] = w_.group_moment[3 * g + 2] + a * Lanes::widen(lag.z);
-    }
-    for (int g = 0; g < plan_.groups; ++g) {
-      const auto mean = [&](int c) {
-        return Lanes::narrow(w_.group_moment[3 * g + c] / w_.group_weight[g]);
-      };
-      w_.shift[g] = Lanes::value({mean(0), mean(1), mean(2)});
-    }
-  }
-
-  // a piece that the shift would leave touching a contact gets none
-  void drop_touching_shifts() {
-    const Real none(T(0)), one(T(1));
-    for (int g = 0; g < plan_.groups; ++g) w_.group_weight[g] = Wide(1.0);
-    for (int i = 0; i < plan_.vertices; ++i) {
-      const int g = plan_.vertex_group[i];
-      if (g < 0) continue;
-      const Real least = contacts_.least_gap(Lanes::vec3((w_.x[i] + w_.u[i]) + w_.shift[g]));
-      w_.group_weight[g] = w_.group_weight[g] * Lanes::widen(select(least > none, one, none));
-    }
-    for (int g = 0; g < plan_.groups; ++g)
-      w_.shift[g] = Lanes::narrow(w_.group_weight[g]) * w_.shift[g];
-  }
-
   void store(int record) {
     const std::int64_t first_row = record * call_.batch;
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      for (int lane = 0; lane < width && first_ + lane < call_.batch; ++lane) {
+      for (int lane = 0; lane < width && in_.first + lane < call_.batch; ++lane) {
         const std::int64_t at =
-            ((first_row + first_ + lane) * plan_.vertices + plan_.vertex_order[i]) * 3;
+            ((first_row + in_.first + lane) * plan_.vertices + plan_.vertex_order[i]) * 3;
         write(call_.out_positions + at, Lanes::get_lane(w_.x[i], lane));
         write(call_.out_velocities + at, Lanes::get_lane(w_.velocity[i], lane));
       }
     }
     if (!call_.info || team_.rank != 0) return;
-    for (int lane = 0; lane < width && first_ + lane < call_.batch; ++lane) {
-      double* row = call_.info + (first_row + first_ + lane) * info_count;
-      const double last = Lanes::lane(residual_, lane), start = first_residual_[lane];
-      row[info_residual] = !set_.report ? NAN : start > 0 ? sqrt(last / start) : 0.0;
+    for (int lane = 0; lane < width && in_.first + lane < call_.batch; ++lane) {
+      double* row = call_.info + (first_row + in_.first + lane) * info_count;
+      const double last = Lanes::lane(residual_, lane), course = course_[lane];
+      row[info_residual] = !set_.report ? NAN : course > 0 ? sqrt(last / course) : 0.0;
       row[info_energy] = set_.report ? Lanes::lane(energy_, lane) : NAN;
       row[info_iterations] = used_[lane];
       row[info_restarts] = schedule_[lane].restarts;
@@ -435,13 +365,13 @@ class Stepper {
   Workspace<Lanes>& w_;
   const Team& team_;
   Sweep<Lanes> sweep_;
-  std::int64_t first_;
+  Inputs<Lanes> in_;
   T h_, theta_;
   Contacts<Real> contacts_;
   Value gravity_ = {};
   Real damping_{T(0)}, omega_{T(1)}, active_{T(1)};
   Wide energy_ = Wide(0.0), residual_ = Wide(0.0);
-  double least_[width] = {}, first_residual_[width] = {};
+  double least_[width] = {}, course_[width] = {};
   Schedule schedule_[width];
   int used_[width] = {};
   bool done_[width] = {};

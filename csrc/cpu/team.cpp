@@ -14,7 +14,10 @@ void run_team(int threads, void (*work)(void*, const Team&), void* context) {
 #pragma omp parallel num_threads(threads)
     {
       const int size = omp_get_num_threads();
-      work(context, Team{omp_get_thread_num(), size, size > 1 ? &barrier : nullptr});
+      const Team team{omp_get_thread_num(), size, size > 1 ? &barrier : nullptr};
+      work(context, team);
+      // meet here, where waiting soon sleeps, and not in the runtime, where it spins for milliseconds
+      team.barrier();
     }
     return;
   }

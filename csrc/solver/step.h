@@ -15,17 +15,17 @@ namespace pd {
 
 template <class Runner>
 void step(Runner& run, const Settings& settings) {
-  run.predict();    // targets s: where inertia, forces and springs would take each vertex
+  run.predict();  // targets s: where inertia, forces and springs would take each vertex
+  if (settings.report) run.measure_course();
   run.start();      // first iterate, on the pins and out of the contacts
   run.translate();  // free pieces: exact along their translation
-  if (settings.report) run.measure_first();
   for (int k = 0; k < settings.iterations; ++k) {
     // local step on every element, then one Jacobi iteration on every vertex, accelerated and projected
     run.iterate(k);
     if (run.finished()) break;
   }
   run.translate();
-  if (settings.report) run.measure_last();
+  if (settings.report) run.measure();
   run.finish();  // new positions and velocities
 }
 

@@ -1,0 +1,83 @@
+"""Every example runs with tiny settings, and what it prints is true of its subject."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """Runs an example as a script in an empty folder; what it printed."""
+
+    def run(name: str, *words: str) -> str:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [name, *words])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
+
+
+def numbers(text: str, pattern: str) -> list[float]:
+    """The groups of the one match, as numbers."""
+    found = re.search(pattern, text)
+    assert found, f"{pattern} is not in:\n{text}"
+    return [float(group.replace(",", "")) for group in found.groups()]
+
+
+def test_no_example_is_left_out() -> None:
+    tested = set(re.findall(r'run\("(\w+\.py)"', Path(__file__).read_text()))
+    assert tested == {path.name for path in EXAMPLES.glob("*.py")}
+
+
+@pytest.mark.parametrize("ending", ["glb", "ply"])
+def test_drop_body(run, tmp_path: Path, ending: str) -> None:
+    out = tmp_path / f"end.{ending}"
+    text = run("drop_body.py", "--cells", "8", "--steps", "3", "--out", str(out))
+    assert trimesh.load(out, force="mesh").faces.shape == (8568, 3)
+    (lowest,) = numbers(text, r"lowest point (\S+) m")
+    # three steps of free fall by implicit Euler from 0.3 m: g h^2 (1 + 2 + 3); the surface lies less than a cell higher
+    fallen = 0.3 - 9.81 / 3600 * 6
+    assert fallen <= lowest <= fallen + 1 / 8
+
+
+def test_batch_randomised(run) -> None:
+    text = run("batch_randomised.py", "--batch", "12", "--steps", "30")
+    (correlation,) = numbers(text, r"correlation (\S+)")
+    assert 0.5 < correlation <= 1.0
+    assert len(re.findall(r"^ +\d+ +\d+ +\d+ +\S+$", text, flags=re.MULTILINE)) == 5
+
+
+def test_grip_and_twist(run) -> None:
+    text = run("grip_and_twist.py", "--steps", "4", "--turn", "40", "--pull", "0.05")
+    (turned,) = numbers(text, r"1\.00 +1\.050 +(\S+)\n")
+    assert turned == 40.0
+    (miss,) = numbers(text, r"misses its targets by at most (\S+) m")
+    assert miss <= 2**-23  # float32 numbers of about 1: a hard grip reaches its targets within rounding
+    (soft_miss,) = numbers(run("grip_and_twist.py", "--steps", "4", "--soft", "10"), r"by at most (\S+) m")
+    assert soft_miss > 1e-3
+
+
+def test_first_iterate(run) -> None:
+    text = run("first_iterate.py", "--steps", "1", "--iterations", "4", "128")
+    for few, many in zip(
+        numbers(text, r" 4 +(\S+) +(\S+) +(\S+)"), numbers(text, r"128 +(\S+) +(\S+) +(\S+)"), strict=True
+    ):
+        assert many < 0.1 * few
+    errors = [float(error) for error in re.findall(r"^ +1e-0\d +\d+ +(\S+) +\S+$", text, flags=re.MULTILINE)]
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_fit_stiffness(run) -> None:
+    text = run("fit_stiffness.py", "--steps", "3", "--fits", "2")
+    distances = [float(d) for d in re.findall(r"^ +\d+ +[\d,]+ +[\d,]+ +(\S+)$", text, flags=re.MULTILINE)]
+    assert len(distances) == 2
+    assert distances[1] < distances[0]
