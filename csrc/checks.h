@@ -68,6 +68,7 @@ Plan<T> plan_view(at::TensorList arrays) {
       "plan: arrays that belong together have different lengths; compile the scene again");
   plan.vertices = vertex_order_rows;
   plan.blocks = tet_order_rows;
+  plan.tets = tet_lane_rows;
   plan.pins = pin_vertex_rows;
   plan.groups = group_size_rows;
   plan.patches = patch_block_rows - 1;
@@ -138,14 +139,10 @@ Material<T> material_view(at::TensorList arrays, std::int64_t vertices, std::int
   return material;
 }
 
-// Elements that the stiffness must have: what the order of the plan reaches.
-template <class T>
-inline void check_tets(Plan<T>& plan, std::int64_t tets) {
-  plan.tets = int(tets);
-  TORCH_CHECK_VALUE(tets <= std::int64_t(plan.blocks) * 16 &&
-                        tets > (std::int64_t(plan.blocks) - plan.patches) * 16 - 1,
-                    "stiffness must have one value per tetrahedron of the plan (at most ",
-                    std::int64_t(plan.blocks) * 16, "), got ", tets);
+inline void check_tets(const Tensor& stiffness, std::int64_t tets) {
+  TORCH_CHECK_VALUE((stiffness.dim() == 1 || stiffness.dim() == 2) && stiffness.size(-1) == tets,
+                    "stiffness must be [", tets, "] or [batch, ", tets,
+                    "], one value per tetrahedron of the plan [Pa], got ", describe(stiffness));
 }
 
 inline void check_state(const Tensor& t, const Tensor& like, const char* name,

@@ -24,11 +24,13 @@ struct Numbers {
   bool inertial, report;
 };
 
+constexpr std::int64_t most = 1'000'000'000;
+
 Settings settings_of(const Numbers& n, bool given, std::int64_t steps, std::int64_t every) {
   TORCH_CHECK_VALUE(n.schedule >= 0 && n.schedule <= 2,
                     "schedule must be 0 (jacobi), 1 (classic) or 2 (guarded), got ", n.schedule);
-  TORCH_CHECK_VALUE(n.iterations >= 0 && n.iterations <= 1'000'000'000,
-                    "iterations must be 0..1e9, got ", n.iterations);
+  TORCH_CHECK_VALUE(n.iterations >= 0 && n.iterations <= most, "iterations must be 0..1e9, got ",
+                    n.iterations);
   TORCH_CHECK_VALUE(n.time_step > 0 && std::isfinite(n.time_step),
                     "time_step must be positive and finite [s], got ", n.time_step);
   TORCH_CHECK_VALUE(n.relaxation > 0 && n.relaxation < 2, "relaxation must lie in (0, 2), got ",
@@ -36,8 +38,8 @@ Settings settings_of(const Numbers& n, bool given, std::int64_t steps, std::int6
   TORCH_CHECK_VALUE(n.rho >= 0 && n.rho < 1, "rho must lie in [0, 1), got ", n.rho);
   TORCH_CHECK_VALUE(n.delay >= 0, "delay must be >= 0, got ", n.delay);
   TORCH_CHECK_VALUE(n.tolerance >= 0, "tolerance must be >= 0, got ", n.tolerance);
-  TORCH_CHECK_VALUE(steps >= 0 && every >= 1, "steps must be >= 0 and every >= 1, got ", steps,
-                    " and ", every);
+  TORCH_CHECK_VALUE(steps >= 0 && every >= 1 && steps <= most && every <= most,
+                    "steps must be 0..1e9 and every 1..1e9, got ", steps, " and ", every);
   Settings s;
   s.steps = int(steps);
   s.every = int(every);
@@ -48,7 +50,7 @@ Settings settings_of(const Numbers& n, bool given, std::int64_t steps, std::int6
   s.relaxation = n.relaxation;
   s.rho = n.rho;
   s.tolerance = n.tolerance;
-  s.delay = int(std::min<std::int64_t>(n.delay, 1'000'000'000));
+  s.delay = int(std::min(n.delay, most));
   s.weighted = n.weighted;
   s.report = n.report;
   return s;
@@ -69,7 +71,7 @@ void step_typed(const StepTensors& t, const Settings& settings,
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
   call.material = material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch);
-  check_tets(call.plan, t.material[0].size(-1));
+  check_tets(t.material[0], call.plan.tets);
   call.settings = settings;
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
   const Tensor f = t.forces ? t.forces->contiguous() : Tensor(),
@@ -137,6 +139,10 @@ void step_inplace(const Tensor& positions, const Tensor& velocities, const Tenso
   // the state is read before it is written: loads and stores of an environment do not overlap in time
   run_step({positions, velocities, forces, start, material, plan, positions, velocities, info},
            settings_of(n, start.has_value(), 1, 1));
+  // so that autograd notices when it needs what has been overwritten
+  for (const Tensor& t : {positions, velocities, info}) {
+    if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
+  }
 }
 
 std::tuple<Tensor, Tensor, Tensor> rollout(
@@ -165,9 +171,7 @@ void field_typed(Field field, const Tensor& positions, const Tensor& direction,
   call.field = field;
   call.batch = positions.size(0);
   check_vertices(positions, call.plan.vertices);
-  TORCH_CHECK_VALUE(stiffness.dim() == 1 || stiffness.dim() == 2,
-                    "stiffness must be [tet] or [batch, tet] (Pa), got ", describe(stiffness));
-  check_tets(call.plan, stiffness.size(-1));
+  check_tets(stiffness, call.plan.tets);
   const Tensor w = stiffness.contiguous(), x = positions.contiguous();
   const Tensor d = direction.defined() ? direction.contiguous() : Tensor();
   call.stiffness =

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from cases import Array, Case
+from cases import Array, Case, box, sliver_mesh
+from torch import Tensor
 
 import torchpd as pd
 from torchpd.reference import StepProblem, step_problem
@@ -73,3 +74,66 @@ def reference_run(problem: StepProblem, first: Array, solver: pd.Jacobi | pd.Che
             relaxation=numbers["relaxation"], weighted=numbers["weighted"],
         )  # fmt: skip
     return guarded_chebyshev(problem, first, iterations=iterations, relaxation=numbers["relaxation"], rho=solver.rho)
+
+
+def small_case() -> Case:
+    """Slivers with hard and soft pins, drag, gravity, a ground and a ball with friction."""
+    mesh = sliver_mesh((3, 2, 2))
+    body = pd.Solid(mesh, youngs=10.0 ** np.random.default_rng(0).uniform(3.0, 5.0, len(mesh.tets)))
+    scene = pd.Scene(
+        body, pd.Pin(body, [0, 3]), pd.Pin(body, [9, 12], 1e3), pd.Gravity(), pd.Damping(1.0),
+        pd.Ground(-0.01, friction=0.5), pd.Sphere((0.4, 0.1, 0.1), 0.1, friction=0.2),
+    )  # fmt: skip
+    rng = np.random.default_rng(1)
+    x = mesh.vertices + 0.01 * rng.standard_normal(mesh.vertices.shape)
+    return Case(scene, x, rng.standard_normal(x.shape), 1.0 / 60.0)
+
+
+def small(dtype: torch.dtype, device: torch.device | str = "cpu", batch: int = 3) -> tuple[pd.Simulator, pd.State]:
+    """A simulator and different environments."""
+    case = small_case()
+    sim = simulator(case, dtype, device, iterations=6)
+    factor = torch.linspace(0.5, 1.5, batch, dtype=dtype, device=device)[:, None, None]
+    x, v = (tensor_of(array, sim) for array in (case.positions, case.velocities))
+    return sim, pd.State(sim.rest_positions + factor * (x - sim.rest_positions), factor * v)
+
+
+def noise(like: Tensor, seed: int = 0) -> Tensor:
+    return torch.randn(like.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)).to(like)
+
+
+def plan_of(sim: pd.Simulator) -> list[Tensor]:
+    return list(sim.plan.arrays)
+
+
+def numbers_of(sim: pd.Simulator, **changed: Any) -> dict[str, Any]:
+    """The keyword arguments of `step`."""
+    given = {"iterations": 4, "time_step": sim.time_step, "tolerance": 0.0, "inertial": False, "report": True}
+    return {**sim.solver.numbers(), **given, **changed}
+
+
+def full_scene() -> pd.Scene:
+    mesh = pd.TetMesh(*box((0.4, 0.2, 0.2), (4, 2, 2)))
+    body = pd.Solid(mesh, youngs=5e4)
+    return pd.Scene(
+        body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Pin(body, [40, 44], 1e3), pd.Gravity(), pd.Damping(1.0),
+        pd.Ground(-0.02, friction=0.5), pd.Sphere((0.4, -0.3, 0.1), 0.25, friction=0.2),
+    )  # fmt: skip
+
+
+def simulate(dtype: torch.dtype, device: torch.device | str = "cpu", **options: Any) -> pd.Simulator:
+    return pd.Simulator(full_scene(), 1 / 60, dtype=dtype, progress=False, **{"iterations": 12, **options}).to(device)
+
+
+def moving(sim: pd.Simulator, batch: int = 3) -> pd.State:
+    """Different environments that fall and swing."""
+    state = sim.rest_state(batch)
+    speed = torch.linspace(0.2, 1.0, batch, dtype=sim.dtype, device=sim.device)[:, None]
+    velocities = state.velocities.clone()
+    velocities[..., 1] = -3.0 * speed * state.positions[..., 0]
+    velocities[..., 2] = speed
+    return pd.State(state.positions, velocities)
+
+
+def same_bits(one: pd.State | pd.Track, other: pd.State | pd.Track) -> bool:
+    return torch.equal(one.positions, other.positions) and torch.equal(one.velocities, other.velocities)

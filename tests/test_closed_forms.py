@@ -87,7 +87,7 @@ STRETCHES = {  # F, |F - R|^2
     "collapsed": (np.zeros((3, 3)), 3.0),
     "mirrored": (np.diag([-1.0, 1.0, 1.0]), 4.0),  # singular values 1, 1, -1: (1 - -1)^2
     "mirrored and short": (np.diag([1.0, 1.0, -0.2]), 1.44),
-    # F F^T - I has one eigenvalue: the symmetric shear is sqrt(1 + s^2 / 4), trace of the stretch 1 + 2 sqrt(1 + s^2 / 4)
+    # |F|^2 + 3 - 2 tr S, where the stretch S of a shear by s has the trace 1 + 2 sqrt(1 + s^2 / 4)
     "sheared": (np.array([[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]), 3.25 + 3.0 - 2.0 * (1.0 + 2.0 * math.sqrt(1.0625))),
 }
 
@@ -107,7 +107,7 @@ def test_energy_of_one_tetrahedron(name: str, dtype: torch.dtype, device: torch.
 
 
 def test_force_of_one_stretched_tetrahedron(dtype: torch.dtype, device: torch.device) -> None:
-    """Stretched by 1.3 along x: vertex 1 pulls with w V 0.3 dN/dx = 1e4 / 6 * 0.3, vertex 0 against it, others nothing."""
+    """Stretched by 1.3 along x: vertex 1 pulls with w V 0.3 dN/dx = 1e4 / 6 * 0.3, vertex 0 against it."""
     sim = simulator(one_tet(), dtype, device)
     gradient = sim.gradient(tensor_of(TET * [1.3, 1.0, 1.0], sim, 1))[0].double().cpu()
     pull = 1e4 / 6.0 * 0.3
@@ -157,7 +157,7 @@ def test_terminal_velocity(dtype: torch.dtype, device: torch.device) -> None:
 
 @pytest.mark.parametrize("iterations", [1, 3, 10])
 def test_momentum_of_free_bodies(iterations: int, dtype: torch.dtype, device: torch.device) -> None:
-    """Two deformed bodies of different stiffness, forces on them: P' = P + h (M g + F) each, with iterations too few."""
+    """Two deformed bodies, forces on them: P' = P + h (M g + F) each, however few the iterations."""
     vertices, tets = box((0.3, 0.3, 0.3), (3, 3, 3))
     soft, hard = (pd.Solid(pd.TetMesh(vertices + [x, 0.0, 0.0], tets), e) for x, e in ((0.0, 1e3), (1.0, 1e6)))
     scene = pd.Scene(soft, hard, pd.Gravity((0.0, -9.8, 0.0)))
@@ -213,8 +213,8 @@ def test_block_on_the_ground_stays(dtype: torch.dtype, device: torch.device) -> 
     bottom, top = case.positions[:, 1] == 0.0, np.isclose(case.positions[:, 1], 0.3)
     assert heights.min() >= -ULP[dtype]
     assert heights[bottom].max() <= 2 * ULP[dtype]
-    # vertices carry the weight of half a cell more or less: the discrete column shortens by exactly this too; the strain
-    # of 1.3 % at the foot makes the length nonlinear in second order, 1 %, and Kuhn cells are not symmetric, another 2 %
+    # with lumped masses the discrete column shortens by just as much; Kuhn cells are not symmetric, which costs 2 %,
+    # and the strain of 3 % at the foot enters in second order
     shorter = 0.3 - heights[top].mean()
     assert shorter == pytest.approx(1000.0 * 9.8 * 0.3**2 / (2 * 1e5), rel=0.03)
     assert float(end.velocities.abs().max()) <= 1e-3
@@ -252,7 +252,7 @@ def points_after(case: Case, positions: Array, velocities: Array, dtype: torch.d
 
 
 def test_points_meet_a_tilted_plane(dtype: torch.dtype, device: torch.device) -> None:
-    """A point that would end a depth d inside is put back along the normal, and Coulomb takes friction d of its slip."""
+    """A point that would end d inside is put back along the normal, and Coulomb takes friction d of its slip."""
     normal = np.array([0.6, 0.8, 0.0])
     along = np.array([0.8, -0.6, 0.0])
     case = cloud(pd.Ground(0.0, normal=(3.0, 4.0, 0.0), friction=0.5))

@@ -29,8 +29,8 @@ def scene() -> Case:
     body = pd.Solid(mesh, youngs=10.0 ** np.random.default_rng(0).uniform(4.0, 6.0, len(mesh.tets)))
     free = pd.Solid(pd.TetMesh(block.vertices + [0.0, 3.0, 0.0], block.tets), 1e5)
     parts = pd.Scene(
-        body, free, pd.Pin(body, mesh.vertices[:, 0] < 0.05), pd.Pin(body, [60, 70], 1e4), pd.Gravity(), pd.Damping(1.0),
-        pd.Ground(-0.01, friction=0.5), pd.Sphere((0.5, -0.1, 0.1), 0.1, friction=0.3),
+        body, free, pd.Pin(body, mesh.vertices[:, 0] < 0.05), pd.Pin(body, [60, 70], 1e4), pd.Gravity(),
+        pd.Damping(1.0), pd.Ground(-0.01, friction=0.5), pd.Sphere((0.5, -0.1, 0.1), 0.1, friction=0.3),
     )  # fmt: skip
     rest = parts.values().rest_positions
     return Case(parts, rest, 0.0 * rest, 1.0 / 60.0)
@@ -172,7 +172,7 @@ def test_instruction_sets_agree() -> None:
     widest = results[names[0]]
     for name in names[1:]:
         for key in widest.keys() - {"simd"}:
-            # they differ in fused operations: rounding of some fifty operations an iteration, extrapolated 12 times (k^2)
+            # they fuse differently: rounding of some fifty operations an iteration, extrapolated 12 times (k^2)
             unit = 2.0**-24 if "float32" in key else 2.0**-53
             for one, other in zip(results[name][key], widest[key], strict=True):
                 size = np.abs(other).max()

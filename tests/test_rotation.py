@@ -67,9 +67,7 @@ def check_rotation(rotations: torch.Tensor, matrices: Array) -> None:
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("name", CLASSES)
-def test_it_is_a_rotation_and_the_best_one(
-    name: str, scale: float, dtype: torch.dtype, device: torch.device
-) -> None:
+def test_it_is_a_rotation_and_the_best_one(name: str, scale: float, dtype: torch.dtype, device: torch.device) -> None:
     given = torch.tensor(CLASSES[name] * scale, dtype=dtype, device=device)
     check_rotation(pd.nearest_rotation(given), given.double().cpu().numpy())
 
@@ -146,7 +144,8 @@ def test_derivative_is_that_of_a_turning_frame(dtype: torch.dtype, device: torch
     turn = Rotation.random(random_state=2).as_matrix()
     spin = np.array([[0.0, -0.3, 0.2], [0.3, 0.0, -0.5], [-0.2, 0.5, 0.0]])
     f, turning, stretching = (
-        torch.tensor(m, dtype=dtype, device=device) for m in (turn @ stretch, turn @ spin @ stretch, turn @ stretch @ stretch)
+        torch.tensor(m, dtype=dtype, device=device)
+        for m in (turn @ stretch, turn @ spin @ stretch, turn @ stretch @ stretch)
     )
     differential = torch.ops.torchpd.rotation_differential
     limit = 30 * torch.finfo(dtype).eps  # products of a handful of matrices of size two

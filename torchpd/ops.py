@@ -230,11 +230,7 @@ def _step_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str
 
 def _step_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _: Tensor) -> tuple[Any, ...]:
     wanted = ctx.needs_input_grad
-    contacts = [
-        row.name for row, needed in zip(MATERIAL_TABLE, wanted[4], strict=True) if needed and row.name in _CONTACTS
-    ]
-    if contacts:
-        raise RuntimeError(f"torchpd: a step has no derivative for {' and '.join(contacts)}; detach them")
+    _check_differentiable(wanted[4])
     if wanted[3]:
         raise RuntimeError("torchpd: a step has no derivative for its first iterate; detach start")
     positions, velocities, after, *rest = ctx.saved_tensors
@@ -247,7 +243,55 @@ def _step_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _:
     return x, v, f if wanted[2] else None, None, values, [None] * len(plan)
 
 
+def _check_differentiable(wanted: Sequence[bool]) -> None:
+    contacts = [
+        row.name for row, needed in zip(MATERIAL_TABLE, wanted, strict=True) if needed and row.name in _CONTACTS
+    ]
+    if contacts:
+        raise RuntimeError(f"torchpd: a step has no derivative for {' and '.join(contacts)}; detach them")
+
+
+def _rollout_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
+    positions, velocities, _, material, plan = inputs
+    ctx.save_for_backward(positions, velocities, output[0], output[1], *material, *plan)
+    ctx.time_step = keyword_only_inputs["time_step"]
+    ctx.every = keyword_only_inputs["every"]
+
+
+def _at_step(material: Sequence[Tensor], step: int) -> list[Tensor]:
+    """The material of one step of a rollout: spheres move on."""
+    return [
+        _moved(array, step) if row.name == "spheres" else array
+        for row, array in zip(MATERIAL_TABLE, material, strict=True)
+    ]
+
+
+def _moved(spheres: Tensor, steps: int) -> Tensor:
+    return torch.cat([spheres[..., :3] + steps * spheres[..., 5:], spheres[..., 3:]], dim=-1)
+
+
+def _rollout_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _: Tensor) -> tuple[Any, ...]:
+    """Backwards through the recorded states, one adjoint a step."""
+    if ctx.every != 1:
+        raise RuntimeError("torchpd: the rollout op is differentiable with every=1 only, where it records every state")
+    _check_differentiable(ctx.needs_input_grad[3])
+    x0, v0, positions, velocities, *rest = ctx.saved_tensors
+    material, plan = rest[: len(MATERIAL_TABLE)], rest[len(MATERIAL_TABLE) :]
+    x, v, forces = torch.zeros_like(x0), torch.zeros_like(x0), torch.zeros_like(x0)
+    values = [torch.zeros_like(array) for array in material]
+    for step in reversed(range(len(positions))):
+        before = (positions[step - 1], velocities[step - 1]) if step else (x0, v0)
+        x, v = x + grad_positions[step], v + grad_velocities[step]
+        x, v, f, *parts = _ops.step_vjp(
+            x, v, positions[step], *before, _at_step(material, step), plan, ctx.time_step
+        )  # fmt: skip
+        forces = forces + f
+        values = [total + part for total, part in zip(values, parts, strict=True)]
+    return x, v, forces if ctx.needs_input_grad[2] else None, values, [None] * len(plan)
+
+
 _CONTACTS = ("planes", "spheres")
+torch.library.register_autograd("torchpd::rollout", _rollout_backward, setup_context=_rollout_setup)
 torch.library.register_autograd("torchpd::step", _step_backward, setup_context=_step_setup)
 
 for _name, _backward, _inputs in (

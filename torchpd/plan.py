@@ -127,6 +127,9 @@ def compile_plan(
     group, group_size = _free_pieces(values)
     arrays["vertex_group"] = group[order]
     arrays["group_size"] = group_size
+    real = arrays["tet_volume"].reshape(-1) > 0.0
+    arrays["tet_lane"] = np.empty(tets, dtype=np.int32)
+    arrays["tet_lane"][arrays["tet_order"].reshape(-1)[real]] = np.flatnonzero(real)
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
     tensors = (torch.from_numpy(np.ascontiguousarray(arrays[row.name])) for row in PLAN_TABLE)
     return Plan(tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors))

@@ -6,43 +6,25 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from .effects import Pin, Sphere
+from .material import MATERIAL_ROWS, check_material, material_of
 from .ops import INFO_WIDTH
 from .plan import Plan, compile_plan
-from .scene import Scene, SceneValues
+from .scene import Scene
 from .solvers import Chebyshev, Jacobi, Solver
 from .state import Info, State, Track
 from .summary import describe
-from .tables import MATERIAL_TABLE
+from .targets import Anchors, Targets
 
 __all__ = ["Simulator", "Targets"]
 
-Targets = Tensor | Mapping[Pin | Sphere, Tensor]
 PerStep = Callable[[int], Any]
 
 _ops = torch.ops.torchpd
-_ROWS = {row.name: row for row in MATERIAL_TABLE}
 _BARS = 50  # how often a progress bar moves during a rollout
-
-
-def _material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
-    spheres = np.pad(values.spheres, ((0, 0), (0, 3)))
-    arrays = {
-        "stiffness": values.stiffness,
-        "masses": values.masses,
-        "gravity": values.gravity,
-        "damping": values.damping,
-        "pin_stiffness": values.pin_stiffness,
-        "pin_targets": values.pin_targets,
-        "planes": values.planes,
-        "spheres": spheres,
-    }
-    return {name: torch.tensor(arrays[name], dtype=dtype) for name in _ROWS}
 
 
 class Simulator(nn.Module):
@@ -98,10 +80,9 @@ class Simulator(nn.Module):
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
         values = scene.values()
         self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
-        self._pins = {pin: scene.pin_range(pin) for pin in scene.pins}
-        self._spheres = {sphere: number for number, sphere in enumerate(scene.spheres)}
+        self._anchors = Anchors(scene, self.time_step)
         self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
-        for name, value in _material_of(values, dtype).items():
+        for name, value in material_of(values, dtype).items():
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
 
     # ---- what a simulation is made of
@@ -123,7 +104,7 @@ class Simulator(nn.Module):
 
     def material(self) -> list[Tensor]:
         """The differentiable arrays in the order of the ops."""
-        return [getattr(self, name) for name in _ROWS]
+        return [getattr(self, name) for name in MATERIAL_ROWS]
 
     def set_material(self, **arrays: Tensor | float) -> None:
         """Replace differentiable arrays, for all environments or with a leading batch for each.
@@ -132,30 +113,35 @@ class Simulator(nn.Module):
             arrays: by name, see the class. Shapes, positive stiffness and masses are checked here, once.
         """
         for name, value in arrays.items():
-            if name not in _ROWS:
-                raise TypeError(f"set_material: no array {name!r}; there are {', '.join(_ROWS)}")
+            if name not in MATERIAL_ROWS:
+                raise TypeError(f"set_material: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}")
             own = getattr(self, name)
-            tensor = torch.as_tensor(value, dtype=self.dtype, device=self.device)
+            tensor = torch.as_tensor(value)
+            if tensor.is_complex() or tensor.dtype == torch.bool:
+                raise TypeError(f"set_material: {name} must hold real numbers, got {tensor.dtype}")
+            tensor = tensor.to(dtype=self.dtype, device=self.device)
             tensor = tensor.expand(own.shape) if tensor.dim() == 0 else tensor
-            shape = tuple(own.shape[own.dim() - _ROWS[name].dims :])
+            shape = tuple(own.shape[own.dim() - MATERIAL_ROWS[name].dims :])
             if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
                 raise ValueError(
                     f"set_material: {name} must be {list(shape)}, or with a batch in front, got {list(tensor.shape)}"
                 )
-            _check_material(name, tensor)
+            check_material(name, tensor)
             trains = own.requires_grad
             setattr(self, name, nn.Parameter(tensor.detach().clone().contiguous(), requires_grad=trains))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
+        wanted = fn(torch.empty(0, dtype=self.dtype, device=self.device))
+        if wanted.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        moved = self.plan.map(fn)
-        if moved.dtype != self.plan.dtype:
+        if wanted.dtype != self.dtype:
             # digits that float32 has lost do not come back by widening: compile for the new precision. The material may
             # have been trained, and keeps the digits it has.
             values = self.scene.values()
-            moved = compile_plan(values, dtype=moved.dtype, progress=False).to(moved.device)
-            self.rest_positions = torch.tensor(values.rest_positions, dtype=moved.dtype, device=moved.device)
-        self.plan = moved
+            self.plan = compile_plan(values, dtype=wanted.dtype, progress=False)
+            self.rest_positions = torch.tensor(values.rest_positions, dtype=wanted.dtype, device=wanted.device)
+        self.plan = self.plan.to(wanted.device)
         return self
 
     def extra_repr(self) -> str:
@@ -194,18 +180,24 @@ class Simulator(nn.Module):
         Returns:
             The next state, or (state, info).
         """
+        material = self._material_at(targets, state[0].shape[0])
+        after, rows = self._step(state, forces, material, start, report=return_info)
+        return (after, Info.from_rows(rows)) if return_info else after
+
+    def _step(
+        self, state: State, forces: Tensor | None, material: list[Tensor], start: str | Tensor, *, report: bool
+    ) -> tuple[State, Tensor]:
         given, inertial = _first_iterate(start)
         positions, velocities, rows = _ops.step(
             state[0],
             state[1],
             forces,
             given,
-            self._material_at(targets, state[0].shape[0]),
+            material,
             list(self.plan.arrays),
-            **self._numbers(inertial=inertial, report=return_info),
+            **self._numbers(inertial=inertial, report=report),
         )
-        after = State(positions, velocities)
-        return (after, Info.from_rows(rows)) if return_info else after
+        return State(positions, velocities), rows
 
     @torch.no_grad()
     def step_(
@@ -222,6 +214,10 @@ class Simulator(nn.Module):
         Args:
             info: rows [B, 6] float64 to fill in, see `Info.from_rows`; None leaves out residual and energy.
         """
+        if state[0].requires_grad or state[1].requires_grad:
+            raise ValueError(
+                "step_ overwrites the state, so it must not require gradients; detach it or call the simulator"
+            )
         given, inertial = _first_iterate(start)
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(
@@ -254,9 +250,10 @@ class Simulator(nn.Module):
             steps: how many.
             every: steps from one record to the next; the track has steps // every records.
             forces: constant, or a function of the step number.
-            targets: constant, or a function of the step number; moving spheres then drag along what they touch.
+            targets: constant (a sphere with a velocity goes on with it), or a function of the step number (a sphere's
+                velocity then follows from its centres).
             start: first iterate of every step, "velocity" or "inertial".
-            return_info: fill in residual and energy of the recorded steps.
+            return_info: fill in residual and energy of the recorded steps; NaN otherwise.
             progress: show a bar.
 
         Returns:
@@ -265,27 +262,26 @@ class Simulator(nn.Module):
         steps, every = _whole("steps", steps, 0), _whole("every", every, 1)
         if start not in ("velocity", "inertial"):
             raise ValueError(f'rollout: start must be "velocity" or "inertial", got {start!r}')
+        # the op has a derivative where it records every state
+        one_by_one = (
+            callable(forces) or callable(targets) or (every > 1 and self._tracks_gradient(state, forces, targets))
+        )
+        if not (one_by_one or progress):
+            material = self._material_at(cast(Targets | None, targets), state[0].shape[0])
+            return self._rollout_piece(state, steps, every, forces, material, start, return_info)
         with tqdm(total=steps, desc="simulating", unit="step", disable=not progress, leave=False) as bar:
-            if callable(forces) or callable(targets) or self._tracks_gradient(state, forces, targets):
+            if one_by_one:
                 return self._rollout_one_by_one(state, steps, every, forces, targets, start, return_info, bar)
-            # in pieces, so that the bar moves
-            piece = max(every, steps // _BARS // every * every) if progress else max(steps, 1)
-            tracks = []
-            for first in range(0, max(steps, 1), piece):
-                count = min(piece, steps - first)
-                tracks.append(self._rollout_piece(state, count, every, forces, targets, start, return_info))
-                state = tracks[-1].state() if count >= every else state
-                bar.update(count)
-        return _join_tracks(tracks)
+            return self._rollout_in_pieces(state, steps, every, forces, targets, start, return_info, bar)
 
     def _rollout_piece(
-        self, state: State, steps: int, every: int, forces: Any, targets: Any, start: str, report: bool
+        self, state: State, steps: int, every: int, forces: Any, material: list[Tensor], start: str, report: bool
     ) -> Track:
         positions, velocities, rows = _ops.rollout(
             state[0],
             state[1],
             forces,
-            self._material_at(targets, state[0].shape[0]),
+            material,
             list(self.plan.arrays),
             steps=steps,
             every=every,
@@ -293,39 +289,53 @@ class Simulator(nn.Module):
         )
         return Track(positions, velocities, Info.from_rows(rows))
 
+    def _rollout_in_pieces(
+        self, state: State, steps: int, every: int, forces: Any, targets: Any, start: str, report: bool, bar: Any
+    ) -> Track:
+        piece = max(every, steps // _BARS // every * every)
+        material = self._material_at(targets, state[0].shape[0])
+        tracks = []
+        for first in range(0, max(steps, 1), piece):
+            count = min(piece, steps - first)
+            tracks.append(self._rollout_piece(state, count, every, forces, material, start, report))
+            state = tracks[-1].state() if count >= every else state
+            material = self._moved_on(material, count)
+            bar.update(count)
+        info = Info(*(torch.cat(column) for column in zip(*(track.info for track in tracks), strict=True)))
+        return Track(torch.cat([t.positions for t in tracks]), torch.cat([t.velocities for t in tracks]), info)
+
     def _rollout_one_by_one(
         self, state: State, steps: int, every: int, forces: Any, targets: Any, start: str, report: bool, bar: Any
     ) -> Track:
         states, infos = [], []
-        last_centres = {sphere: self.spheres[..., number, :3] for sphere, number in self._spheres.items()}
+        batch = state[0].shape[0]
+        last_centres = {part: self.spheres[..., number, :3] for part, number in self._anchors.spheres.items()}
+        material = self.material() if callable(targets) else self._material_at(targets, batch)
         for step in range(steps):
-            now = targets(step) if callable(targets) else targets
-            if isinstance(now, Mapping):
-                now, last_centres = self._with_velocities(now, last_centres)
+            if callable(targets):
+                now = targets(step)
+                if isinstance(now, Mapping):
+                    now, last_centres = self._anchors.with_velocities(now, last_centres)
+                material = self._material_at(now, batch)
             recorded = (step + 1) % every == 0
             pushed = forces(step) if callable(forces) else forces
-            out = self(state, pushed, now, start, return_info=True) if report and recorded else None
-            state = out[0] if out else self(state, pushed, now, start)
+            state, rows = self._step(state, pushed, material, start, report=report and recorded)
+            material = self._moved_on(material, 1)
             if recorded:
                 states.append(state)
-                infos.append(out[1] if out else Info.from_rows(state[0].new_full((len(state[0]), INFO_WIDTH), 0.0)))
+                infos.append(rows)
             bar.update(1)
         if not states:
-            return self._rollout_piece(state, 0, every, None, None, start, False)
-        info = Info(*(torch.stack(column) for column in zip(*infos, strict=True)))
+            return self._rollout_piece(state, 0, every, None, material, start, False)
+        info = Info.from_rows(torch.stack(infos))
         return Track(torch.stack([s[0] for s in states]), torch.stack([s[1] for s in states]), info)
 
-    def _with_velocities(
-        self, targets: Mapping[Any, Tensor], last: dict[Sphere, Tensor]
-    ) -> tuple[dict[Any, Tensor], dict[Sphere, Tensor]]:
-        """Adds to the centres of spheres how fast they came there since the last step."""
-        filled, last = dict(targets), dict(last)
-        for part, value in targets.items():
-            if isinstance(part, Sphere) and value.shape[-1] == 3:
-                velocity = (value - last[part]) / self.time_step
-                filled[part] = torch.cat([value.expand(velocity.shape), velocity], dim=-1)
-                last[part] = value
-        return filled, last
+    def _moved_on(self, material: list[Tensor], steps: int) -> list[Tensor]:
+        """The material with moving spheres where they are some steps later."""
+        return [
+            self._anchors.moved_on(array, steps) if name == "spheres" else array
+            for name, array in zip(MATERIAL_ROWS, material, strict=True)
+        ]
 
     def _tracks_gradient(self, state: State, forces: Any, targets: Any) -> bool:
         if not torch.is_grad_enabled():
@@ -346,11 +356,11 @@ class Simulator(nn.Module):
             targets: of pins, as in `forward`.
         """
         positions = state if isinstance(state, Tensor) else state[0]
-        material = dict(zip(_ROWS, self._material_at(targets, positions.shape[0]), strict=True))
+        material = dict(zip(MATERIAL_ROWS, self._material_at(targets, positions.shape[0]), strict=True))
         energy = cast(Tensor, _ops.element_energy(positions, material["stiffness"], list(self.plan.arrays))).sum(-1)
         weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
         energy = energy - (material["masses"] * weight).sum(-1)
-        if self._pins:
+        if len(self.plan.pin_vertex):
             energy = energy + self._spring_energy(positions, material["pin_stiffness"], material["pin_targets"])
         if not isinstance(state, Tensor):
             energy = energy + 0.5 * (material["masses"] * state[1].square().sum(-1)).sum(-1)
@@ -397,53 +407,9 @@ class Simulator(nn.Module):
         """The material with pins and spheres where `targets` puts them."""
         if targets is None:
             return self.material()
-        pins, spheres = self.pin_targets, self.spheres
-        if isinstance(targets, Tensor):
-            pins = self._checked_targets("targets", targets, batch, len(self.plan.pin_vertex), (3,))
-        else:
-            for part, value in targets.items():
-                if part in self._pins:
-                    where = self._pins[part]
-                    value = self._checked_targets("targets of a Pin", value, batch, where.stop - where.start, (3,))
-                    pins = _overwrite(pins, where, value)
-                elif part in self._spheres:
-                    number = self._spheres[part]
-                    value = self._checked_targets("targets of a Sphere", value.unsqueeze(-2), batch, 1, (3, 6))
-                    spheres = _overwrite(spheres, slice(number, number + 1), self._sphere_row(number, value))
-                else:
-                    raise KeyError(f"targets: {type(part).__name__} is not a Pin or Sphere of this scene")
+        pins, spheres = self._anchors.place(targets, self.pin_targets, self.spheres, batch)
         replaced = {"pin_targets": pins, "spheres": spheres}
-        return [replaced.get(name, getattr(self, name)).contiguous() for name in _ROWS]
-
-    def _checked_targets(self, name: str, value: Tensor, batch: int, rows: int, widths: tuple[int, ...]) -> Tensor:
-        shape = tuple(value.shape)
-        if shape[-2:-1] != (rows,) or shape[-1] not in widths or shape[:-2] not in ((), (1,), (batch,)):
-            wanted = " or ".join(f"[{rows}, {width}]" for width in widths)
-            raise ValueError(f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(shape)}")
-        if value.dtype != self.dtype or value.device != self.device:
-            raise TypeError(f"{name} must be {self.dtype} on {self.device}, got {value.dtype} on {value.device}")
-        return value
-
-    def _sphere_row(self, number: int, value: Tensor) -> Tensor:
-        """Centre at the end of the step, radius, friction, motion during the step."""
-        own = self.spheres[..., number : number + 1, 3:5]
-        motion = value[..., 3:] * self.time_step if value.shape[-1] == 6 else torch.zeros_like(value)
-        lead = torch.broadcast_shapes(own.shape[:-1], value.shape[:-1])
-        return torch.cat([value[..., :3].expand(*lead, 3), own.expand(*lead, 2), motion.expand(*lead, 3)], dim=-1)
-
-
-def _overwrite(array: Tensor, rows: slice, value: Tensor) -> Tensor:
-    """`array` [.., n, k] with some rows replaced, batched when either is."""
-    lead = torch.broadcast_shapes(array.shape[:-2], value.shape[:-2])
-    parts = (array[..., : rows.start, :], value, array[..., rows.stop :, :])
-    return torch.cat([part.expand(*lead, *part.shape[-2:]) for part in parts], dim=-2)
-
-
-def _join_tracks(tracks: list[Track]) -> Track:
-    if len(tracks) == 1:
-        return tracks[0]
-    info = Info(*(torch.cat(column) for column in zip(*(track.info for track in tracks), strict=True)))
-    return Track(torch.cat([t.positions for t in tracks]), torch.cat([t.velocities for t in tracks]), info)
+        return [replaced.get(name, getattr(self, name)).contiguous() for name in MATERIAL_ROWS]
 
 
 def _first_iterate(start: str | Tensor) -> tuple[Tensor | None, bool]:
@@ -465,14 +431,3 @@ def _whole(name: str, value: int, least: int) -> int:
     if isinstance(value, bool) or int(value) != value or value < least:
         raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
     return int(value)
-
-
-def _check_material(name: str, tensor: Tensor) -> None:
-    if name in ("stiffness", "masses", "pin_stiffness"):
-        good = bool((tensor > 0).all()) and (name == "pin_stiffness" or bool(tensor.isfinite().all()))
-        if not good:
-            raise ValueError(f"set_material: {name} must be positive{'' if name == 'pin_stiffness' else ' and finite'}")
-    elif not bool(tensor.isfinite().all()):
-        raise ValueError(f"set_material: {name} must be finite")
-    if name == "damping" and bool((tensor < 0).any()):
-        raise ValueError("set_material: damping must be >= 0")

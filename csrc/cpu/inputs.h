@@ -45,13 +45,12 @@ struct Inputs {
     return r;
   }
 
-  // visit(vertex, spring, hard, target); a pin is hard in all environments or in none
+  // visit(vertex, spring, target), an infinite spring meaning that the vertex stays on its target
   template <class Visit>
   void each_pin(Visit visit) const {
     for (int p = 0; p < call.plan.pins; ++p) {
-      const Real spring = number(call.material.pin_stiffness, p);
-      const bool hard = call.material.pin_stiffness.of(0)[p] == T(HUGE_VAL);
-      visit(call.plan.pin_vertex[p], spring, hard, vector(call.material.pin_targets, 3 * p));
+      visit(call.plan.pin_vertex[p], number(call.material.pin_stiffness, p),
+            vector(call.material.pin_targets, 3 * p));
     }
   }
 };

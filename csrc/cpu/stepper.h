@@ -51,9 +51,10 @@ class Stepper {
     }
     team_.barrier();
     if (team_.rank == 0)
-      in_.each_pin([&](std::int64_t i, Real spring, bool hard, Value pin) {
+      in_.each_pin([&](std::int64_t i, Real spring, Value pin) {
         const Value offset = pin - w_.x[i];
-        w_.target[i] = hard ? offset : target(i, spring, offset);
+        const Real soft = select(spring < Real(T(HUGE_VAL)), spring, none);
+        w_.target[i] = hold(i, offset, target(i, soft, offset));
       });
     for (std::int64_t slot = team_.begin(plan_.slots); slot < team_.end(plan_.slots); ++slot) {
       w_.origin[slot] =
@@ -231,8 +232,8 @@ class Stepper {
     }
     team_.barrier();
     if (team_.rank == 0)
-      in_.each_pin([&](std::int64_t i, Real spring, bool hard, Value) {
-        w_.inertia[i] = hard ? none : w_.inertia[i] + spring;
+      in_.each_pin([&](std::int64_t i, Real spring, Value) {
+        w_.inertia[i] = select(spring < Real(T(HUGE_VAL)), w_.inertia[i] + spring, none);
       });
     set_weights(set_.weighted);
     team_.barrier();

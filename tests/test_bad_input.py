@@ -1,0 +1,215 @@
+"""What an op cannot run is refused, with the name, the contract and what came."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from small_scene import call_step, numbers, small_simulator
+from torch import Tensor
+
+import torchpd as pd
+
+ops = torch.ops.torchpd
+
+
+@pytest.fixture(scope="module")
+def sim() -> pd.Simulator:
+    return small_simulator()
+
+
+def replaced(arrays: list[Tensor], name: str, value: Tensor, sim: pd.Simulator) -> list[Tensor]:
+    """Material or plan with one array exchanged."""
+    own = getattr(sim, name, None)
+    own = getattr(sim.plan, name) if own is None else own
+    return [value if array is own else array for array in arrays]
+
+
+def twice(x: Tensor) -> Tensor:
+    return x.repeat(1, 2, 1)
+
+
+# what replaces arguments, given fitting positions; the error; its words
+STATES: dict[str, tuple[Callable[[Tensor], dict[str, Tensor]], type[Exception], str]] = {
+    "positions of integers": (
+        lambda x: {"positions": x.long()},
+        TypeError,
+        r"positions must be float32 or float64 .* got Long",
+    ),
+    "positions of halves": (
+        lambda x: {"positions": x.half()},
+        TypeError,
+        r"positions must be float32 or float64 .* got Half",
+    ),
+    "positions without batch": (
+        lambda x: {"positions": x[0]},
+        ValueError,
+        r"positions must be \[batch, vertices, 3\] \(m\), got Float \[27, 3\] on cpu",
+    ),
+    "positions in the plane": (
+        lambda x: {"positions": x[..., :2]},
+        ValueError,
+        r"positions must be \[batch, vertices, 3\]",
+    ),
+    "too many vertices": (
+        lambda x: {"positions": twice(x), "velocities": twice(x)},
+        ValueError,
+        r"positions must have the 27 vertices of the plan, got Float \[2, 54, 3\]",
+    ),
+    "other velocities": (
+        lambda x: {"velocities": x[:1]},
+        ValueError,
+        r"velocities must be \[2, 27, 3\] like positions \(m/s\), got Float \[1, 27, 3\]",
+    ),
+    "precise velocities": (
+        lambda x: {"velocities": x.double()},
+        TypeError,
+        r"velocities must be Float like positions \(m/s\), got Double",
+    ),
+    "other forces": (
+        lambda x: {"forces": x[0]},
+        ValueError,
+        r"forces must be \[2, 27, 3\] like positions \(N\)",
+    ),
+    "precise forces": (
+        lambda x: {"forces": x.double()},
+        TypeError,
+        r"forces must be Float like positions",
+    ),
+    "other start": (
+        lambda x: {"start": x[:, :5]},
+        ValueError,
+        r"start must be \[2, 27, 3\] like positions \(first iterate, m\)",
+    ),
+    "precise state": (
+        lambda x: {"positions": x.double(), "velocities": x.double()},
+        TypeError,
+        r"plan\.[a-z_]+ must be Double \(.*\), got Float",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_states_are_checked(name: str, sim: pd.Simulator) -> None:
+    change, kind, message = STATES[name]
+    with pytest.raises(kind, match=message):
+        call_step(sim, **change(sim.rest_state(2).positions))
+
+
+NUMBERS = {
+    "schedule": ((-1, 3), r"schedule must be 0 \(jacobi\), 1 \(classic\) or 2 \(guarded\), got"),
+    "iterations": ((-1, 10**10), r"iterations must be 0\.\.1e9, got"),
+    "time_step": ((0.0, -1.0, math.nan, math.inf), r"time_step must be positive and finite \[s\], got"),
+    "relaxation": ((0.0, 2.0, -0.1, math.nan), r"relaxation must lie in \(0, 2\), got"),
+    "rho": ((-0.1, 1.0, math.nan), r"rho must lie in \[0, 1\), got"),
+    "delay": ((-1,), r"delay must be >= 0, got"),
+    "tolerance": ((-1e-3, math.nan), r"tolerance must be >= 0, got"),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_numbers_are_checked(name: str, sim: pd.Simulator) -> None:
+    values, message = NUMBERS[name]
+    for value in values:
+        with pytest.raises(ValueError, match=message):
+            call_step(sim, **{name: value})
+
+
+@pytest.mark.parametrize(("steps", "every"), [(-1, 1), (4, 0), (4, -2)])
+def test_steps_of_a_rollout_are_checked(steps: int, every: int, sim: pd.Simulator) -> None:
+    state = sim.rest_state()
+    with pytest.raises(ValueError, match=r"steps must be 0\.\.1e9 and every 1\.\.1e9, got"):
+        ops.rollout(*state, None, sim.material(), list(sim.plan.arrays), **numbers(sim), steps=steps, every=every)
+
+
+def test_material_is_checked(sim: pd.Simulator) -> None:
+    wrong: list[tuple[str, Tensor, str]] = [
+        ("masses", sim.masses[:-1], r"material\.masses must be \[27\] or the same after a batch of 2"),
+        ("masses", sim.masses.repeat(3, 1), r"material\.masses must be \[27\] or the same after a batch of 2"),
+        (
+            "masses",
+            sim.masses.double(),
+            r"material\.masses must be Float \(lumped mass .* \[kg\]\), got Double",
+        ),
+        ("gravity", sim.gravity[:2], r"material\.gravity must be \[3\]"),
+        ("damping", sim.damping[None, None], r"material\.damping must be \[\]"),
+        ("pin_stiffness", sim.pin_stiffness[:1], r"material\.pin_stiffness must be \[3\]"),
+        ("pin_targets", sim.pin_targets.T, r"material\.pin_targets must be (contiguous|\[3, 3\])"),
+        ("planes", sim.planes[:, :4].contiguous(), r"material\.planes must be \[1, 5\]"),
+        ("spheres", sim.spheres[0], r"material\.spheres must have 2 dimensions, or 3 with a batch"),
+        ("stiffness", sim.stiffness[: len(sim.stiffness) // 2], r"stiffness must be \[48\] or \[batch, 48\], one value per tetrahedron"),
+    ]
+    for name, value, message in wrong:
+        with pytest.raises((TypeError, ValueError), match=message):
+            call_step(sim, material=replaced(sim.material(), name, value, sim))
+    with pytest.raises(ValueError, match=r"material must be 8 arrays, got 7"):
+        call_step(sim, material=sim.material()[:-1])
+
+
+def test_plans_are_checked(sim: pd.Simulator) -> None:
+    arrays, plan = list(sim.plan.arrays), sim.plan
+    wrong: list[tuple[str, Tensor, str]] = [
+        ("tet_rest", plan.tet_rest.double(), r"plan\.tet_rest must be Float \(inverse rest matrix"),
+        ("tet_rest", plan.tet_rest[:, :9].contiguous(), r"plan\.tet_rest must be \[block, 144\] \(inverse rest matrix"),
+        ("tet_rest", plan.tet_rest[:-1], r"arrays that belong together have different lengths"),
+        ("tet_corner", plan.tet_corner.int(), r"plan\.tet_corner must be Short"),
+        ("slot_vertex", plan.slot_vertex[:-1], r"the ends of the patches do not match"),
+        ("vertex_group", plan.vertex_group[:-1], r"arrays that belong together"),
+        ("vertex_order", plan.vertex_order.flip(0)[::2], r"plan\.vertex_order must be contiguous"),
+    ]
+    for name, value, message in wrong:
+        with pytest.raises((TypeError, ValueError), match=message):
+            call_step(sim, plan=replaced(arrays, name, value, sim))
+    with pytest.raises(ValueError, match=r"plan must be the \d+ arrays of Plan\.arrays, got 1"):
+        call_step(sim, plan=arrays[:1])
+
+
+@pytest.mark.parametrize("change", [-17, -15, -1, 1, 8, 15, 17])
+def test_stiffness_of_another_mesh(change: int, sim: pd.Simulator) -> None:
+    """One value too few would be read, and an energy written, past the end of an array."""
+    count = len(sim.stiffness) + change
+    stiffness = torch.ones(count)
+    x = sim.rest_state().positions
+    plan = list(sim.plan.arrays)
+    message = rf"stiffness must be \[48\] or \[batch, 48\], one value per tetrahedron .* got Float \[{count}\]"
+    for call in (
+        lambda: ops.element_energy(x, stiffness, plan),
+        lambda: ops.gradient(x, stiffness, plan),
+        lambda: call_step(sim, material=replaced(sim.material(), "stiffness", stiffness, sim)),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+def test_step_in_place_checks_what_it_writes(sim: pd.Simulator) -> None:
+    x, v = sim.rest_state(2)
+    rest = (None, None, sim.material(), list(sim.plan.arrays))
+    info = torch.empty(2, 6, dtype=torch.float64)
+    for bad in (info[:1], info.float(), info[:, :5], info.T.contiguous().T):
+        with pytest.raises(ValueError, match=r"info must be a contiguous float64 \[2, 6\], got"):
+            ops.step_(x, v, bad, *rest, **numbers(sim))
+    for state in ((x.mT.contiguous().mT, v), (x, v.mT.contiguous().mT)):
+        with pytest.raises(ValueError, match="step_: positions and velocities must be contiguous"):
+            ops.step_(*state, info, *rest, **numbers(sim))
+
+
+def test_rotations_are_checked() -> None:
+    for bad, kind, message in (
+        (torch.eye(3).long(), TypeError, r"matrices must be float32 or float64 \[\.\.\., 3, 3\], got Long"),
+        (torch.zeros(3), ValueError, r"matrices must be \[\.\.\., 3, 3\], got Float \[3\]"),
+        (torch.zeros(5, 3, 2), ValueError, r"matrices must be \[\.\.\., 3, 3\]"),
+    ):
+        with pytest.raises(kind, match=message):
+            pd.nearest_rotation(bad)
+    for other in (torch.zeros(1, 3, 3), torch.zeros(2, 3, 3, dtype=torch.float64)):
+        with pytest.raises(ValueError, match=r"direction must be .* like matrices, got"):
+            ops.rotation_differential(torch.zeros(2, 3, 3), other)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="a second device is needed to mix devices")
+def test_devices_are_not_mixed(sim: pd.Simulator) -> None:
+    x = sim.rest_state(2).positions
+    with pytest.raises(Exception, match=r"velocities must be on cpu like positions|same device"):
+        call_step(sim, velocities=x.cuda())

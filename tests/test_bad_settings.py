@@ -1,0 +1,166 @@
+"""Settings, effects and targets that make no sense are refused, with the name, the contract and what came."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from small_scene import body, scene, small_simulator
+
+import torchpd as pd
+from torchpd.plan import compile_plan
+
+ops = torch.ops.torchpd
+
+
+@pytest.fixture(scope="module")
+def sim() -> pd.Simulator:
+    return small_simulator()
+
+
+def test_settings_of_a_simulator_are_checked() -> None:
+    parts = scene()
+    for keywords, kind, message in (
+        ({"time_step": 0.0}, ValueError, r"time_step must be positive and finite \[s\], got 0"),
+        ({"time_step": math.inf}, ValueError, r"time_step must be positive and finite"),
+        ({"iterations": -1}, ValueError, r"iterations must be a whole number >= 0, got -1"),
+        ({"iterations": 2.5}, ValueError, r"iterations must be a whole number >= 0, got 2\.5"),
+        ({"iterations": True}, ValueError, r"iterations must be a whole number >= 0, got True"),
+        ({"tolerance": 1.0}, ValueError, r"tolerance must lie in \[0, 1\), got 1"),
+        ({"tolerance": -0.1}, ValueError, r"tolerance must lie in \[0, 1\)"),
+        ({"tolerance": math.nan}, ValueError, r"tolerance must lie in \[0, 1\), got nan"),
+        ({"solver": "jacobi"}, TypeError, r"solver must be Jacobi or Chebyshev, got str"),
+        ({"dtype": torch.float16}, ValueError, r"dtype must be torch\.float32 or torch\.float64, got torch\.float16"),
+    ):
+        with pytest.raises(kind, match=message):
+            pd.Simulator(parts, **keywords)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="scene must be a Scene, got Solid"):
+        pd.Simulator(body())  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"patch_size must lie in 16\.\.8192"):
+        compile_plan(parts.values(), patch_size=8)
+
+
+def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
+    state = sim.rest_state(2)
+    pin, soft = sim.scene.pins
+    (sphere,) = sim.scene.spheres
+    targets: list[tuple[Any, type[Exception], str]] = [
+        (torch.zeros(2, 3), ValueError, r"targets must be \[3, 3\], or that with a batch of 2 in front, got \[2, 3\]"),
+        (torch.zeros(5, 3, 3), ValueError, r"targets must be \[3, 3\]"),
+        (torch.zeros(3, 3).double(), TypeError, r"targets must be torch\.float32 on cpu, got torch\.float64 on cpu"),
+        ({pin: torch.zeros(1, 3)}, ValueError, r"targets of a Pin must be \[2, 3\]"),
+        ({soft: torch.zeros(3)}, ValueError, r"targets of a Pin must be \[1, 3\]"),
+        ({sphere: torch.zeros(4)}, ValueError, r"targets of a Sphere must be \[3\] or \[6\]"),
+        ({pd.Sphere((0, 0, 0), 1.0): torch.zeros(3)}, KeyError, r"Sphere is not a Pin or Sphere of this scene"),
+        ({sim.scene.solids[0]: torch.zeros(3)}, KeyError, r"Solid is not a Pin or Sphere of this scene"),
+    ]
+    for target, kind, message in targets:
+        with pytest.raises(kind, match=message):
+            sim(state, targets=target)
+    for call in (lambda: sim(state, start="rest"), lambda: sim.rollout(state, 2, start="rest")):
+        with pytest.raises(ValueError, match=r'start must be "velocity"(, | or )"inertial"'):
+            call()
+    for steps, every, message in (
+        (-1, 1, "steps must be a whole number >= 0, got -1"),
+        (1.5, 1, "steps must be a whole number >= 0, got 1.5"),
+        (3, 0, "every must be a whole number >= 1, got 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            sim.rollout(state, steps, every)  # type: ignore[arg-type]
+    for batch in (-1, 1.5):
+        with pytest.raises(ValueError, match="batch must be a whole number >= 0"):
+            sim.rest_state(batch)  # type: ignore[arg-type]
+
+
+def test_set_material_is_checked(sim: pd.Simulator) -> None:
+    before = [array.clone() for array in sim.material()]
+    for arrays, kind, message in (
+        ({"youngs": 1e5}, TypeError, r"no array 'youngs'; there are stiffness, masses"),
+        ({"stiffness": torch.ones(3)}, ValueError, r"stiffness must be \[48\], or with a batch in front, got \[3\]"),
+        ({"stiffness": 0.0}, ValueError, "stiffness must be positive"),
+        ({"stiffness": math.inf}, ValueError, "stiffness must be positive"),
+        ({"masses": -1.0}, ValueError, "masses must be positive"),
+        ({"masses": math.nan}, ValueError, "masses must be positive"),
+        ({"pin_stiffness": 0.0}, ValueError, "pin_stiffness must be positive"),
+        ({"gravity": math.nan}, ValueError, "gravity must be finite"),
+        ({"damping": -1.0}, ValueError, "damping must be >= 0"),
+    ):
+        with pytest.raises(kind, match=message):
+            sim.set_material(**arrays)  # type: ignore[arg-type]
+    assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
+
+
+def test_solvers_are_checked() -> None:
+    for make, message in (
+        (lambda: pd.Jacobi(relaxation=0.0), r"Jacobi\.relaxation must lie in \(0, 2\)"),
+        (lambda: pd.Jacobi(relaxation=2.0), r"Jacobi\.relaxation must lie in \(0, 2\)"),
+        (lambda: pd.Jacobi(diagonal="full"), r"Jacobi\.diagonal must be one of 'weighted', 'plain', got 'full'"),
+        (lambda: pd.Chebyshev("fast"), r"Chebyshev\.schedule must be one of 'guarded', 'classic', got 'fast'"),
+        (lambda: pd.Chebyshev("classic"), r"needs rho; torchpd\.estimate_rho"),
+        (lambda: pd.Chebyshev("classic", rho=1.0), r"Chebyshev\.rho must lie in \(0, 1\), got 1"),
+        (lambda: pd.Chebyshev("classic", rho=0.9, delay=-1), r"Chebyshev\.delay must be a whole number >= 0, got -1"),
+        (lambda: pd.Chebyshev("classic", rho=0.9, delay=1.5), r"Chebyshev\.delay must be a whole number"),
+        (lambda: pd.Chebyshev(rho=math.nan), r"Chebyshev\.rho must be finite"),
+        (lambda: pd.Chebyshev(relaxation=3.0), r"Chebyshev\.relaxation must lie in \(0, 2\)"),
+        (lambda: pd.Chebyshev(delay=5), r'Chebyshev\.delay belongs to schedule="classic"'),
+        (lambda: pd.Chebyshev(diagonal="plain"), r'Chebyshev\.diagonal must be "weighted" when guarded'),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()  # type: ignore[no-untyped-call]
+
+
+def test_effects_are_checked() -> None:
+    solid = body()
+    for make, kind, message in (
+        (lambda: pd.Solid("mesh", 1e5), TypeError, r"Solid: mesh must be a TetMesh, got str; .*tetrahedralize"),
+        (lambda: pd.Solid(solid.mesh, 0.0), ValueError, r"Solid\.youngs must be positive \[Pa\], got 0\.0 at 0"),
+        (lambda: pd.Solid(solid.mesh, [1.0]), ValueError, r"Solid\.youngs must be \[48\] .* got \[1\]"),
+        (lambda: pd.Solid(solid.mesh, 1e5, math.nan), ValueError, r"Solid\.density must be finite"),
+        (lambda: pd.Pin(solid, []), ValueError, r"Pin\.vertices must name at least one vertex"),
+        (lambda: pd.Pin(solid, np.zeros(27, bool)), ValueError, r"Pin\.vertices must name at least one vertex"),
+        (lambda: pd.Pin(solid, [27]), IndexError, r"Pin\.vertices must lie in 0\.\.26 .* got 27"),
+        (lambda: pd.Pin(solid, [-1]), IndexError, r"Pin\.vertices must lie in 0\.\.26"),
+        (lambda: pd.Pin(solid, [1, 1]), ValueError, r"Pin\.vertices must not name a vertex twice"),
+        (lambda: pd.Pin(solid, [0.5]), ValueError, r"Pin\.vertices must be integers"),
+        (lambda: pd.Pin(solid, np.ones(5, bool)), ValueError, r"Pin\.vertices must be \[27\]"),
+        (lambda: pd.Pin(solid, [1], -1.0), ValueError, r"Pin\.stiffness must be positive \[N/m\]"),
+        (lambda: pd.Pin(solid, [1], [1.0, 2.0]), ValueError, r"Pin\.stiffness must be \[1\]"),
+        (lambda: pd.Pin("solid", [1]), TypeError, r"Pin: solid must be a Solid"),
+        (lambda: pd.Gravity((0.0, 1.0)), ValueError, r"Gravity\.vector must be \[3\]"),
+        (lambda: pd.Gravity((0.0, math.inf, 0.0)), ValueError, r"Gravity\.vector must be finite"),
+        (lambda: pd.Ground(math.nan), ValueError, r"Ground\.height must be finite"),
+        (lambda: pd.Ground(normal=(0, 0, 0)), ValueError, r"Ground\.normal must not be the zero vector"),
+        (lambda: pd.Ground(friction=-0.1), ValueError, r"Ground\.friction must be >= 0, got -0\.1"),
+        (lambda: pd.Sphere((0, 0), 1.0), ValueError, r"Sphere\.center must be \[3\]"),
+        (lambda: pd.Sphere((0, 0, 0), 0.0), ValueError, r"Sphere\.radius must be positive \[m\], got 0"),
+        (lambda: pd.Sphere((0, 0, 0), 1.0, -1.0), ValueError, r"Sphere\.friction must be >= 0"),
+        (lambda: pd.Damping(-1.0), ValueError, r"Damping\.rate must be >= 0, got -1"),
+        (lambda: pd.Damping("fast"), TypeError, r"Damping\.rate must hold real numbers"),
+    ):
+        with pytest.raises(kind, match=message):
+            make()  # type: ignore[no-untyped-call]
+
+
+def test_scenes_are_checked() -> None:
+    solid, other = body(), body()
+    for parts, kind, message in (
+        ((), ValueError, "Scene needs at least one body"),
+        ((pd.Gravity(),), ValueError, "Scene needs at least one body"),
+        ((solid, "gravity"), TypeError, "Scene: parts are bodies and effects of torchpd, got str"),
+        ((solid, solid), ValueError, "the same part is given twice"),
+        ((solid, pd.Gravity(), pd.Gravity()), ValueError, "at most one Gravity, got 2"),
+        ((solid, pd.Damping(1.0), pd.Damping(1.0)), ValueError, "at most one Damping, got 2"),
+        ((solid, pd.Pin(other, [0])), ValueError, "holds a Solid that is not a part of this scene"),
+    ):
+        with pytest.raises(kind, match=message):
+            pd.Scene(*parts)  # type: ignore[arg-type]
+    twice = pd.Scene(solid, pd.Pin(solid, [0, 1]), pd.Pin(solid, [1, 2]))
+    with pytest.raises(ValueError, match="two pins hold the same vertex"):
+        pd.Simulator(twice)
+    with pytest.raises(ValueError, match="not a part of the scene"):
+        twice.vertex_range(other)
+    with pytest.raises(ValueError, match="not a part of the scene"):
+        twice.pin_range(pd.Pin(solid, [3]))

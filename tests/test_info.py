@@ -1,0 +1,104 @@
+"""What a step says about itself: energy, residual, iterations, stops."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from cases import beam
+from runs import displacement, moving, simulate, simulator, state_of, tensor_of
+
+import torchpd as pd
+from torchpd.reference_solvers import newton, relative_error
+
+pytestmark = pytest.mark.usefixtures("poisoned")
+
+
+def test_energy_of_a_state(dtype: torch.dtype, device: torch.device) -> None:
+    """Weight, motion and springs as they are written down; a translation does not strain."""
+    sim = simulate(dtype, device)
+    values = sim.scene.values()
+    state = sim.rest_state(2)
+    lifted = pd.State(state.positions + 0.5, state.velocities + 2.0)
+    mass = 1000.0 * 0.4 * 0.2 * 0.2
+    weight = mass * 9.81 * (0.1 + 0.5)
+    springs = 2 * 0.5 * 1e3 * 3 * 0.5**2
+    motion = 0.5 * mass * 12.0
+    # 75 terms; strains are a few ulp of 1 m over cells of 0.1 m, squared
+    close = {"rel": 200 * torch.finfo(dtype).eps}
+    assert sim.energy(lifted.positions).tolist() == pytest.approx([weight + springs] * 2, **close)
+    assert sim.energy(lifted).tolist() == pytest.approx([weight + springs + motion] * 2, **close)
+    pulled = {sim.scene.pins[1]: tensor_of(values.pin_targets[values.pin_stiffness < np.inf], sim) + 0.5}
+    assert sim.energy(lifted, pulled).tolist() == pytest.approx([weight + motion] * 2, **close)
+
+
+def test_info_is_blank_unless_asked_for(dtype: torch.dtype, device: torch.device) -> None:
+    sim = simulate(dtype, device)
+    state = moving(sim)
+    _, info = sim(state, return_info=True)
+    assert all(column.shape == (3,) for column in info)
+    assert info.iterations.dtype == info.restarts.dtype == torch.int64
+    assert info.converged.dtype == torch.bool
+    assert bool((info.residual > 0).all() & (info.residual < 1).all())
+    quiet = sim.rollout(state, 2).info
+    assert bool(quiet.residual.isnan().all() & quiet.energy.isnan().all())
+    assert torch.equal(quiet.iterations, torch.full((2, 3), 12, device=device))
+    assert torch.equal(quiet.rho, info.rho.expand(2, 3))
+
+
+def test_rho_of_the_guarded_schedule_is_the_bound(dtype: torch.dtype, device: torch.device) -> None:
+    case = beam(1e5)
+    sim = simulator(case, dtype, device, iterations=1)
+    _, info = sim(state_of(case, sim), return_info=True)
+    # mu itself rounds, and 1 - theta mu is of order one
+    expected = 1.0 - 1.9 * case.problem().smallest_ratio
+    assert float(info.rho) == pytest.approx(expected, abs=16 * torch.finfo(dtype).eps)
+    sim.solver = pd.Chebyshev(rho=0.5)
+    _, info = sim(state_of(case, sim), return_info=True)
+    assert float(info.rho) == 0.5
+
+
+def test_tolerance_stops_each_environment_by_itself(dtype: torch.dtype, device: torch.device) -> None:
+    """|u_{k+1} - u_k| <= tolerance |u_{k+1}| at the stop, not one iteration before it."""
+    sim = simulate(dtype, device, iterations=300, tolerance=1e-3, solver=pd.Jacobi())
+    state = moving(sim)
+    after, info = sim(state, return_info=True)
+    assert bool(info.converged.all())
+    assert len(info.iterations.unique()) > 1
+    sim.tolerance = 0.0
+    for item in range(3):
+        iterates = []
+        for sim.iterations in range(int(info.iterations[item]) - 2, int(info.iterations[item]) + 1):
+            iterates.append(displacement(sim, sim(state), item))
+        changes = [np.linalg.norm(b - a) / np.linalg.norm(b) for a, b in itertools.pairwise(iterates)]
+        # norms of 225 numbers whose differences are 1e-3 of them
+        slack = 1e3 * torch.finfo(dtype).eps
+        assert changes[1] <= 1e-3 * (1 + slack)
+        assert changes[0] > 1e-3 * (1 - slack)
+        assert np.array_equal(iterates[-1], displacement(sim, after, item))
+
+
+def test_tolerance_that_is_not_met_says_so(device: torch.device) -> None:
+    sim = simulate(torch.float64, device, iterations=5, tolerance=1e-12)
+    _, info = sim(moving(sim), return_info=True)
+    assert not bool(info.converged.any())
+    assert info.iterations.tolist() == [5, 5, 5]
+
+
+def test_residual_tells_the_error(device: torch.device) -> None:
+    """Both fall together, and at the solution both are rounding."""
+    case = beam(1e4)
+    problem = case.problem()
+    solution, course = newton(problem), problem.first_iterate()
+    sim = simulator(case, torch.float64, device)
+    seen = []
+    for sim.iterations in (5, 20, 60, 400):
+        after, info = sim(state_of(case, sim), return_info=True)
+        seen.append((float(info.residual), relative_error(displacement(sim, after), solution, course)))
+    for (residual, error), (later_residual, later_error) in itertools.pairwise(seen):
+        assert later_residual < 0.3 * residual
+        assert later_error < 0.3 * error
+    assert max(seen[-1]) <= 1e-11
+    assert float(info.energy) == pytest.approx(problem.energy(solution), rel=1e-12)

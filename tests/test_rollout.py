@@ -1,0 +1,119 @@
+"""Rollouts and steps in place are repeated steps, bit for bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from cases import contact_block
+from runs import moving, same_bits, simulate, simulator, state_of, tensor_of
+
+import torchpd as pd
+from torchpd.state import Info
+
+pytestmark = pytest.mark.usefixtures("poisoned")
+
+
+def test_step_in_place_is_the_step(dtype: torch.dtype, device: torch.device) -> None:
+    for batch in (1, 3, 9):
+        sim = simulate(dtype, device)
+        state = moving(sim, batch)
+        forces = 0.1 * state.velocities
+        expected, info = sim(state, forces, start="inertial", return_info=True)
+        rows = torch.full((batch, 6), float("nan"), dtype=torch.float64, device=device)
+        addresses = [t.data_ptr() for t in state]
+        sim.step_(state, forces, start="inertial", info=rows)
+        assert same_bits(state, expected)
+        assert [t.data_ptr() for t in state] == addresses
+        assert all(torch.equal(one, other) for one, other in zip(Info.from_rows(rows), info, strict=True))
+
+
+@pytest.mark.parametrize("batch", [1, 9])
+def test_rollout_is_repeated_steps(batch: int, dtype: torch.dtype, device: torch.device) -> None:
+    sim = simulate(dtype, device)
+    state = moving(sim, batch)
+    forces = 0.1 * state.velocities.flip(0)
+    track = sim.rollout(state, 7, 2, forces=forces, return_info=True)
+    assert track.positions.shape == (3, batch, sim.vertices, 3)
+    for step in range(6):
+        state, info = sim(state, forces, return_info=True)
+        if step % 2 == 1:
+            assert same_bits(track.state(step // 2), state)
+            columns = [column[step // 2] for column in track.info]
+            assert all(torch.equal(one, other) for one, other in zip(columns, info, strict=True))
+
+
+def test_progress_and_functions_change_no_bit(
+    dtype: torch.dtype, device: torch.device, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sim = simulate(dtype, device)
+    state = moving(sim)
+    forces = 0.1 * state.velocities
+    for steps, every in ((23, 1), (230, 3)):
+        quiet = sim.rollout(state, steps, every, forces=forces, return_info=True)
+        assert capsys.readouterr().err == ""
+        shown = sim.rollout(state, steps, every, forces=forces, return_info=True, progress=True)
+        assert "simulating" in capsys.readouterr().err
+        called = sim.rollout(state, steps, every, forces=lambda _: forces, return_info=True)
+        for other in (shown, called):
+            assert same_bits(other, quiet)
+            assert all(torch.equal(a, b) for a, b in zip(other.info, quiet.info, strict=True))
+
+
+def test_forces_and_targets_as_functions_of_the_step(dtype: torch.dtype, device: torch.device) -> None:
+    sim = simulate(dtype, device)
+    pin = sim.scene.pins[0]
+    held = tensor_of(sim.scene.values().pin_targets[sim.scene.pin_range(pin)], sim)
+    state = moving(sim)
+    push = 0.1 * state.velocities
+
+    def forces(step: int) -> torch.Tensor:
+        return push * step
+
+    def targets(step: int) -> dict[pd.Pin, torch.Tensor]:
+        return {pin: held + 0.001 * (step + 1)}
+
+    track = sim.rollout(state, 6, 3, forces=forces, targets=targets)
+    for step in range(6):
+        state = sim(state, forces(step), targets(step))
+        if step % 3 == 2:
+            assert same_bits(track.state(step // 3), state)
+    # a hard pin is where it was told to be: x + (target - x), one rounding
+    error = (track.positions[-1][:, pin.vertices] - (held + 0.006)).abs().max()
+    assert float(error) <= 2 * torch.finfo(dtype).eps
+
+
+def test_moving_sphere_drags_in_a_rollout(dtype: torch.dtype, device: torch.device) -> None:
+    """Centres given step by step carry the velocity between them; it moves what sticks, and a still centre does not."""
+    ball = pd.Sphere((0.15, -1.0, 0.15), 1.0, friction=20.0)
+    case = contact_block(ball, pd.Damping(5.0))
+    sim = simulator(case, dtype, device, iterations=30)
+    start = tensor_of(np.array([0.15, -1.0, 0.15]), sim)
+    shift = tensor_of(np.array([0.002, 0.0, 0.0]), sim)
+    settled = sim.rollout(state_of(case, sim), 60, 60).state()
+    moved = sim.rollout(settled, 10, targets=lambda step: {ball: start + shift * (step + 1)}).state()
+    still = sim.rollout(settled, 10, targets=lambda step: {ball: start}).state()
+    went, stayed = ((after.positions - settled.positions)[..., 0].mean() for after in (moved, still))
+    # ten steps of 2 mm on a soft block that lags behind at first
+    assert 0.01 < float(went) < 0.021
+    assert abs(float(stayed)) < 1e-3
+    # constant targets with a velocity: the ball goes on by itself within one rollout
+    target = torch.cat([start + shift, shift / sim.time_step])
+    own = sim.rollout(settled, 10, targets={ball: target}).state()
+    # the centres agree up to ten roundings, friction keeps the rest together
+    assert float((own.positions - moved.positions).abs().max()) <= 1e4 * torch.finfo(dtype).eps
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
+@pytest.mark.parametrize("batch", [3, 9])
+def test_a_broken_environment_breaks_alone(value: float, batch: int, dtype: torch.dtype, device: torch.device) -> None:
+    sim = simulate(dtype, device)
+    clean = moving(sim, batch)
+    sick = pd.State(clean.positions.clone(), clean.velocities.clone())
+    sick.positions[1, 20, 1] = value
+    others = [item for item in range(batch) if item != 1]
+    expected, found = (sim.rollout(state, 3, return_info=True) for state in (clean, sick))
+    for one, other in zip([*found[:2], *found.info], [*expected[:2], *expected.info], strict=True):
+        assert torch.equal(one[:, others], other[:, others])
+    if not np.isfinite(value):
+        assert not bool(found.positions[-1, 1].isfinite().all())

@@ -1,0 +1,92 @@
+"""The simulator as a module: precision, material, state_dict, copies."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cases import box
+from runs import moving, same_bits, simulate
+
+import torchpd as pd
+
+pytestmark = pytest.mark.usefixtures("poisoned")
+
+
+@pytest.mark.parametrize("target", [torch.float64, torch.float32])
+def test_precision_can_be_changed(target: torch.dtype, device: torch.device) -> None:
+    """After .to(dtype) it is the simulator that would have been compiled so: no digit of float32 is left in it."""
+    source = torch.float32 if target == torch.float64 else torch.float64
+    moved, fresh = simulate(source, device).to(target), simulate(target, device)
+    assert moved.dtype == moved.rest_positions.dtype == target
+    for name, one, other in zip([*range(len(fresh.plan.arrays))], moved.plan.arrays, fresh.plan.arrays, strict=True):
+        assert one.dtype == other.dtype, name
+        assert torch.equal(one, other), name
+    assert torch.equal(moved.rest_positions, fresh.rest_positions)
+    moved.load_state_dict(fresh.state_dict())
+    state = moving(fresh)
+    assert same_bits(moved(state), fresh(state))
+
+
+def test_integer_arrays_survive_every_conversion() -> None:
+    sim = simulate(torch.float32)
+    kinds = [array.dtype for array in sim.plan.arrays]
+    assert [array.dtype for array in sim.double().float().to("cpu").plan.arrays] == kinds
+
+
+def test_state_dict_restores_the_material(dtype: torch.dtype, device: torch.device) -> None:
+    trained = simulate(dtype, device)
+    trained.set_material(stiffness=trained.stiffness * 0.3, gravity=torch.tensor([0.0, 1.0, 0.0]), damping=2.0)
+    other = simulate(dtype, device)
+    state = moving(other)
+    assert not same_bits(trained(state), other(state))
+    other.load_state_dict(copy.deepcopy(trained.state_dict()))
+    assert same_bits(trained(state), other(state))
+    assert set(trained.state_dict()) == {
+        "stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets", "planes", "spheres",
+    }  # fmt: skip
+
+
+def test_copies_are_independent(dtype: torch.dtype) -> None:
+    sim = simulate(dtype)
+    state = moving(sim)
+    twin, before = copy.deepcopy(sim), sim(state)
+    twin.set_material(stiffness=1e3)
+    assert same_bits(sim(state), before)
+    assert not same_bits(twin(state), before)
+
+
+def test_parameters_are_there_to_be_trained_on_request() -> None:
+    sim = simulate(torch.float64)
+    assert all(not parameter.requires_grad for parameter in sim.parameters())
+    sim.stiffness.requires_grad_()
+    sim.set_material(stiffness=2e4)
+    assert sim.stiffness.requires_grad
+    assert sim.stiffness.is_leaf
+    (slope,) = torch.autograd.grad(sim.energy(moving(sim).positions * 1.1).sum(), sim.stiffness)
+    assert float(slope.abs().max()) > 0.0
+
+
+def test_set_material_is_the_scene_of_those_values(dtype: torch.dtype, device: torch.device) -> None:
+    """Every value of a scene set afterwards gives the bits of the scene that had it from the start."""
+    vertices, tets = box((0.3, 0.2, 0.2), (3, 2, 2))
+    youngs = np.random.default_rng(0).uniform(1e4, 1e5, len(tets))
+
+    def build(e: Any, rho: float, g: float, rate: float, k: float, mu: float, r: float) -> pd.Simulator:
+        body = pd.Solid(pd.TetMesh(vertices, tets), e, rho)
+        parts = pd.Pin(body, [0, 1], k), pd.Gravity((0.0, g, 0.0)), pd.Damping(rate), pd.Ground(-0.01, friction=mu)
+        scene = pd.Scene(body, *parts, pd.Sphere((0.3, -0.2, 0.1), r))
+        return pd.Simulator(scene, 1 / 60, 10, dtype=dtype).to(device)
+
+    wanted = build(youngs, 700.0, -3.0, 4.0, 2e3, 0.1, 0.21)
+    sim = build(1e5, 1000.0, -9.8, 1.0, 1e3, 0.9, 0.1)
+    state = moving(sim)
+    assert not same_bits(sim(state), wanted(state))
+    sim.set_material(**{name: getattr(wanted, name) for name in wanted.state_dict()})
+    assert same_bits(sim(state), wanted(state))
+    sim.set_material(stiffness=5e4, damping=0.5)
+    assert torch.equal(sim.stiffness, torch.full_like(sim.stiffness, 5e4))
+    assert sim.damping.shape == ()

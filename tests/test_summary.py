@@ -1,0 +1,79 @@
+"""What is not in the scene is not listed, costs no bytes and changes no bits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from cases import Case, box
+from runs import moving, same_bits, simulator
+
+import torchpd as pd
+
+pytestmark = pytest.mark.usefixtures("poisoned")
+
+
+WORDS = ("hard pins", "soft pins", "gravity", "damping", "grounds", "spheres")
+
+
+def bare(*parts: Any) -> Case:
+    vertices, tets = box((0.3, 0.2, 0.2), (3, 2, 2))
+    body = pd.Solid(pd.TetMesh(vertices, tets), 1e5)
+    built = [part(body) if callable(part) else part for part in parts]
+    return Case(pd.Scene(body, *built), vertices, 0.0 * vertices, 1 / 60)
+
+
+def test_print_lists_only_what_is_in_the_scene() -> None:
+    effects = {
+        "hard pins": lambda body: pd.Pin(body, [0]),
+        "soft pins": lambda body: pd.Pin(body, [0], 1e3),
+        "gravity": pd.Gravity(),
+        "damping": pd.Damping(1.0),
+        "grounds": pd.Ground(),
+        "spheres": pd.Sphere((0, -1, 0), 0.5),
+    }
+    assert set(effects) == set(WORDS)
+    for name, effect in effects.items():
+        text = str(simulator(bare(effect), torch.float32))
+        assert [word for word in WORDS if f"{word}:" in text] == [name]
+    text = str(simulator(bare(), torch.float32, iterations=17, tolerance=1e-3))
+    assert not [word for word in WORDS if f"{word}:" in text]
+    for fact in (
+        "36 vertices",
+        "72 tetrahedra",
+        "at most 17 iterations",
+        "Chebyshev guarded",
+        "tolerance 0.001",
+        "weighted diagonal",
+    ):
+        assert fact in text, fact
+
+
+def test_absent_effects_add_no_bytes(dtype: torch.dtype) -> None:
+    def size(case: Case) -> tuple[int, int]:
+        sim = simulator(case, dtype)
+        return sim.plan.bytes, sum(array.numel() for array in sim.material())
+
+    plan, material = size(bare())
+    # 72 moduli, 36 masses, gravity, damping: nothing for pins and contacts
+    assert material == 72 + 36 + 3 + 1
+    assert size(bare(pd.Gravity(), pd.Damping(1.0))) == (plan, material)
+    assert size(bare(pd.Ground())) == (plan, material + 5)
+    assert size(bare(pd.Sphere((0, -1, 0), 0.5))) == (plan, material + 8)
+    # a pinned piece is no longer free: its entry in group_size turns into the number of the pin
+    assert size(bare(lambda body: pd.Pin(body, [0]))) == (plan, material + 4)
+
+
+def test_absent_effects_change_no_bits(dtype: torch.dtype, device: torch.device) -> None:
+    """An effect without strength or out of reach gives the bits of a scene that never had it."""
+    plain = simulator(bare(), dtype, device, iterations=9)
+    state = moving(plain)
+    expected = plain(state)
+    for effect in (
+        pd.Gravity((0, 0, 0)),
+        pd.Damping(0.0),
+        pd.Ground(-100.0, friction=0.0),
+        pd.Sphere((0, -100, 0), 1.0),
+    ):
+        assert same_bits(simulator(bare(effect), dtype, device, iterations=9)(state), expected), effect

@@ -1,0 +1,57 @@
+"""The arrays that training may change: how they start, and what they must be."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .scene import SceneValues
+from .tables import MATERIAL_TABLE
+
+__all__ = ["MATERIAL_ROWS", "check_material", "material_of"]
+
+MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
+
+_UNIT_SLACK = 1e-4  # of the length of a plane's normal: float32 rounding and a training step's
+
+
+def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
+    """The arrays of a scene in the precision of the simulation, checked after rounding to it."""
+    spheres = np.pad(values.spheres, ((0, 0), (0, 3)))  # at rest
+    material = {
+        name: torch.tensor(spheres if name == "spheres" else getattr(values, name), dtype=dtype)
+        for name in MATERIAL_ROWS
+    }
+    soft = torch.isfinite(torch.from_numpy(values.pin_stiffness.copy()))
+    if not bool(torch.isfinite(material["pin_stiffness"])[soft].all()):
+        raise ValueError(
+            f"Pin.stiffness: a spring is too stiff for {dtype}; leave stiffness out to hold vertices exactly"
+        )
+    for name, tensor in material.items():
+        check_material(name, tensor)
+    return material
+
+
+def _require(good: Tensor, name: str, contract: str, tensor: Tensor) -> None:
+    if not bool(good.all()):
+        raise ValueError(f"{name} must be {contract} in {tensor.dtype}")
+
+
+def check_material(name: str, tensor: Tensor) -> None:
+    """Refuse values that no step can work with; shapes are the caller's to check."""
+    if name == "pin_stiffness":
+        _require(tensor > 0, name, "positive, inf for pins that hold exactly,", tensor)
+        return
+    _require(tensor.isfinite(), name, "finite", tensor)
+    if name in ("stiffness", "masses"):
+        _require(tensor > 0, name, "positive", tensor)
+    elif name == "damping":
+        _require(tensor >= 0, name, ">= 0", tensor)
+    elif name == "planes":
+        lengths = tensor[..., :3].norm(dim=-1)
+        _require((lengths - 1).abs() <= _UNIT_SLACK, "planes: the normal (columns 0 to 2)", "of unit length", tensor)
+        _require(tensor[..., 4] >= 0, "planes: friction (column 4)", ">= 0", tensor)
+    elif name == "spheres":
+        _require(tensor[..., 3] > 0, "spheres: the radius (column 3)", "positive", tensor)
+        _require(tensor[..., 4] >= 0, "spheres: friction (column 4)", ">= 0", tensor)

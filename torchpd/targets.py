@@ -1,0 +1,93 @@
+"""Where pins and spheres are to be at the end of a step, as rows of the material."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .effects import Sphere
+from .scene import Scene
+
+__all__ = ["Anchors", "Targets"]
+
+Targets = Tensor | Mapping[Any, Tensor]
+
+
+def _overwrite(array: Tensor, rows: slice, value: Tensor) -> Tensor:
+    """`array` [.., n, k] with some rows replaced, batched when either is."""
+    lead = torch.broadcast_shapes(array.shape[:-2], value.shape[:-2])
+    parts = (array[..., : rows.start, :], value, array[..., rows.stop :, :])
+    return torch.cat([part.expand(*lead, *part.shape[-2:]) for part in parts], dim=-2)
+
+
+class Anchors:
+    """The pins and spheres of a scene, found by identity: parts hold arrays, which torch.compile cannot hash."""
+
+    def __init__(self, scene: Scene, time_step: float) -> None:
+        self.time_step = time_step
+        self.pins = {id(pin): scene.pin_range(pin) for pin in scene.pins}
+        self.spheres = {id(sphere): number for number, sphere in enumerate(scene.spheres)}
+        self.pinned = sum(len(pin.vertices) for pin in scene.pins)
+
+    def place(self, targets: Targets | None, pins: Tensor, spheres: Tensor, batch: int) -> tuple[Tensor, Tensor]:
+        """`pin_targets` [.., P, 3] and `spheres` [.., S, 8] where `targets` puts them."""
+        if targets is None:
+            return pins, spheres
+        if isinstance(targets, Tensor):
+            return self._checked("targets", targets, batch, self.pinned, (3,), pins), spheres
+        for part, value in targets.items():
+            if id(part) in self.pins:
+                rows = self.pins[id(part)]
+                value = self._checked("targets of a Pin", value, batch, rows.stop - rows.start, (3,), pins)
+                pins = _overwrite(pins, rows, value)
+            elif id(part) in self.spheres:
+                number = self.spheres[id(part)]
+                value = self._checked("targets of a Sphere", value.unsqueeze(-2), batch, 1, (3, 6), spheres)
+                spheres = _overwrite(spheres, slice(number, number + 1), self._row(spheres, number, value))
+            else:
+                raise KeyError(f"targets: this {type(part).__name__} is not a Pin or Sphere of the scene")
+        return pins, spheres
+
+    def _checked(
+        self, name: str, value: Tensor, batch: int, rows: int, widths: tuple[int, ...], like: Tensor
+    ) -> Tensor:
+        shape = tuple(value.shape)
+        if shape[-2:-1] != (rows,) or shape[-1] not in widths or shape[:-2] not in ((), (1,), (batch,)):
+            lead = "" if "Sphere" in name else f"{rows}, "
+            wanted = " or ".join(f"[{lead}{width}]" for width in widths)
+            raise ValueError(f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(shape)}")
+        if value.dtype != like.dtype or value.device != like.device:
+            raise TypeError(f"{name} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}")
+        return value
+
+    def _row(self, spheres: Tensor, number: int, value: Tensor) -> Tensor:
+        """Centre at the end of the step, radius, friction, motion during the step."""
+        own = spheres[..., number : number + 1, 3:5]
+        motion = value[..., 3:] * self.time_step if value.shape[-1] == 6 else torch.zeros_like(value)
+        lead = torch.broadcast_shapes(own.shape[:-1], value.shape[:-1])
+        return torch.cat([value[..., :3].expand(*lead, 3), own.expand(*lead, 2), motion.expand(*lead, 3)], dim=-1)
+
+    def with_velocities(
+        self, targets: Mapping[Any, Tensor], last: dict[int, Tensor]
+    ) -> tuple[dict[Any, Tensor], dict[int, Tensor]]:
+        """Adds to the centres of spheres how fast they came there since the last step."""
+        filled, last = dict(targets), dict(last)
+        for part, value in targets.items():
+            if isinstance(part, Sphere) and id(part) in last and value.shape[-1] == 3:
+                velocity = (value - last[id(part)]) / self.time_step
+                filled[part] = torch.cat([value.expand(velocity.shape), velocity], dim=-1)
+                last[id(part)] = value
+        return filled, last
+
+    @staticmethod
+    def moved_on(spheres: Tensor, steps: int) -> Tensor:
+        """Spheres after some steps of constant motion, added up as the kernels do."""
+        if spheres.shape[-2] == 0 or not bool(spheres[..., 5:].any()):
+            return spheres
+        centre = spheres[..., :3]
+        for _ in range(steps):
+            centre = centre + spheres[..., 5:]
+        return torch.cat([centre, spheres[..., 3:]], dim=-1)
