@@ -35,9 +35,9 @@ void check_mesh(const Doubles& positions, const Indices& tets) {
     if (t[i] < 0 || t[i] >= count)
       throw py::index_error("tets refer to vertices that positions does not have");
   }
-  // numbers are 32-bit, with 144 of them a block of 16
-  if (tets.shape(0) > (std::int64_t(1) << 30) || count > (std::int64_t(1) << 30)) {
-    throw py::value_error("a mesh may have up to 2^30 vertices and tetrahedra");
+  // slots, up to four a tetrahedron, are counted in 32 bits
+  if (tets.shape(0) > (std::int64_t(1) << 28) || count > (std::int64_t(1) << 28)) {
+    throw py::value_error("a mesh may have up to 2^28 vertices and tetrahedra");
   }
 }
 

@@ -132,6 +132,8 @@ void step_inplace(const Tensor& positions, const Tensor& velocities, const Tenso
                   delay,    weighted,   tolerance, inertial,   report};
   TORCH_CHECK_VALUE(positions.is_contiguous() && velocities.is_contiguous(),
                     "step_: positions and velocities must be contiguous");
+  TORCH_CHECK_VALUE(!positions.is_alias_of(velocities),
+                    "step_: positions and velocities must not share memory");
   TORCH_CHECK_VALUE(info.scalar_type() == at::kDouble && info.is_contiguous() && info.dim() == 2 &&
                         info.size(0) == positions.size(0) && info.size(1) == info_count,
                     "info must be a contiguous float64 [", positions.size(0), ", ", int(info_count),

@@ -111,6 +111,89 @@ def test_resting_contact() -> None:
     check(weighted_loss(sim, state, torch.zeros_like(state[0])), state.velocities)
 
 
+@pytest.mark.parametrize("center, radius", [((0.5, -0.04, 0.1), 0.05), ((0.5, -0.29, 0.1), 0.3)])
+def test_contact_with_a_ball(center: tuple[float, float, float], radius: float) -> None:
+    # the surface curves away under a vertex that slides: without that term the first of these is 20 % off
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (4, 2, 2))
+    scene = pd.Scene(pd.Solid(mesh, youngs=1e5), pd.Gravity(), pd.Sphere(center, radius))
+    sim = pd.Simulator(scene, 1 / 30, 4000, dtype=torch.float64)
+    state = sim.rest_state()
+    generator = torch.Generator().manual_seed(0)
+    state = pd.State(state.positions, 0.05 * torch.randn(state[0].shape, generator=generator, dtype=torch.float64))
+    state = pd.State(state.positions, state.velocities - torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64))
+    check(weighted_loss(sim, state, torch.zeros_like(state[0])), state.velocities)
+
+
+@pytest.mark.parametrize("gap", [1e-5, 5e-5])
+def test_near_a_contact_is_not_in_it(gap: float) -> None:
+    # a free body that is moved moves with it: d(sum of y') / d(translation in y) is the number of vertices
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (4, 2, 2)).translated((0.0, gap, 0.0))
+    sim = pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e4), pd.Ground()), 1 / 60, 300, dtype=torch.float64)
+    state = sim.rest_state()
+    x = state.positions.requires_grad_()
+    (gradient,) = torch.autograd.grad(sim(pd.State(x, state.velocities)).positions[..., 1].sum(), x)
+    assert float(gradient[..., 1].sum()) == pytest.approx(len(mesh.vertices), rel=1e-9)
+
+
+def test_friction_that_holds() -> None:
+    # vertices that stick move with the start of the step along the ground
+    mesh = pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2))
+    scene = pd.Scene(pd.Solid(mesh, youngs=2e4), pd.Gravity(), pd.Ground(friction=2.0))
+    sim = pd.Simulator(scene, 1 / 60, 4000, dtype=torch.float64)
+    state = sim.rest_state()
+    x = state.positions.requires_grad_()
+    moved = torch.zeros_like(x)
+    moved[..., 0] = 1.0
+    (gradient,) = torch.autograd.grad(sim(pd.State(x, state.velocities)).positions[..., 0].sum(), x)
+    assert float((gradient * moved).sum()) == pytest.approx(len(mesh.vertices), rel=1e-6)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_rollout_op_against_single_steps(moving: bool) -> None:
+    # the op's derivative goes backwards through its records; a moving ball must be where it was at each step
+    ball = pd.Sphere((0.5, -0.29, 0.1), 0.3)
+    sim, state = body(ball)
+    here = torch.tensor([0.5, -0.29, 0.1, 0.0, 0.3 if moving else 0.0, 0.0], dtype=torch.float64)
+    x = state.positions.clone().requires_grad_()
+    track = sim.rollout(pd.State(x, state.velocities), 3, targets={ball: here})
+    (gradient,) = torch.autograd.grad(track.positions.square().sum(), x)
+    after, total = pd.State(x, state.velocities), torch.zeros((), dtype=torch.float64)
+    for step in range(3):
+        there = torch.cat([here[:3] + step * here[3:] / 30, here[3:]])
+        after = sim(after, targets={ball: there})
+        total = total + after.positions.square().sum()
+    (expected,) = torch.autograd.grad(total, x)
+    assert torch.allclose(gradient, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+
+
+def test_forward_mode_is_refused() -> None:
+    sim, state = body(iterations=10)
+    for function in (
+        lambda x: sim(pd.State(x, state.velocities)).positions,
+        lambda x: sim.rollout(pd.State(x, state.velocities), 2).positions,
+        lambda x: sim.energy(x),
+    ):
+        with pytest.raises(RuntimeError, match="forward-mode"):
+            torch.func.jvp(function, (state.positions,), (torch.ones_like(state.positions),))
+    F = torch.eye(3, dtype=torch.float64)
+    with pytest.raises(RuntimeError, match="forward-mode"):
+        torch.func.jvp(pd.nearest_rotation, (F,), (F,))
+
+
+def test_info_is_no_function_to_differentiate() -> None:
+    sim, state = body(iterations=10)
+    _, info = sim(pd.State(state.positions.clone().requires_grad_(), state.velocities), return_info=True)
+    assert not info.energy.requires_grad
+
+
+def test_step_gradient_vanishes_at_the_solution() -> None:
+    sim, state = body()
+    forces = torch.randn(state[0].shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    solved = sim.step_gradient(state, sim(state, forces), forces).norm()
+    course = sim.step_gradient(state, state.positions + sim.time_step * state.velocities, forces).norm()
+    assert float(solved) <= 1e-12 * float(course)  # 600 iterations leave rounding only
+
+
 def test_rollout_is_differentiable() -> None:
     sim, state = body()
     sim.stiffness.requires_grad_()

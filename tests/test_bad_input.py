@@ -139,7 +139,11 @@ def test_material_is_checked(sim: pd.Simulator) -> None:
         ("pin_targets", sim.pin_targets.T, r"material\.pin_targets must be (contiguous|\[3, 3\])"),
         ("planes", sim.planes[:, :4].contiguous(), r"material\.planes must be \[1, 5\]"),
         ("spheres", sim.spheres[0], r"material\.spheres must have 2 dimensions, or 3 with a batch"),
-        ("stiffness", sim.stiffness[: len(sim.stiffness) // 2], r"stiffness must be \[48\] or \[batch, 48\], one value per tetrahedron"),
+        (
+            "stiffness",
+            sim.stiffness[: len(sim.stiffness) // 2],
+            r"stiffness must be \[48\] or \[batch, 48\], one value per tetrahedron",
+        ),
     ]
     for name, value, message in wrong:
         with pytest.raises((TypeError, ValueError), match=message):

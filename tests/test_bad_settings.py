@@ -54,8 +54,8 @@ def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
         ({pin: torch.zeros(1, 3)}, ValueError, r"targets of a Pin must be \[2, 3\]"),
         ({soft: torch.zeros(3)}, ValueError, r"targets of a Pin must be \[1, 3\]"),
         ({sphere: torch.zeros(4)}, ValueError, r"targets of a Sphere must be \[3\] or \[6\]"),
-        ({pd.Sphere((0, 0, 0), 1.0): torch.zeros(3)}, KeyError, r"Sphere is not a Pin or Sphere of this scene"),
-        ({sim.scene.solids[0]: torch.zeros(3)}, KeyError, r"Solid is not a Pin or Sphere of this scene"),
+        ({pd.Sphere((0, 0, 0), 1.0): torch.zeros(3)}, KeyError, r"this Sphere is not a Pin or Sphere of the scene"),
+        ({sim.scene.solids[0]: torch.zeros(3)}, KeyError, r"this Solid is not a Pin or Sphere of the scene"),
     ]
     for target, kind, message in targets:
         with pytest.raises(kind, match=message):
@@ -80,13 +80,21 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
     for arrays, kind, message in (
         ({"youngs": 1e5}, TypeError, r"no array 'youngs'; there are stiffness, masses"),
         ({"stiffness": torch.ones(3)}, ValueError, r"stiffness must be \[48\], or with a batch in front, got \[3\]"),
-        ({"stiffness": 0.0}, ValueError, "stiffness must be positive"),
-        ({"stiffness": math.inf}, ValueError, "stiffness must be positive"),
+        ({"stiffness": 0.0}, ValueError, "stiffness must be positive in torch.float32"),
+        ({"stiffness": 1e-60}, ValueError, "stiffness must be positive in torch.float32"),
+        ({"stiffness": math.inf}, ValueError, "stiffness must be finite"),
         ({"masses": -1.0}, ValueError, "masses must be positive"),
-        ({"masses": math.nan}, ValueError, "masses must be positive"),
-        ({"pin_stiffness": 0.0}, ValueError, "pin_stiffness must be positive"),
+        ({"masses": math.nan}, ValueError, "masses must be finite"),
+        ({"pin_stiffness": 0.0}, ValueError, "pin_stiffness must be positive, inf for pins that hold exactly"),
         ({"gravity": math.nan}, ValueError, "gravity must be finite"),
         ({"damping": -1.0}, ValueError, "damping must be >= 0"),
+        (
+            {"planes": torch.tensor([[0.0, 2.0, 0.0, 0.0, 0.0]])},
+            ValueError,
+            r"planes: the normal .* must be of unit length",
+        ),
+        ({"planes": torch.tensor([[0.0, 1.0, 0.0, 0.0, -1.0]])}, ValueError, r"planes: friction .* must be >= 0"),
+        ({"spheres": torch.zeros(1, 8)}, ValueError, r"spheres: the radius .* must be positive"),
     ):
         with pytest.raises(kind, match=message):
             sim.set_material(**arrays)  # type: ignore[arg-type]

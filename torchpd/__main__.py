@@ -70,20 +70,23 @@ def _demo(arguments: argparse.Namespace) -> str:
     return run_demo(DemoOptions(**{name: value for name, value in options.items() if name != "command"}))
 
 
-def _doctor() -> str:
-    from .doctor import report
+def _doctor() -> int:
+    from .doctor import problems, report
 
-    return report()
+    print(report())
+    return 1 if problems() else 0
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run one command; 0, or 2 after a sentence on what is wrong with the request, or 130 when interrupted."""
+    """Run one command; 0, 1 when the doctor finds a problem, 2 after a sentence on a bad request, 130 interrupted."""
     arguments = _parser().parse_args(words)
     try:
         with warnings.catch_warnings():
             # what was repaired in a mesh is news for the user, not for a developer: no file and line
             warnings.showwarning = lambda message, *_, **__: print(f"note: {message}", file=sys.stderr)
-            print(_demo(arguments) if arguments.command == "demo" else _doctor())
+            if arguments.command == "doctor":
+                return _doctor()
+            print(_demo(arguments))
     except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
         print(f"torchpd: {_one_line(error)}", file=sys.stderr)
         return 2

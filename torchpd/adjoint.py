@@ -24,12 +24,12 @@ from torch import Tensor
 from .diagonal import named_material, named_plan, pinned_vertices, step_diagonal
 from .tables import MATERIAL_TABLE
 
-__all__ = ["AdjointCall", "step_adjoint"]
+__all__ = ["AdjointCall", "step_adjoint", "step_gradient"]
 
 # Relative residual of the adjoint system at which the solve stops: near the rounding floor of each precision.
 _TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 _MOST_ITERATIONS = 2000
-_TOUCHING = 1e-4  # of a vertex's displacement scale: how near a contact counts as held
+_STICKING = 1e-3  # of what friction could take back: slip below it counts as none
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class AdjointCall:
 
     positions: Tensor  # x [B, V, 3]
     velocities: Tensor  # v
+    forces: Tensor | None
     after: Tensor  # x'
     material: list[Tensor]
     plan: list[Tensor]
@@ -77,44 +78,120 @@ def conjugate_gradients(
     return solution, _dot(residual, residual).sqrt() / torch.where(scale > 0, scale, torch.ones_like(scale))
 
 
-def _plane_normals(material: dict[str, Tensor], x: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """(normal, gap, friction) of every contact at positions x: broadcastable to [B, V, 3], [B, V], [B, V]."""
+@dataclass(frozen=True)
+class _Held:
+    """What contacts do to the vertices of a solved step."""
+
+    projector: Tensor  # off the normals that hold a vertex [B, V, 3, 3]
+    stuck: Tensor  # bool [B, V, 1]: friction holds it
+    curvature: Tensor  # of the surface it slides on, times the push [B, V, 1] N/m
+
+    def off_normals(self, field: Tensor) -> Tensor:
+        """The part of a field [B, V, 3] that contacts let through."""
+        return (self.projector @ field.unsqueeze(-1)).squeeze(-1)
+
+
+def _surfaces(material: dict[str, Tensor], x: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
+    """(normal, gap, friction, motion, curvature) of every contact at positions x [B, V, 3]."""
     found = []
     for plane in material["planes"].unbind(-2):
         normal, height, friction = plane[..., None, :3], plane[..., None, 3], plane[..., None, 4]
-        found.append((normal.expand_as(x), (x * normal).sum(-1) - height, friction))
+        rest = torch.zeros_like(x)
+        found.append((normal.expand_as(x), (x * normal).sum(-1) - height, friction, rest, rest[..., 0]))
     for ball in material["spheres"].unbind(-2):
         offset = x - ball[..., None, :3]
-        length = offset.norm(dim=-1)
-        normal = offset / length.clamp_min(torch.finfo(x.dtype).tiny).unsqueeze(-1)
-        found.append((normal, length - ball[..., None, 3], ball[..., None, 4]))
+        length = offset.norm(dim=-1).clamp_min(torch.finfo(x.dtype).tiny)
+        motion = ball[..., None, 5:].expand_as(x)
+        normal = offset / length.unsqueeze(-1)
+        found.append((normal, length - ball[..., None, 3], ball[..., None, 4], motion, 1 / length))
     return found
 
 
-def _held_by_contacts(call: AdjointCall, residual: Tensor) -> tuple[Tensor, Tensor]:
-    """Projector off the normals that hold a vertex [B, V, 3, 3], and which vertices friction holds [B, V]."""
-    material = named_material(call.material)
-    identity = torch.eye(3, dtype=residual.dtype, device=residual.device)
-    projector = identity.expand(*residual.shape, 3)
-    stuck = residual.new_zeros(residual.shape[:2], dtype=torch.bool)
+def _held_by_contacts(call: AdjointCall, residual: Tensor, diagonal: Tensor) -> _Held:
+    """A contact holds a vertex when one unaccelerated iteration, x' - r / D, would end inside it."""
+    projector = torch.eye(3, dtype=residual.dtype, device=residual.device).expand(*residual.shape, 3)
+    stuck = torch.zeros_like(residual[..., 0], dtype=torch.bool)
+    total = torch.zeros_like(residual[..., 0])
     moved = call.after - call.positions
-    extent = (call.positions.amax((1, 2)) - call.positions.amin((1, 2))).unsqueeze(-1)
-    for normal, gap, friction in _plane_normals(material, call.after):
+    for normal, gap, friction, motion, curvature in _surfaces(named_material(call.material), call.after):
         push = (residual * normal).sum(-1)
-        holds = (gap.abs() <= _TOUCHING * extent) & (push > 0)
-        # a push larger than what the tangential residual needs: Coulomb's cone is not reached
-        tangential = (residual - push.unsqueeze(-1) * normal).norm(dim=-1)
-        slip = (moved - (moved * normal).sum(-1, keepdim=True) * normal).norm(dim=-1)
-        sticks = holds & (friction > 0) & (tangential <= friction * push) & (slip <= _TOUCHING * extent)
+        holds = (push > 0) & (gap < push / diagonal.squeeze(-1))
+        slip = moved - motion
+        slip = (slip - (slip * normal).sum(-1, keepdim=True) * normal).norm(dim=-1)
+        # what friction can take back in one iteration is more than what has slipped
+        stuck = stuck | (holds & (friction > 0) & (slip * diagonal.squeeze(-1) < _STICKING * friction * push))
         outer = normal.unsqueeze(-1) * normal.unsqueeze(-2)
         projector = torch.where(holds[..., None, None], projector - outer @ projector, projector)
-        stuck = stuck | sticks
-    return projector, stuck
+        total = total + torch.where(holds, push * curvature, torch.zeros_like(push))
+    return _Held(projector, stuck.unsqueeze(-1), total.unsqueeze(-1))
 
 
 def _reduce(gradient: Tensor, like: Tensor, dims: int) -> Tensor:
     """Sum over environments for an array that they share."""
     return gradient.sum(0) if like.dim() == dims else gradient.sum_to_size(like.shape)
+
+
+def _inertial(material: dict[str, Tensor], time_step: float) -> Tensor:
+    """m / h^2 (1 + damping h) [V, 1] or [B, V, 1]."""
+    damping = material["damping"].unsqueeze(-1).unsqueeze(-1)
+    return material["masses"].unsqueeze(-1) / time_step**2 * (1 + damping * time_step)
+
+
+def step_gradient(call: AdjointCall) -> Tensor:
+    """Gradient of the step's objective at `call.after` [B, V, 3] N; contacts do not enter, hard pins have none.
+
+    m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - forces + springs + elastic gradient.
+    """
+    material, plan = named_material(call.material), named_plan(call.plan)
+    masses, gravity = material["masses"].unsqueeze(-1), material["gravity"].unsqueeze(-2)
+    pull = masses * (call.velocities / call.time_step + gravity)
+    gradient = _inertial(material, call.time_step) * (call.after - call.positions) - pull
+    gradient = gradient + torch.ops.torchpd.gradient(call.after, material["stiffness"], call.plan)
+    pins = pinned_vertices(plan)
+    springs = material["pin_stiffness"].unsqueeze(-1)
+    hard = torch.isinf(springs)
+    pulled = torch.where(hard, 0.0, springs) * (call.after[:, pins] - material["pin_targets"])
+    gradient = gradient.index_add(1, pins, pulled.expand(len(gradient), -1, -1))
+    held = torch.zeros_like(gradient).index_add(1, pins, hard.to(gradient.dtype).expand(len(gradient), -1, 3))
+    gradient = gradient if call.forces is None else gradient - call.forces
+    return torch.where(held > 0, torch.zeros_like(gradient), gradient)
+
+
+def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
+    """The multiplier l of H l = dL/dx' on what moves, and what contacts hold."""
+    inertia, diagonal = (t.unsqueeze(-1) for t in step_diagonal(call.plan, call.material, call.time_step))
+    free = torch.isfinite(inertia)
+    inertia = torch.where(free, inertia, torch.zeros_like(inertia))
+    diagonal = torch.where(free, diagonal, torch.ones_like(diagonal)).expand(len(right), -1, -1)
+    material = named_material(call.material)
+    contacts = material["planes"].shape[-2] + material["spheres"].shape[-2] > 0
+    held = _held_by_contacts(call, step_gradient(call), diagonal) if contacts else None
+
+    def allowed(field: Tensor) -> Tensor:
+        moves = free if held is None else free & ~held.stuck
+        field = torch.where(moves, field, torch.zeros_like(field))
+        return field if held is None else held.off_normals(field)
+
+    def product(field: Tensor) -> Tensor:
+        image = inertia * field + _elastic_product(call, field)
+        return allowed(image if held is None else image - held.curvature * field)
+
+    tolerance = _TOLERANCE[right.dtype]
+    multiplier, error = conjugate_gradients(product, diagonal, allowed(right), tolerance)
+    worst = float(error.max()) if len(error) else 0.0
+    if not worst <= 1e3 * tolerance:
+        warnings.warn(
+            f"torchpd: the adjoint of a step was solved to a relative residual of {worst:.1e} only; the state is far "
+            "from an equilibrium (more iterations in the step help) or at an unstable one",
+            stacklevel=2,
+        )
+    return multiplier.contiguous(), held
+
+
+def _elastic_product(call: AdjointCall, field: Tensor) -> Tensor:
+    stiffness = named_material(call.material)["stiffness"]
+    result: Tensor = torch.ops.torchpd.hessian_product(call.after, field.contiguous(), stiffness, call.plan)
+    return result
 
 
 def step_adjoint(call: AdjointCall, grad_after: Tensor, grad_velocities: Tensor) -> list[Tensor]:
@@ -125,69 +202,33 @@ def step_adjoint(call: AdjointCall, grad_after: Tensor, grad_velocities: Tensor)
         grad_after: dL/dx' [B, V, 3].
         grad_velocities: dL/dv' [B, V, 3].
     """
-    ops = torch.ops.torchpd
-    h, x, v, after = call.time_step, call.positions, call.velocities, call.after
-    material, plan = named_material(call.material), named_plan(call.plan)
-    stiffness, masses = material["stiffness"], material["masses"].unsqueeze(-1)
-    gravity, damping = material["gravity"].unsqueeze(-2), material["damping"].unsqueeze(-1).unsqueeze(-1)
-    inertia, diagonal = (t.unsqueeze(-1) for t in step_diagonal(call.plan, call.material, h))
-    free = torch.isfinite(inertia)
-    inertia = torch.where(free, inertia, torch.zeros_like(inertia))
-    diagonal = torch.where(free, diagonal, torch.ones_like(diagonal)).expand(x.shape[0], -1, -1)
-
-    pins = pinned_vertices(plan)
-    springs = material["pin_stiffness"]
-    hard = torch.isinf(springs).unsqueeze(-1)
-    springs = torch.where(hard, torch.zeros_like(springs.unsqueeze(-1)), springs.unsqueeze(-1))
-    inertial = masses / h**2 * (1 + damping * h)
-    moved = after - x
-    residual = inertial * moved - masses * (v / h + gravity) + ops.gradient(after, stiffness, call.plan)
-    residual = residual.index_add(
-        1, pins, (springs * (after[:, pins] - material["pin_targets"])).expand(len(x), -1, -1)
-    )
-    contacts = material["planes"].shape[-2] + material["spheres"].shape[-2] > 0
-    projector, stuck = _held_by_contacts(call, residual) if contacts else (None, None)
-
-    def tangential(field: Tensor) -> Tensor:
-        return field if projector is None else (projector @ field.unsqueeze(-1)).squeeze(-1)
-
-    def allowed(field: Tensor) -> Tensor:
-        moves = free if stuck is None else free & ~stuck.unsqueeze(-1)
-        return tangential(torch.where(moves, field, torch.zeros_like(field)))
-
-    def hessian(field: Tensor) -> Tensor:
-        result: Tensor = inertia * field + ops.hessian_product(after, field.contiguous(), stiffness, call.plan)
-        return result
-
+    h, material, pins = call.time_step, named_material(call.material), pinned_vertices(named_plan(call.plan))
+    masses, inertial = material["masses"].unsqueeze(-1), _inertial(material, h)
     right = grad_after + grad_velocities / h
-    multiplier, error = conjugate_gradients(
-        lambda p: allowed(hessian(p)), diagonal, allowed(right), _TOLERANCE[x.dtype]
-    )
-    worst = float(error.max()) if len(error) else 0.0
-    if not worst <= 1e3 * _TOLERANCE[x.dtype]:
-        warnings.warn(
-            f"torchpd: the adjoint of a step was solved to a relative residual of {worst:.1e} only; the state is far "
-            "from an equilibrium (more iterations in the step help) or at an unstable one",
-            stacklevel=2,
-        )
+    multiplier, held = _solve(call, right)
 
-    multiplier = multiplier.contiguous()
-    passed_on = right - ops.hessian_product(after, multiplier, stiffness, call.plan)
-    grad_x = inertial * torch.where(free, multiplier, torch.zeros_like(multiplier)) - grad_velocities / h
-    if stuck is not None:
-        grad_x = grad_x + torch.where(stuck.unsqueeze(-1), tangential(passed_on), torch.zeros_like(right))
-    at_pins = multiplier[:, pins]
-    rate = moved / h
+    # what the vertices that are held would pass on: to the targets of pins, to the start of those that friction holds
+    passed_on = right - _elastic_product(call, multiplier)
+    grad_positions = inertial * multiplier - grad_velocities / h
+    if held is not None:
+        grad_positions = grad_positions + torch.where(held.stuck, held.off_normals(passed_on), 0.0)
+    springs = material["pin_stiffness"].unsqueeze(-1)
+    hard = torch.isinf(springs)
+    at_pins, stretch = multiplier[:, pins], call.after[:, pins] - material["pin_targets"]
+    rate = (call.after - call.positions) / h
+    pull = inertial / masses * h * rate - call.velocities / h - material["gravity"].unsqueeze(-2)
     by_name = {
-        "stiffness": -ops.element_energy_product(after, multiplier, torch.ones_like(stiffness), call.plan),
-        "masses": -(multiplier * ((1 + damping * h) * rate / h - v / h - gravity)).sum(-1),
+        "stiffness": -torch.ops.torchpd.element_energy_product(
+            call.after, multiplier, torch.ones_like(material["stiffness"]), call.plan
+        ),
+        "masses": -(multiplier * pull).sum(-1),
         "gravity": (masses * multiplier).sum(1),
         "damping": -(masses * multiplier * rate).sum((1, 2)),
-        "pin_stiffness": torch.where(hard, 0.0, -at_pins * (after[:, pins] - material["pin_targets"])).sum(-1),
-        "pin_targets": torch.where(hard, passed_on[:, pins], springs * at_pins),
+        "pin_stiffness": torch.where(hard, 0.0, -at_pins * stretch).sum(-1),
+        "pin_targets": torch.where(hard, passed_on[:, pins], torch.where(hard, 0.0, springs) * at_pins),
     }
     grads = [
         _reduce(by_name[row.name], array, row.dims) if row.name in by_name else torch.zeros_like(array)
         for row, array in zip(MATERIAL_TABLE, call.material, strict=True)
     ]
-    return [grad_x, masses / h * multiplier, multiplier, *grads]
+    return [grad_positions, masses / h * multiplier, multiplier, *grads]

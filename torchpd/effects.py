@@ -114,7 +114,10 @@ class Pin:
             check_shape("Pin.stiffness", springs, (len(chosen),), "a scalar or one value per pinned vertex [N/m]")
             check_finite("Pin.stiffness", springs)
             check_positive("Pin.stiffness", springs, unit="N/m")
-        _set(self, solid=solid, vertices=chosen.astype(np.int64), stiffness=springs)
+            springs.setflags(write=False)
+        chosen = chosen.astype(np.int64)
+        chosen.setflags(write=False)
+        _set(self, solid=solid, vertices=chosen, stiffness=springs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +134,8 @@ class Gravity:
 class Ground:
     """A plane that vertices cannot pass: normal . x >= height, with Coulomb friction.
 
+    Contacts act one after another: in the wedge of two planes a vertex may end somewhat inside the earlier one.
+
     Args:
         height: of the plane along its normal [m].
         normal: towards the free side; normalised here.
@@ -143,13 +148,16 @@ class Ground:
 
     def __init__(self, height: float = 0.0, normal: ArrayLike = (0.0, 1.0, 0.0), friction: float = 0.0) -> None:
         direction = check_vector("Ground.normal", normal)
-        length = float(np.linalg.norm(direction))
-        if length == 0.0:
+        largest = float(np.abs(direction).max())
+        if largest == 0.0:
             raise ValueError("Ground.normal must not be the zero vector")
+        direction = direction / largest  # so that no length overflows
+        direction = direction / np.linalg.norm(direction)
+        direction.setflags(write=False)
         _set(
             self,
             height=check_scalar("Ground.height", height),
-            normal=direction / length,
+            normal=direction,
             friction=check_scalar("Ground.friction", friction, minimum=0.0),
         )
 

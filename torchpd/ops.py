@@ -1,6 +1,6 @@
 """Python side of the ops: fake kernels, derivatives, vmap. Importing this module loads the extension.
 
-Every op takes a native leading batch, so that the rules for vmap only merge dimensions.
+Ops on states take a native leading batch, so that the rules for vmap only merge dimensions.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from .adjoint import AdjointCall, step_adjoint
 from .tables import MATERIAL_TABLE
 
-__all__ = ["INFO_WIDTH", "nearest_rotation"]
+__all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_tangents"]
 
 INFO_WIDTH = 6
 
@@ -36,8 +37,18 @@ def nearest_rotation(F: Tensor) -> Tensor:
     Returns:
         [..., 3, 3].
     """
+    refuse_tangents(F)
     result: Tensor = _ops.nearest_rotation(F)
     return result
+
+
+def refuse_tangents(*tensors: Tensor | None) -> None:
+    """The ops have no forward-mode derivatives, and torch would take them to be zero."""
+    if forward_ad._current_level < 0:
+        return
+    for tensor in tensors:
+        if tensor is not None and forward_ad.unpack_dual(tensor).tangent is not None:
+            raise RuntimeError("torchpd: forward-mode derivatives are not provided; use reverse mode (backward, vjp)")
 
 
 # ---- fake kernels: shapes, types and devices only
@@ -198,12 +209,14 @@ def step_vjp(
     after: Tensor,
     positions: Tensor,
     velocities: Tensor,
+    forces: Tensor | None,
     material: Sequence[Tensor],
     plan: Sequence[Tensor],
+    *,
     time_step: float,
 ) -> list[Tensor]:
     """The adjoint of a step: gradients for positions, velocities, forces and every material array."""
-    call = AdjointCall(positions, velocities, after, list(material), list(plan), time_step)
+    call = AdjointCall(positions, velocities, forces, after, list(material), list(plan), time_step)
     return step_adjoint(call, grad_positions, grad_velocities)
 
 
@@ -214,8 +227,10 @@ def _(
     after: Tensor,
     positions: Tensor,
     velocities: Tensor,
+    forces: Tensor | None,
     material: Sequence[Tensor],
     plan: Sequence[Tensor],
+    *,
     time_step: float,
 ) -> list[Tensor]:
     state = [positions.new_empty(positions.shape) for _ in range(3)]
@@ -223,8 +238,8 @@ def _(
 
 
 def _step_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
-    positions, velocities, _, _, material, plan = inputs
-    ctx.save_for_backward(positions, velocities, output[0], *material, *plan)
+    positions, velocities, forces, _, material, plan = inputs
+    ctx.save_for_backward(positions, velocities, forces, output[0], *material, *plan)
     ctx.time_step = keyword_only_inputs["time_step"]
 
 
@@ -233,11 +248,11 @@ def _step_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _:
     _check_differentiable(wanted[4])
     if wanted[3]:
         raise RuntimeError("torchpd: a step has no derivative for its first iterate; detach start")
-    positions, velocities, after, *rest = ctx.saved_tensors
+    positions, velocities, forces, after, *rest = ctx.saved_tensors
     material, plan = rest[: len(MATERIAL_TABLE)], rest[len(MATERIAL_TABLE) :]
     grads = _ops.step_vjp(
-        grad_positions.contiguous(), grad_velocities.contiguous(), after, positions, velocities, material, plan,
-        ctx.time_step,
+        grad_positions.contiguous(), grad_velocities.contiguous(), after, positions, velocities, forces, material, plan,
+        time_step=ctx.time_step,
     )  # fmt: skip
     x, v, f, *values = grads
     return x, v, f if wanted[2] else None, None, values, [None] * len(plan)
@@ -252,8 +267,8 @@ def _check_differentiable(wanted: Sequence[bool]) -> None:
 
 
 def _rollout_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
-    positions, velocities, _, material, plan = inputs
-    ctx.save_for_backward(positions, velocities, output[0], output[1], *material, *plan)
+    positions, velocities, forces, material, plan = inputs
+    ctx.save_for_backward(positions, velocities, forces, output[0], output[1], *material, *plan)
     ctx.time_step = keyword_only_inputs["time_step"]
     ctx.every = keyword_only_inputs["every"]
 
@@ -275,7 +290,7 @@ def _rollout_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor,
     if ctx.every != 1:
         raise RuntimeError("torchpd: the rollout op is differentiable with every=1 only, where it records every state")
     _check_differentiable(ctx.needs_input_grad[3])
-    x0, v0, positions, velocities, *rest = ctx.saved_tensors
+    x0, v0, given, positions, velocities, *rest = ctx.saved_tensors
     material, plan = rest[: len(MATERIAL_TABLE)], rest[len(MATERIAL_TABLE) :]
     x, v, forces = torch.zeros_like(x0), torch.zeros_like(x0), torch.zeros_like(x0)
     values = [torch.zeros_like(array) for array in material]
@@ -283,7 +298,7 @@ def _rollout_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor,
         before = (positions[step - 1], velocities[step - 1]) if step else (x0, v0)
         x, v = x + grad_positions[step], v + grad_velocities[step]
         x, v, f, *parts = _ops.step_vjp(
-            x, v, positions[step], *before, _at_step(material, step), plan, ctx.time_step
+            x, v, positions[step], *before, given, _at_step(material, step), plan, time_step=ctx.time_step
         )  # fmt: skip
         forces = forces + f
         values = [total + part for total, part in zip(values, parts, strict=True)]
@@ -314,7 +329,8 @@ def _join(tensor: Tensor, dim: int | None, size: int, batch: int, own: int) -> T
     Shared arrays stay shared; an array for each of `batch` environments is repeated for each of the `size` maps.
     """
     if dim is None:
-        return tensor if tensor.dim() == own else tensor.repeat(size, *[1] * own)
+        shared = tensor.dim() == own or (len(tensor) == 1 and batch > 1)
+        return tensor if shared else tensor.repeat(size, *[1] * own)
     tensor = tensor.movedim(dim, 0)
     if tensor.dim() == own + 1:
         return tensor.repeat_interleave(batch, 0)

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from .adjoint import AdjointCall, step_gradient
 from .material import MATERIAL_ROWS, check_material, material_of
-from .ops import INFO_WIDTH
+from .ops import INFO_WIDTH, refuse_tangents
 from .plan import Plan, compile_plan
 from .scene import Scene
 from .solvers import Chebyshev, Jacobi, Solver
@@ -107,28 +108,52 @@ class Simulator(nn.Module):
         return [getattr(self, name) for name in MATERIAL_ROWS]
 
     def set_material(self, **arrays: Tensor | float) -> None:
-        """Replace differentiable arrays, for all environments or with a leading batch for each.
+        """Replace differentiable arrays, for all environments or with a leading batch for each; all of them, or none.
+
+        An array of the same shape is overwritten, so that optimisers keep it; another batch makes a new parameter.
 
         Args:
-            arrays: by name, see the class. Shapes, positive stiffness and masses are checked here, once.
+            arrays: by name, see the class. Shapes and values are checked here, once.
         """
-        for name, value in arrays.items():
-            if name not in MATERIAL_ROWS:
-                raise TypeError(f"set_material: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}")
-            own = getattr(self, name)
-            tensor = torch.as_tensor(value)
-            if tensor.is_complex() or tensor.dtype == torch.bool:
-                raise TypeError(f"set_material: {name} must hold real numbers, got {tensor.dtype}")
-            tensor = tensor.to(dtype=self.dtype, device=self.device)
-            tensor = tensor.expand(own.shape) if tensor.dim() == 0 else tensor
-            shape = tuple(own.shape[own.dim() - MATERIAL_ROWS[name].dims :])
-            if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
-                raise ValueError(
-                    f"set_material: {name} must be {list(shape)}, or with a batch in front, got {list(tensor.shape)}"
-                )
-            check_material(name, tensor)
-            trains = own.requires_grad
-            setattr(self, name, nn.Parameter(tensor.detach().clone().contiguous(), requires_grad=trains))
+        checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
+        with torch.no_grad():
+            for name, tensor in checked.items():
+                own = getattr(self, name)
+                if own.shape == tensor.shape:
+                    own.copy_(tensor)
+                else:
+                    setattr(self, name, nn.Parameter(tensor.clone(), requires_grad=own.requires_grad))
+
+    def _checked_material(self, name: str, value: Tensor | float) -> Tensor:
+        if name not in MATERIAL_ROWS:
+            raise TypeError(f"set_material: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}")
+        own = getattr(self, name)
+        tensor = torch.as_tensor(value).detach()
+        if tensor.is_complex() or tensor.dtype == torch.bool:
+            raise TypeError(f"set_material: {name} must hold real numbers, got {tensor.dtype}")
+        tensor = tensor.to(dtype=self.dtype, device=self.device)
+        shape = tuple(own.shape[own.dim() - MATERIAL_ROWS[name].dims :])
+        tensor = tensor.expand(shape) if tensor.dim() == 0 else tensor
+        if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
+            raise ValueError(
+                f"set_material: {name} must be {list(shape)}, or with a batch in front, got {list(tensor.shape)}"
+            )
+        check_material(name, tensor)
+        return tensor.contiguous()
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """Checks values, and takes arrays of every environment where this simulator had shared ones."""
+        for name in MATERIAL_ROWS:
+            if prefix + name in state_dict:
+                self.set_material(**{name: state_dict[prefix + name]})
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def _check_state(self, state: State) -> None:
+        if state[0].dtype != self.dtype or state[0].device != self.device:
+            raise TypeError(
+                f"state must be {self.dtype} on {self.device} like the simulator, got {state[0].dtype} on "
+                f"{state[0].device}; sim.to(...) changes the simulator"
+            )
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
         wanted = fn(torch.empty(0, dtype=self.dtype, device=self.device))
@@ -141,6 +166,8 @@ class Simulator(nn.Module):
             values = self.scene.values()
             self.plan = compile_plan(values, dtype=wanted.dtype, progress=False)
             self.rest_positions = torch.tensor(values.rest_positions, dtype=wanted.dtype, device=wanted.device)
+        if self.device.type == "meta" and wanted.device.type != "meta":
+            self.plan = compile_plan(self.scene.values(), dtype=wanted.dtype, progress=False)
         self.plan = self.plan.to(wanted.device)
         return self
 
@@ -178,7 +205,8 @@ class Simulator(nn.Module):
             return_info: also how the solve went; costs two more local steps, no synchronisation.
 
         Returns:
-            The next state, or (state, info).
+            The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
+            error follows the residual). Forward mode and `torch.func.grad` are not provided.
         """
         material = self._material_at(targets, state[0].shape[0])
         after, rows = self._step(state, forces, material, start, report=return_info)
@@ -187,7 +215,9 @@ class Simulator(nn.Module):
     def _step(
         self, state: State, forces: Tensor | None, material: list[Tensor], start: str | Tensor, *, report: bool
     ) -> tuple[State, Tensor]:
+        self._check_state(state)
         given, inertial = _first_iterate(start)
+        refuse_tangents(*state, forces, *material)
         positions, velocities, rows = _ops.step(
             state[0],
             state[1],
@@ -197,7 +227,8 @@ class Simulator(nn.Module):
             list(self.plan.arrays),
             **self._numbers(inertial=inertial, report=report),
         )
-        return State(positions, velocities), rows
+        # a report, not a function to differentiate: torch would pass zeros back through it
+        return State(positions, velocities), rows.detach()
 
     @torch.no_grad()
     def step_(
@@ -218,6 +249,7 @@ class Simulator(nn.Module):
             raise ValueError(
                 "step_ overwrites the state, so it must not require gradients; detach it or call the simulator"
             )
+        self._check_state(state)
         given, inertial = _first_iterate(start)
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(
@@ -277,6 +309,8 @@ class Simulator(nn.Module):
     def _rollout_piece(
         self, state: State, steps: int, every: int, forces: Any, material: list[Tensor], start: str, report: bool
     ) -> Track:
+        self._check_state(state)
+        refuse_tangents(*state, forces, *material)
         positions, velocities, rows = _ops.rollout(
             state[0],
             state[1],
@@ -287,7 +321,7 @@ class Simulator(nn.Module):
             every=every,
             **self._numbers(inertial=start == "inertial", report=report),
         )
-        return Track(positions, velocities, Info.from_rows(rows))
+        return Track(positions, velocities, Info.from_rows(rows.detach()))
 
     def _rollout_in_pieces(
         self, state: State, steps: int, every: int, forces: Any, targets: Any, start: str, report: bool, bar: Any
@@ -356,6 +390,7 @@ class Simulator(nn.Module):
             targets: of pins, as in `forward`.
         """
         positions = state if isinstance(state, Tensor) else state[0]
+        refuse_tangents(positions)
         material = dict(zip(MATERIAL_ROWS, self._material_at(targets, positions.shape[0]), strict=True))
         energy = cast(Tensor, _ops.element_energy(positions, material["stiffness"], list(self.plan.arrays))).sum(-1)
         weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
@@ -375,6 +410,25 @@ class Simulator(nn.Module):
         """Gradient of the elastic energy [B, V, 3] [N]: minus the elastic forces."""
         result: Tensor = _ops.gradient(positions, self.stiffness, list(self.plan.arrays))
         return result
+
+    def step_gradient(
+        self, state: State, after: State | Tensor, forces: Tensor | None = None, targets: Targets | None = None
+    ) -> Tensor:
+        """Gradient of the objective of a step at some positions [B, V, 3] [N]: what a solve brings to zero.
+
+        Contacts do not enter: where one holds a vertex, its reaction remains. Hard pins have none.
+
+        Args:
+            state: where the step starts.
+            after: the positions to judge, for example the next state.
+            forces: as in `forward`.
+            targets: as in `forward`.
+        """
+        self._check_state(state)
+        positions = after if isinstance(after, Tensor) else after[0]
+        material = self._material_at(targets, state[0].shape[0])
+        call = AdjointCall(state[0], state[1], forces, positions, material, list(self.plan.arrays), self.time_step)
+        return step_gradient(call)
 
     # ---- files
 

@@ -104,8 +104,8 @@ def estimate_rho(
 
     Source: Vyatkin and Dolgovesov 2023; Wang 2015, section 4.
     """
-    if iterations < 2:
-        raise ValueError(f"estimate_rho: iterations must be >= 2, got {iterations}")
+    if iterations < 20:
+        raise ValueError(f"estimate_rho: iterations must be >= 20, so that trials can accelerate; got {iterations}")
     if method == "bound":
         rho = _bound(sim)
     elif method == "power":

@@ -38,6 +38,10 @@ class Anchors:
             return pins, spheres
         if isinstance(targets, Tensor):
             return self._checked("targets", targets, batch, self.pinned, (3,), pins), spheres
+        if not isinstance(targets, Mapping):
+            raise TypeError(
+                f"targets must be a tensor or a mapping from parts to tensors, got {type(targets).__name__}"
+            )
         for part, value in targets.items():
             if id(part) in self.pins:
                 rows = self.pins[id(part)]
@@ -48,7 +52,10 @@ class Anchors:
                 value = self._checked("targets of a Sphere", value.unsqueeze(-2), batch, 1, (3, 6), spheres)
                 spheres = _overwrite(spheres, slice(number, number + 1), self._row(spheres, number, value))
             else:
-                raise KeyError(f"targets: this {type(part).__name__} is not a Pin or Sphere of the scene")
+                raise ValueError(
+                    f"targets: this {type(part).__name__} is not a Pin or Sphere of the scene; parts go by identity, and "
+                    "a copied or loaded simulator has its own, in sim.scene.pins and sim.scene.spheres"
+                )
         return pins, spheres
 
     def _checked(

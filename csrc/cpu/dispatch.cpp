@@ -9,7 +9,7 @@ extern const Kernels kernels_avx512, kernels_avx2, kernels_portable;
 
 static std::vector<const Kernels*> supported() {
   std::vector<const Kernels*> found;
-#if defined(__x86_64__)
+#if defined(__x86_64__) && !defined(__clang__)
   if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
       __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq")) {
     found.push_back(&kernels_avx512);

@@ -7,6 +7,18 @@
 
 namespace pd {
 
+// One instruction set's compiled physics.
+struct Kernels {
+  const char* name;
+  void (*step32)(const StepCall<float>&, int threads);
+  void (*step64)(const StepCall<double>&, int threads);
+  void (*field32)(const FieldCall<float>&, int threads);
+  void (*field64)(const FieldCall<double>&, int threads);
+  void (*rotation32)(const RotationCall<float>&, int threads);
+  void (*rotation64)(const RotationCall<double>&, int threads);
+  void (*flops)(float* seconds, std::int64_t* operations);  // multiply-add loop, for calibration
+};
+
 // Fastest that the processor supports; the environment variable TORCHPD_SIMD names a slower one, to test it.
 const Kernels& kernels();
 

@@ -3,7 +3,8 @@
 #pragma GCC diagnostic ignored "-Wuninitialized"
 #include "cpu/system.h"
 
-#if defined(__x86_64__)
+// clang has no such pragma, and builds the portable level alone
+#if defined(__x86_64__) && !defined(__clang__)
 #pragma GCC push_options
 #pragma GCC target("avx512f,avx512vl,avx512bw,avx512dq,avx2,fma,bmi,bmi2,lzcnt,popcnt")
 #define PD_TARGET avx512

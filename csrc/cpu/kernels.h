@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <vector>
 
 namespace pd::inline PD_TARGET {
 
@@ -27,6 +28,7 @@ void step_batches(const StepCall<T>& call, int threads) {
   const std::int64_t groups = (call.batch + W - 1) / W;
   std::atomic<std::int64_t> next{0};
   run_team(int(std::min<std::int64_t>(threads, groups)), [&](const Team&) {
+    const CleanRegisters clean;
     Workspace<Lanes> work(call);
     Scratch<Lanes> scratch(call.plan.most_slots);
     const Team alone;
@@ -35,16 +37,25 @@ void step_batches(const StepCall<T>& call, int threads) {
   });
 }
 
+template <class Lanes, class T>
+std::vector<Scratch<Lanes>> make_scratches(const Plan<T>& plan, int threads) {
+  std::vector<Scratch<Lanes>> scratches;
+  for (int i = 0; i < threads; ++i) scratches.emplace_back(plan.most_slots);
+  return scratches;
+}
+
 // One environment after another by the whole team, or each by one thread when its patches are too few to share.
 template <class T>
 void step_singles(const StepCall<T>& call, int threads) {
   using Lanes = Single<T>;
   if (call.batch > 1 && call.plan.patches < 2 * threads) return step_batches<Lanes>(call, threads);
   Workspace<Lanes> work(call);
+  // before the team starts: a member without memory would keep the others waiting
+  auto scratches = make_scratches<Lanes>(call.plan, threads);
   run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
-    Scratch<Lanes> scratch(call.plan.most_slots);
+    const CleanRegisters clean;
     for (std::int64_t e = 0; e < call.batch; ++e) {
-      Stepper<Lanes>(call, work, scratch, team, e).roll();
+      Stepper<Lanes>(call, work, scratches[team.rank], team, e).roll();
       team.barrier();
     }
   });
@@ -52,7 +63,6 @@ void step_singles(const StepCall<T>& call, int threads) {
 
 template <class T>
 void step_any(const StepCall<T>& call, int threads) {
-  const CleanRegisters clean;
   constexpr int wide = native_width<T>;
   constexpr int narrow = wide > 4 ? wide / 2 : wide;
   if (call.batch < least_batch) return step_singles(call, threads);
@@ -64,12 +74,12 @@ void step_any(const StepCall<T>& call, int threads) {
 
 template <class T>
 void field_any(const FieldCall<T>& call, int threads) {
-  const CleanRegisters clean;
   using Lanes = Single<T>;
   Workspace<Lanes> work(call);
+  auto scratches = make_scratches<Lanes>(call.plan, threads);
   run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
-    Scratch<Lanes> scratch(call.plan.most_slots);
-    FieldPass<T> pass(call, work, scratch, team);
+    const CleanRegisters clean;
+    FieldPass<T> pass(call, work, scratches[team.rank], team);
     for (std::int64_t e = 0; e < call.batch; ++e) pass.run(e);
   });
 }

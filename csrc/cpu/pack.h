@@ -165,20 +165,6 @@ PD_HD Pack<T, W> reciprocal(Pack<T, W> a) {
   return Pack<T, W>(T(1)) / a;
 }
 
-// from[index[lane]] of every lane; the index counts elements.
-template <class T, int W, class I>
-PD_HD Pack<T, W> gather(const T* from, const I* index) {
-  Pack<T, W> r;
-#if PD_VECTOR_BYTES == 64
-  if constexpr (W == 16 && sizeof(T) == 4 && sizeof(I) == 2) {
-    const __m512i offset = _mm512_cvtepu16_epi32(_mm256_load_si256((const __m256i*)index));
-    return (typename Pack<T, W>::Vector)_mm512_i32gather_ps(offset, from, 4);
-  }
-#endif
-  for (int lane = 0; lane < W; ++lane) r.v[lane] = from[index[lane]];
-  return r;
-}
-
 // The lanes in which the fast rotation is not to be trusted, one by one.
 template <class T, int W>
 [[gnu::noinline, gnu::cold]] void repair_lanes(const Mat3<Pack<T, W>>& f, Mask<T, W> good,

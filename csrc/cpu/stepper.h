@@ -345,7 +345,10 @@ class Stepper {
     for (int lane = 0; lane < width && in_.first + lane < call_.batch; ++lane) {
       double* row = call_.info + (first_row + in_.first + lane) * info_count;
       const double last = Lanes::lane(residual_, lane), course = course_[lane];
-      row[info_residual] = !set_.report ? NAN : course > 0 ? sqrt(last / course) : 0.0;
+      row[info_residual] = !set_.report ? NAN
+                           : course > 0 ? sqrt(last / course)
+                           : last > 0   ? HUGE_VAL
+                                        : 0.0;
       row[info_energy] = set_.report ? Lanes::lane(energy_, lane) : NAN;
       row[info_iterations] = used_[lane];
       row[info_restarts] = schedule_[lane].restarts;

@@ -12,10 +12,11 @@
 #include <memory>
 #include <new>
 #include <type_traits>
+#include <vector>
 
+#include "cpu/dispatch.h"
 #include "cpu/team.h"
 #include "plan/views.h"
-#include "solver/step.h"
 #if defined(__x86_64__)
 #include <immintrin.h>
 #endif

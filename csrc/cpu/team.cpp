@@ -4,21 +4,30 @@
 #include <omp.h>
 #endif
 
+#include <exception>
+
 namespace pd {
 
 void run_team(int threads, void (*work)(void*, const Team&), void* context) {
 #if defined(_OPENMP)
   if (threads > 1 && !omp_in_parallel()) {
     Barrier barrier;
+    std::exception_ptr failure;
     // the runtime may grant fewer threads than asked for: the team counts those that came
 #pragma omp parallel num_threads(threads)
     {
       const int size = omp_get_num_threads();
       const Team team{omp_get_thread_num(), size, size > 1 ? &barrier : nullptr};
-      work(context, team);
+      try {
+        work(context, team);
+      } catch (...) {  // memory that could not be had: an exception must not leave the region
+#pragma omp critical
+        failure = std::current_exception();
+      }
       // meet here, where waiting soon sleeps, and not in the runtime, where it spins for milliseconds
       team.barrier();
     }
+    if (failure) std::rethrow_exception(failure);
     return;
   }
 #endif

@@ -24,7 +24,7 @@ struct Schedule {
   double limit = 0, omega = 1, last_energy = HUGE_VAL;
   int momentum = 0, restarts = 0;
 
-  PD_HD Schedule() = default;
+  Schedule() = default;
 
   // `mu` is the smallest ratio of inertia to diagonal; 1 - theta mu bounds the spectral radius from below.
   PD_HD Schedule(const Settings& settings, double mu, bool friction)

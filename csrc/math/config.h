@@ -1,11 +1,6 @@
-// What every physics header needs: the one macro that lets it build for both devices, and the name of its target.
+// What every physics header needs: the macro for both devices, and the name of the target.
 #pragma once
-
-#if defined(__CUDACC__)
-#define PD_HD __host__ __device__ __forceinline__
-#else
-#define PD_HD [[gnu::always_inline]] inline
-#endif
+#include "math/device.h"
 
 // Each instruction set compiles the headers once. An inline namespace of its own keeps the linker
 // from merging, say, an AVX-512 instance of a template into the plain x86-64 code.

@@ -1,6 +1,8 @@
 // What a kernel sees: plain structs of pointers, made from the tables. Knows neither torch nor a device.
 #pragma once
 
+#include "math/device.h"
+
 #include <cstdint>
 
 namespace pd {
@@ -24,7 +26,7 @@ struct Values {
   const T* data = nullptr;
   std::int64_t stride = 0;  // numbers from one environment to the next
 
-  const T* of(std::int64_t environment) const { return data + environment * stride; }
+  PD_HD const T* of(std::int64_t environment) const { return data + environment * stride; }
 };
 
 template <class T>
@@ -100,18 +102,6 @@ struct RotationCall {
   const T* direction =
       nullptr;       // [count, 3, 3]; null: the rotations, else their derivative along it
   T* out = nullptr;  // [count, 3, 3]
-};
-
-// One instruction set's compiled physics.
-struct Kernels {
-  const char* name;
-  void (*step32)(const StepCall<float>&, int threads);
-  void (*step64)(const StepCall<double>&, int threads);
-  void (*field32)(const FieldCall<float>&, int threads);
-  void (*field64)(const FieldCall<double>&, int threads);
-  void (*rotation32)(const RotationCall<float>&, int threads);
-  void (*rotation64)(const RotationCall<double>&, int threads);
-  void (*flops)(float* seconds, std::int64_t* operations);  // multiply-add loop, for calibration
 };
 
 }  // namespace pd

@@ -7,14 +7,16 @@
 // constant A. With K_e = grad N grad N^T and l_e = lambda_max(diag(K_e)^-1/2 K_e diag(K_e)^-1/2): K_e <= l_e diag(K_e), so
 // A <= D = diag(a_i + sum_e l_e w_e V_e |grad N_i|^2). Hence E(u - theta D^-1 g) <= E(u) - theta (1 - theta/2) g^T D^-1 g:
 // no step with 0 < theta < 2 and omega = 1 raises E, for any mesh, state, stiffness and time step, inverted elements
-// included. Projection onto convex contacts keeps this, since D is one number a vertex.
+// included. Projection onto one plane keeps this, since D is one number a vertex;
+// several contacts of a vertex are projected on one after another, and a ball acts as a plane within an iteration.
 #pragma once
+#include "math/config.h"
 #include "plan/views.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class Runner>
-void step(Runner& run, const Settings& settings) {
+PD_HD void step(Runner& run, const Settings& settings) {
   run.predict();  // targets s: where inertia, forces and springs would take each vertex
   if (settings.report) run.measure_course();
   run.start();      // first iterate, on the pins and out of the contacts
@@ -29,4 +31,4 @@ void step(Runner& run, const Settings& settings) {
   run.finish();  // new positions and velocities
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET
