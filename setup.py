@@ -20,11 +20,11 @@ MINIMUM_PYTHON = (3, 10)
 MINIMUM_TORCH = (2, 11)
 PROBE = "#include <concepts>\nstatic_assert(std::integral<int>);\nint main() {}\n"
 # -ffp-contract=off: the code says itself where to fuse, so that every path gives the same bits.
-# Neither -ffast-math nor -march=native: results must be the same bits on every machine that runs a wheel.
+# Neither -ffast-math nor -march=native: results must be the same bits on every machine of one instruction set.
 # -g0: python's own flags often ask for debug information, which doubles the time and the size of the build.
 OPTIMISATION = ["-O3", "-g0", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off"]
-# GCC 12 puts a vzeroupper before the return of functions that hand back a vector in a register, and loses half of it, where
-# the instruction set comes from a pragma. The kernels clean up once, at their end.
+# GCC 12 puts a vzeroupper before the return of functions that hand back a vector in a register, and loses half of it,
+# where the instruction set comes from a pragma. The kernels clean up themselves, at their end.
 X86 = ["-mno-vzeroupper"] if platform.machine() in ("x86_64", "AMD64") else []
 WARNINGS = ["-Wall", "-Wextra", "-Wno-psabi"]
 

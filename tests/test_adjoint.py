@@ -111,7 +111,7 @@ def test_resting_contact() -> None:
     check(weighted_loss(sim, state, torch.zeros_like(state[0])), state.velocities)
 
 
-@pytest.mark.parametrize("center, radius", [((0.5, -0.04, 0.1), 0.05), ((0.5, -0.29, 0.1), 0.3)])
+@pytest.mark.parametrize(("center", "radius"), [((0.5, -0.04, 0.1), 0.05), ((0.5, -0.29, 0.1), 0.3)])
 def test_contact_with_a_ball(center: tuple[float, float, float], radius: float) -> None:
     # the surface curves away under a vertex that slides: without that term the first of these is 20 % off
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (4, 2, 2))

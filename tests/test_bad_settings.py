@@ -54,8 +54,8 @@ def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
         ({pin: torch.zeros(1, 3)}, ValueError, r"targets of a Pin must be \[2, 3\]"),
         ({soft: torch.zeros(3)}, ValueError, r"targets of a Pin must be \[1, 3\]"),
         ({sphere: torch.zeros(4)}, ValueError, r"targets of a Sphere must be \[3\] or \[6\]"),
-        ({pd.Sphere((0, 0, 0), 1.0): torch.zeros(3)}, KeyError, r"this Sphere is not a Pin or Sphere of the scene"),
-        ({sim.scene.solids[0]: torch.zeros(3)}, KeyError, r"this Solid is not a Pin or Sphere of the scene"),
+        ({pd.Sphere((0, 0, 0), 1.0): torch.zeros(3)}, ValueError, r"this Sphere is not a Pin or Sphere of the scene"),
+        ({sim.scene.solids[0]: torch.zeros(3)}, ValueError, r"this Solid is not a Pin or Sphere of the scene"),
     ]
     for target, kind, message in targets:
         with pytest.raises(kind, match=message):

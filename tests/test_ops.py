@@ -40,7 +40,11 @@ def samples(name: str, dtype: torch.dtype, device: torch.device) -> tuple[tuple[
             {**numbers, "iterations": 400},
         ),
         "step_": ((x.clone(), v.clone(), info, f, x + 0.01 * direction, material, plan), numbers),
-        "rollout": ((x, v, f, material, plan), {**numbers, "steps": 4, "every": 2}),
+        "rollout": (
+            (wanted(still), wanted(zero), wanted(0.01 * f), material, plan),
+            {**numbers, "iterations": 400, "steps": 3, "every": 1},
+        ),
+        "step_vjp": ((f, direction, still, still, zero, 0.01 * f, material, plan), {"time_step": sim.time_step}),
         "gradient": ((wanted(x), w, plan), {}),
         "element_energy": ((wanted(x), w, plan), {}),
         "element_energy_product": ((wanted(x), wanted(direction), w, plan), {}),
@@ -53,7 +57,7 @@ def samples(name: str, dtype: torch.dtype, device: torch.device) -> tuple[tuple[
 
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
-    "nearest_rotation", "rotation_differential",
+    "nearest_rotation", "rotation_differential", "step_vjp",
 )  # fmt: skip
 FIELDS = OPS[3:7]
 
