@@ -115,9 +115,7 @@ class Pin:
             check_finite("Pin.stiffness", springs)
             check_positive("Pin.stiffness", springs, unit="N/m")
             springs.setflags(write=False)
-        chosen = chosen.astype(np.int64)
-        chosen.setflags(write=False)
-        _set(self, solid=solid, vertices=chosen, stiffness=springs)
+        _set(self, solid=solid, vertices=chosen.astype(np.int64), stiffness=springs)
 
 
 @dataclass(frozen=True, eq=False)

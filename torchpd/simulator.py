@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from .adjoint import AdjointCall, step_gradient
 from .material import MATERIAL_ROWS, check_material, material_of
 from .ops import INFO_WIDTH, refuse_tangents
 from .plan import Plan, compile_plan
+from .rollout import PerStep, Rollout, roll
 from .scene import Scene
 from .solvers import Chebyshev, Jacobi, Solver
 from .state import Info, State, Track
@@ -22,10 +22,7 @@ from .targets import Anchors, Targets
 
 __all__ = ["Simulator", "Targets"]
 
-PerStep = Callable[[int], Any]
-
 _ops = torch.ops.torchpd
-_BARS = 50  # how often a progress bar moves during a rollout
 
 
 class Simulator(nn.Module):
@@ -81,7 +78,7 @@ class Simulator(nn.Module):
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
         values = scene.values()
         self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
-        self._anchors = Anchors(scene, self.time_step)
+        self.anchors = Anchors(scene, self.time_step)
         self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
         for name, value in material_of(values, dtype).items():
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
@@ -148,7 +145,8 @@ class Simulator(nn.Module):
                 self.set_material(**{name: state_dict[prefix + name]})
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
-    def _check_state(self, state: State) -> None:
+    def check_state(self, state: State) -> None:
+        """Refuse a state of another precision or on another device."""
         if state[0].dtype != self.dtype or state[0].device != self.device:
             raise TypeError(
                 f"state must be {self.dtype} on {self.device} like the simulator, got {state[0].dtype} on "
@@ -208,14 +206,15 @@ class Simulator(nn.Module):
             The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
             error follows the residual). Forward mode and `torch.func.grad` are not provided.
         """
-        material = self._material_at(targets, state[0].shape[0])
-        after, rows = self._step(state, forces, material, start, report=return_info)
+        material = self.material_at(targets, state[0].shape[0])
+        after, rows = self.advance(state, forces, material, start, report=return_info)
         return (after, Info.from_rows(rows)) if return_info else after
 
-    def _step(
+    def advance(
         self, state: State, forces: Tensor | None, material: list[Tensor], start: str | Tensor, *, report: bool
     ) -> tuple[State, Tensor]:
-        self._check_state(state)
+        """One step with a given material, see `material_at`: the next state, and rows for `Info.from_rows`."""
+        self.check_state(state)
         given, inertial = _first_iterate(start)
         refuse_tangents(*state, forces, *material)
         positions, velocities, rows = _ops.step(
@@ -225,7 +224,7 @@ class Simulator(nn.Module):
             given,
             material,
             list(self.plan.arrays),
-            **self._numbers(inertial=inertial, report=report),
+            **self.numbers(inertial=inertial, report=report),
         )
         # a report, not a function to differentiate: torch would pass zeros back through it
         return State(positions, velocities), rows.detach()
@@ -249,7 +248,7 @@ class Simulator(nn.Module):
             raise ValueError(
                 "step_ overwrites the state, so it must not require gradients; detach it or call the simulator"
             )
-        self._check_state(state)
+        self.check_state(state)
         given, inertial = _first_iterate(start)
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(
@@ -258,9 +257,9 @@ class Simulator(nn.Module):
             rows,
             forces,
             given,
-            self._material_at(targets, state[0].shape[0]),
+            self.material_at(targets, state[0].shape[0]),
             list(self.plan.arrays),
-            **self._numbers(inertial=inertial, report=info is not None),
+            **self.numbers(inertial=inertial, report=info is not None),
         )
 
     def rollout(
@@ -294,89 +293,7 @@ class Simulator(nn.Module):
         steps, every = _whole("steps", steps, 0), _whole("every", every, 1)
         if start not in ("velocity", "inertial"):
             raise ValueError(f'rollout: start must be "velocity" or "inertial", got {start!r}')
-        # the op has a derivative where it records every state
-        one_by_one = (
-            callable(forces) or callable(targets) or (every > 1 and self._tracks_gradient(state, forces, targets))
-        )
-        if not (one_by_one or progress):
-            material = self._material_at(cast(Targets | None, targets), state[0].shape[0])
-            return self._rollout_piece(state, steps, every, forces, material, start, return_info)
-        with tqdm(total=steps, desc="simulating", unit="step", disable=not progress, leave=False) as bar:
-            if one_by_one:
-                return self._rollout_one_by_one(state, steps, every, forces, targets, start, return_info, bar)
-            return self._rollout_in_pieces(state, steps, every, forces, targets, start, return_info, bar)
-
-    def _rollout_piece(
-        self, state: State, steps: int, every: int, forces: Any, material: list[Tensor], start: str, report: bool
-    ) -> Track:
-        self._check_state(state)
-        refuse_tangents(*state, forces, *material)
-        positions, velocities, rows = _ops.rollout(
-            state[0],
-            state[1],
-            forces,
-            material,
-            list(self.plan.arrays),
-            steps=steps,
-            every=every,
-            **self._numbers(inertial=start == "inertial", report=report),
-        )
-        return Track(positions, velocities, Info.from_rows(rows.detach()))
-
-    def _rollout_in_pieces(
-        self, state: State, steps: int, every: int, forces: Any, targets: Any, start: str, report: bool, bar: Any
-    ) -> Track:
-        piece = max(every, steps // _BARS // every * every)
-        material = self._material_at(targets, state[0].shape[0])
-        tracks = []
-        for first in range(0, max(steps, 1), piece):
-            count = min(piece, steps - first)
-            tracks.append(self._rollout_piece(state, count, every, forces, material, start, report))
-            state = tracks[-1].state() if count >= every else state
-            material = self._moved_on(material, count)
-            bar.update(count)
-        info = Info(*(torch.cat(column) for column in zip(*(track.info for track in tracks), strict=True)))
-        return Track(torch.cat([t.positions for t in tracks]), torch.cat([t.velocities for t in tracks]), info)
-
-    def _rollout_one_by_one(
-        self, state: State, steps: int, every: int, forces: Any, targets: Any, start: str, report: bool, bar: Any
-    ) -> Track:
-        states, infos = [], []
-        batch = state[0].shape[0]
-        last_centres = {part: self.spheres[..., number, :3] for part, number in self._anchors.spheres.items()}
-        material = self.material() if callable(targets) else self._material_at(targets, batch)
-        for step in range(steps):
-            if callable(targets):
-                now = targets(step)
-                if isinstance(now, Mapping):
-                    now, last_centres = self._anchors.with_velocities(now, last_centres)
-                material = self._material_at(now, batch)
-            recorded = (step + 1) % every == 0
-            pushed = forces(step) if callable(forces) else forces
-            state, rows = self._step(state, pushed, material, start, report=report and recorded)
-            material = self._moved_on(material, 1)
-            if recorded:
-                states.append(state)
-                infos.append(rows)
-            bar.update(1)
-        if not states:
-            return self._rollout_piece(state, 0, every, None, material, start, False)
-        info = Info.from_rows(torch.stack(infos))
-        return Track(torch.stack([s[0] for s in states]), torch.stack([s[1] for s in states]), info)
-
-    def _moved_on(self, material: list[Tensor], steps: int) -> list[Tensor]:
-        """The material with moving spheres where they are some steps later."""
-        return [
-            self._anchors.moved_on(array, steps) if name == "spheres" else array
-            for name, array in zip(MATERIAL_ROWS, material, strict=True)
-        ]
-
-    def _tracks_gradient(self, state: State, forces: Any, targets: Any) -> bool:
-        if not torch.is_grad_enabled():
-            return False
-        given = targets.values() if isinstance(targets, Mapping) else [targets]
-        tensors = [*state, forces, *given, *self.material()]
-        return any(isinstance(tensor, Tensor) and tensor.requires_grad for tensor in tensors)
+        return roll(self, Rollout(state, steps, every, forces, targets, start, return_info), progress=progress)
 
     # ---- energies
 
@@ -391,7 +308,7 @@ class Simulator(nn.Module):
         """
         positions = state if isinstance(state, Tensor) else state[0]
         refuse_tangents(positions)
-        material = dict(zip(MATERIAL_ROWS, self._material_at(targets, positions.shape[0]), strict=True))
+        material = dict(zip(MATERIAL_ROWS, self.material_at(targets, positions.shape[0]), strict=True))
         energy = cast(Tensor, _ops.element_energy(positions, material["stiffness"], list(self.plan.arrays))).sum(-1)
         weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
         energy = energy - (material["masses"] * weight).sum(-1)
@@ -424,9 +341,9 @@ class Simulator(nn.Module):
             forces: as in `forward`.
             targets: as in `forward`.
         """
-        self._check_state(state)
+        self.check_state(state)
         positions = after if isinstance(after, Tensor) else after[0]
-        material = self._material_at(targets, state[0].shape[0])
+        material = self.material_at(targets, state[0].shape[0])
         call = AdjointCall(state[0], state[1], forces, positions, material, list(self.plan.arrays), self.time_step)
         return step_gradient(call)
 
@@ -447,7 +364,8 @@ class Simulator(nn.Module):
 
     # ---- arguments of the ops
 
-    def _numbers(self, *, inertial: bool, report: bool) -> dict[str, Any]:
+    def numbers(self, *, inertial: bool, report: bool) -> dict[str, Any]:
+        """The settings as keyword arguments of the ops."""
         return {
             **self.solver.numbers(),
             "iterations": self.iterations,
@@ -457,11 +375,11 @@ class Simulator(nn.Module):
             "report": report,
         }
 
-    def _material_at(self, targets: Targets | None, batch: int) -> list[Tensor]:
+    def material_at(self, targets: Targets | None, batch: int) -> list[Tensor]:
         """The material with pins and spheres where `targets` puts them."""
         if targets is None:
             return self.material()
-        pins, spheres = self._anchors.place(targets, self.pin_targets, self.spheres, batch)
+        pins, spheres = self.anchors.place(targets, self.pin_targets, self.spheres, batch)
         replaced = {"pin_targets": pins, "spheres": spheres}
         return [replaced.get(name, getattr(self, name)).contiguous() for name in MATERIAL_ROWS]
 

@@ -53,8 +53,8 @@ class Anchors:
                 spheres = _overwrite(spheres, slice(number, number + 1), self._row(spheres, number, value))
             else:
                 raise ValueError(
-                    f"targets: this {type(part).__name__} is not a Pin or Sphere of the scene; parts go by identity, and "
-                    "a copied or loaded simulator has its own, in sim.scene.pins and sim.scene.spheres"
+                    f"targets: this {type(part).__name__} is not a Pin or Sphere of the scene; parts go by identity: "
+                    "a copied or loaded simulator has its own in sim.scene.pins and sim.scene.spheres"
                 )
         return pins, spheres
 

@@ -1,0 +1,129 @@
+"""Many steps: in one call of the op where nothing changes on the way, else one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from .material import MATERIAL_ROWS
+from .ops import refuse_tangents
+from .state import Info, State, Track
+from .targets import Anchors, Targets
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+__all__ = ["PerStep", "Rollout", "roll"]
+
+PerStep = Callable[[int], Any]
+_MOVES_OF_BAR = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """What `Simulator.rollout` was asked for."""
+
+    state: State
+    steps: int
+    every: int
+    forces: Tensor | PerStep | None
+    targets: Targets | PerStep | None
+    start: str
+    report: bool
+
+    @property
+    def records(self) -> int:
+        """How many states are kept."""
+        return self.steps // self.every
+
+    def tracks_gradient(self, material: list[Tensor]) -> bool:
+        """Whether anything that goes in wants a gradient."""
+        if not torch.is_grad_enabled():
+            return False
+        given = self.targets.values() if isinstance(self.targets, Mapping) else [self.targets]
+        tensors = [*self.state, self.forces, *given, *material]
+        return any(isinstance(tensor, Tensor) and tensor.requires_grad for tensor in tensors)
+
+
+def roll(sim: Simulator, call: Rollout, *, progress: bool) -> Track:
+    """The recorded states."""
+    varies = callable(call.forces) or callable(call.targets)
+    # the op has a derivative where it records every state
+    one_by_one = varies or (call.every > 1 and call.tracks_gradient(sim.material()))
+    if not (one_by_one or progress):
+        return _piece(sim, call, _constant_material(sim, call))
+    with tqdm(total=call.steps, desc="simulating", unit="step", disable=not progress, leave=False) as bar:
+        return _one_by_one(sim, call, bar) if one_by_one else _in_pieces(sim, call, bar)
+
+
+def _constant_material(sim: Simulator, call: Rollout) -> list[Tensor]:
+    return sim.material() if callable(call.targets) else sim.material_at(call.targets, call.state[0].shape[0])
+
+
+def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
+    sim.check_state(call.state)
+    refuse_tangents(*call.state, call.forces if isinstance(call.forces, Tensor) else None, *material)
+    positions, velocities, rows = torch.ops.torchpd.rollout(
+        call.state[0],
+        call.state[1],
+        call.forces,
+        material,
+        list(sim.plan.arrays),
+        steps=call.steps,
+        every=call.every,
+        **sim.numbers(inertial=call.start == "inertial", report=call.report),
+    )
+    return Track(positions, velocities, Info.from_rows(rows.detach()))
+
+
+def _in_pieces(sim: Simulator, call: Rollout, bar: Any) -> Track:
+    """So that the bar moves."""
+    size = max(call.every, call.steps // _MOVES_OF_BAR // call.every * call.every)
+    material = _constant_material(sim, call)
+    tracks = []
+    for first in range(0, max(call.steps, 1), size):
+        part = replace(call, steps=min(size, call.steps - first))
+        tracks.append(_piece(sim, part, material))
+        call = replace(call, state=tracks[-1].state()) if part.records else call
+        material = _moved_on(material, part.steps)
+        bar.update(part.steps)
+    info = Info(*(torch.cat(column) for column in zip(*(track.info for track in tracks), strict=True)))
+    return Track(torch.cat([t.positions for t in tracks]), torch.cat([t.velocities for t in tracks]), info)
+
+
+def _one_by_one(sim: Simulator, call: Rollout, bar: Any) -> Track:
+    states, rows = [], []
+    state, batch = call.state, call.state[0].shape[0]
+    centres = {part: sim.spheres[..., number, :3] for part, number in sim.anchors.spheres.items()}
+    material = _constant_material(sim, call)
+    for step in range(call.steps):
+        if callable(call.targets):
+            now = call.targets(step)
+            if isinstance(now, Mapping):
+                now, centres = sim.anchors.with_velocities(now, centres)
+            material = sim.material_at(now, batch)
+        recorded = (step + 1) % call.every == 0
+        forces = call.forces(step) if callable(call.forces) else call.forces
+        state, row = sim.advance(state, forces, material, call.start, report=call.report and recorded)
+        material = _moved_on(material, 1)
+        if recorded:
+            states.append(state)
+            rows.append(row)
+        bar.update(1)
+    if not states:
+        return _piece(sim, replace(call, steps=0, forces=None), sim.material())
+    info = Info.from_rows(torch.stack(rows))
+    return Track(torch.stack([s[0] for s in states]), torch.stack([s[1] for s in states]), info)
+
+
+def _moved_on(material: list[Tensor], steps: int) -> list[Tensor]:
+    """The material with moving spheres where they are some steps later."""
+    return [
+        Anchors.moved_on(array, steps) if name == "spheres" else array
+        for name, array in zip(MATERIAL_ROWS, material, strict=True)
+    ]
