@@ -79,7 +79,7 @@ def test_forces_and_targets_as_functions_of_the_step(dtype: torch.dtype, device:
         if step % 3 == 2:
             assert same_bits(track.state(step // 3), state)
     # a hard pin is where it was told to be: x + (target - x), one rounding
-    error = (track.positions[-1][:, pin.vertices] - (held + 0.006)).abs().max()
+    error = (track.positions[-1][:, pin.vertices.tolist()] - (held + 0.006)).abs().max()
     assert float(error) <= 2 * torch.finfo(dtype).eps
 
 

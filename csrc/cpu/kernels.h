@@ -22,7 +22,7 @@ struct CleanRegisters {
 // Fewest environments for which lanes run over environments instead of elements.
 constexpr std::int64_t least_batch = 8;
 
-template <class Lanes, class T>
+template <class Lanes, bool Touching, class T>
 void step_batches(const StepCall<T>& call, int threads) {
   constexpr int W = Lanes::environments;
   const std::int64_t groups = (call.batch + W - 1) / W;
@@ -33,7 +33,7 @@ void step_batches(const StepCall<T>& call, int threads) {
     Scratch<Lanes> scratch(call.plan.most_slots);
     const Team alone;
     for (std::int64_t g = next++; g < groups; g = next++)
-      Stepper<Lanes>(call, work, scratch, alone, g * W).roll();
+      Stepper<Lanes, Touching>(call, work, scratch, alone, g * W).roll();
   });
 }
 
@@ -45,31 +45,38 @@ std::vector<Scratch<Lanes>> make_scratches(const Plan<T>& plan, int threads) {
 }
 
 // One environment after another by the whole team, or each by one thread when its patches are too few to share.
-template <class T>
+template <bool Touching, class T>
 void step_singles(const StepCall<T>& call, int threads) {
   using Lanes = Single<T>;
-  if (call.batch > 1 && call.plan.patches < 2 * threads) return step_batches<Lanes>(call, threads);
+  if (call.batch > 1 && call.plan.patches < 2 * threads)
+    return step_batches<Lanes, Touching>(call, threads);
   Workspace<Lanes> work(call);
   // before the team starts: a member without memory would keep the others waiting
   auto scratches = make_scratches<Lanes>(call.plan, threads);
   run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
     const CleanRegisters clean;
     for (std::int64_t e = 0; e < call.batch; ++e) {
-      Stepper<Lanes>(call, work, scratches[team.rank], team, e).roll();
+      Stepper<Lanes, Touching>(call, work, scratches[team.rank], team, e).roll();
       team.barrier();
     }
   });
 }
 
-template <class T>
-void step_any(const StepCall<T>& call, int threads) {
+template <bool Touching, class T>
+void step_with(const StepCall<T>& call, int threads) {
   constexpr int wide = native_width<T>;
   constexpr int narrow = wide > 4 ? wide / 2 : wide;
-  if (call.batch < least_batch) return step_singles(call, threads);
+  if (call.batch < least_batch) return step_singles<Touching>(call, threads);
   // half the lanes where full ones would leave a thread without work
   const std::int64_t groups = (call.batch + wide - 1) / wide;
-  if (groups >= threads) return step_batches<Batch<T, wide>>(call, threads);
-  step_batches<Batch<T, narrow>>(call, threads);
+  if (groups >= threads) return step_batches<Batch<T, wide>, Touching>(call, threads);
+  step_batches<Batch<T, narrow>, Touching>(call, threads);
+}
+
+template <class T>
+void step_any(const StepCall<T>& call, int threads) {
+  const bool touching = call.material.planes_count + call.material.spheres_count > 0;
+  touching ? step_with<true>(call, threads) : step_with<false>(call, threads);
 }
 
 template <class T>

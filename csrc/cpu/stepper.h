@@ -9,7 +9,8 @@
 
 namespace pd::inline PD_TARGET {
 
-template <class Lanes>
+// `Touching`: the scene has contacts. Without them not even the question whether there are any is compiled.
+template <class Lanes, bool Touching>
 class Stepper {
   using T = typename Lanes::Scalar;
   using Real = typename Lanes::Real;
@@ -86,7 +87,7 @@ class Stepper {
     if (plan_.groups == 0 || given_first) return;
     if (team_.rank == 0) {
       find_shifts(plan_, w_);
-      if (!contacts_.empty()) drop_touching_shifts(plan_, w_, contacts_);
+      if constexpr (Touching) drop_touching_shifts(plan_, w_, contacts_);
       for (int i = 0; i < plan_.vertices; ++i) {
         if (plan_.vertex_group[i] < 0) continue;
         w_.u[i] = w_.u[i] + w_.shift[plan_.vertex_group[i]];
@@ -183,7 +184,7 @@ class Stepper {
   }
 
   Value contact(std::int64_t i, const Value& u, const Value& around) const {
-    if (contacts_.empty()) return u;
+    if constexpr (!Touching) return u;
     return hold(
         i, u,
         Lanes::value(contacts_.project(Lanes::vec3(w_.x[i]), Lanes::vec3(u), Lanes::vec3(around))));
@@ -323,7 +324,7 @@ class Stepper {
   Value unbalanced(std::int64_t i, const Value& gradient) const {
     const Real none(T(0));
     const Value zero = Lanes::value({none, none, none});
-    if (contacts_.empty()) return hold(i, zero, gradient);
+    if constexpr (!Touching) return hold(i, zero, gradient);
     const Real inverse = w_.inverse[i],
                diagonal = Real(T(1)) / select(inverse > none, inverse, Real(T(1)));
     return hold(

@@ -85,8 +85,6 @@ struct Contacts {
   const Ball<R>* balls = nullptr;
   int plane_count = 0, ball_count = 0;
 
-  PD_HD bool empty() const { return plane_count + ball_count == 0; }
-
   PD_HD Vec3<R> project(const Vec3<R>& x, Vec3<R> u, const Vec3<R>& around) const {
     for (int i = 0; i < plane_count; ++i) u = pd::project(planes[i], x, u, around);
     for (int i = 0; i < ball_count; ++i) u = pd::project(balls[i], x, u, around);
