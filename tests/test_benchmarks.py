@@ -122,3 +122,11 @@ def test_unknown_scene_is_refused() -> None:
     ended = run("--only", "nothing")
     assert ended.returncode == 2
     assert "no scene nothing; there are 1k, 10k" in ended.stderr
+
+
+def test_beam_counts_iterations() -> None:
+    command = [sys.executable, "benchmarks/beam.py", "--most", "40"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    soft = next(line for line in result.stdout.splitlines() if "1e+04  guarded" in line)
+    # 1e-2 and 1e-3 within 40 iterations, 1e-6 not
+    assert soft.split()[-4:] == ["22", "38", ">", "40"]

@@ -1,0 +1,70 @@
+"""Iterations that one step of a beam needs to reach an error, for three stiffnesses: the table of the README.
+
+The beam of the tests: 1 x 0.2 x 0.2 m, 3750 tetrahedra, held at x = 0, thrown downwards with v_y = -10 x^2, time step 1/30 s,
+float64. Error |x - x*| / |x_0 - x*| with x* solved by Newton's method, start "inertial".
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+from torch import Tensor
+
+import torchpd as pd
+from torchpd.reference import step_problem
+from torchpd.reference_solvers import newton
+
+STIFFNESSES = (1e4, 1e5, 1e6)
+ERRORS = (1e-2, 1e-3, 1e-6)
+
+
+def beam(youngs: float) -> tuple[pd.Simulator, pd.State]:
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (25, 5, 5))
+    solid = pd.Solid(mesh, youngs=youngs, density=1000.0)
+    scene = pd.Scene(solid, pd.Pin(solid, mesh.vertices[:, 0] == 0.0), pd.Gravity((0.0, -9.8, 0.0)))
+    sim = pd.Simulator(scene, 1 / 30, dtype=torch.float64)
+    state = sim.rest_state()
+    state.velocities[..., 1] = -10.0 * state.positions[..., 0] ** 2
+    return sim, state
+
+
+def solution(sim: pd.Simulator, state: pd.State) -> Tensor:
+    x, v = (part[0].numpy() for part in state)
+    problem = step_problem(sim.scene.values(), x, v, sim.time_step)
+    return torch.from_numpy(x + newton(problem, problem.first_iterate("inertial")))
+
+
+def iterations_to(sim: pd.Simulator, state: pd.State, solved: Tensor, error: float, most: int) -> str:
+    """Fewest iterations, by bisection."""
+
+    def error_after(iterations: int) -> float:
+        sim.iterations = iterations
+        return float((sim(state, start="inertial").positions[0] - solved).norm())
+
+    goal = error * error_after(0)
+    low, high = 0, most
+    if error_after(most) > goal:
+        return f"> {most}"
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if error_after(middle) <= goal else (middle, high)
+    return str(high)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--most", type=int, default=5000, help="iterations at most")
+    most = parser.parse_args().most
+    print(f"{'youngs':>8}  {'solver':<20}" + "".join(f"{error:>10.0e}" for error in ERRORS))
+    for youngs in STIFFNESSES:
+        sim, state = beam(youngs)
+        solved = solution(sim, state)
+        for name, solver in (("guarded Chebyshev", pd.Chebyshev()), ("plain Jacobi", pd.Jacobi(diagonal="plain"))):
+            sim.solver = solver
+            counts = [iterations_to(sim, state, solved, error, most) for error in ERRORS]
+            print(f"{youngs:>8.0e}  {name:<20}" + "".join(f"{count:>10}" for count in counts))
+
+
+if __name__ == "__main__":
+    main()
