@@ -95,7 +95,8 @@ def relative(pattern: str) -> list[str]:
 
 def make_extension():
     """`torchpd._C`: CPU always, CUDA when a toolkit of torch's major version is there."""
-    cuda = TOOLKIT["find_toolkit"]().home is not None
+    # a build without CUDA sources is a CPU build, whatever toolkit there is
+    cuda = TOOLKIT["find_toolkit"]().home is not None and bool(relative("**/*.cu"))
     kind = cpp_extension.CUDAExtension if cuda else cpp_extension.CppExtension
     # torch's headers do not pass -Wextra; as system headers they keep quiet, and -I of the same folder is ignored.
     system = [word for path in cpp_extension.include_paths() for word in ("-isystem", path)]

@@ -1,7 +1,7 @@
 """Iterations that one step of a beam needs to reach an error, for three stiffnesses: the table of the README.
 
-The beam of the tests: 1 x 0.2 x 0.2 m, 3750 tetrahedra, held at x = 0, thrown downwards with v_y = -10 x^2, time step 1/30 s,
-float64. Error |x - x*| / |x_0 - x*| with x* solved by Newton's method, start "inertial".
+The beam of the tests: 1 x 0.2 x 0.2 m, 3750 tetrahedra, held at x = 0, thrown downwards with v_y = -10 x^2, time step
+1/30 s, float64. Error |x - x*| / |x_0 - x*| with x* solved by Newton's method, start "inertial".
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from . import _C
 from .adjoint import AdjointCall, step_gradient
 from .material import MATERIAL_ROWS, check_material, material_of
 from .ops import INFO_WIDTH, refuse_tangents
@@ -157,6 +158,8 @@ class Simulator(nn.Module):
         wanted = fn(torch.empty(0, dtype=self.dtype, device=self.device))
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
+        if wanted.device.type not in ("cpu", "meta") and not _C.build_info()["cuda"]:
+            raise RuntimeError(f"this build of torchpd has no kernels for {wanted.device.type}; it runs on the CPU")
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         if wanted.dtype != self.dtype:
             # digits that float32 has lost do not come back by widening: compile for the new precision. The material may
