@@ -63,12 +63,7 @@ class FieldPass {
       w_.weight[e] = plan_.tet_volume[e] * call_.stiffness.of(environment)[plan_.tet_order[e]];
     }
     team_.barrier();
-    for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
-      const int first = plan_.patch_slot[patch], end = plan_.patch_slot[patch + 1];
-      for (int slot = first; slot < end; ++slot) {
-        w_.origin[slot] = w_.x[plan_.slot_vertex[slot]] - w_.x[plan_.slot_vertex[first]];
-      }
-    }
+    sweep_.set_origins();
     team_.barrier();
   }
 

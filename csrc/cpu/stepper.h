@@ -57,10 +57,7 @@ class Stepper {
         const Real soft = select(spring < Real(T(HUGE_VAL)), spring, none);
         w_.target[i] = hold(i, offset, target(i, soft, offset));
       });
-    for (std::int64_t slot = team_.begin(plan_.slots); slot < team_.end(plan_.slots); ++slot) {
-      w_.origin[slot] =
-          w_.x[plan_.slot_vertex[slot]] - w_.x[plan_.slot_vertex[patch_of_slot(slot)]];
-    }
+    sweep_.set_origins();
     team_.barrier();
   }
 
@@ -157,16 +154,6 @@ class Stepper {
   }
 
  private:
-  // the slot whose vertex is the origin of the patch that `slot` is in: positions near it keep their last bits anywhere
-  std::int64_t patch_of_slot(std::int64_t slot) const {
-    int low = 0, high = plan_.patches;
-    while (high - low > 1) {
-      const int middle = (low + high) / 2;
-      (plan_.patch_slot[middle] <= slot ? low : high) = middle;
-    }
-    return plan_.patch_slot[low];
-  }
-
   Value target(std::int64_t i, const Real& spring, const Value& pin) const {
     const Real h(h_), mass = in_.number(call_.material.masses, plan_.vertex_order[i]);
     const Real weight = inertia_weight(mass, damping_, spring, h);

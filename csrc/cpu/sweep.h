@@ -84,6 +84,17 @@ struct Sweep {
     team.barrier();
   }
 
+  // Positions relative to the first vertex of each patch, which keep their last bits however far from the origin.
+  void set_origins() {
+    for (int patch = team.begin(plan.patches); patch < team.end(plan.patches); ++patch) {
+      const int first = plan.patch_slot[patch], end = plan.patch_slot[patch + 1];
+      const Value anchor = work.x[plan.slot_vertex[first]];
+      for (int slot = first; slot < end; ++slot) {
+        work.origin[slot] = work.x[plan.slot_vertex[slot]] - anchor;
+      }
+    }
+  }
+
   // Copies what the slots of a patch refer to, for elements to read.
   template <int Fields>
   void gather_slots(int patch) {
