@@ -9,6 +9,7 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+import sys
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -66,6 +67,10 @@ def missing_packages(packages: Iterable[Package]) -> list[Package]:
 
 
 def _version(package: Package) -> str:
+    # of what this process runs: the metadata of torch leave out which CUDA it was built for
+    loaded = getattr(sys.modules.get(package.module), "__version__", None)
+    if isinstance(loaded, str):
+        return loaded
     try:
         return importlib.metadata.version(package.pip_name)
     except importlib.metadata.PackageNotFoundError:
