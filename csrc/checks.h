@@ -25,13 +25,19 @@ inline std::string describe(const Tensor& t) {
   return c10::str(at::toString(t.scalar_type()), " ", t.sizes(), " on ", t.device().str());
 }
 
-// A contiguous CPU tensor of the given type, else an error that says what the argument is.
-inline void check_storage(const Tensor& t, at::ScalarType type, const std::string& name,
-                          const char* meaning) {
+// Where the tensors of a call have to be, and the argument that decides it.
+struct Place {
+  at::Device device;
+  const char* like = "positions";
+};
+
+// A contiguous tensor of the given type in its place, else an error that says what the argument is.
+inline void check_storage(const Tensor& t, at::ScalarType type, const Place& place,
+                          const std::string& name, const char* meaning) {
   TORCH_CHECK_TYPE(t.scalar_type() == type, name, " must be ", at::toString(type), " (", meaning,
                    "), got ", describe(t));
-  TORCH_CHECK_VALUE(t.device().is_cpu(), name, " must be on cpu like the other arguments (",
-                    meaning, "), got ", describe(t));
+  TORCH_CHECK_VALUE(t.device() == place.device, name, " must be on ", place.device.str(), " like ",
+                    place.like, " (", meaning, "), got ", describe(t));
   TORCH_CHECK_VALUE(t.is_contiguous(), name, " must be contiguous (", meaning, "), got strides ",
                     t.strides());
 }
@@ -42,54 +48,68 @@ constexpr int plan_arrays = 0
     ;
 #undef X
 
+// One array of a plan: [rows], or [rows, width] when that is more than 1.
+inline void check_array(const Tensor& t, at::ScalarType type, std::int64_t rows, std::int64_t width,
+                        const Place& place, const std::string& name, const char* meaning) {
+  check_storage(t, type, place, name, meaning);
+  std::vector<std::int64_t> shape{rows};
+  if (width > 1) shape.push_back(width);
+  TORCH_CHECK_VALUE(t.sizes() == at::IntArrayRef(shape), name, " must be ", at::IntArrayRef(shape),
+                    " (", meaning, "), got ", describe(t), "; compile the scene again");
+}
+
+// The counts of a plan. They stay on the CPU, so that no op waits for another device.
+inline const int32* sizes_view(const Tensor& t, std::int64_t count) {
+  check_array(t, at::kInt, count, 1, {at::kCPU, "every plan's sizes"}, "plan.sizes", "counts");
+  return t.const_data_ptr<int32>();
+}
+
+// Lengths of the arrays, by the names in plan.def.
+struct PlanRows {
+  std::int64_t size, vertex, group, pin, block, patch_end, slot, shared_end, shared_slot;
+};
+
+// What the arrays hold is trusted; how long they are is not.
 template <class T>
-Plan<T> plan_view(at::TensorList arrays) {
+Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   TORCH_CHECK_VALUE(arrays.size() == plan_arrays, "plan must be the ", plan_arrays,
                     " arrays of Plan.arrays, got ", arrays.size());
+  const int32* size = sizes_view(arrays[0], plan_size_count);
   Plan<T> plan;
+  plan.vertices = size[plan_vertices];
+  plan.tets = size[plan_tets];
+  plan.pins = size[plan_pins];
+  plan.groups = size[plan_groups];
+  plan.blocks = size[plan_blocks];
+  plan.patches = size[plan_patches];
+  plan.slots = size[plan_slots];
+  plan.shared = size[plan_shared];
+  plan.most_slots = size[plan_most_slots];
+  TORCH_CHECK_VALUE(plan.patches >= 1 && plan.most_slots >= 1 && plan.most_slots <= plan.slots,
+                    "plan.sizes must count at least one patch, and no more slots in one than in "
+                    "all, got ",
+                    plan.patches, " patches with up to ", plan.most_slots, " of ", plan.slots,
+                    " slots; compile the scene again");
+  // every slot that does not hold an interior vertex of its patch holds a shared one
+  const PlanRows count{
+      plan_size_count, plan.vertices,   plan.groups,
+      plan.pins,       plan.blocks,     plan.patches + 1,
+      plan.slots,      plan.shared + 1, plan.slots - (plan.vertices - plan.shared)};
   int at = 0;
   using real = T;
-#define X(name, type, width, rows, meaning)                                                        \
-  check_storage(arrays[at], scalar_type<type>, "plan." #name, meaning);                            \
-  TORCH_CHECK_VALUE(                                                                               \
-      arrays[at].dim() == (width > 1 ? 2 : 1) && (width == 1 || arrays[at].size(1) == width),      \
-      "plan." #name " must be [" #rows, width > 1 ? ", " #width "] (" : "] (", meaning, "), got ", \
-      describe(arrays[at]));                                                                       \
-  const int name##_rows = int(arrays[at].size(0));                                                 \
+#define X(name, type, width, rows, meaning)                                                     \
+  check_array(arrays[at], scalar_type<type>, count.rows, width, place, "plan." #name, meaning); \
   plan.name = arrays[at++].const_data_ptr<type>();
 #include "plan/plan.def"
 #undef X
-  TORCH_CHECK_VALUE(
-      patch_block_rows >= 2 && patch_vertex_rows == patch_block_rows &&
-          patch_slot_rows == patch_block_rows && tet_rest_rows == tet_order_rows &&
-          tet_volume_rows == tet_order_rows && tet_bound_rows == tet_order_rows &&
-          tet_corner_rows == tet_order_rows && vertex_group_rows == vertex_order_rows &&
-          shared_start_rows >= 1,
-      "plan: arrays that belong together have different lengths; compile the scene again");
-  plan.vertices = vertex_order_rows;
-  plan.blocks = tet_order_rows;
-  plan.tets = tet_lane_rows;
-  plan.pins = pin_vertex_rows;
-  plan.groups = group_size_rows;
-  plan.patches = patch_block_rows - 1;
-  plan.slots = slot_vertex_rows;
-  plan.shared = shared_start_rows - 1;
-  for (int p = 0; p < plan.patches; ++p) {
-    plan.most_slots = std::max(plan.most_slots, plan.patch_slot[p + 1] - plan.patch_slot[p]);
-  }
-  TORCH_CHECK_VALUE(plan.patch_block[plan.patches] == plan.blocks &&
-                        plan.patch_slot[plan.patches] == plan.slots &&
-                        plan.patch_vertex[plan.patches] + plan.shared == plan.vertices &&
-                        plan.shared_start[plan.shared] == shared_slot_rows,
-                    "plan: the ends of the patches do not match the lengths of the arrays; compile "
-                    "the scene again");
   return plan;
 }
 
 template <class T>
 Values<T> values_view(const Tensor& t, std::int64_t rows, std::int64_t width, bool single,
-                      std::int64_t batch, const char* name, const char* meaning) {
-  check_storage(t, scalar_type<T>, std::string("material.") + name, meaning);
+                      std::int64_t batch, const Place& place, const char* name,
+                      const char* meaning) {
+  check_storage(t, scalar_type<T>, place, std::string("material.") + name, meaning);
   std::vector<std::int64_t> shape;
   if (!single) shape.push_back(rows);
   if (width > 1) shape.push_back(width);
@@ -120,7 +140,7 @@ inline std::int64_t rows_of(const Tensor& t, int width, const char* name) {
 
 template <class T>
 Material<T> material_view(at::TensorList arrays, std::int64_t vertices, std::int64_t pins,
-                          std::int64_t batch) {
+                          std::int64_t batch, const Place& place) {
   TORCH_CHECK_VALUE(arrays.size() == material_arrays, "material must be ", material_arrays,
                     " arrays, got ", arrays.size());
   Material<T> material;
@@ -131,7 +151,7 @@ Material<T> material_view(at::TensorList arrays, std::int64_t vertices, std::int
   if (std::string(#rows) == "plane") count.plane = rows_of(arrays[at], width, #name);          \
   if (std::string(#rows) == "sphere") count.sphere = rows_of(arrays[at], width, #name);        \
   material.name = values_view<T>(arrays[at++], count.rows, width, std::string(#rows) == "one", \
-                                 batch, #name, meaning);
+                                 batch, place, #name, meaning);
 #include "plan/material.def"
 #undef X
   material.planes_count = int(count.plane);
@@ -156,9 +176,13 @@ inline void check_state(const Tensor& t, const Tensor& like, const char* name,
                     " like positions (", meaning, "), got ", describe(t));
 }
 
-inline void check_positions(const Tensor& t, const char* name) {
+inline void check_real(const Tensor& t, const char* name, const char* meaning) {
   TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name,
-                   " must be float32 or float64 [batch, vertices, 3] (m), got ", describe(t));
+                   " must be float32 or float64 ", meaning, ", got ", describe(t));
+}
+
+inline void check_positions(const Tensor& t, const char* name) {
+  check_real(t, name, "[batch, vertices, 3] (m)");
   TORCH_CHECK_VALUE(t.dim() == 3 && t.size(2) == 3, name, " must be [batch, vertices, 3] (m), got ",
                     describe(t));
 }
@@ -166,6 +190,76 @@ inline void check_positions(const Tensor& t, const char* name) {
 inline void check_vertices(const Tensor& positions, std::int64_t vertices) {
   TORCH_CHECK_VALUE(positions.size(1) == vertices, "positions must have the ", vertices,
                     " vertices of the plan, got ", describe(positions));
+}
+
+// What step_ overwrites.
+inline void check_inplace(const Tensor& positions, const Tensor& velocities, const Tensor& info) {
+  TORCH_CHECK_VALUE(positions.is_contiguous() && velocities.is_contiguous(),
+                    "step_: positions and velocities must be contiguous");
+  TORCH_CHECK_VALUE(!positions.is_alias_of(velocities),
+                    "step_: positions and velocities must not share memory");
+  TORCH_CHECK_VALUE(info.scalar_type() == at::kDouble && info.is_contiguous() && info.dim() == 2 &&
+                        info.size(0) == positions.size(0) && info.size(1) == info_count,
+                    "info must be a contiguous float64 [", positions.size(0), ", ", int(info_count),
+                    "], got ", describe(info));
+  TORCH_CHECK_VALUE(info.device() == positions.device(), "info must be on ",
+                    positions.device().str(), " like positions, got ", describe(info));
+}
+
+inline void check_matrices(const Tensor& t, const char* name) {
+  check_real(t, name, "[..., 3, 3]");
+  TORCH_CHECK_VALUE(t.dim() >= 2 && t.size(-1) == 3 && t.size(-2) == 3, name,
+                    " must be [..., 3, 3], got ", describe(t));
+}
+
+// The direction in which matrices move.
+inline void check_direction(const Tensor& direction, const Tensor& matrices) {
+  check_matrices(direction, "direction");
+  TORCH_CHECK_VALUE(
+      direction.sizes() == matrices.sizes() && direction.scalar_type() == matrices.scalar_type() &&
+          direction.device() == matrices.device(),
+      "direction must be ", describe(matrices), " like matrices, got ", describe(direction));
+}
+
+// What a step is told besides tensors, in the order of the schemas.
+struct Numbers {
+  std::int64_t schedule, iterations;
+  double time_step, relaxation, rho;
+  std::int64_t delay;
+  bool weighted;
+  double tolerance;
+  bool inertial, report;
+};
+
+inline Settings settings_of(const Numbers& n, bool given, std::int64_t steps, std::int64_t every) {
+  constexpr std::int64_t most = 1'000'000'000;
+  TORCH_CHECK_VALUE(n.schedule >= 0 && n.schedule <= 2,
+                    "schedule must be 0 (jacobi), 1 (classic) or 2 (guarded), got ", n.schedule);
+  TORCH_CHECK_VALUE(n.iterations >= 0 && n.iterations <= most, "iterations must be 0..1e9, got ",
+                    n.iterations);
+  TORCH_CHECK_VALUE(n.time_step > 0 && std::isfinite(n.time_step),
+                    "time_step must be positive and finite [s], got ", n.time_step);
+  TORCH_CHECK_VALUE(n.relaxation > 0 && n.relaxation < 2, "relaxation must lie in (0, 2), got ",
+                    n.relaxation);
+  TORCH_CHECK_VALUE(n.rho >= 0 && n.rho < 1, "rho must lie in [0, 1), got ", n.rho);
+  TORCH_CHECK_VALUE(n.delay >= 0, "delay must be >= 0, got ", n.delay);
+  TORCH_CHECK_VALUE(n.tolerance >= 0, "tolerance must be >= 0, got ", n.tolerance);
+  TORCH_CHECK_VALUE(steps >= 0 && every >= 1 && steps <= most && every <= most,
+                    "steps must be 0..1e9 and every 1..1e9, got ", steps, " and ", every);
+  Settings s;
+  s.steps = int(steps);
+  s.every = int(every);
+  s.iterations = int(n.iterations);
+  s.schedule = ScheduleKind(n.schedule);
+  s.start = given ? StartKind::given : n.inertial ? StartKind::inertial : StartKind::velocity;
+  s.time_step = n.time_step;
+  s.relaxation = n.relaxation;
+  s.rho = n.rho;
+  s.tolerance = n.tolerance;
+  s.delay = int(std::min(n.delay, most));
+  s.weighted = n.weighted;
+  s.report = n.report;
+  return s;
 }
 
 }  // namespace pd

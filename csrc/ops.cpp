@@ -14,48 +14,6 @@ namespace {
 
 using OptionalTensor = std::optional<Tensor>;
 
-// What a step is told besides tensors, in the order of the schemas.
-struct Numbers {
-  std::int64_t schedule, iterations;
-  double time_step, relaxation, rho;
-  std::int64_t delay;
-  bool weighted;
-  double tolerance;
-  bool inertial, report;
-};
-
-constexpr std::int64_t most = 1'000'000'000;
-
-Settings settings_of(const Numbers& n, bool given, std::int64_t steps, std::int64_t every) {
-  TORCH_CHECK_VALUE(n.schedule >= 0 && n.schedule <= 2,
-                    "schedule must be 0 (jacobi), 1 (classic) or 2 (guarded), got ", n.schedule);
-  TORCH_CHECK_VALUE(n.iterations >= 0 && n.iterations <= most, "iterations must be 0..1e9, got ",
-                    n.iterations);
-  TORCH_CHECK_VALUE(n.time_step > 0 && std::isfinite(n.time_step),
-                    "time_step must be positive and finite [s], got ", n.time_step);
-  TORCH_CHECK_VALUE(n.relaxation > 0 && n.relaxation < 2, "relaxation must lie in (0, 2), got ",
-                    n.relaxation);
-  TORCH_CHECK_VALUE(n.rho >= 0 && n.rho < 1, "rho must lie in [0, 1), got ", n.rho);
-  TORCH_CHECK_VALUE(n.delay >= 0, "delay must be >= 0, got ", n.delay);
-  TORCH_CHECK_VALUE(n.tolerance >= 0, "tolerance must be >= 0, got ", n.tolerance);
-  TORCH_CHECK_VALUE(steps >= 0 && every >= 1 && steps <= most && every <= most,
-                    "steps must be 0..1e9 and every 1..1e9, got ", steps, " and ", every);
-  Settings s;
-  s.steps = int(steps);
-  s.every = int(every);
-  s.iterations = int(n.iterations);
-  s.schedule = ScheduleKind(n.schedule);
-  s.start = given ? StartKind::given : n.inertial ? StartKind::inertial : StartKind::velocity;
-  s.time_step = n.time_step;
-  s.relaxation = n.relaxation;
-  s.rho = n.rho;
-  s.tolerance = n.tolerance;
-  s.delay = int(std::min(n.delay, most));
-  s.weighted = n.weighted;
-  s.report = n.report;
-  return s;
-}
-
 struct StepTensors {
   Tensor positions, velocities;
   OptionalTensor forces, start;
@@ -67,10 +25,12 @@ template <class T>
 void step_typed(const StepTensors& t, const Settings& settings,
                 void (*kernel)(const StepCall<T>&, int)) {
   StepCall<T> call;
-  call.plan = plan_view<T>(t.plan);
+  const Place place{t.positions.device()};
+  call.plan = plan_view<T>(t.plan, place);
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
-  call.material = material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch);
+  call.material =
+      material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch, place);
   check_tets(t.material[0], call.plan.tets);
   call.settings = settings;
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
@@ -130,14 +90,7 @@ void step_inplace(const Tensor& positions, const Tensor& velocities, const Tenso
   check_positions(positions, "positions");
   const Numbers n{schedule, iterations, time_step, relaxation, rho,
                   delay,    weighted,   tolerance, inertial,   report};
-  TORCH_CHECK_VALUE(positions.is_contiguous() && velocities.is_contiguous(),
-                    "step_: positions and velocities must be contiguous");
-  TORCH_CHECK_VALUE(!positions.is_alias_of(velocities),
-                    "step_: positions and velocities must not share memory");
-  TORCH_CHECK_VALUE(info.scalar_type() == at::kDouble && info.is_contiguous() && info.dim() == 2 &&
-                        info.size(0) == positions.size(0) && info.size(1) == info_count,
-                    "info must be a contiguous float64 [", positions.size(0), ", ", int(info_count),
-                    "], got ", describe(info));
+  check_inplace(positions, velocities, info);
   // the state is read before it is written: loads and stores of an environment do not overlap in time
   run_step({positions, velocities, forces, start, material, plan, positions, velocities, info},
            settings_of(n, start.has_value(), 1, 1));
@@ -169,15 +122,16 @@ void field_typed(Field field, const Tensor& positions, const Tensor& direction,
                  const Tensor& stiffness, at::TensorList plan, const Tensor& out,
                  void (*kernel)(const FieldCall<T>&, int)) {
   FieldCall<T> call;
-  call.plan = plan_view<T>(plan);
+  const Place place{positions.device()};
+  call.plan = plan_view<T>(plan, place);
   call.field = field;
   call.batch = positions.size(0);
   check_vertices(positions, call.plan.vertices);
   check_tets(stiffness, call.plan.tets);
   const Tensor w = stiffness.contiguous(), x = positions.contiguous();
   const Tensor d = direction.defined() ? direction.contiguous() : Tensor();
-  call.stiffness =
-      values_view<T>(w, call.plan.tets, 1, false, call.batch, "stiffness", "Young's modulus [Pa]");
+  call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
+                                  "Young's modulus [Pa]");
   call.positions = x.const_data_ptr<T>();
   call.direction = d.defined() ? d.const_data_ptr<T>() : nullptr;
   call.out = out.mutable_data_ptr<T>();
@@ -188,7 +142,7 @@ Tensor run_field(Field field, const Tensor& positions, const Tensor& direction,
                  const Tensor& stiffness, at::TensorList plan) {
   check_positions(positions, "positions");
   if (direction.defined()) check_state(direction, positions, "direction", "m");
-  const bool per_element = field >= Field::element_energy;
+  const bool per_element = field == Field::element_energy || field == Field::element_energy_product;
   TORCH_CHECK_VALUE(stiffness.dim() >= 1, "stiffness must be [tet] or [batch, tet] (Pa), got ",
                     describe(stiffness));
   const Tensor out = per_element
@@ -220,11 +174,31 @@ Tensor element_energy_product(const Tensor& positions, const Tensor& direction,
   return run_field(Field::element_energy_product, positions, direction, stiffness, plan);
 }
 
-void check_matrices(const Tensor& t, const char* name) {
-  TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name,
-                   " must be float32 or float64 [..., 3, 3], got ", describe(t));
-  TORCH_CHECK_VALUE(t.dim() >= 2 && t.size(-1) == 3 && t.size(-2) == 3, name,
-                    " must be [..., 3, 3], got ", describe(t));
+template <class T>
+Tensor diagonal_typed(const Tensor& stiffness, at::TensorList plan, bool weighted,
+                      void (*kernel)(const FieldCall<T>&, int)) {
+  FieldCall<T> call;
+  const Place place{stiffness.device(), "stiffness"};
+  call.plan = plan_view<T>(plan, place);
+  call.field = Field::diagonal;
+  call.weighted = weighted;
+  check_tets(stiffness, call.plan.tets);
+  std::vector<std::int64_t> shape(stiffness.sizes().begin(), stiffness.sizes().end());
+  shape.back() = call.plan.vertices;
+  call.batch = shape.size() == 2 ? shape[0] : 1;
+  const Tensor w = stiffness.contiguous(), out = at::empty(shape, stiffness.options());
+  call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
+                                  "Young's modulus [Pa]");
+  call.out = out.mutable_data_ptr<T>();
+  if (call.batch > 0) kernel(call, at::get_num_threads());
+  return out;
+}
+
+Tensor elastic_diagonal(const Tensor& stiffness, at::TensorList plan, bool weighted) {
+  check_real(stiffness, "stiffness", "[tets] or [batch, tets] (Pa)");
+  return stiffness.scalar_type() == at::kFloat
+             ? diagonal_typed<float>(stiffness, plan, weighted, kernels().field32)
+             : diagonal_typed<double>(stiffness, plan, weighted, kernels().field64);
 }
 
 template <class T>
@@ -240,12 +214,7 @@ void rotation_typed(const Tensor& matrices, const Tensor& direction, const Tenso
 
 Tensor run_rotation(const Tensor& matrices, const Tensor& direction) {
   check_matrices(matrices, "matrices");
-  if (direction.defined()) {
-    check_matrices(direction, "direction");
-    TORCH_CHECK_VALUE(
-        direction.sizes() == matrices.sizes() && direction.scalar_type() == matrices.scalar_type(),
-        "direction must be ", describe(matrices), " like matrices, got ", describe(direction));
-  }
+  if (direction.defined()) check_direction(direction, matrices);
   const Tensor out = at::empty(matrices.sizes(), matrices.options());
   if (matrices.scalar_type() == at::kFloat) {
     rotation_typed<float>(matrices, direction, out, kernels().rotation32);
@@ -291,6 +260,7 @@ TORCH_LIBRARY(torchpd, m) {
   m.def(
       "element_energy_product(Tensor positions, Tensor direction, Tensor stiffness, Tensor[] plan) "
       "-> Tensor");
+  m.def("elastic_diagonal(Tensor stiffness, Tensor[] plan, *, bool weighted) -> Tensor");
   m.def("nearest_rotation(Tensor matrices) -> Tensor");
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }
@@ -303,6 +273,7 @@ TORCH_LIBRARY_IMPL(torchpd, CPU, m) {
   m.impl("hessian_product", &hessian_product);
   m.impl("element_energy", &element_energy);
   m.impl("element_energy_product", &element_energy_product);
+  m.impl("elastic_diagonal", &elastic_diagonal);
   m.impl("nearest_rotation", &nearest_rotation);
   m.impl("rotation_differential", &rotation_differential);
 }

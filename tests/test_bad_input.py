@@ -13,6 +13,7 @@ from torch import Tensor
 import torchpd as pd
 
 ops = torch.ops.torchpd
+PATCHES, MOST_SLOTS = 5, 8  # in the order of PlanSize
 
 
 @pytest.fixture(scope="module")
@@ -154,13 +155,21 @@ def test_material_is_checked(sim: pd.Simulator) -> None:
 
 def test_plans_are_checked(sim: pd.Simulator) -> None:
     arrays, plan = list(sim.plan.arrays), sim.plan
+    none, many = plan.sizes.clone(), plan.sizes.clone()
+    none[PATCHES], many[MOST_SLOTS] = 0, 1000
     wrong: list[tuple[str, Tensor, str]] = [
+        ("sizes", plan.sizes.long(), r"plan\.sizes must be Int \(counts\), got Long"),
+        ("sizes", plan.sizes[:-1], r"plan\.sizes must be \[9\] \(counts\), got Int \[8\]"),
+        ("sizes", none, r"plan\.sizes must count at least one patch"),
+        ("sizes", many, r"no more slots in one than in all, got 1 patches with up to 1000 of 27 slots"),
+        ("sizes", plan.sizes + 1, r"plan\.[a-z_]+ must be \[\d+\] .*; compile the scene again"),
         ("tet_rest", plan.tet_rest.double(), r"plan\.tet_rest must be Float \(inverse rest matrix"),
-        ("tet_rest", plan.tet_rest[:, :9].contiguous(), r"plan\.tet_rest must be \[block, 144\] \(inverse rest matrix"),
-        ("tet_rest", plan.tet_rest[:-1], r"arrays that belong together have different lengths"),
+        ("tet_rest", plan.tet_rest[:, :9].contiguous(), r"plan\.tet_rest must be \[3, 144\] \(inverse rest matrix"),
+        ("tet_rest", plan.tet_rest[:-1], r"plan\.tet_rest must be \[3, 144\] .* got Float \[2, 144\] on cpu; compile"),
         ("tet_corner", plan.tet_corner.int(), r"plan\.tet_corner must be Short"),
-        ("slot_vertex", plan.slot_vertex[:-1], r"the ends of the patches do not match"),
-        ("vertex_group", plan.vertex_group[:-1], r"arrays that belong together"),
+        ("slot_vertex", plan.slot_vertex[:-1], r"plan\.slot_vertex must be \[27\] \(internal vertex"),
+        ("vertex_group", plan.vertex_group[:-1], r"plan\.vertex_group must be \[27\]"),
+        ("shared_slot", torch.zeros(1, dtype=torch.int32), r"plan\.shared_slot must be \[0\]"),
         ("vertex_order", plan.vertex_order.flip(0)[::2], r"plan\.vertex_order must be contiguous"),
     ]
     for name, value, message in wrong:
@@ -181,10 +190,21 @@ def test_stiffness_of_another_mesh(change: int, sim: pd.Simulator) -> None:
     for call in (
         lambda: ops.element_energy(x, stiffness, plan),
         lambda: ops.gradient(x, stiffness, plan),
+        lambda: ops.elastic_diagonal(stiffness, plan, weighted=True),
         lambda: call_step(sim, material=replaced(sim.material(), "stiffness", stiffness, sim)),
     ):
         with pytest.raises(ValueError, match=message):
             call()
+
+
+def test_stiffness_of_a_diagonal_is_checked(sim: pd.Simulator) -> None:
+    plan = list(sim.plan.arrays)
+    with pytest.raises(
+        TypeError, match=r"stiffness must be float32 or float64 \[tets\] or \[batch, tets\] \(Pa\), got Long"
+    ):
+        ops.elastic_diagonal(sim.stiffness.long(), plan, weighted=True)
+    with pytest.raises(TypeError, match=r"plan\.[a-z_]+ must be Double \(.*\), got Float"):
+        ops.elastic_diagonal(sim.stiffness.double(), plan, weighted=True)
 
 
 def test_step_in_place_checks_what_it_writes(sim: pd.Simulator) -> None:

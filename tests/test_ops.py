@@ -49,6 +49,7 @@ def samples(name: str, dtype: torch.dtype, device: torch.device) -> tuple[tuple[
         "element_energy": ((wanted(x), w, plan), {}),
         "element_energy_product": ((wanted(x), wanted(direction), w, plan), {}),
         "hessian_product": ((x, wanted(direction), w.detach(), plan), {}),
+        "elastic_diagonal": ((w.detach(), plan), {"weighted": True}),
         "nearest_rotation": ((wanted(matrices),), {}),
         "rotation_differential": ((wanted(matrices), wanted(matrices.flip(0))), {}),
     }
@@ -57,9 +58,8 @@ def samples(name: str, dtype: torch.dtype, device: torch.device) -> tuple[tuple[
 
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
-    "nearest_rotation", "rotation_differential", "step_vjp",
+    "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp",
 )  # fmt: skip
-FIELDS = OPS[3:7]
 
 
 @pytest.mark.parametrize("name", OPS)
@@ -103,6 +103,42 @@ def test_fields_are_those_of_the_reference(scale: float, dtype: torch.dtype, dev
     for name, (have, want) in found.items():
         error = np.abs(have[0].detach().double().cpu().numpy() - want).max()
         assert error <= loose.get(name, 1.0) * relative * np.abs(want).max(), name
+
+
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize("weighted", [True, False])
+def test_elastic_diagonal_is_the_sum_over_elements(weighted: bool, dtype: torch.dtype, device: torch.device) -> None:
+    """sum_e l_e w_e V_e |grad N_i|^2 from the mesh alone, for a shared stiffness and for one of each environment."""
+    case = small_case()
+    sim = simulator(case, dtype, device)
+    values = case.scene.values()
+    shape = pd.reference.elements(values.rest_positions, values.tets)
+    factor = shape.volumes * (shape.spread if weighted else 1.0)
+    many = torch.stack([sim.stiffness, 3.0 * sim.stiffness.flip(0)])
+    for stiffness in (sim.stiffness, many, many[:1], many[:0]):
+        found = ops.elastic_diagonal(stiffness, plan_of(sim), weighted=weighted)
+        assert found.dtype == dtype
+        assert found.shape == (*stiffness.shape[:-1], sim.vertices)
+        rows = zip(stiffness.reshape(-1, len(values.tets)), found.reshape(-1, sim.vertices), strict=True)
+        for w, row in rows:
+            share = (w.detach().double().cpu().numpy() * factor)[:, None] * (shape.shape_gradients**2).sum(axis=2)
+            want = np.zeros(sim.vertices)
+            np.add.at(want, values.tets, share)
+            # positive terms: rounding of some twenty operations each and of a sum of up to 24; the inverse of a rest
+            # matrix, of condition up to 1e3 on slivers, is found in float64 for both precisions
+            np.testing.assert_allclose(
+                row.double().cpu().numpy(), want, rtol=50 * ULP[dtype] + 1e3 * ULP[torch.float64]
+            )
+
+
+def test_elastic_diagonal_refuses_a_gradient() -> None:
+    sim, _ = small(torch.float32)
+    stiffness = sim.stiffness.detach().requires_grad_()
+    diagonal = ops.elastic_diagonal(stiffness, plan_of(sim), weighted=True)
+    with pytest.raises(
+        RuntimeError, match="the elastic diagonal, a preconditioner, has no derivative; detach stiffness"
+    ):
+        diagonal.sum().backward()
 
 
 def test_step_allocates_what_it_fills(poisoned: None, dtype: torch.dtype, device: torch.device) -> None:

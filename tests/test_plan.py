@@ -186,7 +186,7 @@ def test_arrays_are_those_of_the_table(plan: Plan) -> None:
         assert array.is_contiguous(), row.name
         assert array.shape[1:] == ((row.width,) if row.width > 1 else ()), row.name
     assert plan.bytes == sum(array.numel() * array.element_size() for array in plan.arrays)
-    with pytest.raises(AttributeError, match="Plan has no array 'tets'; it has vertex_order"):
+    with pytest.raises(AttributeError, match="Plan has no array 'tets'; it has sizes, vertex_order"):
         plan.tets  # noqa: B018
 
 
@@ -199,6 +199,21 @@ def test_plan_to_keeps_integers(plan: Plan) -> None:
         else:
             assert torch.equal(one, other)
             assert one.dtype == other.dtype
+
+
+def test_sizes_count_what_the_arrays_hold(plan: Plan, values: SceneValues) -> None:
+    slots = plan.patch_slot.diff()
+    assert plan.sizes.tolist() == [
+        len(values.rest_positions), len(values.tets), len(values.pin_vertices), len(plan.group_size),
+        len(plan.tet_rest), plan.patches, len(plan.slot_vertex),
+        plan.vertices - int(plan.patch_vertex[-1]), int(slots.max()),
+    ]  # fmt: skip
+
+
+def test_sizes_stay_on_the_cpu(plan: Plan) -> None:
+    moved = plan.to("meta")
+    assert [array.device.type for array in moved.arrays] == ["cpu"] + ["meta"] * (len(PLAN_TABLE) - 1)
+    assert moved.device.type == "meta"
 
 
 def test_compiling_twice_gives_the_same_plan(values: SceneValues) -> None:

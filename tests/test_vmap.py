@@ -65,6 +65,8 @@ def test_vmap_of_rollout_fields_and_rotations(dtype: torch.dtype, device: torch.
         (lambda e: ops.hessian_product(x[0], e, own, plan), (d,)),
         (lambda y, e: ops.element_energy_product(y, e, w, plan), (x, d)),
         (lambda s: ops.element_energy(x[0], s, plan), (torch.stack([w, 2 * w, 3 * w, 4 * w]),)),
+        (lambda s: ops.elastic_diagonal(s, plan, weighted=True), (torch.stack([w, 2 * w, 3 * w, 4 * w]),)),
+        (lambda s: ops.elastic_diagonal(s, plan, weighted=False), (torch.stack([own, 2 * own, 3 * own, 4 * own]),)),
         (ops.nearest_rotation, (matrices,)),
         (ops.rotation_differential, (matrices, matrices.flip(0))),
     ]

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .diagonal import named_material, named_plan, pinned_vertices, step_diagonal
+from .diagonal import named_material, pinned_vertices, step_diagonal
 from .tables import MATERIAL_TABLE
 
 __all__ = ["AdjointCall", "step_adjoint", "step_gradient"]
@@ -144,12 +144,12 @@ def step_gradient(call: AdjointCall) -> Tensor:
 
     m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - forces + springs + elastic gradient.
     """
-    material, plan = named_material(call.material), named_plan(call.plan)
+    material = named_material(call.material)
     masses, gravity = material["masses"].unsqueeze(-1), material["gravity"].unsqueeze(-2)
     pull = masses * (call.velocities / call.time_step + gravity)
     gradient = _inertial(material, call.time_step) * (call.after - call.positions) - pull
     gradient = gradient + torch.ops.torchpd.gradient(call.after, material["stiffness"], call.plan)
-    pins = pinned_vertices(plan)
+    pins = pinned_vertices(call.plan)
     springs = material["pin_stiffness"].unsqueeze(-1)
     hard = torch.isinf(springs)
     pulled = torch.where(hard, 0.0, springs) * (call.after[:, pins] - material["pin_targets"])
@@ -211,7 +211,7 @@ def step_adjoint(call: AdjointCall, grad_after: Tensor, grad_velocities: Tensor)
         grad_after: dL/dx' [B, V, 3].
         grad_velocities: dL/dv' [B, V, 3].
     """
-    h, material, pins = call.time_step, named_material(call.material), pinned_vertices(named_plan(call.plan))
+    h, material, pins = call.time_step, named_material(call.material), pinned_vertices(call.plan)
     masses, inertial = material["masses"].unsqueeze(-1), _inertial(material, h)
     right = grad_after + grad_velocities / h
     multiplier, held = _solve(call, right)

@@ -53,6 +53,16 @@ def _field_vmap(op: Any) -> Callable[..., tuple[Tensor, int]]:
     return rule
 
 
+@torch.library.register_vmap("torchpd::elastic_diagonal")
+def _diagonal_vmap(
+    info: Any, in_dims: tuple[Any, ...], stiffness: Tensor, plan: list[Tensor], *, weighted: bool
+) -> tuple[Tensor, int]:
+    _check_plan(in_dims[1])
+    mapped = stiffness.movedim(in_dims[0], 0)
+    rows = _ops.elastic_diagonal(mapped.flatten(0, -2), plan, weighted=weighted)
+    return rows.unflatten(0, mapped.shape[:-1]), 0
+
+
 def _rotation_vmap(op: Any) -> Callable[..., tuple[Tensor, int]]:
     def rule(info: Any, in_dims: tuple[int | None, ...], *matrices: Tensor) -> tuple[Tensor, int]:
         moved = [

@@ -90,6 +90,12 @@ def _(positions: Tensor, direction: Tensor, stiffness: Tensor, plan: Sequence[Te
     return positions.new_empty((positions.shape[0], stiffness.shape[-1]))
 
 
+@torch.library.register_fake("torchpd::elastic_diagonal")
+def _(stiffness: Tensor, plan: Sequence[Tensor], *, weighted: bool) -> Tensor:
+    _, vertex_order, *_ = plan
+    return stiffness.new_empty((*stiffness.shape[:-1], vertex_order.shape[0]))
+
+
 @torch.library.register_fake("torchpd::nearest_rotation")
 def _(matrices: Tensor) -> Tensor:
     return matrices.new_empty(matrices.shape)
@@ -170,6 +176,14 @@ def _hessian_product_backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor | No
         )
     positions, _, stiffness = ctx.saved_tensors
     return None, _ops.hessian_product(positions, grad, stiffness, ctx.plan), None, _for_plan(ctx)
+
+
+def _diagonal_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
+    """Nothing to save."""
+
+
+def _diagonal_backward(ctx: Any, grad: Tensor) -> tuple[None, None]:
+    raise RuntimeError("torchpd: the elastic diagonal, a preconditioner, has no derivative; detach stiffness")
 
 
 def _rotation_differential(F: Tensor, direction: Tensor) -> Tensor:
@@ -305,6 +319,7 @@ def _rollout_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor,
 
 _CONTACTS = ("planes", "spheres")
 torch.library.register_autograd("torchpd::rollout", _rollout_backward, setup_context=_rollout_setup)
+torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_diagonal_setup)
 torch.library.register_autograd("torchpd::step", _step_backward, setup_context=_step_setup)
 
 for _name, _backward, _inputs in (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,7 @@ from tqdm import tqdm
 
 from . import _C
 from .scene import SceneValues
-from .tables import PLAN_TABLE, PlanRow
+from .tables import PLAN_TABLE
 
 __all__ = ["Plan", "compile_plan"]
 
@@ -22,7 +21,6 @@ _WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to s
 
 
 _POSITION = {row.name: number for number, row in enumerate(PLAN_TABLE)}
-_TYPES = {"int32": torch.int32, "int16": torch.int16}
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,19 +59,14 @@ class Plan:
         """Memory of all arrays."""
         return sum(array.numel() * array.element_size() for array in self.arrays)
 
-    def map(self, function: Callable[[Tensor], Tensor]) -> Plan:
-        """A plan with `function` applied to every array; the integer types are kept."""
-        return Plan(
-            tuple(self._keep_type(row, function(array)) for row, array in zip(PLAN_TABLE, self.arrays, strict=True))
-        )
-
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Plan:
-        """A copy on another device or in another precision. Widening brings no digits back: compile again."""
-        return self.map(lambda array: array.to(device=device, dtype=dtype if array.is_floating_point() else None))
+        """A copy on another device or in another precision. Widening brings no digits back: compile again.
 
-    @staticmethod
-    def _keep_type(row: PlanRow, array: Tensor) -> Tensor:
-        return array.to(_TYPES[row.type]) if row.type in _TYPES else array
+        `sizes` stay on the CPU: the host reads them, and must not wait for a device.
+        """
+        sizes, *others = self.arrays
+        moved = (array.to(device=device, dtype=dtype if array.is_floating_point() else None) for array in others)
+        return Plan((sizes, *moved))
 
 
 def _advance(bar: tqdm[Any], done: float) -> None:
@@ -98,6 +91,16 @@ def _free_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int
     number = np.where(free, np.cumsum(free) - 1, -1)
     group = number[values.component].astype(np.int32)
     return group, np.bincount(group[group >= 0], minlength=int(free.sum())).astype(np.int32)
+
+
+def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
+    """Counts in the order of PlanSize in csrc/plan/views.h."""
+    slots = np.diff(arrays["patch_slot"])
+    counts = (
+        len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), len(arrays["group_size"]),
+        len(arrays["tet_order"]), len(slots), len(arrays["slot_vertex"]), len(arrays["shared_start"]) - 1, slots.max(),
+    )  # fmt: skip
+    return np.array(counts, dtype=np.int32)
 
 
 def compile_plan(
@@ -127,9 +130,7 @@ def compile_plan(
     group, group_size = _free_pieces(values)
     arrays["vertex_group"] = group[order]
     arrays["group_size"] = group_size
-    real = arrays["tet_volume"].reshape(-1) > 0.0
-    arrays["tet_lane"] = np.empty(tets, dtype=np.int32)
-    arrays["tet_lane"][arrays["tet_order"].reshape(-1)[real]] = np.flatnonzero(real)
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
+    arrays["sizes"] = _sizes(arrays, tets)
     tensors = (torch.from_numpy(np.ascontiguousarray(arrays[row.name])) for row in PLAN_TABLE)
     return Plan(tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors))

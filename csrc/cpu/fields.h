@@ -1,4 +1,4 @@
-// Elastic energy and its derivatives at given positions, environment by environment.
+// Elastic energy and its derivatives at given positions, and their diagonal, environment by environment.
 #pragma once
 #include "cpu/sweep.h"
 
@@ -22,16 +22,18 @@ class FieldPass {
   void run(std::int64_t environment) {
     load(environment);
     if (call_.field == Field::gradient) {
-      vertex_field<1>(environment, SolidGradient<false>{});
+      vertex_field<1, 3>(environment, SolidGradient<false>{});
+    } else if (call_.field == Field::diagonal) {
+      vertex_field<1, 1>(environment, SolidDiagonal{});
     } else if (call_.field == Field::hessian_product) {
-      vertex_field<2>(environment, one_by_one([](const auto& elements, int s) {
-                        using R = typename std::remove_cvref_t<decltype(elements)>::R;
-                        Vec3<R> x[4], dx[4], g[4];
-                        elements.corners(s, 0, x);
-                        elements.corners(s, 1, dx);
-                        solid_hessian_product(x, dx, elements.rest(s), elements.weight(s), g);
-                        elements.add(s, g);
-                      }));
+      vertex_field<2, 3>(environment, one_by_one([](const auto& elements, int s) {
+                           using R = typename std::remove_cvref_t<decltype(elements)>::R;
+                           Vec3<R> x[4], dx[4], g[4];
+                           elements.corners(s, 0, x);
+                           elements.corners(s, 1, dx);
+                           solid_hessian_product(x, dx, elements.rest(s), elements.weight(s), g);
+                           elements.add(s, g);
+                         }));
     } else if (call_.field == Field::element_energy) {
       element_field<1>(environment, [](const auto& x, const auto& rest, const auto& weight) {
         using R = std::remove_cvref_t<decltype(weight)>;
@@ -55,23 +57,24 @@ class FieldPass {
   // Positions go to u relative to each patch's first vertex through the origin, as in a step.
   void load(std::int64_t environment) {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      w_.x[i] = read(call_.positions, environment, i);
+      if (call_.positions) w_.x[i] = read(call_.positions, environment, i);
       if (call_.direction) w_.before[i] = read(call_.direction, environment, i);
     }
     const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;
     for (std::int64_t e = team_.begin(elements); e < team_.end(elements); ++e) {
-      w_.weight[e] = plan_.tet_volume[e] * call_.stiffness.of(environment)[plan_.tet_order[e]];
+      const T volume = plan_.tet_volume[e] * (call_.weighted ? plan_.tet_bound[e] : T(1));
+      w_.weight[e] = volume * call_.stiffness.of(environment)[plan_.tet_order[e]];
     }
     team_.barrier();
     sweep_.set_origins();
     team_.barrier();
   }
 
-  template <int Fields, class Element>
+  template <int Fields, int Components, class Element>
   void vertex_field(std::int64_t environment, Element element) {
     sweep_.template run<Fields>(0, element, [&](std::int64_t i, const Quad<T>& force, Sum&) {
-      T* to = call_.out + (environment * plan_.vertices + plan_.vertex_order[i]) * 3;
-      for (int c = 0; c < 3; ++c) to[c] = force.q.v[c];
+      T* to = call_.out + (environment * plan_.vertices + plan_.vertex_order[i]) * Components;
+      for (int c = 0; c < Components; ++c) to[c] = force.q.v[c];
     });
   }
 

@@ -142,6 +142,11 @@ PD_HD Pack<T, W> multiply_subtract(Pack<T, W> a, Pack<T, W> b, Pack<T, W> c) {
   return multiply_add(a, b, -c);
 }
 
+template <class T, int W>
+PD_HD Pack<T, W> rough_square_root(Pack<T, W> a) {
+  return square_root(a);
+}
+
 // About 14 bits where the hardware has it: enough for a Newton step, which corrects itself.
 template <class T, int W>
 PD_HD Pack<T, W> rough_reciprocal(Pack<T, W> a) {
@@ -167,8 +172,7 @@ PD_HD Pack<T, W> reciprocal(Pack<T, W> a) {
 
 // The lanes in which the fast rotation is not to be trusted, one by one.
 template <class T, int W>
-[[gnu::noinline, gnu::cold]] void repair_lanes(const Mat3<Pack<T, W>>& f, Mask<T, W> good,
-                                               Mat3<Pack<T, W>>& r) {
+PD_COLD void repair_lanes(const Mat3<Pack<T, W>>& f, Mask<T, W> good, Mat3<Pack<T, W>>& r) {
   for (int lane = 0; lane < W; ++lane) {
     if (good.m[lane]) continue;
     Mat3<T> one;

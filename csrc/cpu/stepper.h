@@ -9,7 +9,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: the scene has contacts. Without them not even the question whether there are any is compiled.
+// `Touching`: see solver/vertex.h.
 template <class Lanes, bool Touching>
 class Stepper {
   using T = typename Lanes::Scalar;
@@ -55,7 +55,7 @@ class Stepper {
       in_.each_pin([&](std::int64_t i, Real spring, Value pin) {
         const Value offset = pin - w_.x[i];
         const Real soft = select(spring < Real(T(HUGE_VAL)), spring, none);
-        w_.target[i] = hold(i, offset, target(i, soft, offset));
+        w_.target[i] = vertex(i).hold(offset, target(i, soft, offset));
       });
     sweep_.set_origins();
     team_.barrier();
@@ -63,10 +63,9 @@ class Stepper {
 
   void start() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      Value u = set_.start == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
-      if (set_.start == StartKind::given) u = in_.at_vertex(call_.start, i) - w_.x[i];
-      u = hold(i, w_.target[i], u);
-      w_.u[i] = w_.before[i] = contact(i, u, u);
+      Value guess = set_.start == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
+      if (set_.start == StartKind::given) guess = in_.at_vertex(call_.start, i) - w_.x[i];
+      w_.u[i] = w_.before[i] = vertex(i).first(contacts_, guess);
     }
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
@@ -102,8 +101,7 @@ class Stepper {
     const bool guard = schedule_[0].wants_energy(k);
     if (guard) {
       sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
-        const Value offset = w_.u[i] - w_.target[i];
-        sums.energy = multiply_add(w_.inertia[i] * offset, offset, sums.energy);
+        sums.energy = vertex(i).add_energy(w_.u[i], sums.energy);
         update(i, force, sums);
       });
     } else {
@@ -123,8 +121,7 @@ class Stepper {
   // The gradient on the straight course x + h v is what residuals are relative to, whatever the first iterate.
   void measure_course() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      const Value u = hold(i, w_.target[i], Real(h_) * w_.velocity[i]);
-      w_.u[i] = contact(i, u, u);
+      w_.u[i] = vertex(i).first(contacts_, Real(h_) * w_.velocity[i]);
     }
     measure();
     for (int lane = 0; lane < width; ++lane) course_[lane] = Lanes::lane(residual_, lane);
@@ -134,9 +131,9 @@ class Stepper {
   void measure() {
     team_.barrier();
     sweep_.run(0, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
-      const Value offset = w_.u[i] - w_.target[i];
-      sums.energy = multiply_add(w_.inertia[i] * offset, offset, sums.energy);
-      const Value residual = unbalanced(i, multiply_add(w_.inertia[i], offset, force));
+      const auto v = vertex(i);
+      sums.energy = v.add_energy(w_.u[i], sums.energy);
+      const Value residual = v.unbalanced(contacts_, w_.u[i], force);
       sums.first = multiply_add(residual, residual, sums.first);
     });
     const auto sum = total(0);
@@ -162,19 +159,8 @@ class Stepper {
     return inertia_target(weight, mass, w_.velocity[i], gravity_, force, spring, pin, h);
   }
 
-  // `held` where the vertex does not move, `free` elsewhere
-  Value hold(std::int64_t i, const Value& held, const Value& free) const {
-    const auto moves = w_.inverse[i] > Real(T(0));
-    const Vec3<Real> a = Lanes::vec3(free), b = Lanes::vec3(held);
-    return Lanes::value(
-        {select(moves, a.x, b.x), select(moves, a.y, b.y), select(moves, a.z, b.z)});
-  }
-
-  Value contact(std::int64_t i, const Value& u, const Value& around) const {
-    if constexpr (!Touching) return u;
-    return hold(
-        i, u,
-        Lanes::value(contacts_.project(Lanes::vec3(w_.x[i]), Lanes::vec3(u), Lanes::vec3(around))));
+  PD_HD Vertex<Lanes, Touching> vertex(std::int64_t i) const {
+    return {w_.x[i], w_.target[i], w_.inertia[i], w_.inverse[i]};
   }
 
   void load() {
@@ -213,7 +199,7 @@ class Stepper {
 
   // a and 1 / D of every vertex, w V of every element, and the smallest a / D
   void weigh() {
-    const Real none(T(0)), one(T(1));
+    const Real none(T(0));
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
       w_.inertia[i] = inertia_weight(in_.number(call_.material.masses, plan_.vertex_order[i]),
                                      damping_, none, Real(h_));
@@ -225,20 +211,10 @@ class Stepper {
       });
     set_weights(set_.weighted);
     team_.barrier();
-    const auto diagonal = one_by_one([](const auto& elements, int s) {
-      using R = typename std::remove_cvref_t<decltype(elements)>::R;
-      R d[4];
-      solid_diagonal(elements.rest(s), elements.weight(s), d);
-      const Vec3<R> g[4] = {
-          {d[0], d[0], d[0]}, {d[1], d[1], d[1]}, {d[2], d[2], d[2]}, {d[3], d[3], d[3]}};
-      elements.add(s, g);
-    });
-    sweep_.run(0, diagonal, [&](std::int64_t i, const Value& force, Sum& sums) {
+    sweep_.run(0, SolidDiagonal{}, [&](std::int64_t i, const Value& force, Sum& sums) {
       const Real a = w_.inertia[i];
-      const auto moves = a > none;
-      const Real inverse = one / (a + Lanes::vec3(force).x);
-      w_.inverse[i] = select(moves, inverse, none);
-      sums.least = lesser(sums.least, select(moves, a * inverse, sums.least));
+      w_.inverse[i] = inverse_diagonal(a, Lanes::vec3(force).x);
+      sums.least = lesser(sums.least, select(a > none, a * w_.inverse[i], sums.least));
     });
     Real least = Real(T(HUGE_VAL));
     for (int part = 0; part < w_.part_count; ++part) least = lesser(least, w_.parts[0][part].least);
@@ -263,9 +239,7 @@ class Stepper {
 
   void update(std::int64_t i, const Value& force, Sum& sums) {
     const Value u = w_.u[i], before = w_.before[i];
-    const Value gradient = multiply_add(w_.inertia[i], u - w_.target[i], force);
-    Value next =
-        contact(i, accelerate(u, before, gradient, Real(theta_) * w_.inverse[i], omega_), u);
+    Value next = vertex(i).next(contacts_, u, before, force, Real(theta_), omega_);
     if (set_.tolerance > 0) {
       next = freeze(u, next);
       const Value change = next - u;
@@ -306,17 +280,6 @@ class Stepper {
       const double change = Lanes::lane(sum.first, lane), length = Lanes::lane(sum.second, lane);
       if (soft && change <= set_.tolerance * set_.tolerance * length) done_[lane] = true;
     }
-  }
-
-  Value unbalanced(std::int64_t i, const Value& gradient) const {
-    const Real none(T(0));
-    const Value zero = Lanes::value({none, none, none});
-    if constexpr (!Touching) return hold(i, zero, gradient);
-    const Real inverse = w_.inverse[i],
-               diagonal = Real(T(1)) / select(inverse > none, inverse, Real(T(1)));
-    return hold(
-        i, zero,
-        diagonal * (w_.u[i] - contact(i, subtract_product(w_.u[i], inverse, gradient), w_.u[i])));
   }
 
   void store(int record) {

@@ -18,14 +18,14 @@ PD_HD Mat3<R> deformation_gradient(const Vec3<R> (&x)[4], const Mat3<R>& rest_in
 template <class R>
 PD_HD void shape_gradients(const Mat3<R>& rest_inverse, Vec3<R> (&n)[4]) {
   for (int c = 0; c < 3; ++c) n[c + 1] = rest_inverse.row[c];
-  n[0] = -((n[1] + n[2]) + n[3]);
+  n[0] = (-n[1] - n[2]) - n[3];
 }
 
 // P grad N_c of the four corners, for a stress P
 template <class R>
 PD_HD void corner_forces(const Mat3<R>& stress, const Mat3<R>& rest_inverse, Vec3<R> (&g)[4]) {
   for (int c = 0; c < 3; ++c) g[c + 1] = stress * rest_inverse.row[c];
-  g[0] = -((g[1] + g[2]) + g[3]);
+  g[0] = (-g[1] - g[2]) - g[3];
 }
 
 // F - R: how far the element is from its rest shape
@@ -85,12 +85,23 @@ PD_HD R element_energy_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
   return weight * frobenius(strain(x, rest_inverse), deformation_gradient(dx, rest_inverse));
 }
 
-// Diagonal of the majoriser on the four corners: l_e w V |grad N_c|^2, `weight` being l_e w V.
-template <class R>
-PD_HD void solid_diagonal(const Mat3<R>& rest_inverse, const R& weight, R (&d)[4]) {
-  Vec3<R> n[4];
-  shape_gradients(rest_inverse, n);
-  for (int c = 0; c < 4; ++c) d[c] = weight * dot(n[c], n[c]);
-}
+// Diagonal of the majoriser on the four corners, l_e w V |grad N_c|^2 in every component, the weight being l_e w V.
+struct SolidDiagonal {
+  static constexpr int strip = 1;
+
+  template <int N, class Elements>
+  PD_HD void run(const Elements& elements) const {
+    using R = typename Elements::R;
+    for (int s = 0; s < N; ++s) {
+      Vec3<R> n[4], d[4];
+      shape_gradients(elements.rest(s), n);
+      for (int c = 0; c < 4; ++c) {
+        const R entry = elements.weight(s) * dot(n[c], n[c]);
+        d[c] = {entry, entry, entry};
+      }
+      elements.add(s, d);
+    }
+  }
+};
 
 }  // namespace pd::inline PD_TARGET

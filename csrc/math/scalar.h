@@ -11,8 +11,6 @@ PD_HD float square_root(float a) { return sqrtf(a); }
 PD_HD double square_root(double a) { return sqrt(a); }
 PD_HD float absolute(float a) { return fabsf(a); }
 PD_HD double absolute(double a) { return fabs(a); }
-PD_HD float reciprocal(float a) { return 1.0f / a; }
-PD_HD double reciprocal(double a) { return 1.0 / a; }
 // a b + c, c - a b and a b - c, rounded once where the processor can. Said outright, and the compiler told to fuse nothing by
 // itself, because whether it fuses depends on the surroundings, and the same bits are wanted from every path.
 #if defined(PD_NO_FMA)
@@ -27,8 +25,28 @@ PD_HD double subtract_product(double c, double a, double b) { return multiply_ad
 PD_HD float multiply_subtract(float a, float b, float c) { return multiply_add(a, b, -c); }
 PD_HD double multiply_subtract(double a, double b, double c) { return multiply_add(a, b, -c); }
 
-PD_HD float rough_reciprocal(float a) { return 1.0f / a; }
-PD_HD double rough_reciprocal(double a) { return 1.0 / a; }
+// Of numbers that are neither tiny nor huge, to the last bit or two; the rough ones serve Newton's method, which corrects
+// itself. What a GPU has for them takes such numbers alone: 0 and infinity for those beyond 1e-38 and 1e38.
+#if defined(__CUDA_ARCH__)
+PD_HD float reciprocal(float a) {
+  float r;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(a));
+  return r;
+}
+PD_HD float rough_square_root(float a) {
+  float r;
+  asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(a));
+  return r;
+}
+#else
+PD_HD float reciprocal(float a) { return 1.0f / a; }
+PD_HD float rough_square_root(float a) { return sqrtf(a); }
+#endif
+PD_HD double reciprocal(double a) { return 1.0 / a; }
+PD_HD double rough_square_root(double a) { return sqrt(a); }
+PD_HD float rough_reciprocal(float a) { return reciprocal(a); }
+PD_HD double rough_reciprocal(double a) { return reciprocal(a); }
+
 PD_HD float lesser(float a, float b) { return b < a ? b : a; }
 PD_HD double lesser(double a, double b) { return b < a ? b : a; }
 PD_HD float select(bool take, float a, float b) { return take ? a : b; }

@@ -10,13 +10,27 @@ namespace pd {
 using int16 = std::int16_t;
 using int32 = std::int32_t;
 
+// Numbers of a plan's array of sizes.
+enum PlanSize : int {
+  plan_vertices,
+  plan_tets,
+  plan_pins,
+  plan_groups,
+  plan_blocks,
+  plan_patches,
+  plan_slots,
+  plan_shared,
+  plan_most_slots,
+  plan_size_count
+};
+
 template <class T>
 struct Plan {
   using real = T;
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "plan/plan.def"
 #undef X
-  int vertices = 0, tets = 0, pins = 0, blocks = 0, patches = 0, slots = 0, shared = 0, groups = 0;
+  int vertices = 0, tets = 0, pins = 0, groups = 0, blocks = 0, patches = 0, slots = 0, shared = 0;
   int most_slots = 0;  // of any patch
 };
 
@@ -81,8 +95,14 @@ struct StepCall {
   double* info = nullptr;  // [records, batch, info_count], may be null
 };
 
-// Elastic energy and its derivatives at given positions.
-enum class Field : int { gradient, hessian_product, element_energy, element_energy_product };
+// Elastic energy and its derivatives at given positions, and the diagonal that bounds its second ones.
+enum class Field : int {
+  gradient,
+  hessian_product,
+  element_energy,
+  element_energy_product,
+  diagonal
+};
 
 template <class T>
 struct FieldCall {
@@ -90,9 +110,11 @@ struct FieldCall {
   Field field = Field::gradient;
   Values<T> stiffness;
   std::int64_t batch = 0;
-  const T* positions = nullptr;  // [batch, vertices, 3]
+  bool weighted = false;         // with l_e, by the diagonal
+  const T* positions = nullptr;  // [batch, vertices, 3], by all but the diagonal
   const T* direction = nullptr;  // [batch, vertices, 3], by the products
-  T* out = nullptr;              // [batch, vertices, 3], or [batch, tets] of the element energies
+  T* out =
+      nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, vertices] of the diagonal
 };
 
 template <class T>

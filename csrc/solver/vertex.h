@@ -1,5 +1,6 @@
-// What a step does with one vertex: predict, accelerate.
+// What a step does with one vertex: weigh, predict, hold, project, accelerate, measure.
 #pragma once
+#include "effects/contact.h"
 #include "math/vec.h"
 
 namespace pd::inline PD_TARGET {
@@ -20,11 +21,78 @@ PD_HD V inertia_target(const R& weight, const R& mass, const V& velocity, const 
   return (R(1) / weight) * pull;
 }
 
+// 1 / D; 0 for a vertex that a pin holds exactly, to which a = 0 is given
+template <class R>
+PD_HD R inverse_diagonal(const R& inertia, const R& elastic) {
+  return select(inertia > R(0), R(1) / (inertia + elastic), R(0));
+}
+
 // x_{k+1} = x_{k-1} + omega (x_k - theta D^-1 grad E - x_{k-1})            (Wang 2015, eq. 16; descent = theta / D)
 template <class V, class R>
 PD_HD V accelerate(const V& u, const V& before, const V& gradient, const R& descent,
                    const R& omega) {
   return multiply_add(omega, subtract_product(u, descent, gradient) - before, before);
 }
+
+// One vertex during a step, in each of the environments that Lanes runs side by side: Real is one number of each, Value one
+// vector, with vec3() and value() between Value and Vec3<Real>. Displacements u count from x.
+// `Touching`: the scene has contacts. Without them not even the question whether there are any is compiled.
+template <class Lanes, bool Touching>
+struct Vertex {
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Value = typename Lanes::Value;
+
+  Value x, target;        // at the start of the step; s
+  Real inertia, inverse;  // a; 1 / D, 0 where a pin holds the vertex on its target
+
+  // `held` where the vertex does not move, `free` elsewhere
+  PD_HD Value hold(const Value& held, const Value& free) const {
+    const auto moves = inverse > Real(T(0));
+    const Vec3<Real> a = Lanes::vec3(free), b = Lanes::vec3(held);
+    return Lanes::value(
+        {select(moves, a.x, b.x), select(moves, a.y, b.y), select(moves, a.z, b.z)});
+  }
+
+  // `u` out of the contacts; `around`: see effects/contact.h
+  PD_HD Value project(const Contacts<Real>& contacts, const Value& u, const Value& around) const {
+    if constexpr (!Touching) return u;
+    return hold(
+        u, Lanes::value(contacts.project(Lanes::vec3(x), Lanes::vec3(u), Lanes::vec3(around))));
+  }
+
+  // the iterate to begin with, from a guess
+  PD_HD Value first(const Contacts<Real>& contacts, const Value& guess) const {
+    const Value u = hold(target, guess);
+    return project(contacts, u, u);
+  }
+
+  // dE/du, `force` being that of the elements, dE_elastic/du
+  PD_HD Value gradient(const Value& u, const Value& force) const {
+    return multiply_add(inertia, u - target, force);
+  }
+
+  // `sum` + a |u - s|^2, component by component: twice the energy
+  PD_HD Value add_energy(const Value& u, const Value& sum) const {
+    const Value offset = u - target;
+    return multiply_add(inertia * offset, offset, sum);
+  }
+
+  // the iterate after u
+  PD_HD Value next(const Contacts<Real>& contacts, const Value& u, const Value& before,
+                   const Value& force, const Real& theta, const Real& omega) const {
+    const Value free = accelerate(u, before, gradient(u, force), theta * inverse, omega);
+    return project(contacts, free, u);
+  }
+
+  // the part of dE/du that neither a pin nor a contact balances: D times the way of a plain iteration
+  PD_HD Value unbalanced(const Contacts<Real>& contacts, const Value& u, const Value& force) const {
+    const Real none(T(0)), one(T(1));
+    const Value zero = Lanes::value({none, none, none}), free = gradient(u, force);
+    if constexpr (!Touching) return hold(zero, free);
+    const Real diagonal = one / select(inverse > none, inverse, one);
+    return hold(zero, diagonal * (u - project(contacts, subtract_product(u, inverse, free), u)));
+  }
+};
 
 }  // namespace pd::inline PD_TARGET
