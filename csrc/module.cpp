@@ -1,6 +1,7 @@
 // `torchpd._C`: mesh work on NumPy arrays, the tables, what was built. Loading it also registers the ops.
 #include "cpu/dispatch.h"
 #include "plan/build.h"
+#include "plan/device_build.h"
 
 #include <pybind11/functional.h>
 #include <pybind11/numpy.h>
@@ -14,15 +15,18 @@ namespace py = pybind11;
 namespace {
 
 using Doubles = py::array_t<double, py::array::c_style>;
+using Numbers = py::array_t<std::int32_t, py::array::c_style>;
 using Indices = py::array_t<std::int64_t, py::array::c_style>;
 
+// Hands the numbers over to NumPy without a copy.
 template <class T>
-py::array_t<T> as_array(const std::vector<T>& numbers, py::ssize_t width) {
-  const auto rows = py::ssize_t(numbers.size()) / width;
-  py::array_t<T> array(width > 1 ? std::vector<py::ssize_t>{rows, width}
-                                 : std::vector<py::ssize_t>{rows});
-  std::copy(numbers.begin(), numbers.end(), array.mutable_data());
-  return array;
+py::array_t<T> as_array(std::vector<T>& numbers, py::ssize_t width) {
+  auto* owned = new std::vector<T>(std::move(numbers));
+  const py::capsule owner(owned, [](void* p) { delete static_cast<std::vector<T>*>(p); });
+  const auto rows = py::ssize_t(owned->size()) / width;
+  return py::array_t<T>(
+      width > 1 ? std::vector<py::ssize_t>{rows, width} : std::vector<py::ssize_t>{rows},
+      owned->data(), owner);
 }
 
 void check_mesh(const Doubles& positions, const Indices& tets) {
@@ -46,14 +50,14 @@ py::dict build_plan(const Doubles& positions, const Indices& tets, int patch_siz
   check_mesh(positions, tets);
   if (patch_size < 16 || patch_size > 8192)
     throw py::value_error("patch_size must lie in 16..8192");
-  const auto plan = pd::build_plan(positions.data(), positions.shape(0), tets.data(), tets.shape(0),
-                                   patch_size, progress);
+  auto plan = pd::build_plan(positions.data(), positions.shape(0), tets.data(), tets.shape(0),
+                             patch_size, progress);
   py::dict arrays;
   std::map<std::string, int> widths;
 #define X(name, type, width, rows, meaning) widths[#name] = width;
 #include "plan/plan.def"
 #undef X
-  const auto add = [&](const char* name, const auto& numbers) {
+  const auto add = [&](const char* name, auto& numbers) {
     arrays[name] = as_array(numbers, widths.at(name));
   };
   add("vertex_order", plan.vertex_order);
@@ -71,11 +75,43 @@ py::dict build_plan(const Doubles& positions, const Indices& tets, int patch_siz
   return arrays;
 }
 
+py::dict build_device_plan(const Doubles& positions, const Indices& tets, int patches,
+                           const Numbers& piece, const std::function<void(double)>& progress) {
+  check_mesh(positions, tets);
+  if (patches < 1 || patches > tets.shape(0)) {
+    throw py::value_error("patches must lie in 1.." + std::to_string(tets.shape(0)) +
+                          ", the number of tetrahedra, got " + std::to_string(patches));
+  }
+  const std::int64_t vertices = positions.shape(0);
+  if (piece.ndim() != 1 || piece.shape(0) != vertices)
+    throw py::value_error("piece must be int32 [vertices], a number for each row of positions");
+  for (std::int64_t v = 0; v < vertices; ++v) {
+    if (piece.at(v) < -1 || piece.at(v) >= vertices)
+      throw py::value_error("piece must hold numbers of pieces, counted from 0, or -1");
+  }
+  auto plan = pd::build_device_plan(positions.data(), vertices, tets.data(), tets.shape(0), patches,
+                                    piece.data(), progress);
+  py::dict arrays;
+#define X(name, type, width, rows, meaning) arrays[#name] = as_array(plan.name, width);
+#include "plan/device.def"
+#undef X
+  return arrays;
+}
+
 py::list plan_table() {
   py::list rows;
 #define X(name, type, width, rows_, meaning) \
   rows.append(py::make_tuple(#name, #type, width, #rows_, meaning));
 #include "plan/plan.def"
+#undef X
+  return rows;
+}
+
+py::list device_plan_table() {
+  py::list rows;
+#define X(name, type, width, rows_, meaning) \
+  rows.append(py::make_tuple(#name, #type, width, #rows_, meaning));
+#include "plan/device.def"
 #undef X
   return rows;
 }
@@ -127,8 +163,12 @@ PYBIND11_MODULE(_C, m) {
       "torchpd::*.";
   m.def("build_plan", &build_plan, py::arg("positions"), py::arg("tets"), py::arg("patch_size"),
         py::arg("progress"));
+  m.def("build_device_plan", &build_device_plan, py::arg("positions"), py::arg("tets"),
+        py::arg("patches"), py::arg("piece"), py::arg("progress"));
   m.def("plan_table", &plan_table,
         "Rows (name, type, width, rows, meaning) of the constant arrays, in op order.");
+  m.def("device_plan_table", &device_plan_table,
+        "Rows (name, type, width, rows, meaning) of the constant arrays on a GPU, in op order.");
   m.def("material_table", &material_table,
         "Rows (name, width, rows, meaning) of the differentiable arrays, in op order.");
   m.def("build_info", &build_info, "What this build can do on this machine.");

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +17,7 @@ from . import _C
 from .scene import SceneValues
 from .tables import PLAN_TABLE
 
-__all__ = ["Plan", "compile_plan"]
+__all__ = ["Plan", "compile_plan", "compiling", "free_pieces", "internal_numbers"]
 
 _WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
 
@@ -69,6 +71,13 @@ class Plan:
         return Plan((sizes, *moved))
 
 
+@contextmanager
+def compiling(tets: int, progress: bool) -> Iterator[Callable[[float], None]]:
+    """Shows a bar when the mesh is large; gives the function that hears the fraction done."""
+    with tqdm(total=100, desc="compiling the scene", leave=False, disable=not progress or tets < _WORTH_A_BAR) as bar:
+        yield lambda done: _advance(bar, done)
+
+
 def _advance(bar: tqdm[Any], done: float) -> None:
     bar.update(int(100 * done) - bar.n)
 
@@ -83,7 +92,7 @@ def _patch_size(tets: int) -> int:
     return max(16, -(-tets // patches))
 
 
-def _free_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def free_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Number of the unpinned piece that each vertex belongs to (-1: pinned), and the size of each such piece."""
     pieces = int(values.component.max()) + 1
     free = np.ones(pieces, dtype=bool)
@@ -103,6 +112,13 @@ def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
     return np.array(counts, dtype=np.int32)
 
 
+def internal_numbers(vertex_order: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Internal number of each of the user's vertices."""
+    internal = np.empty_like(vertex_order)
+    internal[vertex_order] = np.arange(len(vertex_order), dtype=vertex_order.dtype)
+    return internal
+
+
 def compile_plan(
     values: SceneValues, *, dtype: torch.dtype = torch.float32, patch_size: int | None = None, progress: bool = True
 ) -> Plan:
@@ -117,18 +133,16 @@ def compile_plan(
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
     tets = len(values.tets)
-    with tqdm(total=100, desc="compiling the scene", leave=False, disable=not progress or tets < _WORTH_A_BAR) as bar:
+    with compiling(tets, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_plan(
             values.rest_positions,
             values.tets,
             patch_size or _patch_size(tets),
-            lambda done: _advance(bar, done),
+            advance,
         )
-    order = arrays["vertex_order"]
-    internal = np.empty_like(order)
-    internal[order] = np.arange(len(order), dtype=order.dtype)
-    group, group_size = _free_pieces(values)
-    arrays["vertex_group"] = group[order]
+    internal = internal_numbers(arrays["vertex_order"])
+    group, group_size = free_pieces(values)
+    arrays["vertex_group"] = group[arrays["vertex_order"]]
     arrays["group_size"] = group_size
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
     arrays["sizes"] = _sizes(arrays, tets)

@@ -8,6 +8,14 @@
 
 namespace pd {
 
+int most_threads() {
+#if defined(_OPENMP)
+  return omp_get_max_threads();
+#else
+  return 1;
+#endif
+}
+
 void run_team(int threads, void (*work)(void*, const Team&), void* context) {
 #if defined(_OPENMP)
   if (threads > 1 && !omp_in_parallel()) {

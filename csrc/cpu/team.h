@@ -51,6 +51,9 @@ struct Team {
   std::int64_t end(std::int64_t count) const { return count * (rank + 1) / size; }
 };
 
+// How many threads this process may use at most.
+int most_threads();
+
 // Calls work(context, team) in every thread of a new team of at most `threads`; alone inside another parallel region.
 void run_team(int threads, void (*work)(void* context, const Team& team), void* context);
 

@@ -1,7 +1,6 @@
 // Turns a tetrahedral mesh into the arrays of plan.def: patches, orders, gathers, rest matrices.
 #pragma once
 
-#include <array>
 #include <cstdint>
 #include <functional>
 #include <vector>
@@ -20,8 +19,5 @@ struct MeshPlan {
 MeshPlan build_plan(const double* positions, std::int64_t vertices, const std::int64_t* tets,
                     std::int64_t count, int patch_size,
                     const std::function<void(double)>& progress);
-
-// l_e of shape gradients: the largest eigenvalue of diag(K)^-1/2 K diag(K)^-1/2, K = grad N grad N^T.
-double element_bound(const std::array<std::array<double, 3>, 4>& gradients);
 
 }  // namespace pd

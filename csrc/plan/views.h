@@ -34,6 +34,38 @@ struct Plan {
   int most_slots = 0;  // of any patch
 };
 
+// Numbers of DevicePlan::sizes; most_*: the largest of any patch.
+enum DeviceSize : int {
+  size_kernel,
+  size_vertices,
+  size_tets,
+  size_pins,
+  size_pieces,
+  size_blocks,
+  size_patches,
+  size_slots,
+  size_shared,
+  size_parts,
+  size_most_slots,
+  size_most_pairs,
+  size_most_entries,
+  size_most_shared,
+  size_most_parts,
+  size_count
+};
+
+// The constant arrays on a GPU. All but `sizes` are in its memory.
+template <class T>
+struct DevicePlan {
+  using real = T;
+#define X(name, type, width, rows, meaning) const type* name = nullptr;
+#include "plan/device.def"
+#undef X
+  int kernel = 0, vertices = 0, tets = 0, pins = 0, pieces = 0, blocks = 0, patches = 0, slots = 0;
+  int shared = 0, parts = 0;
+  int most_slots = 0, most_pairs = 0, most_entries = 0, most_shared = 0, most_parts = 0;
+};
+
 // One array of the material: the same for all environments when stride is 0.
 template <class T>
 struct Values {
@@ -80,9 +112,9 @@ enum InfoField : int {
 };
 
 // Everything one call of step or rollout works on. Positions in the user's order, [batch, vertices, 3].
-template <class T>
+template <class T, class P = Plan<T>>
 struct StepCall {
-  Plan<T> plan;
+  P plan;
   Material<T> material;
   Settings settings;
   std::int64_t batch = 0;
@@ -95,6 +127,9 @@ struct StepCall {
   double* info = nullptr;  // [records, batch, info_count], may be null
 };
 
+template <class T>
+using DeviceStep = StepCall<T, DevicePlan<T>>;
+
 // Elastic energy and its derivatives at given positions, and the diagonal that bounds its second ones.
 enum class Field : int {
   gradient,
@@ -104,9 +139,9 @@ enum class Field : int {
   diagonal
 };
 
-template <class T>
+template <class T, class P = Plan<T>>
 struct FieldCall {
-  Plan<T> plan;
+  P plan;
   Field field = Field::gradient;
   Values<T> stiffness;
   std::int64_t batch = 0;

@@ -15,6 +15,10 @@
 
 namespace pd::inline PD_TARGET {
 
+// The runner's own functions say where it runs: in a kernel, or on the host.
+#if defined(__CUDACC__)
+#pragma nv_exec_check_disable
+#endif
 template <class Runner>
 PD_HD void step(Runner& run, const Settings& settings) {
   run.predict();  // targets s: where inertia, forces and springs would take each vertex

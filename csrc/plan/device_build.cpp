@@ -1,0 +1,297 @@
+#include "plan/device_build.h"
+
+#include "cpu/team.h"
+#include "plan/pairing.h"
+#include "plan/partition.h"
+#include "plan/phases.h"
+#include "plan/rest.h"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+namespace pd {
+
+namespace {
+
+constexpr int lanes = 32, slice = 8;
+constexpr std::int64_t none = 65535;  // slots and entries of a patch count up to one less
+
+struct Mesh {
+  const double* positions;
+  const std::int64_t* tets;
+  Partition partition;
+  Numbering numbering;
+};
+
+// A patch by its own numbers.
+struct Patch {
+  std::vector<std::int32_t> vertex;  // user's vertex in each slot
+  std::vector<std::int32_t> first;   // entry of each slot
+  std::vector<std::int32_t> forces;  // corners of pairs that each slot adds up
+  std::vector<Pair> pairs;           // user's tetrahedra, corners are slots
+  std::int64_t entries = 0;
+
+  std::int64_t blocks() const { return (std::ssize(pairs) + lanes - 1) / lanes; }
+};
+
+[[noreturn]] void refuse(int patches, std::int64_t entries) {
+  throw std::invalid_argument("patches = " + std::to_string(patches) +
+                              " is too few: one of them would have at least " +
+                              std::to_string(entries) + " entries, and 16 bits count up to " +
+                              std::to_string(none - 1) + "; take more patches");
+}
+
+// Slots of a patch in an order that leaves little padding between entries: interior vertices first, most forces first.
+std::vector<std::int32_t> slots_of(const Patch& patch, const std::vector<std::uint8_t>& is_shared) {
+  std::vector<std::int32_t> order(patch.vertex.size()), slot(order.size());
+  for (std::size_t v = 0; v < order.size(); ++v) order[v] = std::int32_t(v);
+  std::stable_sort(order.begin(), order.end(), [&](std::int32_t a, std::int32_t b) {
+    const bool shared = is_shared[patch.vertex[a]], other = is_shared[patch.vertex[b]];
+    return shared != other ? other : patch.forces[a] > patch.forces[b];
+  });
+  for (std::size_t s = 0; s < order.size(); ++s) slot[order[s]] = std::int32_t(s);
+  return slot;
+}
+
+template <class T>
+void scatter(std::vector<T>& items, const std::vector<std::int32_t>& place) {
+  std::vector<T> moved(items.size());
+  for (std::size_t i = 0; i < items.size(); ++i) moved[place[i]] = items[i];
+  items = std::move(moved);
+}
+
+// Every slice of eight slots has room for as many forces as its busiest.
+void count_entries(Patch& patch) {
+  patch.first.resize(patch.forces.size());
+  for (std::size_t s = 0; s < patch.forces.size(); s += slice) {
+    const std::size_t end = std::min(s + slice, patch.forces.size());
+    for (std::size_t i = s; i < end; ++i) patch.first[i] = std::int32_t(patch.entries + i - s);
+    patch.entries += slice * *std::max_element(patch.forces.begin() + std::ptrdiff_t(s),
+                                               patch.forces.begin() + std::ptrdiff_t(end));
+  }
+}
+
+// `number` [vertices] is -1 before and after.
+Patch make_patch(const Mesh& mesh, std::span<const std::int32_t> tets,
+                 std::vector<std::int32_t>& number) {
+  Patch patch;
+  std::vector<Corners> corners(tets.size());
+  for (std::size_t t = 0; t < tets.size(); ++t) {
+    for (int k = 0; k < 4; ++k) {
+      const std::int64_t v = mesh.tets[4 * std::int64_t(tets[t]) + k];
+      if (number[v] < 0) {
+        number[v] = std::int32_t(patch.vertex.size());
+        patch.vertex.push_back(std::int32_t(v));
+      }
+      corners[t][k] = number[v];
+    }
+  }
+  for (const std::int32_t v : patch.vertex) number[v] = -1;
+
+  patch.pairs = pair_tets(corners);
+  patch.forces.assign(patch.vertex.size(), 0);
+  for (const Pair& pair : patch.pairs) {
+    for (int c = 0; c < pair.corners(); ++c) ++patch.forces[pair.corner[c]];
+  }
+  const std::vector<std::int32_t> slot = slots_of(patch, mesh.numbering.is_shared);
+  scatter(patch.vertex, slot);
+  scatter(patch.forces, slot);
+  for (Pair& pair : patch.pairs) {
+    for (std::int32_t& corner : pair.corner) corner = slot[corner];
+    for (std::int32_t& tet : pair.tet) tet = tet < 0 ? -1 : tets[tet];
+  }
+  spread_banks(patch.pairs);
+  count_entries(patch);
+  return patch;
+}
+
+std::vector<Patch> make_patches(const Mesh& mesh, std::int64_t vertices) {
+  const Partition& partition = mesh.partition;
+  std::int64_t most_tets = 0;
+  for (int p = 0; p < partition.patches(); ++p)
+    most_tets = std::max(most_tets, std::ssize(partition.patch(p)));
+  // five entries for two tetrahedra are the fewest
+  if (5 * most_tets / 2 >= none) refuse(partition.patches(), 5 * most_tets / 2);
+  std::vector<Patch> patches(partition.patches());
+  run_team(most_threads(), [&](const Team& team) {
+    std::vector<std::int32_t> number(vertices, -1);
+    for (std::int64_t p = team.begin(std::ssize(patches)); p < team.end(std::ssize(patches)); ++p)
+      patches[p] = make_patch(mesh, partition.patch(int(p)), number);
+  });
+  // every slot has an entry: their number bounds that of slots
+  for (const Patch& patch : patches) {
+    if (patch.entries >= none) refuse(partition.patches(), patch.entries);
+  }
+  return patches;
+}
+
+// The numbers that say where the arrays of each patch begin.
+void number_patches(DeviceMeshPlan& plan, const std::vector<Patch>& patches) {
+  plan.patch_block = plan.patch_slot = {0};
+  for (const Patch& patch : patches) {
+    plan.patch_pairs.push_back(std::int32_t(patch.pairs.size()));
+    plan.patch_block.push_back(plan.patch_block.back() + std::int32_t(patch.blocks()));
+    plan.patch_slot.push_back(plan.patch_slot.back() + std::int32_t(patch.vertex.size()));
+  }
+  const std::size_t blocks = plan.patch_block.back(), slots = plan.patch_slot.back();
+  plan.pair_tet.resize(blocks * 2 * lanes);
+  plan.pair_rest.resize(blocks * 20 * lanes);
+  plan.pair_bound.resize(blocks * 2 * lanes);
+  plan.pair_corner.resize(blocks * 5 * lanes);
+  plan.slot_vertex.resize(slots);
+  plan.slot_row.resize(slots);
+}
+
+std::int32_t packed(std::int64_t low, std::int64_t high) {
+  return std::int32_t(std::uint32_t(low) | std::uint32_t(high) << 16);
+}
+
+// Inverse rest matrices, volumes and bounds of a pair in lane `lane` of `block`.
+void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, const Pair& pair,
+               std::int64_t block, std::int64_t lane) {
+  const auto quad = [&](int i) -> double& {
+    return plan.pair_rest[((5 * block + i / 4) * lanes + lane) * 4 + i % 4];
+  };
+  const auto vertex = [&](int c) { return std::int64_t(patch.vertex[pair.corner[c]]); };
+  for (int which = 0; which < 2; ++which) {
+    const Rest rest = rest_of(mesh.positions, {vertex(0), vertex(1), vertex(2), vertex(3 + which)});
+    for (int i = 0; i < 9; ++i) quad(9 * which + i) = rest.inverse[i];
+    quad(18 + which) = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
+    plan.pair_bound[(2 * block + which) * lanes + lane] = rest.bound;
+  }
+}
+
+void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch,
+                 std::int64_t first_block) {
+  std::vector<std::int32_t> entry = patch.first;
+  const std::int64_t count = std::ssize(patch.pairs);
+  for (std::int64_t i = 0; i < patch.blocks() * lanes; ++i) {
+    const std::int64_t block = first_block + i / lanes, lane = i % lanes;
+    Pair pair = patch.pairs[std::min(i, count - 1)];
+    int forces = pair.corners();
+    if (i >= count) {  // padding strains like the last pair, but weighs nothing and pulls nowhere
+      pair.tet = {-1, -1};
+      forces = 0;
+    }
+    fill_rest(plan, mesh, patch, pair, block, lane);
+    for (int which = 0; which < 2; ++which)
+      plan.pair_tet[(2 * block + which) * lanes + lane] = pair.tet[which];
+    for (int c = 0; c < 5; ++c) {
+      const std::int32_t slot = pair.corner[c];
+      plan.pair_corner[(5 * block + c) * lanes + lane] =
+          packed(slot, c < forces ? entry[slot] : none);
+      if (c < forces) entry[slot] += slice;
+    }
+  }
+}
+
+// Slots of one patch. Its interior vertices are numbered anew, in the order of their slots.
+void fill_slots(DeviceMeshPlan& plan, const Numbering& numbering, const Patch& patch, int number) {
+  const std::int32_t inside = numbering.patch_vertex[number];
+  const std::int32_t interior = numbering.patch_vertex[number + 1] - inside;
+  for (std::int32_t s = 0; s < std::int32_t(patch.vertex.size()); ++s) {
+    const std::int32_t v = patch.vertex[s];
+    const std::int32_t slot = plan.patch_slot[number] + s;
+    plan.slot_vertex[slot] = s < interior ? inside + s : numbering.internal[v];
+    if (s < interior) plan.vertex_order[inside + s] = v;
+    plan.slot_row[slot] = packed(patch.first[s], patch.forces[s]);
+  }
+}
+
+// The vertices of each piece without pins, patch by patch: every vertex in the first patch that has it.
+void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pieces) {
+  const std::int32_t first_shared = plan.patch_vertex.back();
+  plan.patch_part = plan.part_start = {0};
+  plan.piece_start.assign(pieces + 1, 0);
+  std::vector<std::int32_t> part_piece;
+  std::vector<std::pair<std::int32_t, std::int32_t>> mine;  // piece, slot
+  for (std::size_t p = 0; p + 1 < plan.patch_slot.size(); ++p) {
+    mine.clear();
+    for (std::int32_t slot = plan.patch_slot[p]; slot < plan.patch_slot[p + 1]; ++slot) {
+      const std::int32_t v = plan.slot_vertex[slot], number = piece[plan.vertex_order[v]];
+      plan.slot_piece.push_back(number);
+      const bool owned =
+          v < first_shared || plan.shared_slot[plan.shared_start[v - first_shared]] == slot;
+      if (number >= 0 && owned) mine.emplace_back(number, slot);
+    }
+    std::sort(mine.begin(), mine.end());
+    for (std::size_t i = 0; i < mine.size(); ++i) {
+      plan.part_slot.push_back(mine[i].second);
+      if (i + 1 < mine.size() && mine[i + 1].first == mine[i].first) continue;
+      plan.part_start.push_back(std::int32_t(plan.part_slot.size()));
+      part_piece.push_back(mine[i].first);
+    }
+    plan.patch_part.push_back(std::int32_t(part_piece.size()));
+  }
+  for (const std::int32_t number : part_piece) ++plan.piece_start[number + 1];
+  std::partial_sum(plan.piece_start.begin(), plan.piece_start.end(), plan.piece_start.begin());
+  std::vector<std::int32_t> next(plan.piece_start.begin(), plan.piece_start.end() - 1);
+  plan.piece_part.resize(part_piece.size());
+  for (std::size_t part = 0; part < part_piece.size(); ++part)
+    plan.piece_part[next[part_piece[part]]++] = std::int32_t(part);
+}
+
+std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan, const std::vector<Patch>& patches,
+                                      std::int64_t tets, std::int32_t pieces) {
+  std::vector<std::int32_t> sizes(size_count, 0);
+  sizes[size_kernel] = -1;
+  sizes[size_vertices] = std::int32_t(plan.vertex_order.size());
+  sizes[size_tets] = std::int32_t(tets);
+  sizes[size_pieces] = pieces;
+  sizes[size_blocks] = plan.patch_block.back();
+  sizes[size_patches] = std::int32_t(patches.size());
+  sizes[size_slots] = plan.patch_slot.back();
+  sizes[size_shared] = std::int32_t(plan.shared_start.size() - 1);
+  sizes[size_parts] = std::int32_t(plan.piece_part.size());
+  for (std::size_t p = 0; p < patches.size(); ++p) {
+    const auto raise = [&](DeviceSize which, std::int64_t size) {
+      sizes[which] = std::max(sizes[which], std::int32_t(size));
+    };
+    const std::int64_t slots = std::ssize(patches[p].vertex);
+    raise(size_most_slots, slots);
+    raise(size_most_pairs, std::ssize(patches[p].pairs));
+    raise(size_most_entries, patches[p].entries);
+    raise(size_most_shared, slots - (plan.patch_vertex[p + 1] - plan.patch_vertex[p]));
+    if (pieces > 0) raise(size_most_parts, plan.patch_part[p + 1] - plan.patch_part[p]);
+  }
+  return sizes;
+}
+
+}  // namespace
+
+DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
+                                 const std::int64_t* tets, std::int64_t count, int patches,
+                                 const std::int32_t* piece,
+                                 const std::function<void(double)>& progress) {
+  Mesh mesh{positions, tets, partition_mesh(positions, tets, count, patches, 1), {}};
+  progress(0.4);
+  mesh.numbering = number_vertices(mesh.partition, tets, vertices);
+  const std::vector<Patch> made = make_patches(mesh, vertices);
+  progress(0.7);
+
+  DeviceMeshPlan plan;
+  number_patches(plan, made);
+  plan.vertex_order = mesh.numbering.vertex_order;
+  run_team(most_threads(), [&](const Team& team) {
+    for (std::int64_t p = team.begin(patches); p < team.end(patches); ++p) {
+      fill_blocks(plan, mesh, made[p], plan.patch_block[p]);
+      fill_slots(plan, mesh.numbering, made[p], int(p));
+    }
+  });
+  plan.patch_vertex = std::move(mesh.numbering.patch_vertex);
+  SharedSlots shared =
+      link_shared(plan.slot_vertex, plan.patch_vertex.back(), std::ssize(plan.vertex_order));
+  plan.shared_start = std::move(shared.start);
+  plan.shared_slot = std::move(shared.slot);
+  const std::int32_t pieces = *std::max_element(piece, piece + vertices) + 1;
+  if (pieces > 0) add_parts(plan, piece, pieces);
+  plan.sizes = count_sizes(plan, made, count, pieces);
+  progress(1.0);
+  return plan;
+}
+
+}  // namespace pd

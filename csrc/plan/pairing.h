@@ -1,0 +1,24 @@
+// Joins the tetrahedra of a patch into pairs that share a face: five vertices instead of eight.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <vector>
+
+namespace pd {
+
+using Corners = std::array<std::int32_t, 4>;
+
+// Tetrahedra (p0, p1, p2, p3) and (p0, p1, p2, p4). One that found no neighbour stands alone: tet[1] = -1, p4 = p3.
+struct Pair {
+  std::array<std::int32_t, 2> tet;
+  std::array<std::int32_t, 5> corner;
+
+  bool single() const { return tet[1] < 0; }
+  int corners() const { return single() ? 4 : 5; }
+};
+
+// `tets` of one patch by vertices numbered below 2^21; `tet` of the pairs counts from 0 in their order.
+std::vector<Pair> pair_tets(const std::vector<Corners>& tets);
+
+}  // namespace pd

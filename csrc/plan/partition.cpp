@@ -1,0 +1,120 @@
+#include "plan/partition.h"
+
+#include <algorithm>
+#include <array>
+#include <numeric>
+
+namespace pd {
+
+namespace {
+
+using Point = std::array<double, 3>;
+
+std::vector<Point> tet_centres(const double* x, const std::int64_t* tets, std::int64_t count) {
+  std::vector<Point> centres(count);
+  for (std::int64_t t = 0; t < count; ++t) {
+    for (int c = 0; c < 3; ++c) {
+      centres[t][c] = 0;
+      for (int k = 0; k < 4; ++k) centres[t][c] += 0.25 * x[3 * tets[4 * t + k] + c];
+    }
+  }
+  return centres;
+}
+
+// Splits [begin, end) of `items` at `middle` across the longest side of the box of their centres.
+void bisect(std::vector<std::int32_t>& items, const std::vector<Point>& centres, std::int64_t begin,
+            std::int64_t middle, std::int64_t end) {
+  Point low = centres[items[begin]], high = low;
+  for (std::int64_t i = begin; i < end; ++i) {
+    for (int c = 0; c < 3; ++c) {
+      low[c] = std::min(low[c], centres[items[i]][c]);
+      high[c] = std::max(high[c], centres[items[i]][c]);
+    }
+  }
+  int axis = 0;
+  for (int c = 1; c < 3; ++c) {
+    if (high[c] - low[c] > high[axis] - low[axis]) axis = c;
+  }
+  // ties fall to the number, so that every platform makes the same plan
+  std::nth_element(
+      items.begin() + begin, items.begin() + middle, items.begin() + end, [&](auto a, auto b) {
+        return centres[a][axis] != centres[b][axis] ? centres[a][axis] < centres[b][axis] : a < b;
+      });
+}
+
+void divide(Partition& mesh, const std::vector<Point>& centres, std::int64_t begin,
+            std::int64_t end, std::int64_t patches, std::int64_t grain) {
+  if (patches <= 1) {
+    std::sort(mesh.tets.begin() + begin, mesh.tets.begin() + end);
+    mesh.start.push_back(end);
+    return;
+  }
+  const std::int64_t grains = (end - begin + grain - 1) / grain, left = patches / 2;
+  const std::int64_t middle = std::min(end, begin + grains * left / patches * grain);
+  if (middle > begin && middle < end) bisect(mesh.tets, centres, begin, middle, end);
+  divide(mesh, centres, begin, middle, left, grain);
+  divide(mesh, centres, middle, end, patches - left, grain);
+}
+
+}  // namespace
+
+Partition partition_mesh(const double* positions, const std::int64_t* tets, std::int64_t count,
+                         std::int64_t patches, std::int64_t grain) {
+  Partition mesh{std::vector<std::int32_t>(count), {0}};
+  std::iota(mesh.tets.begin(), mesh.tets.end(), 0);
+  divide(mesh, tet_centres(positions, tets, count), 0, count, patches, grain);
+  return mesh;
+}
+
+Numbering number_vertices(const Partition& mesh, const std::int64_t* tets, std::int64_t vertices) {
+  Numbering n;
+  n.is_shared.assign(vertices, 0);
+  n.internal.assign(vertices, -1);
+  std::vector<std::int32_t> owner(vertices, -1);  // first patch of each vertex
+  std::vector<std::int64_t> by_owner;             // in order of first appearance
+  by_owner.reserve(vertices);
+  for (int p = 0; p < mesh.patches(); ++p) {
+    for (const std::int32_t t : mesh.patch(p)) {
+      for (int k = 0; k < 4; ++k) {
+        const std::int64_t v = tets[4 * std::int64_t(t) + k];
+        if (owner[v] < 0) {
+          owner[v] = p;
+          by_owner.push_back(v);
+        } else if (owner[v] != p) {
+          n.is_shared[v] = 1;
+        }
+      }
+    }
+  }
+  n.patch_vertex.assign(mesh.patches() + 1, 0);
+  n.vertex_order.reserve(by_owner.size());
+  for (int shared = 0; shared < 2; ++shared) {
+    for (const std::int64_t v : by_owner) {
+      if (n.is_shared[v] != shared) continue;
+      n.internal[v] = std::int32_t(n.vertex_order.size());
+      n.vertex_order.push_back(std::int32_t(v));
+      if (!shared) ++n.patch_vertex[owner[v] + 1];
+    }
+  }
+  std::partial_sum(n.patch_vertex.begin(), n.patch_vertex.end(), n.patch_vertex.begin());
+  return n;
+}
+
+SharedSlots link_shared(const std::vector<std::int32_t>& slot_vertex, std::int32_t first_shared,
+                        std::int64_t vertices) {
+  SharedSlots shared;
+  shared.start.assign(vertices - first_shared + 1, 0);
+  for (const std::int32_t v : slot_vertex) {
+    if (v >= first_shared) ++shared.start[v - first_shared + 1];
+  }
+  std::partial_sum(shared.start.begin(), shared.start.end(), shared.start.begin());
+  shared.slot.resize(shared.start.back());
+  std::vector<std::int32_t> next(shared.start.begin(), shared.start.end() - 1);
+  for (std::size_t slot = 0; slot < slot_vertex.size(); ++slot) {
+    const std::int32_t v = slot_vertex[slot];
+    if (v >= first_shared) shared.slot[next[v - first_shared]++] = std::int32_t(slot);
+  }
+  return shared;
+}
+
+}  // namespace pd

@@ -1,0 +1,45 @@
+// Cuts a mesh into patches and numbers its vertices by them: the first half of both plans.
+#pragma once
+
+#include <cstdint>
+#include <span>
+#include <vector>
+
+namespace pd {
+
+// Tetrahedra patch by patch, ascending in each.
+struct Partition {
+  std::vector<std::int32_t> tets;   // user's numbers
+  std::vector<std::int64_t> start;  // first of each patch, and the end
+
+  int patches() const { return int(start.size()) - 1; }
+  std::span<const std::int32_t> patch(int p) const {
+    return {tets.data() + start[p], tets.data() + start[p + 1]};
+  }
+};
+
+// Recursive coordinate bisection into patches of nearly equal size: a multiple of `grain`, but for the last.
+// `positions` [vertices, 3], `tets` [count, 4]; up to count / grain patches, rounded up.
+Partition partition_mesh(const double* positions, const std::int64_t* tets, std::int64_t count,
+                         std::int64_t patches, std::int64_t grain);
+
+// Which vertices lie inside one patch, and which are shared; their internal numbers.
+struct Numbering {
+  std::vector<std::uint8_t> is_shared;     // user's numbers
+  std::vector<std::int32_t> internal;      // user's number -> internal number
+  std::vector<std::int32_t> vertex_order;  // internal number -> user's number
+  std::vector<std::int32_t>
+      patch_vertex;  // first interior vertex of each patch; the last entry is the first shared one
+};
+
+Numbering number_vertices(const Partition& mesh, const std::int64_t* tets, std::int64_t vertices);
+
+// For every shared vertex the slots that hold it, in patch order.
+struct SharedSlots {
+  std::vector<std::int32_t> start, slot;
+};
+
+SharedSlots link_shared(const std::vector<std::int32_t>& slot_vertex, std::int32_t first_shared,
+                        std::int64_t vertices);
+
+}  // namespace pd

@@ -1,0 +1,61 @@
+#include "plan/rest.h"
+
+#define PD_NO_FMA
+#include "math/mat.h"
+
+#include <cmath>
+
+namespace pd {
+
+namespace {
+
+// Largest eigenvalue of a symmetric 3x3 matrix by Newton's method on its characteristic polynomial, from above (its trace).
+double largest_eigenvalue(const Mat3<double>& a) {
+  const Mat3<double> c = cofactor(a);
+  const double trace = a.row[0].x + a.row[1].y + a.row[2].z;
+  const double minors = c.row[0].x + c.row[1].y + c.row[2].z;
+  const double det = dot(a.row[0], c.row[0]);
+  double l = trace;
+  for (int step = 0; step < 100; ++step) {
+    const double p = ((l - trace) * l + minors) * l - det;
+    const double slope = (3 * l - 2 * trace) * l + minors;
+    const double change = slope > 0 ? p / slope : 0;
+    l -= change;
+    if (!(change > 1e-15 * trace)) break;
+  }
+  return l;
+}
+
+}  // namespace
+
+Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet) {
+  const auto at = [&](int k) {
+    const double* x = positions + 3 * tet[k];
+    return Vec3<double>{x[0], x[1], x[2]};
+  };
+  const Mat3<double> dm = from_columns(at(1) - at(0), at(2) - at(0), at(3) - at(0));
+  const Mat3<double> adjoint = transpose(cofactor(dm));
+  const double det = dot(dm.row[0], cofactor(dm).row[0]);
+  const Mat3<double> inverse = (1 / det) * adjoint;
+  const Vec3<double>(&n)[3] = inverse.row;
+  const Vec3<double> n0 = -((n[0] + n[1]) + n[2]);
+  return {{n[0].x, n[0].y, n[0].z, n[1].x, n[1].y, n[1].z, n[2].x, n[2].y, n[2].z},
+          det / 6,
+          element_bound({{{n0.x, n0.y, n0.z},
+                          {n[0].x, n[0].y, n[0].z},
+                          {n[1].x, n[1].y, n[1].z},
+                          {n[2].x, n[2].y, n[2].z}}})};
+}
+
+double element_bound(const std::array<std::array<double, 3>, 4>& gradients) {
+  // the nonzero eigenvalues of S S^T, S the normalised gradients, are those of the 3x3 matrix S^T S
+  Mat3<double> sum = {};
+  for (const auto& g : gradients) {
+    const Vec3<double> n = {g[0], g[1], g[2]};
+    const Vec3<double> unit = (1 / std::sqrt(dot(n, n))) * n;
+    sum = {{sum.row[0] + unit.x * unit, sum.row[1] + unit.y * unit, sum.row[2] + unit.z * unit}};
+  }
+  return largest_eigenvalue(sum);
+}
+
+}  // namespace pd

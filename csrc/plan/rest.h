@@ -1,0 +1,21 @@
+// Rest shape of one tetrahedron: what both plans store of it.
+#pragma once
+
+#include <array>
+#include <cstdint>
+
+namespace pd {
+
+struct Rest {
+  std::array<double, 9> inverse;  // Dm^-1, row by row: the shape gradients of corners 1 to 3
+  double volume;                  // negative when the corners wind the other way
+  double bound;                   // l_e
+};
+
+// `tet` holds four rows of `positions` [vertices, 3].
+Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet);
+
+// l_e of shape gradients: the largest eigenvalue of diag(K)^-1/2 K diag(K)^-1/2, K = grad N grad N^T.
+double element_bound(const std::array<std::array<double, 3>, 4>& gradients);
+
+}  // namespace pd

@@ -1,0 +1,55 @@
+"""The plan of a GPU: the constant arrays of a scene in the form that its kernels read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from . import _C
+from .plan import compiling, free_pieces, internal_numbers
+from .scene import SceneValues
+from .tables import DEVICE_PLAN_TABLE
+
+__all__ = ["compile_device_plan"]
+
+_KERNELS = 3  # a block per environment, a grid per environment, a stream of kernels per iteration
+_SIZE_KERNEL, _SIZE_PINS = 0, 3  # as in DeviceSize of csrc/plan/views.h
+
+
+def compile_device_plan(
+    values: SceneValues, patches: int, kernel: int, dtype: torch.dtype, progress: bool = True
+) -> tuple[Tensor, ...]:
+    """Order, partition and weigh a scene for the kernels of a GPU.
+
+    Args:
+        values: the flat arrays of `Scene.values`.
+        patches: parts of the mesh that one thread block each works on, 1 to the number of tetrahedra; more are needed
+            when a patch has more numbers than 16 bits count, from about 20 000 tetrahedra on.
+        kernel: 0 when one thread block steps a whole environment, 1 when a grid does, 2 for kernels per iteration.
+        dtype: torch.float32 or torch.float64.
+        progress: show a bar when the mesh is large.
+
+    Returns:
+        The arrays of csrc/plan/device.def in its order, on the CPU.
+    """
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+    if kernel not in range(_KERNELS):
+        raise ValueError(f"kernel must be 0, 1 or 2, got {kernel}")
+    piece, _ = free_pieces(values)
+    with compiling(len(values.tets), progress) as advance:
+        arrays: dict[str, NDArray[Any]] = _C.build_device_plan(
+            values.rest_positions, values.tets, patches, piece, advance
+        )
+    pins = len(values.pin_vertices)
+    arrays["sizes"][[_SIZE_KERNEL, _SIZE_PINS]] = kernel, pins
+    if pins:
+        arrays["pin_vertex"] = internal_numbers(arrays["vertex_order"])[values.pin_vertices]
+        arrays["vertex_pin"] = np.full(len(values.rest_positions), -1, dtype=np.int32)
+        arrays["vertex_pin"][arrays["pin_vertex"]] = np.arange(pins)
+    tensors = (torch.from_numpy(np.ascontiguousarray(arrays[row.name])) for row in DEVICE_PLAN_TABLE)
+    return tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors)
