@@ -105,7 +105,8 @@ def make_extension():
     cxx = ["-std=c++20", *OPTIMISATION, *X86, *threads, *WARNINGS, *system]
     return kind(
         name="torchpd._C",
-        sources=relative("**/*.cpp") + (relative("**/*.cu") if cuda else []),
+        sources=[path for path in relative("**/*.cpp") if cuda or "/cuda/" not in path]
+        + (relative("**/*.cu") if cuda else []),
         depends=[path for suffix in ("h", "cuh", "inl", "def") for path in relative(f"**/*.{suffix}")],
         include_dirs=[str(ROOT / "csrc")],
         define_macros=[("TORCHPD_CUDA", None)] if cuda else [],

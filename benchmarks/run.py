@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from gpu import run_on_gpu
+from gpu_scenes import GPU_SCENES, QUICK_GPU_SCENES
 from machine import describe_run, measure, milliseconds, multiply_adds_per_second
 from scenes import GOAL_MULTIPLY_ADDS_PER_SECOND, GOAL_THREADS, QUICK_SCENES, SCENES, TIME_STEP, BenchScene
 from tqdm import tqdm
@@ -177,27 +179,37 @@ def parse(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Measure the speed of a step.")
     parser.add_argument("--device", default="cpu", help="cpu, or cuda where the extension has it")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="of the CPU")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help=f"of {', '.join(scene.name for scene in SCENES)}")
-    parser.add_argument("--dtype", nargs="+", default=["float32", "float64"], choices=["float32", "float64"])
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        metavar="NAME",
+        help=f"of {', '.join(scene.name for scene in SCENES)}; a wrong one lists a GPU's",
+    )
+    parser.add_argument("--dtype", nargs="+", choices=["float32", "float64"], help="both, or float32 on a GPU")
     parser.add_argument("--no-torch", dest="torch", action="store_false", help="leave out the step in plain torch")
     parser.add_argument("--quick", action="store_true", help="tiny scenes, to see that everything runs")
+    parser.add_argument("--heavy", action="store_true", help="on a GPU also the scenes that take minutes to prepare")
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
     options = parser.parse_args(words)
     options.repetitions, options.seconds = (2, 0.0) if options.quick else (7, 1.0)
-    scenes = QUICK_SCENES if options.quick else SCENES
+    options.on_gpu = torch.device(options.device).type == "cuda"
+    options.dtype = options.dtype or (["float32"] if options.on_gpu else ["float32", "float64"])
+    scenes: Any = QUICK_SCENES if options.quick else SCENES
+    if options.on_gpu:
+        scenes = QUICK_GPU_SCENES if options.quick else GPU_SCENES
+    if options.on_gpu and not torch.cuda.is_available():
+        parser.error("--device: torch finds no CUDA device")
     unknown = set(options.only or ()) - {scene.name for scene in scenes}
     if unknown:
         parser.error(f"--only: no scene {', '.join(sorted(unknown))}; there are {', '.join(s.name for s in scenes)}")
-    options.scenes = [scene for scene in scenes if not options.only or scene.name in options.only]
+    wanted = options.only or [s.name for s in scenes if options.heavy or not getattr(s, "heavy", False)]
+    options.scenes = [scene for scene in scenes if scene.name in wanted]
     return options
 
 
-def main(words: list[str]) -> None:
-    options = parse(words)
-    torch.set_num_threads(options.threads)
-    result = {
-        "schema": SCHEMA,
-        **describe_run(torch.device(options.device), options.threads),
+def run_on_cpu(options: argparse.Namespace) -> Row:
+    """Everything, printed; what is written besides the description of the machine."""
+    result: Row = {
         "goals_hold_at": {
             "multiply_adds_per_second_per_thread": GOAL_MULTIPLY_ADDS_PER_SECOND,
             "threads": GOAL_THREADS,
@@ -210,6 +222,14 @@ def main(words: list[str]) -> None:
     print(table(result["results"]))
     print("\nmicroseconds of a call, one iteration on one tetrahedron:")
     print("\n".join(f"  {name}: {value:.1f}" for name, value in result["call_microseconds"].items()))
+    return result
+
+
+def main(words: list[str]) -> None:
+    options = parse(words)
+    torch.set_num_threads(options.threads)
+    result = {"schema": SCHEMA, **describe_run(torch.device(options.device), options.threads)}
+    result.update(run_on_gpu(options) if options.on_gpu else run_on_cpu(options))
     if options.out:
         options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(json.dumps(result, indent=1) + "\n")

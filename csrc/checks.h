@@ -105,6 +105,85 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   return plan;
 }
 
+#define X(name, type, width, rows, meaning) +1
+constexpr int device_plan_arrays = 0
+#include "plan/device.def"
+    ;
+#undef X
+
+// Where part_slot stands in the table: how many vertices can move freely is not among the counts.
+#define X(name, type, width, rows, meaning) name,
+enum class DevicePlanArray : int {
+#include "plan/device.def"
+};
+#undef X
+constexpr int part_slot_array = int(DevicePlanArray::part_slot);
+
+// Lengths of the arrays, by the names in device.def.
+struct DevicePlanRows {
+  std::int64_t size, vertex, pin, pinned_vertex, block, patch_end, patch, slot, shared_end,
+      shared_slot, piece_slot, part_patch_end, part_end, part_slot, piece_end, part;
+};
+
+template <class T>
+DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
+  TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays, "plan must be the ", device_plan_arrays,
+                    " arrays of a plan for ", place.device.str(), ", got ", arrays.size(),
+                    "; sim.to(...) compiles the plan of a device");
+  const int32* size = sizes_view(arrays[0], size_count);
+  DevicePlan<T> plan;
+  plan.kernel = size[size_kernel];
+  plan.vertices = size[size_vertices];
+  plan.tets = size[size_tets];
+  plan.pins = size[size_pins];
+  plan.pieces = size[size_pieces];
+  plan.blocks = size[size_blocks];
+  plan.patches = size[size_patches];
+  plan.slots = size[size_slots];
+  plan.shared = size[size_shared];
+  plan.parts = size[size_parts];
+  plan.most_slots = size[size_most_slots];
+  plan.most_pairs = size[size_most_pairs];
+  plan.most_entries = size[size_most_entries];
+  plan.most_shared = size[size_most_shared];
+  plan.most_parts = size[size_most_parts];
+  TORCH_CHECK_VALUE(plan.kernel >= 0 && plan.kernel <= 2 && plan.patches >= 1 &&
+                        (plan.kernel != 0 || plan.patches == 1) && plan.most_slots >= 1 &&
+                        plan.most_slots <= plan.slots && plan.most_entries >= 0,
+                    "plan.sizes must name a kernel, 0 to 2, and at least one patch, one alone for "
+                    "kernel 0, got kernel ",
+                    plan.kernel, " and ", plan.patches, " patches; compile the scene again");
+  // every slot that does not hold an interior vertex of its patch holds a shared one; pieces and pins may be absent
+  const bool pieces = plan.pieces > 0;
+  DevicePlanRows count{};
+  count.size = size_count;
+  count.vertex = plan.vertices;
+  count.pin = plan.pins;
+  count.pinned_vertex = plan.pins ? plan.vertices : 0;
+  count.block = plan.blocks;
+  count.patch = plan.patches;
+  count.patch_end = plan.patches + 1;
+  count.slot = plan.slots;
+  count.shared_end = plan.shared + 1;
+  count.shared_slot = plan.slots - (plan.vertices - plan.shared);
+  count.piece_slot = pieces ? plan.slots : 0;
+  count.part_patch_end = pieces ? plan.patches + 1 : 0;
+  count.part_end = pieces ? plan.parts + 1 : 0;
+  count.part_slot = pieces ? arrays[part_slot_array].size(0) : 0;
+  count.piece_end = pieces ? plan.pieces + 1 : 0;
+  count.part = plan.parts;
+  const Place on_cpu{at::kCPU, "every plan's sizes"};
+  int at = 0;
+  using real = T;
+#define X(name, type, width, rows, meaning)                                               \
+  check_array(arrays[at], scalar_type<type>, count.rows, width, at == 0 ? on_cpu : place, \
+              "plan." #name, meaning);                                                    \
+  plan.name = arrays[at++].const_data_ptr<type>();
+#include "plan/device.def"
+#undef X
+  return plan;
+}
+
 template <class T>
 Values<T> values_view(const Tensor& t, std::int64_t rows, std::int64_t width, bool single,
                       std::int64_t batch, const Place& place, const char* name,

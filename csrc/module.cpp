@@ -2,6 +2,7 @@
 #include "cpu/dispatch.h"
 #include "plan/build.h"
 #include "plan/device_build.h"
+#include "plan/shared_memory.h"
 
 #include <pybind11/functional.h>
 #include <pybind11/numpy.h>
@@ -171,6 +172,12 @@ PYBIND11_MODULE(_C, m) {
         "Rows (name, type, width, rows, meaning) of the constant arrays on a GPU, in op order.");
   m.def("material_table", &material_table,
         "Rows (name, width, rows, meaning) of the differentiable arrays, in op order.");
+  m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("slots"),
+        py::arg("entries"), py::arg("planes"), py::arg("balls"),
+        "Shared memory of a block of the kernels block and grid.");
+  m.def("pass_shared_bytes", &pd::pass_shared_bytes, py::arg("real"), py::arg("slots"),
+        py::arg("entries"), py::arg("fields"),
+        "Shared memory of a block of the kernel stream and of energies and their derivatives.");
   m.def("build_info", &build_info, "What this build can do on this machine.");
   m.def("multiply_adds_per_second", &multiply_adds_per_second,
         "float32, one thread, widest SIMD: for comparing machines.");

@@ -1,234 +1,45 @@
-// The ops: schemas, calls of the kernels. With checks.h the only place that knows both torch and the physics.
-#include "checks.h"
+// The ops: schemas, and the CPU behind them.
+#include "ops.h"
+
 #include "cpu/dispatch.h"
 
-#include <ATen/ATen.h>
 #include <ATen/Parallel.h>
-#include <torch/library.h>
 
-#include <optional>
 #include <string>
 
 namespace pd {
 namespace {
 
-using OptionalTensor = std::optional<Tensor>;
+struct Cpu {
+  template <class T>
+  using Plan = pd::Plan<T>;
 
-struct StepTensors {
-  Tensor positions, velocities;
-  OptionalTensor forces, start;
-  at::TensorList material, plan;
-  Tensor out_positions, out_velocities, info;
+  template <class T>
+  static Plan<T> plan_view(at::TensorList arrays, const Place& place) {
+    return pd::plan_view<T>(arrays, place);
+  }
+
+  static void step(const StepCall<float>& call, const Tensor&) {
+    kernels().step32(call, threads());
+  }
+  static void step(const StepCall<double>& call, const Tensor&) {
+    kernels().step64(call, threads());
+  }
+  static void field(const FieldCall<float>& call, const Tensor&) {
+    kernels().field32(call, threads());
+  }
+  static void field(const FieldCall<double>& call, const Tensor&) {
+    kernels().field64(call, threads());
+  }
+  static void rotation(const RotationCall<float>& call, const Tensor&) {
+    kernels().rotation32(call, threads());
+  }
+  static void rotation(const RotationCall<double>& call, const Tensor&) {
+    kernels().rotation64(call, threads());
+  }
+
+  static int threads() { return at::get_num_threads(); }
 };
-
-template <class T>
-void step_typed(const StepTensors& t, const Settings& settings,
-                void (*kernel)(const StepCall<T>&, int)) {
-  StepCall<T> call;
-  const Place place{t.positions.device()};
-  call.plan = plan_view<T>(t.plan, place);
-  call.batch = t.positions.size(0);
-  check_vertices(t.positions, call.plan.vertices);
-  call.material =
-      material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch, place);
-  check_tets(t.material[0], call.plan.tets);
-  call.settings = settings;
-  const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
-  const Tensor f = t.forces ? t.forces->contiguous() : Tensor(),
-               s = t.start ? t.start->contiguous() : Tensor();
-  call.positions = x.const_data_ptr<T>();
-  call.velocities = v.const_data_ptr<T>();
-  call.forces = f.defined() ? f.const_data_ptr<T>() : nullptr;
-  call.start = s.defined() ? s.const_data_ptr<T>() : nullptr;
-  call.out_positions = t.out_positions.mutable_data_ptr<T>();
-  call.out_velocities = t.out_velocities.mutable_data_ptr<T>();
-  call.info = t.info.mutable_data_ptr<double>();
-  if (call.batch > 0 && settings.steps > 0) kernel(call, at::get_num_threads());
-}
-
-void run_step(const StepTensors& t, const Settings& settings) {
-  check_positions(t.positions, "positions");
-  check_state(t.velocities, t.positions, "velocities", "m/s");
-  if (t.forces) check_state(*t.forces, t.positions, "forces", "N");
-  if (t.start) check_state(*t.start, t.positions, "start", "first iterate, m");
-  if (t.positions.scalar_type() == at::kFloat) {
-    step_typed<float>(t, settings, kernels().step32);
-  } else {
-    step_typed<double>(t, settings, kernels().step64);
-  }
-}
-
-Tensor info_for(const Tensor& positions, at::IntArrayRef records) {
-  std::vector<std::int64_t> shape(records.begin(), records.end());
-  shape.push_back(positions.size(0));
-  shape.push_back(info_count);
-  return at::empty(shape, positions.options().dtype(at::kDouble));
-}
-
-std::tuple<Tensor, Tensor, Tensor> step(const Tensor& positions, const Tensor& velocities,
-                                        const OptionalTensor& forces, const OptionalTensor& start,
-                                        at::TensorList material, at::TensorList plan,
-                                        std::int64_t schedule, std::int64_t iterations,
-                                        double time_step, double relaxation, double rho,
-                                        std::int64_t delay, bool weighted, double tolerance,
-                                        bool inertial, bool report) {
-  check_positions(positions, "positions");
-  const Numbers n{schedule, iterations, time_step, relaxation, rho,
-                  delay,    weighted,   tolerance, inertial,   report};
-  const Tensor x = at::empty(positions.sizes(), positions.options()), v = at::empty_like(x);
-  const Tensor info = info_for(positions, {});
-  run_step({positions, velocities, forces, start, material, plan, x, v, info},
-           settings_of(n, start.has_value(), 1, 1));
-  return {x, v, info};
-}
-
-void step_inplace(const Tensor& positions, const Tensor& velocities, const Tensor& info,
-                  const OptionalTensor& forces, const OptionalTensor& start,
-                  at::TensorList material, at::TensorList plan, std::int64_t schedule,
-                  std::int64_t iterations, double time_step, double relaxation, double rho,
-                  std::int64_t delay, bool weighted, double tolerance, bool inertial, bool report) {
-  check_positions(positions, "positions");
-  const Numbers n{schedule, iterations, time_step, relaxation, rho,
-                  delay,    weighted,   tolerance, inertial,   report};
-  check_inplace(positions, velocities, info);
-  // the state is read before it is written: loads and stores of an environment do not overlap in time
-  run_step({positions, velocities, forces, start, material, plan, positions, velocities, info},
-           settings_of(n, start.has_value(), 1, 1));
-  // so that autograd notices when it needs what has been overwritten
-  for (const Tensor& t : {positions, velocities, info}) {
-    if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
-  }
-}
-
-std::tuple<Tensor, Tensor, Tensor> rollout(
-    const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
-    at::TensorList material, at::TensorList plan, std::int64_t steps, std::int64_t every,
-    std::int64_t schedule, std::int64_t iterations, double time_step, double relaxation, double rho,
-    std::int64_t delay, bool weighted, double tolerance, bool inertial, bool report) {
-  check_positions(positions, "positions");
-  const Numbers n{schedule, iterations, time_step, relaxation, rho,
-                  delay,    weighted,   tolerance, inertial,   report};
-  const Settings settings = settings_of(n, false, steps, every);
-  const std::int64_t records = steps / every;
-  const Tensor x =
-      at::empty({records, positions.size(0), positions.size(1), 3}, positions.options());
-  const Tensor v = at::empty_like(x), info = info_for(positions, {records});
-  run_step({positions, velocities, forces, {}, material, plan, x, v, info}, settings);
-  return {x, v, info};
-}
-
-template <class T>
-void field_typed(Field field, const Tensor& positions, const Tensor& direction,
-                 const Tensor& stiffness, at::TensorList plan, const Tensor& out,
-                 void (*kernel)(const FieldCall<T>&, int)) {
-  FieldCall<T> call;
-  const Place place{positions.device()};
-  call.plan = plan_view<T>(plan, place);
-  call.field = field;
-  call.batch = positions.size(0);
-  check_vertices(positions, call.plan.vertices);
-  check_tets(stiffness, call.plan.tets);
-  const Tensor w = stiffness.contiguous(), x = positions.contiguous();
-  const Tensor d = direction.defined() ? direction.contiguous() : Tensor();
-  call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
-                                  "Young's modulus [Pa]");
-  call.positions = x.const_data_ptr<T>();
-  call.direction = d.defined() ? d.const_data_ptr<T>() : nullptr;
-  call.out = out.mutable_data_ptr<T>();
-  if (call.batch > 0) kernel(call, at::get_num_threads());
-}
-
-Tensor run_field(Field field, const Tensor& positions, const Tensor& direction,
-                 const Tensor& stiffness, at::TensorList plan) {
-  check_positions(positions, "positions");
-  if (direction.defined()) check_state(direction, positions, "direction", "m");
-  const bool per_element = field == Field::element_energy || field == Field::element_energy_product;
-  TORCH_CHECK_VALUE(stiffness.dim() >= 1, "stiffness must be [tet] or [batch, tet] (Pa), got ",
-                    describe(stiffness));
-  const Tensor out = per_element
-                         ? at::empty({positions.size(0), stiffness.size(-1)}, positions.options())
-                         : at::empty(positions.sizes(), positions.options());
-  if (positions.scalar_type() == at::kFloat) {
-    field_typed<float>(field, positions, direction, stiffness, plan, out, kernels().field32);
-  } else {
-    field_typed<double>(field, positions, direction, stiffness, plan, out, kernels().field64);
-  }
-  return out;
-}
-
-Tensor gradient(const Tensor& positions, const Tensor& stiffness, at::TensorList plan) {
-  return run_field(Field::gradient, positions, {}, stiffness, plan);
-}
-
-Tensor hessian_product(const Tensor& positions, const Tensor& direction, const Tensor& stiffness,
-                       at::TensorList plan) {
-  return run_field(Field::hessian_product, positions, direction, stiffness, plan);
-}
-
-Tensor element_energy(const Tensor& positions, const Tensor& stiffness, at::TensorList plan) {
-  return run_field(Field::element_energy, positions, {}, stiffness, plan);
-}
-
-Tensor element_energy_product(const Tensor& positions, const Tensor& direction,
-                              const Tensor& stiffness, at::TensorList plan) {
-  return run_field(Field::element_energy_product, positions, direction, stiffness, plan);
-}
-
-template <class T>
-Tensor diagonal_typed(const Tensor& stiffness, at::TensorList plan, bool weighted,
-                      void (*kernel)(const FieldCall<T>&, int)) {
-  FieldCall<T> call;
-  const Place place{stiffness.device(), "stiffness"};
-  call.plan = plan_view<T>(plan, place);
-  call.field = Field::diagonal;
-  call.weighted = weighted;
-  check_tets(stiffness, call.plan.tets);
-  std::vector<std::int64_t> shape(stiffness.sizes().begin(), stiffness.sizes().end());
-  shape.back() = call.plan.vertices;
-  call.batch = shape.size() == 2 ? shape[0] : 1;
-  const Tensor w = stiffness.contiguous(), out = at::empty(shape, stiffness.options());
-  call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
-                                  "Young's modulus [Pa]");
-  call.out = out.mutable_data_ptr<T>();
-  if (call.batch > 0) kernel(call, at::get_num_threads());
-  return out;
-}
-
-Tensor elastic_diagonal(const Tensor& stiffness, at::TensorList plan, bool weighted) {
-  check_real(stiffness, "stiffness", "[tets] or [batch, tets] (Pa)");
-  return stiffness.scalar_type() == at::kFloat
-             ? diagonal_typed<float>(stiffness, plan, weighted, kernels().field32)
-             : diagonal_typed<double>(stiffness, plan, weighted, kernels().field64);
-}
-
-template <class T>
-void rotation_typed(const Tensor& matrices, const Tensor& direction, const Tensor& out,
-                    void (*kernel)(const RotationCall<T>&, int)) {
-  const Tensor f = matrices.contiguous(),
-               d = direction.defined() ? direction.contiguous() : Tensor();
-  const RotationCall<T> call{f.numel() / 9, f.const_data_ptr<T>(),
-                             d.defined() ? d.const_data_ptr<T>() : nullptr,
-                             out.mutable_data_ptr<T>()};
-  if (call.count > 0) kernel(call, at::get_num_threads());
-}
-
-Tensor run_rotation(const Tensor& matrices, const Tensor& direction) {
-  check_matrices(matrices, "matrices");
-  if (direction.defined()) check_direction(direction, matrices);
-  const Tensor out = at::empty(matrices.sizes(), matrices.options());
-  if (matrices.scalar_type() == at::kFloat) {
-    rotation_typed<float>(matrices, direction, out, kernels().rotation32);
-  } else {
-    rotation_typed<double>(matrices, direction, out, kernels().rotation64);
-  }
-  return out;
-}
-
-Tensor nearest_rotation(const Tensor& matrices) { return run_rotation(matrices, {}); }
-
-Tensor rotation_differential(const Tensor& matrices, const Tensor& direction) {
-  return run_rotation(matrices, direction);
-}
 
 const std::string step_numbers =
     "int schedule, int iterations, float time_step, float relaxation, float rho, int delay, bool "
@@ -265,17 +76,6 @@ TORCH_LIBRARY(torchpd, m) {
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }
 
-TORCH_LIBRARY_IMPL(torchpd, CPU, m) {
-  m.impl("step", &step);
-  m.impl("step_", &step_inplace);
-  m.impl("rollout", &rollout);
-  m.impl("gradient", &gradient);
-  m.impl("hessian_product", &hessian_product);
-  m.impl("element_energy", &element_energy);
-  m.impl("element_energy_product", &element_energy_product);
-  m.impl("elastic_diagonal", &elastic_diagonal);
-  m.impl("nearest_rotation", &nearest_rotation);
-  m.impl("rotation_differential", &rotation_differential);
-}
+TORCH_LIBRARY_IMPL(torchpd, CPU, m) { register_ops<Cpu>(m); }
 
 }  // namespace pd

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
 import torch
+from devices import missing_gpu
 
-from torchpd.extension import load_extension
+# before cuBLAS starts: with deterministic algorithms, see `poisoned`, torch warns of a workspace of any other size
+os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
 
 
 def _devices() -> list[str]:
-    extension, _ = load_extension()
-    with_cuda = extension is not None and extension.build_info()["cuda"] and torch.cuda.is_available()
-    return ["cpu", "cuda"] if with_cuda else ["cpu"]
+    return ["cpu"] if missing_gpu() else ["cpu", "cuda"]
 
 
 @pytest.fixture(scope="session", params=_devices())

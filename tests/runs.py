@@ -89,10 +89,12 @@ def small_case() -> Case:
     return Case(scene, x, rng.standard_normal(x.shape), 1.0 / 60.0)
 
 
-def small(dtype: torch.dtype, device: torch.device | str = "cpu", batch: int = 3) -> tuple[pd.Simulator, pd.State]:
+def small(
+    dtype: torch.dtype, device: torch.device | str = "cpu", batch: int = 3, **options: Any
+) -> tuple[pd.Simulator, pd.State]:
     """A simulator and different environments."""
     case = small_case()
-    sim = simulator(case, dtype, device, iterations=6)
+    sim = simulator(case, dtype, device, **{"iterations": 6, **options})
     factor = torch.linspace(0.5, 1.5, batch, dtype=dtype, device=device)[:, None, None]
     x, v = (tensor_of(array, sim) for array in (case.positions, case.velocities))
     return sim, pd.State(sim.rest_positions + factor * (x - sim.rest_positions), factor * v)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from devices import missing_gpu
 from small_scene import call_step, numbers, small_simulator
 from torch import Tensor
 
@@ -232,7 +233,7 @@ def test_rotations_are_checked() -> None:
             ops.rotation_differential(torch.zeros(2, 3, 3), other)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="a second device is needed to mix devices")
+@pytest.mark.skipif(bool(missing_gpu()), reason="a second device is needed to mix devices")
 def test_devices_are_not_mixed(sim: pd.Simulator) -> None:
     x = sim.rest_state(2).positions
     with pytest.raises(Exception, match=r"velocities must be on cpu like positions|same device"):

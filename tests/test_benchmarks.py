@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -9,7 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
+from devices import missing_gpu
 
 ROOT = Path(__file__).parents[1]
 
@@ -130,3 +134,97 @@ def test_beam_counts_iterations() -> None:
     soft = next(line for line in result.stdout.splitlines() if "1e+04  guarded" in line)
     # 1e-2 and 1e-3 within 40 iterations, 1e-6 not
     assert soft.split()[-4:] == ["22", "38", ">", "40"]
+
+
+@pytest.fixture
+def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The benchmarks are scripts, which find each other in their folder."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+
+
+@pytest.mark.usefixtures("on_path")
+def test_scenes_of_the_gpu_are_what_their_names_say() -> None:
+    scenes = importlib.import_module("gpu_scenes")
+    named = {scene.name: scene for scene in scenes.GPU_SCENES}
+    assert len(named) == len(scenes.GPU_SCENES)
+    for scene in scenes.GPU_SCENES:
+        vertices = np.prod(np.add(scene.cells, 1))
+        size = scene.name.removesuffix("-irregular").removeprefix("one-")
+        if "x" in size:
+            assert size == f"{vertices}x{scene.batch}"
+        elif size == "1200-tets":
+            assert 6 * np.prod(scene.cells) == 1200
+        else:
+            goal = float(size.replace("k", "e3").replace("M", "e6"))
+            assert goal <= vertices <= 1.05 * goal
+        for aim in scene.aims:
+            assert (aim.stretch < aim.must) == aim.is_time
+    for test in scenes.PAPER:
+        assert 6 * np.prod(test.cells) == pytest.approx(test.constraints, rel=0.02)
+    assert named["256x8192"].aims[1].must == 1.5e6
+    # the two goals of a batch ask for about the same
+    assert named["256x8192"].aims[0].must == pytest.approx(1.5e6 * 64 * 6 * np.prod((15, 3, 3)), rel=0.2)
+
+
+@pytest.mark.usefixtures("on_path")
+@pytest.mark.parametrize("cells", [(3, 3, 3), (15, 4, 4)])
+def test_irregular_bar_is_a_mesh_of_the_same_size(cells: tuple[int, int, int]) -> None:
+    mesh = importlib.import_module("gpu_scenes").irregular_bar(cells)
+    corners = mesh.vertices[mesh.tets]
+    volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
+    assert len(mesh.vertices) == np.prod(np.add(cells, 1))
+    # nothing but slivers is missing: each has less than a hundredth of a cell
+    assert 0.97 * 0.04 <= volumes.sum() <= 0.04 * (1 + 1e-9)
+    assert volumes.min() > 0.01 * 0.04 / np.prod(cells)
+    assert np.unique(mesh.tets).size == len(mesh.vertices)
+    counts = np.bincount(mesh.tets.ravel())
+    assert counts.max() > 24  # a regular one has 24 at most
+
+
+@pytest.mark.usefixtures("on_path")
+def test_numbers_of_a_gpu_row() -> None:
+    gpu, scenes, timing = (importlib.import_module(name) for name in ("gpu", "gpu_scenes", "gpu_timing"))
+    scene = next(s for s in scenes.GPU_SCENES if s.name == "256x8192")
+    device = timing.Device("H100", 132, 1.98e9, 3e12, 80 << 30)
+    assert device.lane_instructions == pytest.approx(33.4e12, rel=1e-2)
+    step = 8192 / 1.5e6  # as fast as must be
+    facts = {"kernel": "block", "vertices": 256, "tets": 810}
+    row = gpu.quantities(scene, facts["tets"], step, 1.9 * step)
+    assert row["tet_iterations_per_second"] == pytest.approx(1.5e6 * 810 * 64)
+    assert row["marginal_iteration_microseconds"] == pytest.approx(0.9 * row["iteration_microseconds"])
+    shares = [aim["share_of_must"] for aim in gpu.aims(scene, row, torch.float32)]
+    assert shares == pytest.approx([1.5e6 * 810 * 64 / 65e9, 1.0])
+    assert gpu.aims(scene, row, torch.float64) == []
+    floor = gpu.floors(scene, facts, device, torch.float32, step)
+    assert floor["issue"] == pytest.approx(264 * row["tet_iterations_per_second"] / device.lane_instructions)
+    assert floor["bandwidth"] is None
+    large = next(s for s in scenes.GPU_SCENES if s.name == "one-1M")
+    facts = {"kernel": "stream", "vertices": 1 << 20, "tets": 6_000_000}
+    row = gpu.quantities(large, facts["tets"], 64 * 65e-6, 128 * 65e-6)
+    assert gpu.aims(large, row, torch.float32)[0]["share_of_must"] == pytest.approx(2.0)  # half the time
+    floor = gpu.floors(large, facts, device, torch.float64, 64 * 65e-6)
+    assert floor == {"issue": None, "bandwidth": pytest.approx(230 * (1 << 20) / 3e12 / 65e-6)}
+
+
+@pytest.mark.skipif(not missing_gpu(), reason="there is a GPU")
+def test_a_gpu_that_is_missing_is_refused() -> None:
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU, but no kernels")
+    ended = run("--device", "cuda", "--quick")
+    assert ended.returncode == 2
+    assert "torch finds no CUDA device" in ended.stderr
+
+
+@pytest.mark.skipif(bool(missing_gpu()), reason="needs a GPU")
+def test_quick_run_on_a_gpu(tmp_path: Path) -> None:
+    out = tmp_path / "gpu.json"
+    ended = run("--quick", "--device", "cuda", "--out", str(out))
+    assert ended.returncode == 0, ended.stderr
+    result = json.loads(out.read_text())
+    assert {row["kernel"] for row in result["results"]} == {"block", "grid", "stream"}
+    for row in result["results"]:
+        assert row["step_microseconds"] > 0.0
+        assert row["aims"][0]["share_of_must"] > 0.0
+        assert row["scene"] in ended.stdout
+    for parts in result["call_microseconds"].values():
+        assert parts.keys() == {"host", "graph", "kernels"}

@@ -84,7 +84,7 @@ def test_order_of_the_batch_does_not_matter(dtype: torch.dtype, device: torch.de
 def test_threads_and_runs_do_not_matter(name: str, batch: int, dtype: torch.dtype, device: torch.device) -> None:
     sim = simulator(scene() if name == "scene" else beam(1e5), dtype, device, iterations=20)
     # what two threads share, and on the beam sums of many parts, whose order shows in the energy
-    assert sim.plan.patches >= (2 if name == "scene" else 4)
+    assert device.type != "cpu" or sim.plan.patches >= (2 if name == "scene" else 4)
     state, forces = different_environments(sim, batch)
     energy = sim.energy(state)
     two = run(sim, state, forces)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -61,6 +62,25 @@ def test_gpu_without_cuda_build_is_a_problem(built: None, monkeypatch: pytest.Mo
     monkeypatch.setattr(doctor, "find_toolkit", lambda: Toolkit(None, "12.4", "nvcc is CUDA 12.4 but ..."))
     (problem,) = doctor.problems()
     assert "not built: nvcc is CUDA 12.4" in problem
+
+
+def test_devices_and_driver_are_shown(built: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = [
+        SimpleNamespace(name="Old", major=7, minor=5, total_memory=16 * 2**30),
+        SimpleNamespace(name="New", major=9, minor=0, total_memory=80 * 2**30),
+    ]
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: len(kinds))
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: kinds[index])
+    monkeypatch.setattr(doctor, "_driver", lambda: "580.65")
+    text = doctor.report()
+    assert "Old, compute capability 7.5: too old, the kernels need 8.0, 16 GiB" in text
+    assert "New, compute capability 9.0, 80 GiB" in text
+    assert ["NVIDIA", "driver", "580.65"] in [line.split() for line in text.splitlines()]
+
+
+def test_no_driver_is_no_error(built: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert "none found (nvidia-smi does not answer)" in doctor.report()
 
 
 def test_missing_packages_are_named_as_pip_names_them(built: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -124,6 +124,17 @@ def test_material_of_every_environment_comes_back(tmp_path: Path) -> None:
         assert_same_bits(sim, loaded, batch=3)
 
 
+def test_kernel_comes_back_and_older_files_have_none(file: Path) -> None:
+    body = pd.Solid(pd.shapes.single_tet(), youngs=1e4)
+    pd.Simulator(pd.Scene(body), kernel="grid").save(file)
+    assert pd.Simulator.load(file).kernel == "grid"
+    rewrite(file, lambda _, record: record.pop("kernel"))
+    assert pd.Simulator.load(file).kernel == "auto"
+    rewrite(file, lambda _, record: record.update(kernel="warp"))
+    with pytest.raises(ValueError, match=r"damaged: .*kernel must be"):
+        pd.Simulator.load(file)
+
+
 def test_saving_what_was_loaded_gives_the_same_file(tmp_path: Path) -> None:
     pd.Simulator(everything(), iterations=3).save(tmp_path / "one")
     pd.Simulator.load(tmp_path / "one").save(tmp_path / "two")

@@ -18,9 +18,11 @@ ops = torch.ops.torchpd
 BATCH = 3
 
 
-def samples(name: str, dtype: torch.dtype, device: torch.device) -> tuple[tuple[Any, ...], dict[str, Any]]:
+def samples(
+    name: str, dtype: torch.dtype, device: torch.device, **options: Any
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """Arguments of an op; those for which it has derivatives ask for gradients."""
-    sim, state = small(dtype, device)
+    sim, state = small(dtype, device, **options)
     material, plan = sim.material(), plan_of(sim)
     x, v = state
     f, direction = noise(x), noise(x, 1)

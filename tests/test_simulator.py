@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from cases import box
 from runs import moving, same_bits, simulate
 
 import torchpd as pd
+from torchpd.placing import check_wanted_device
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -90,3 +92,57 @@ def test_set_material_is_the_scene_of_those_values(dtype: torch.dtype, device: t
     sim.set_material(stiffness=5e4, damping=0.5)
     assert torch.equal(sim.stiffness, torch.full_like(sim.stiffness, 5e4))
     assert sim.damping.shape == ()
+
+
+def test_pickled_simulator_takes_the_same_step(dtype: torch.dtype) -> None:
+    sim = simulate(dtype, kernel="stream")
+    state = moving(sim)
+    twin = pickle.loads(pickle.dumps(sim))
+    assert (twin.kernel, twin.plan.kernel) == ("stream", None)
+    assert same_bits(twin(state), sim(state))
+
+
+def test_kernel_changes_nothing_on_the_cpu(dtype: torch.dtype) -> None:
+    sim = simulate(dtype)
+    state = moving(sim)
+    for kernel in ("block", "grid", "stream"):
+        assert same_bits(simulate(dtype, kernel=kernel)(state), sim(state))
+    with pytest.raises(ValueError, match='kernel must be "auto", "block", "grid" or "stream", got \'warp\''):
+        simulate(dtype, kernel="warp")
+
+
+def test_meta_and_back_is_compiled_again(dtype: torch.dtype) -> None:
+    sim = simulate(dtype)
+    state, arrays = moving(sim), sim.plan.arrays
+    there = sim.to("meta")
+    assert there.device.type == there.plan.vertex_order.device.type == "meta"
+    back = there.to_empty(device="cpu")
+    assert all(torch.equal(one, other) for one, other in zip(back.plan.arrays, arrays, strict=True))
+    fresh = simulate(dtype)
+    back.load_state_dict(fresh.state_dict())
+    assert same_bits(back(state), fresh(state))
+
+
+@pytest.mark.skipif(torch.version.cuda is not None, reason="for a CPU build of torch")
+def test_a_gpu_that_cannot_be_had_is_explained() -> None:
+    sim = simulate(torch.float32)
+    state = moving(sim)
+    expected = sim(state)
+    for move in (lambda: sim.to("cuda"), sim.cuda):
+        with pytest.raises(RuntimeError, match=r"no CUDA here: .*CPU build.*build torchpd again; `python -m torchpd"):
+            move()
+    assert same_bits(sim(state), expected)
+
+
+def test_errors_of_others_are_left_alone() -> None:
+    def fail(_: torch.Tensor) -> torch.Tensor:
+        raise RuntimeError("something else")
+
+    with pytest.raises(RuntimeError, match=r"^something else$"):
+        check_wanted_device(fail, torch.empty(0))
+
+
+def test_capture_wants_a_gpu() -> None:
+    sim = simulate(torch.float32)
+    with pytest.raises(RuntimeError, match=r'capture: .* this one is on cpu: move it with \.to\("cuda"\)'):
+        sim.capture(moving(sim))

@@ -10,6 +10,8 @@ from cases import Case, box
 from runs import moving, same_bits, simulator
 
 import torchpd as pd
+from torchpd.gpu import Properties
+from torchpd.regimes import choose_plan
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -77,3 +79,24 @@ def test_absent_effects_change_no_bits(dtype: torch.dtype, device: torch.device)
         pd.Sphere((0, -100, 0), 1.0),
     ):
         assert same_bits(simulator(bare(effect), dtype, device, iterations=9)(state), expected), effect
+
+
+@pytest.mark.parametrize(
+    ("kernel", "facts"),
+    [
+        ("block", ("1 patch,", "one thread block an environment", '"grid" or "stream"')),
+        ("grid", ("2 patches,", "a thread block for each patch, all iterations in one launch", '"block" or "stream"')),
+        ("stream", ("1 patch,", "launches for every iteration", "B an environment during a step")),
+    ],
+)
+def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...]) -> None:
+    sim = simulator(bare(pd.Ground()), torch.float32)
+    values = sim.scene.values()
+    sim.plan = choose_plan(values, torch.float32, Properties(132, 232_448), kernel)
+    text = str(sim)
+    for fact in (*facts, f"kernel {kernel}:", f"why {kernel}: asked for", f"plan {sim.plan.bytes:,} B", "grounds: 1"):
+        assert fact in text, fact
+    assert "SIMD" not in text
+    sim.plan = choose_plan(values, torch.float32, Properties(132, 232_448))
+    assert "why block: shared memory a thread block: block needs" in str(sim)
+    assert "232,448 B are there" in str(sim)

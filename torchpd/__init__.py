@@ -16,6 +16,7 @@ from .tetrahedralize import tetrahedralize
 from .version import __version__
 
 if load_extension()[0] is not None:
+    from .capture import CapturedStep
     from .ops import nearest_rotation
     from .plan import Plan, compile_plan
     from .simulator import Simulator
@@ -29,6 +30,7 @@ else:  # meshes, scenes and the doctor work without it
 
 
 __all__ = [
+    "CapturedStep",
     "Chebyshev",
     "Damping",
     "Embedding",

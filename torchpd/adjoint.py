@@ -29,6 +29,7 @@ __all__ = ["AdjointCall", "step_adjoint", "step_gradient"]
 # Relative residual of the adjoint system at which the solve stops: near the rounding floor of each precision.
 _TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 _MOST_ITERATIONS = 2000
+_ASKED_EVERY = 10  # iterations: asking whether any environment goes on waits for a GPU
 # A body stretched this much turns so little that its Hessian is the constant, positive majoriser but for 1e-4.
 _STRETCH = 1e4
 _STICKING = 1e-3  # of what friction could take back: slip below it counts as none
@@ -56,15 +57,16 @@ def conjugate_gradients(
 ) -> tuple[Tensor, Tensor]:
     """Solve for each environment of [B, V, 3]; returns the solution and the relative residual [B].
 
-    An environment whose matrix turns out not to be positive along a direction keeps what it has by then.
+    An environment whose matrix turns out not to be positive along a direction keeps what it has by then, as does
+    one that is done: the host asks every tenth iteration only whether any goes on.
     """
     solution, residual = torch.zeros_like(right), right
     preconditioned = residual / diagonal
     direction, rho = preconditioned, _dot(residual, preconditioned)
     scale = _dot(right, right).sqrt()
     active = scale > 0
-    for _ in range(_MOST_ITERATIONS):
-        if not bool(active.any()):
+    for iteration in range(_MOST_ITERATIONS):
+        if iteration % _ASKED_EVERY == 0 and not bool(active.any()):
             break
         image = product(direction)
         curvature = _dot(direction, image)

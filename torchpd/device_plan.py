@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import _C
-from .plan import compiling, free_pieces, internal_numbers
+from .plan import KERNELS, compiling, free_pieces, internal_numbers
 from .scene import SceneValues
-from .tables import DEVICE_PLAN_TABLE
+from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 
 __all__ = ["compile_device_plan"]
 
-_KERNELS = 3  # a block per environment, a grid per environment, a stream of kernels per iteration
-_SIZE_KERNEL, _SIZE_PINS = 0, 3  # as in DeviceSize of csrc/plan/views.h
+_SIZE_KERNEL, _SIZE_PINS = DEVICE_SIZES.index("kernel"), DEVICE_SIZES.index("pins")
 
 
 def compile_device_plan(
@@ -38,7 +37,7 @@ def compile_device_plan(
     """
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
-    if kernel not in range(_KERNELS):
+    if kernel not in range(len(KERNELS)):
         raise ValueError(f"kernel must be 0, 1 or 2, got {kernel}")
     piece, _ = free_pieces(values)
     with compiling(len(values.tets), progress) as advance:

@@ -9,6 +9,7 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+import subprocess
 import sys
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from typing import Any, NamedTuple
 import torch
 
 from .extension import BUILD_COMMAND, load_extension
+from .gpu import LEAST_CAPABILITY
 from .toolkit import Toolkit, find_toolkit
 from .version import __version__
 
@@ -82,9 +84,20 @@ def _devices() -> list[tuple[str, str]]:
     rows = [("cpu", f"{os.cpu_count()} logical cores, {torch.get_num_threads()} threads in use")]
     for index in range(torch.cuda.device_count()):
         device = torch.cuda.get_device_properties(index)
-        capability = f"sm_{device.major}{device.minor}"
-        rows.append((f"cuda:{index}", f"{device.name}, {capability}, {device.total_memory / 2**30:.0f} GiB"))
-    return rows
+        old = "" if (device.major, device.minor) >= LEAST_CAPABILITY else ": too old, the kernels need 8.0"
+        facts = f"compute capability {device.major}.{device.minor}{old}, {device.total_memory / 2**30:.0f} GiB"
+        rows.append((f"cuda:{index}", f"{device.name}, {facts}"))
+    return [*rows, ("NVIDIA driver", _driver())]
+
+
+def _driver() -> str:
+    """Release of the driver, asked of its own tool."""
+    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=20).stdout.split()
+    except (OSError, subprocess.SubprocessError):
+        return "none found (nvidia-smi does not answer)"
+    return said[0] if said else "unknown"
 
 
 def _cuda_state(build: Mapping[str, Any] | None, toolkit: Toolkit) -> str:

@@ -65,6 +65,7 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         "time_step": sim.time_step,
         "iterations": sim.iterations,
         "tolerance": sim.tolerance,
+        "kernel": sim.kernel,
         "dtype": str(sim.dtype).removeprefix("torch."),
         "solver": {"kind": type(sim.solver).__name__, **dataclasses.asdict(sim.solver)},
         "meshes": [{"flipped": mesh.flipped} for mesh in meshes],
@@ -197,6 +198,7 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
         solver=_solver(record["solver"]),
         dtype=_DTYPES[record["dtype"]],
         tolerance=record["tolerance"],
+        kernel=record.get("kernel", "auto"),  # files of before there was a choice
     )
     sim.set_material(**{name: tensors[f"material.{name}"] for name, *_ in MATERIAL_TABLE})
     for name in record["trained"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,36 +15,51 @@ from tqdm import tqdm
 
 from . import _C
 from .scene import SceneValues
-from .tables import PLAN_TABLE
+from .tables import DEVICE_SIZES, PLAN_TABLE, PlanRow
 
-__all__ = ["Plan", "compile_plan", "compiling", "free_pieces", "internal_numbers"]
+__all__ = ["KERNELS", "Plan", "compile_plan", "compiling", "free_pieces", "internal_numbers"]
 
 _WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
-
-
-_POSITION = {row.name: number for number, row in enumerate(PLAN_TABLE)}
+# by their number in the `sizes` of a GPU's plan
+KERNELS = ("block", "grid", "stream")
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Constant arrays of a scene in the order of the table that C++ declares, also by name: `plan.vertex_order`."""
+    """Constant arrays of a scene in the order of a table that C++ declares, also by name: `plan.vertex_order`.
+
+    The CPU and GPUs have a table each. `why` says in words why a GPU's plan is for the kernel that it is for.
+    """
 
     arrays: tuple[Tensor, ...]
+    table: tuple[PlanRow, ...] = PLAN_TABLE
+    why: str = ""
 
     def __getattr__(self, name: str) -> Tensor:
-        if name in _POSITION:
-            return self.arrays[_POSITION[name]]
-        raise AttributeError(f"Plan has no array {name!r}; it has {', '.join(_POSITION)}")
+        for number, row in enumerate(self.table):
+            if row.name == name:
+                return self.arrays[number]
+        names = ", ".join(row.name for row in self.table)
+        raise AttributeError(f"Plan has no array {name!r}; it has {names}")
+
+    @property
+    def kernel(self) -> str | None:
+        """Which kernel of a GPU the plan is for: "block", "grid" or "stream"; None for the CPU."""
+        return None if self.table == PLAN_TABLE else KERNELS[self.size("kernel")]
+
+    def size(self, name: str) -> int:
+        """A number of a GPU's plan by its name in DEVICE_SIZES."""
+        return int(self.sizes[DEVICE_SIZES.index(name)])
 
     @property
     def dtype(self) -> torch.dtype:
         """Precision of the real arrays."""
-        return self.tet_rest.dtype
+        return next(array.dtype for array in self.arrays if array.is_floating_point())
 
     @property
     def device(self) -> torch.device:
         """Where the arrays are."""
-        return self.tet_rest.device
+        return self.vertex_order.device
 
     @property
     def vertices(self) -> int:
@@ -53,7 +68,7 @@ class Plan:
 
     @property
     def patches(self) -> int:
-        """Pieces of the mesh that the CPU works on one at a time."""
+        """Pieces of the mesh: the CPU works on one at a time, a GPU has a thread block for each."""
         return len(self.patch_block) - 1
 
     @property
@@ -64,11 +79,12 @@ class Plan:
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Plan:
         """A copy on another device or in another precision. Widening brings no digits back: compile again.
 
-        `sizes` stay on the CPU: the host reads them, and must not wait for a device.
+        The kernels of a GPU and of the CPU need different plans: `Simulator.to` compiles the right one. `sizes` stay on
+        the CPU: the host reads them, and must not wait for a device.
         """
         sizes, *others = self.arrays
         moved = (array.to(device=device, dtype=dtype if array.is_floating_point() else None) for array in others)
-        return Plan((sizes, *moved))
+        return replace(self, arrays=(sizes, *moved))
 
 
 @contextmanager

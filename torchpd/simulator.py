@@ -9,11 +9,13 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from . import _C
 from .adjoint import AdjointCall, step_gradient
+from .capture import CapturedStep
 from .material import MATERIAL_ROWS, check_material, material_of
 from .ops import INFO_WIDTH, refuse_tangents
+from .placing import check_wanted_device, plan_on
 from .plan import Plan, compile_plan
+from .regimes import check_kernel
 from .rollout import PerStep, Rollout, roll
 from .scene import Scene
 from .solvers import Chebyshev, Jacobi, Solver
@@ -41,6 +43,8 @@ class Simulator(nn.Module):
         solver: `Chebyshev()` or `Jacobi()`.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
+        kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "grid" or "stream", see `torchpd.regimes`;
+            "auto" takes the first that fits. Changes nothing on the CPU.
         progress: show a bar while a large scene compiles.
     """
 
@@ -63,6 +67,7 @@ class Simulator(nn.Module):
         dtype: torch.dtype = torch.float32,
         *,
         tolerance: float = 0.0,
+        kernel: str = "auto",
         progress: bool = True,
     ) -> None:
         super().__init__()
@@ -77,6 +82,7 @@ class Simulator(nn.Module):
         self.tolerance = float(tolerance)
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
+        self.kernel = check_kernel(kernel)
         values = scene.values()
         self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
         self.anchors = Anchors(scene, self.time_step)
@@ -155,21 +161,19 @@ class Simulator(nn.Module):
             )
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
-        wanted = fn(torch.empty(0, dtype=self.dtype, device=self.device))
+        wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
-        if wanted.device.type not in ("cpu", "meta") and not _C.build_info()["cuda"]:
-            raise RuntimeError(f"this build of torchpd has no kernels for {wanted.device.type}; it runs on the CPU")
+        changes_precision = wanted.dtype != self.dtype
+        # first, because it may refuse
+        plan = plan_on(self, wanted.dtype, wanted.device)
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        if wanted.dtype != self.dtype:
-            # digits that float32 has lost do not come back by widening: compile for the new precision. The material may
-            # have been trained, and keeps the digits it has.
-            values = self.scene.values()
-            self.plan = compile_plan(values, dtype=wanted.dtype, progress=False)
-            self.rest_positions = torch.tensor(values.rest_positions, dtype=wanted.dtype, device=wanted.device)
-        if self.device.type == "meta" and wanted.device.type != "meta":
-            self.plan = compile_plan(self.scene.values(), dtype=wanted.dtype, progress=False)
-        self.plan = self.plan.to(wanted.device)
+        self.plan = plan
+        if changes_precision:
+            # digits that float32 has lost do not come back by widening. The material may have been trained, and keeps
+            # the digits it has.
+            positions = self.scene.values().rest_positions
+            self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
         return self
 
     def extra_repr(self) -> str:
@@ -297,6 +301,26 @@ class Simulator(nn.Module):
         if start not in ("velocity", "inertial"):
             raise ValueError(f'rollout: start must be "velocity" or "inertial", got {start!r}')
         return roll(self, Rollout(state, steps, every, forces, targets, start, return_info), progress=progress)
+
+    def capture(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        *,
+        return_info: bool = False,
+    ) -> CapturedStep:
+        """Record `step_` as a CUDA graph, which starts with less work for the host: see `CapturedStep`.
+
+        Args:
+            state: what every replay moves on; recording leaves it as it is.
+            forces: as in `forward`; change them in place between replays.
+            targets: as in `forward`; change them in place between replays.
+            start: as in `forward`; positions may be changed in place between replays.
+            return_info: fill in `CapturedStep.info`.
+        """
+        return CapturedStep(self, state, forces, targets, start, report=return_info)
 
     # ---- energies
 

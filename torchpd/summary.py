@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 import torch
 
 from . import _C
+from .regimes import shared_bytes
 from .solvers import Chebyshev
 
 if TYPE_CHECKING:
+    from .plan import Plan
     from .simulator import Simulator
 
 __all__ = ["describe"]
@@ -59,19 +61,53 @@ def _pass_line(sim: Simulator) -> str:
     )
 
 
+_LAUNCHES = {
+    "block": "one thread block an environment, all iterations in one launch",
+    "grid": "a thread block for each patch, all iterations in one launch",
+    "stream": "a thread block for each patch, launches for every iteration",
+}
+
+
+def _kernel_lines(sim: Simulator) -> list[str]:
+    plan = sim.plan
+    kernel = str(plan.kernel)
+    block = shared_bytes(plan, sim.planes.shape[-2], sim.spheres.shape[-2])
+    pairs = int(plan.patch_pairs.sum())
+    mesh = (
+        f"{plan.patches} patch{'es' * (plan.patches > 1)}, {pairs} pairs of tetrahedra, {plan.size('shared')} vertices"
+    )
+    others = " or ".join(f'"{name}"' for name in _LAUNCHES if name != kernel)
+    return [
+        f"kernel {kernel}: {_LAUNCHES[kernel]}",
+        f"mesh: {mesh} that patches share, {block:,} B of shared memory a thread block",
+        f"why {kernel}: {plan.why}; Simulator(..., kernel=...) may ask for {others}",
+    ]
+
+
+def _step_bytes(plan: Plan, real: int) -> str:
+    """Memory that a step takes beside plan, material and states."""
+    if plan.kernel is None:
+        # five vectors of four numbers, two weights, and the slots of the patches
+        return f"{real * (22 * plan.vertices + 8 * len(plan.slot_vertex)):,} B an environment during a step"
+    slots = plan.size("slots")
+    if plan.kernel == "stream":
+        return f"{4 * real * (5 * plan.vertices + 2 * slots):,} B an environment during a step"
+    # five vectors of four numbers a slot, the weights of 32 pairs a block
+    team = real * (20 * slots + 64 * plan.size("blocks"))
+    return f"{team:,} B for each environment that the GPU has in work at a time"
+
+
 def describe(sim: Simulator) -> str:
     """Lines for `print(sim)`: sizes, solver, effects, passes, memory."""
     plan = sim.plan
     material = sum(array.numel() * array.element_size() for array in sim.material())
     real = torch.finfo(sim.dtype).bits // 8
-    # five vectors of four numbers, two weights, and the slots of the patches
-    per_environment = real * (22 * plan.vertices + 8 * len(plan.slot_vertex))
-    simd = _C.build_info()["simd"]
+    where = f"{sim.device} ({_C.build_info()['simd']})" if plan.kernel is None else str(sim.device)
     lines = [
-        f"{plan.vertices} vertices, time step {sim.time_step:.6g} s, {sim.dtype} on {sim.device} ({simd})",
+        f"{plan.vertices} vertices, time step {sim.time_step:.6g} s, {sim.dtype} on {where}",
         _solver_line(sim),
         *_effect_lines(sim),
-        _pass_line(sim),
-        f"memory: plan {plan.bytes:,} B, material {material:,} B, {per_environment:,} B an environment during a step",
+        *([_pass_line(sim)] if plan.kernel is None else _kernel_lines(sim)),
+        f"memory: plan {plan.bytes:,} B, material {material:,} B, {_step_bytes(plan, real)}",
     ]
     return "\n  ".join(lines)

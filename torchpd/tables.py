@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from . import _C
 
-__all__ = ["DEVICE_PLAN_TABLE", "MATERIAL_TABLE", "PLAN_TABLE", "MaterialRow", "PlanRow"]
+__all__ = ["DEVICE_PLAN_TABLE", "DEVICE_SIZES", "MATERIAL_TABLE", "PLAN_TABLE", "MaterialRow", "PlanRow"]
 
 
 class PlanRow(NamedTuple):
@@ -36,3 +36,8 @@ class MaterialRow(NamedTuple):
 PLAN_TABLE = tuple(PlanRow(*row) for row in _C.plan_table())
 DEVICE_PLAN_TABLE = tuple(PlanRow(*row) for row in _C.device_plan_table())
 MATERIAL_TABLE = tuple(MaterialRow(*row) for row in _C.material_table())
+# numbers of a GPU plan's `sizes`: DeviceSize of csrc/plan/views.h
+DEVICE_SIZES = (
+    "kernel", "vertices", "tets", "pins", "pieces", "blocks", "patches", "slots", "shared", "parts",
+    "most_slots", "most_pairs", "most_entries", "most_shared", "most_parts",
+)  # fmt: skip

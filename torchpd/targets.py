@@ -92,8 +92,9 @@ class Anchors:
     @staticmethod
     def moved_on(spheres: Tensor, steps: int) -> Tensor:
         """Spheres after some steps of constant motion, added up as the kernels do."""
-        if spheres.shape[-2] == 0 or not bool(spheres[..., 5:].any()):
+        if spheres.shape[-2] == 0:
             return spheres
+        # also where none moves: to ask would mean to wait for a GPU
         centre = spheres[..., :3]
         for _ in range(steps):
             centre = centre + spheres[..., 5:]

@@ -16,7 +16,8 @@ __all__ = ["CUDA_ARCHITECTURES", "NVCC_FLAGS", "Toolkit", "choose_toolkit", "fin
 # torch asks a visible GPU when TORCH_CUDA_ARCH_LIST is unset, which fails on a build machine without one.
 # The PTX of the last architecture lets newer devices compile it when they load it.
 CUDA_ARCHITECTURES = "8.0;9.0+PTX"
-NVCC_FLAGS = ("-std=c++20", "-O3", "--expt-relaxed-constexpr")
+# --fmad=false: the code says itself where to fuse, as for the CPU.
+NVCC_FLAGS = ("-std=c++20", "-O3", "--expt-relaxed-constexpr", "--fmad=false")
 
 
 class Toolkit(NamedTuple):

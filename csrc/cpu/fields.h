@@ -26,14 +26,7 @@ class FieldPass {
     } else if (call_.field == Field::diagonal) {
       vertex_field<1, 1>(environment, SolidDiagonal{});
     } else if (call_.field == Field::hessian_product) {
-      vertex_field<2, 3>(environment, one_by_one([](const auto& elements, int s) {
-                           using R = typename std::remove_cvref_t<decltype(elements)>::R;
-                           Vec3<R> x[4], dx[4], g[4];
-                           elements.corners(s, 0, x);
-                           elements.corners(s, 1, dx);
-                           solid_hessian_product(x, dx, elements.rest(s), elements.weight(s), g);
-                           elements.add(s, g);
-                         }));
+      vertex_field<2, 3>(environment, SolidHessian{});
     } else if (call_.field == Field::element_energy) {
       element_field<1>(environment, [](const auto& x, const auto& rest, const auto& weight) {
         using R = std::remove_cvref_t<decltype(weight)>;

@@ -85,6 +85,23 @@ PD_HD R element_energy_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
   return weight * frobenius(strain(x, rest_inverse), deformation_gradient(dx, rest_inverse));
 }
 
+// The second derivative of every element at field 0, along field 1.
+struct SolidHessian {
+  static constexpr int strip = 1;
+
+  template <int N, class Elements>
+  PD_HD void run(const Elements& elements) const {
+    using R = typename Elements::R;
+    for (int s = 0; s < N; ++s) {
+      Vec3<R> x[4], dx[4], g[4];
+      elements.corners(s, 0, x);
+      elements.corners(s, 1, dx);
+      solid_hessian_product(x, dx, elements.rest(s), elements.weight(s), g);
+      elements.add(s, g);
+    }
+  }
+};
+
 // Diagonal of the majoriser on the four corners, l_e w V |grad N_c|^2 in every component, the weight being l_e w V.
 struct SolidDiagonal {
   static constexpr int strip = 1;

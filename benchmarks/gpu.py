@@ -1,0 +1,226 @@
+"""`run.py --device cuda`: rows for the scenes of gpu_scenes.py, what a call costs, and the tests of the paper."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import statistics
+import time
+from typing import Any
+
+import torch
+from gpu_scenes import PAPER, GpuScene, PaperTest
+from gpu_timing import Device, describe_device, event_times, graph_times, host_seconds, kernel_seconds
+from machine import milliseconds
+from scenes import TIME_STEP
+from tqdm import tqdm
+
+import torchpd as pd
+
+Row = dict[str, Any]
+
+ROLLOUT = 16  # steps in one call
+
+
+def quantities(scene: GpuScene, tets: int, step: float, twice: float) -> Row:
+    """What follows from the seconds of a step with K and with 2 K iterations."""
+    return {
+        "step_microseconds": 1e6 * step,
+        "iteration_microseconds": 1e6 * step / scene.iterations,
+        "marginal_iteration_microseconds": 1e6 * (twice - step) / scene.iterations,
+        "tet_iterations_per_second": tets * scene.batch * scene.iterations / step,
+        "environment_steps_per_second": scene.batch / step,
+    }
+
+
+def floors(scene: GpuScene, facts: Row, device: Device, dtype: torch.dtype, step: float) -> Row:
+    """Shares of an iteration's time that instructions, and with the stream kernels memory, take at the very least."""
+    iteration = step / scene.iterations
+    real = torch.finfo(dtype).bits // 8
+    single = dtype == torch.float32  # float64 issues other instructions
+    moved = device.bandwidth_floor(facts["vertices"], scene.batch, real)
+    return {
+        "issue": device.issue_floor(facts["tets"], scene.batch) / iteration if single else None,
+        "bandwidth": moved / iteration if facts["kernel"] == "stream" else None,
+    }
+
+
+def aims(scene: GpuScene, row: Row, dtype: torch.dtype) -> list[Row]:
+    """The goals, and the share of the lower one that was reached: 1 or more is good."""
+    if dtype != torch.float32:
+        return []
+    return [
+        {
+            "quantity": aim.quantity,
+            "must": aim.must,
+            "stretch": aim.stretch,
+            "share_of_must": aim.share(row[aim.quantity]),
+        }
+        for aim in scene.aims
+    ]
+
+
+def compile_on(scene: GpuScene, dtype: torch.dtype, device: torch.device) -> tuple[pd.Simulator, Row]:
+    """The simulator, and what compiling it took: `plan_seconds` for the CPU's plan and the device's together."""
+    parts = scene.build()
+    gc.collect()
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats(device)
+    begin = time.perf_counter()
+    sim = pd.Simulator(parts, TIME_STEP, scene.iterations, dtype=dtype, progress=False, kernel=scene.kernel)
+    sim = sim.to(device)
+    torch.cuda.synchronize(device)
+    facts = {
+        "kernel": sim.plan.kernel,
+        "vertices": sim.vertices,
+        "tets": sum(len(body.mesh.tets) for body in parts.solids),
+        "patches": sim.plan.patches,
+        "plan_seconds": time.perf_counter() - begin,
+        "plan_bytes": sim.plan.bytes,
+    }
+    return sim, facts
+
+
+def measure_scene(scene: GpuScene, dtype: torch.dtype, machine: Device, options: argparse.Namespace) -> Row:
+    """One row of the result; rates come from the median."""
+    sim, facts = compile_on(scene, dtype, torch.device(options.device))
+    state = scene.start(sim)
+    given = {"repetitions": options.repetitions, "seconds": options.seconds}
+    eager = event_times(lambda: sim(state), repetitions=options.repetitions, seconds=0.0)
+    peak = torch.cuda.max_memory_allocated(sim.device)
+    times = graph_times(lambda: sim(state), **given)
+    rollout = graph_times(lambda: sim.rollout(state, ROLLOUT, ROLLOUT), repetitions=options.repetitions, seconds=0.0)
+    sim.iterations = 2 * scene.iterations
+    twice = statistics.median(graph_times(lambda: sim(state), **given))
+    step = statistics.median(times)
+    row: Row = {
+        "scene": scene.name,
+        "dtype": str(dtype).removeprefix("torch."),
+        "irregular": scene.irregular,
+        "batch": scene.batch,
+        "iterations": scene.iterations,
+        **facts,
+        "peak_bytes": peak,
+        "bytes_per_vertex": peak / (sim.vertices * scene.batch),
+        "milliseconds": milliseconds(times),
+        "eager_milliseconds": milliseconds(eager),
+        "rollout_step_microseconds": 1e6 * statistics.median(rollout) / ROLLOUT,
+        **quantities(scene, facts["tets"], step, twice),
+        "share_of_floor": floors(scene, facts, machine, dtype, step),
+    }
+    return {**row, "aims": aims(scene, row, dtype)}
+
+
+def measure_calls(options: argparse.Namespace) -> Row:
+    """Microseconds of a call: the host's part, a run in a graph, the kernels alone. One iteration, one tetrahedron."""
+    runs = 5 if options.quick else 200
+    found: Row = {}
+    for kernel in ("block", "grid", "stream"):
+        scene = pd.Scene(pd.Solid(pd.shapes.single_tet(), youngs=1e4))
+        sim = pd.Simulator(scene, TIME_STEP, 1, kernel=kernel, progress=False).to(options.device)
+        state = sim.rest_state()
+        calls = {
+            "sim(state)": (1, lambda sim=sim, state=state: sim(state)),
+            "sim.step_(state)": (1, lambda sim=sim, state=state: sim.step_(state)),
+            "one step of a rollout": (100, lambda sim=sim, state=state: sim.rollout(state, 100, 100)),
+        }
+        for name, (steps, call) in calls.items():
+            alone = kernel_seconds(call, runs)
+            found[f"{kernel}: {name}"] = {
+                "host": 1e6 * host_seconds(call, runs) / steps,
+                "graph": 1e6 * statistics.median(graph_times(call, repetitions=runs, seconds=0.0)) / steps,
+                "kernels": None if alone is None else 1e6 * alone / steps,
+            }
+    return found
+
+
+def measure_paper(options: argparse.Namespace) -> list[Row]:
+    """Scenes of as many tetrahedra as the paper's have constraints, with 64 iterations."""
+    return [measure_test(test, kernel, options) for test in PAPER for kernel in ("block", "grid")]
+
+
+def measure_test(test: PaperTest, kernel: str, options: argparse.Namespace) -> Row:
+    scene = GpuScene(test.name, test.cells, kernel=kernel)
+    sim, facts = compile_on(scene, torch.float32, torch.device(options.device))
+    state = scene.start(sim)
+    given = {"repetitions": options.repetitions, "seconds": 0.0}
+    milliseconds_here = 1e3 * statistics.median(graph_times(lambda: sim(state), **given))
+    return {
+        "scene": test.name,
+        "kernel": kernel,
+        "tets": facts["tets"],
+        "milliseconds": milliseconds_here,
+        "eager_milliseconds": 1e3 * statistics.median(event_times(lambda: sim(state), **given)),
+        "constraints_of_the_paper": test.constraints,
+        "milliseconds_of_the_paper": test.milliseconds,
+        "speedup": test.milliseconds / milliseconds_here,
+    }
+
+
+def cell(value: float | None, places: int, scale: float = 1.0) -> str:
+    """For a table."""
+    return "-" if value is None else f"{value * scale:,.{places}f}"
+
+
+def table(rows: list[Row]) -> str:
+    """The rows for a reader."""
+    lines = [
+        ["scene", "dtype", "kernel", "tets", "batch", "K", "us/step", "us/it", "marginal", "eager us", "rollout us",
+         "G tet-it/s", "k steps/s", "of must", "issue", "bandwidth", "plan s", "peak MB", "B/vertex"]
+    ]  # fmt: skip
+    for row in rows:
+        shares = [aim["share_of_must"] for aim in row["aims"]]
+        lines.append(
+            [
+                row["scene"],
+                row["dtype"],
+                row["kernel"],
+                cell(row["tets"], 0),
+                cell(row["batch"], 0),
+                cell(row["iterations"], 0),
+                cell(row["step_microseconds"], 1),
+                cell(row["iteration_microseconds"], 3),
+                cell(row["marginal_iteration_microseconds"], 3),
+                cell(row["eager_milliseconds"]["median"], 1, 1e3),
+                cell(row["rollout_step_microseconds"], 1),
+                cell(row["tet_iterations_per_second"], 2, 1e-9),
+                cell(row["environment_steps_per_second"], 2, 1e-3),
+                " ".join(cell(share, 2) for share in shares) or "-",
+                cell(row["share_of_floor"]["issue"], 2),
+                cell(row["share_of_floor"]["bandwidth"], 2),
+                cell(row["plan_seconds"], 2),
+                cell(row["peak_bytes"], 1, 1e-6),
+                cell(row["bytes_per_vertex"], 0),
+            ]
+        )
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
+    return "\n".join("  ".join(c.rjust(width) for c, width in zip(line, widths, strict=True)) for line in lines)
+
+
+def run_on_gpu(options: argparse.Namespace) -> Row:
+    """Everything, printed; what is written besides the description of the machine."""
+    device = torch.device(options.device)
+    with torch.no_grad(), torch.cuda.device(device):
+        machine = describe_device(device)
+        result: Row = {
+            "device": {
+                **vars(machine),
+                "lane_instructions_per_second": machine.lane_instructions,
+                "cuda": torch.version.cuda,
+            },
+            "call_microseconds": measure_calls(options),
+            "paper": [] if options.quick or options.only else measure_paper(options),
+        }
+        jobs = [(scene, getattr(torch, name)) for name in options.dtype for scene in options.scenes]
+        bar = tqdm(jobs, desc="measuring", unit="scene", leave=False)
+        result["results"] = [measure_scene(scene, dtype, machine, options) for scene, dtype in bar]
+    print(table(result["results"]))
+    print("\nmicroseconds of a call (host, in a graph, kernels alone), one iteration on one tetrahedron:")
+    for name, parts in result["call_microseconds"].items():
+        print(f"  {name}: " + ", ".join(cell(part, 1) for part in parts.values()))
+    for row in result["paper"]:
+        print(
+            f"  {row['scene']} ({row['tets']} tets, {row['kernel']}): {row['milliseconds']:.3f} ms a step, "
+            f"the paper {row['milliseconds_of_the_paper']:.0f} ms"
+        )
+    return result

@@ -1,0 +1,144 @@
+"""What is measured on a GPU: bars from 64 to 4 M vertices, regular and irregular, alone and in batches, with goals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scenes import DENSITY, YOUNGS
+from scipy.spatial import Delaunay
+
+import torchpd as pd
+
+SIZE = (1.0, 0.2, 0.2)  # m
+ITERATIONS = 64
+
+
+@dataclass(frozen=True)
+class Aim:
+    """What an H100 must reach in float32, and what it should: rates as high, times as low as that."""
+
+    quantity: str  # a number of a row: a rate, or microseconds
+    must: float
+    stretch: float
+
+    @property
+    def is_time(self) -> bool:
+        return self.quantity.endswith("microseconds")
+
+    def share(self, value: float) -> float:
+        """Of `must`: 1 or more is reached."""
+        return self.must / value if self.is_time else value / self.must
+
+
+def regular_bar(cells: tuple[int, int, int]) -> pd.TetMesh:
+    """Kuhn's six tetrahedra a cell."""
+    return pd.shapes.box(SIZE, cells)
+
+
+def irregular_bar(cells: tuple[int, int, int], *, seed: int = 0) -> pd.TetMesh:
+    """Delaunay tetrahedra of the corners of the cells, each moved by up to 0.3 of a cell, without slivers.
+
+    Vertices have 4 to some 40 tetrahedra, and lie in memory in random order, as those of meshes from elsewhere do.
+    """
+    rng = np.random.default_rng(seed)
+    axes = [np.arange(count + 1.0) for count in cells]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    shift = rng.uniform(-0.3, 0.3, points.shape)
+    shift[(points == 0.0) | (points == cells)] = 0.0  # the walls stay flat
+    points = rng.permutation(points + shift)
+    tets = Delaunay(points).simplices.astype(np.int64)
+    volume = np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) / 6.0
+    # in units of a cell, where Kuhn's tetrahedra have 1/6
+    tets = np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)[np.abs(volume) > 0.01]
+    used, compact = np.unique(tets, return_inverse=True)
+    return pd.TetMesh(points[used] / cells * SIZE, compact.reshape(-1, 4))
+
+
+@dataclass(frozen=True)
+class GpuScene:
+    """Copies of a bar that is held at one end, swings, and bends by its weight."""
+
+    name: str
+    cells: tuple[int, int, int]
+    batch: int = 1
+    kernel: str = "auto"
+    irregular: bool = False
+    iterations: int = ITERATIONS
+    aims: tuple[Aim, ...] = ()
+    heavy: bool = False  # minutes to prepare: only when asked for
+
+    def build(self) -> pd.Scene:
+        """The scene of one environment."""
+        mesh = irregular_bar(self.cells) if self.irregular else regular_bar(self.cells)
+        bar = pd.Solid(mesh, youngs=YOUNGS, density=DENSITY)
+        return pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] < 1e-9), pd.Gravity((0.0, -9.81, 0.0)))
+
+    def start(self, sim: pd.Simulator) -> pd.State:
+        """At rest, with velocities v_y = -3 x^2, so that rotations are not trivial."""
+        positions, velocities = sim.rest_state(self.batch)
+        velocities[..., 1] = -3.0 * positions[..., 0] ** 2
+        return pd.State(positions, velocities)
+
+
+# vertices: cells
+SMALL = {64: (3, 3, 3), 256: (15, 3, 3), 400: (15, 4, 4), 1000: (9, 9, 9)}
+BATCHES = (1, 132, 1024, 8192)
+BATCH_AIM = Aim("tet_iterations_per_second", 65e9, 90e9)
+STEP_AIM = Aim("environment_steps_per_second", 1.5e6, 2.1e6)  # 256 vertices, 64 iterations
+
+
+def _small_aims(vertices: int, batch: int) -> tuple[Aim, ...]:
+    if batch < 1024:
+        return ()
+    return (BATCH_AIM, STEP_AIM) if (vertices, batch) == (256, 8192) else (BATCH_AIM,)
+
+
+def _pair(name: str, cells: tuple[int, int, int], kernel: str, aim: Aim, *, heavy: bool = False) -> list[GpuScene]:
+    """The regular and the irregular mesh."""
+    return [
+        GpuScene(name + suffix, cells, kernel=kernel, irregular=bool(suffix), aims=(aim,), heavy=heavy)
+        for suffix in ("", "-irregular")
+    ]
+
+
+def _iteration(must: float, stretch: float) -> Aim:
+    return Aim("iteration_microseconds", must, stretch)
+
+
+GPU_SCENES = (
+    *(
+        GpuScene(f"{vertices}x{batch}{suffix}", cells, batch, irregular=bool(suffix), aims=_small_aims(vertices, batch))
+        for suffix in ("", "-irregular")
+        for vertices, cells in SMALL.items()
+        for batch in BATCHES
+    ),
+    *_pair("one-1200-tets", (8, 5, 5), "grid", Aim("step_microseconds", 80.0, 45.0)),
+    *_pair("one-10k", (39, 15, 15), "grid", _iteration(3.0, 2.3)),
+    *_pair("one-100k", (99, 31, 31), "grid", _iteration(14.0, 11.0)),
+    *_pair("one-1M", (255, 63, 63), "stream", _iteration(130.0, 105.0)),
+    *_pair("one-4M", (1023, 63, 63), "stream", _iteration(480.0, 400.0), heavy=True),
+)
+
+QUICK_GPU_SCENES = tuple(
+    GpuScene(f"tiny-{kernel}{suffix}", (6, 2, 2), batch, kernel, bool(suffix), 4, (BATCH_AIM,))
+    for suffix in ("", "-irregular")
+    for kernel, batch in (("block", 9), ("grid", 2), ("stream", 1))
+)
+
+
+@dataclass(frozen=True)
+class PaperTest:
+    """One of the source paper's three: its constraints and milliseconds on a GTX 470, and cells here."""
+
+    name: str
+    constraints: int
+    milliseconds: float
+    cells: tuple[int, int, int]
+
+
+PAPER = (
+    PaperTest("paper-1200", 1200, 27.0, (8, 5, 5)),
+    PaperTest("paper-1000", 1000, 26.0, (7, 6, 4)),  # 1008 tetrahedra
+    PaperTest("paper-200", 200, 20.0, (11, 3, 1)),  # 198
+)

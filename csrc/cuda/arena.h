@@ -1,0 +1,26 @@
+// Arrays one after another in a block of memory.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+namespace pd {
+
+// Without a base it only adds up their size.
+class Arena {
+ public:
+  explicit Arena(void* base) : base_(static_cast<std::byte*>(base)) {}
+
+  template <class Item>
+  void place(Item*& array, std::int64_t count) {
+    array = reinterpret_cast<Item*>(base_ + size_);
+    size_ += (count * std::int64_t(sizeof(Item)) + 255) / 256 * 256;
+  }
+
+  std::int64_t size() const { return size_; }
+
+ private:
+  std::byte* base_;
+  std::int64_t size_ = 0;
+};
+
+}  // namespace pd

@@ -1,0 +1,235 @@
+// Elastic energy and its derivatives at given positions: one pass over the patches of any plan.
+#pragma once
+#include "cuda/arena.h"
+#include "cuda/collect.h"
+#include "cuda/launch.h"
+#include "cuda/patch.h"
+#include "cuda/runtime.h"
+#include "plan/shared_memory.h"
+
+#include <stdexcept>
+#include <string>
+
+namespace pd {
+
+constexpr int field_threads = 256;
+
+template <class T>
+struct FieldWork {
+  DeviceField<T> field;
+  T* weights;             // [batch or 1, blocks, 2, 32] w V
+  Quad<T>* shared_force;  // [batch, slots]
+
+  __device__ const T* weights_of(std::int64_t environment) const {
+    const std::int64_t own = field.stiffness.stride ? environment : 0;
+    return weights + own * field.plan.blocks * 2 * pair_lanes;
+  }
+};
+
+// Where the result of one vertex goes.
+template <int Numbers, class T>
+__device__ void write_vertex(const DeviceField<T>& field, std::int64_t environment, int vertex,
+                             const Vec3<T>& force) {
+  const DevicePlan<T>& plan = field.plan;
+  T* to = field.out + (environment * plan.vertices + plan.vertex_order[vertex]) * Numbers;
+  if constexpr (Numbers == 3) {
+    write3(to, force);
+  } else {
+    *to = force.x;
+  }
+}
+
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    field_weights(const __grid_constant__ FieldWork<T> work) {
+  const DevicePlan<T>& plan = work.field.plan;
+  const std::int64_t set = blockIdx.x / plan.patches;
+  const Patch<T> patch(plan, int(blockIdx.x % plan.patches));
+  weigh_pairs(patch, work.field.stiffness.of(set), work.field.weighted,
+              work.weights + set * plan.blocks * 2 * pair_lanes);
+}
+
+// Positions relative to the first vertex of the patch, and directions, in shared memory.
+template <class T>
+__device__ void read_fields(const DeviceField<T>& field, const Patch<T>& patch,
+                            std::int64_t environment, Quad<T>* position, Quad<T>* direction) {
+  const DevicePlan<T>& plan = field.plan;
+  const auto at = [&](const T* from, int slot) {
+    const std::int64_t row = environment * plan.vertices + plan.vertex_order[patch.vertex(slot)];
+    return read3(from + 3 * row);
+  };
+  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
+    position[s] = {};
+    if (field.positions) position[s] = quad(at(field.positions, s) - at(field.positions, 0));
+    if (direction) direction[s] = quad(at(field.direction, s));
+  }
+}
+
+// Fields: how many vectors of a vertex an element reads; Numbers: how many a vertex gets.
+template <class Element, int Fields, int Numbers, class T>
+__global__ void __launch_bounds__(field_threads)
+    field_vertices(const __grid_constant__ FieldWork<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  const DevicePlan<T>& plan = work.field.plan;
+  const std::int64_t environment = blockIdx.x / plan.patches;
+  const Patch<T> patch(plan, int(blockIdx.x % plan.patches));
+  Quad<T>* position = reinterpret_cast<Quad<T>*>(shared);
+  Quad<T>* direction = Fields == 2 ? position + plan.most_slots : nullptr;
+  Quad<T>* entries = position + Fields * plan.most_slots;
+  read_fields(work.field, patch, environment, position, direction);
+  __syncthreads();
+  const Quad<T>* fields[Fields];
+  fields[0] = position;
+  if constexpr (Fields == 2) fields[1] = direction;
+  each_pair(patch, const_cast<const Quad<T>* const(&)[Fields]>(fields),
+            work.weights_of(environment), entries, Element{});
+  __syncthreads();
+  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
+    const int slot = patch.first_slot + s;
+    const Vec3<T> force = sum_entries(entries, plan.slot_row[slot]);
+    if (s < patch.interior) {
+      write_vertex<Numbers>(work.field, environment, patch.first_vertex + s, force);
+    } else {
+      work.shared_force[environment * plan.slots + slot] = quad(force);
+    }
+  }
+}
+
+template <int Numbers, class T>
+__global__ void __launch_bounds__(field_threads)
+    field_shared(const __grid_constant__ FieldWork<T> work) {
+  const DevicePlan<T>& plan = work.field.plan;
+  const int blocks = (plan.shared + field_threads - 1) / field_threads;
+  const std::int64_t environment = blockIdx.x / blocks;
+  const int i = int(blockIdx.x % blocks) * field_threads + int(threadIdx.x);
+  if (i >= plan.shared) return;
+  Vec3<T> force = {T(0), T(0), T(0)};
+  for (int at = plan.shared_start[i]; at < plan.shared_start[i + 1]; ++at)
+    force = force + vec3(work.shared_force[environment * plan.slots + plan.shared_slot[at]]);
+  write_vertex<Numbers>(work.field, environment, plan.patch_vertex[plan.patches] + i, force);
+}
+
+// Product: the derivative of the energy along the direction, else the energy.
+template <bool Product, class T>
+__global__ void __launch_bounds__(field_threads)
+    field_elements(const __grid_constant__ FieldWork<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  const DevicePlan<T>& plan = work.field.plan;
+  const std::int64_t environment = blockIdx.x / plan.patches;
+  const Patch<T> patch(plan, int(blockIdx.x % plan.patches));
+  Quad<T>* position = reinterpret_cast<Quad<T>*>(shared);
+  Quad<T>* direction = Product ? position + plan.most_slots : nullptr;
+  read_fields(work.field, patch, environment, position, direction);
+  __syncthreads();
+  const T* weights = work.weights_of(environment);
+  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
+    const PairPlace place = place_of(patch, number);
+    Mat3<T> rest[2];
+    T volume[2];
+    load_rest(plan, place, rest, volume);
+    for (int e = 0; e < 2; ++e) {
+      const int tet = plan.pair_tet[place.in(2, e)];
+      if (tet < 0) continue;
+      Vec3<T> x[4], dx[4];
+      for (int c = 0; c < 4; ++c) {
+        const unsigned slot = unsigned(plan.pair_corner[place.in(5, c < 3 ? c : 3 + e)]) & 0xffff;
+        x[c] = vec3(position[slot]);
+        if constexpr (Product) dx[c] = vec3(direction[slot]);
+      }
+      const T weight = weights[place.in(2, e)];
+      T& out = work.field.out[environment * plan.tets + tet];
+      if constexpr (Product) {
+        out = element_energy_product(x, dx, rest[e], weight);
+      } else {
+        const Mat3<T> d = strain(x, rest[e]);
+        out = T(0.5) * weight * frobenius(d, d);
+      }
+    }
+  }
+}
+
+template <class T>
+FieldWork<T> arrange(Arena& arena, const DeviceField<T>& field) {
+  const DevicePlan<T>& plan = field.plan;
+  FieldWork<T> work{field, nullptr, nullptr};
+  arena.place(work.weights,
+              (field.stiffness.stride ? field.batch : 1) * plan.blocks * 2 * pair_lanes);
+  arena.place(work.shared_force, plan.shared ? field.batch * plan.slots : 0);
+  return work;
+}
+
+template <class T>
+std::int64_t field_bytes(const DeviceField<T>& field) {
+  Arena arena(nullptr);
+  arrange(arena, field);
+  return arena.size();
+}
+
+template <class T>
+void launch_field(void (*kernel)(FieldWork<T>), const FieldWork<T>& work, int fields,
+                  cudaStream_t stream) {
+  const DevicePlan<T>& plan = work.field.plan;
+  const std::size_t bytes =
+      pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, fields);
+  if (resident_blocks(reinterpret_cast<const void*>(kernel), field_threads, bytes) == 0)
+    throw std::runtime_error("torchpd: a patch of the plan wants " + std::to_string(bytes) +
+                             " bytes of shared memory, more than this device has; build the "
+                             "simulator with kernel=\"stream\"");
+  kernel<<<blocks_of(work.field.batch * plan.patches), field_threads, bytes, stream>>>(work);
+  check(cudaGetLastError());
+}
+
+template <class Element, int Fields, int Numbers, class T>
+void run_vertices(const FieldWork<T>& work, cudaStream_t stream) {
+  launch_field(field_vertices<Element, Fields, Numbers, T>, work, Fields, stream);
+  if (work.field.plan.shared == 0) return;
+  const std::int64_t blocks = (work.field.plan.shared + field_threads - 1) / field_threads;
+  field_shared<Numbers, T>
+      <<<blocks_of(work.field.batch * blocks), field_threads, 0, stream>>>(work);
+  check(cudaGetLastError());
+}
+
+template <class T>
+void run_field(const DeviceField<T>& field, void* memory, Stream to) {
+  const auto stream = static_cast<cudaStream_t>(to);
+  Arena arena(memory);
+  const FieldWork<T> work = arrange(arena, field);
+  const std::int64_t sets = field.stiffness.stride ? field.batch : 1;
+  field_weights<T><<<blocks_of(sets * field.plan.patches), field_threads, 0, stream>>>(work);
+  check(cudaGetLastError());
+  switch (field.field) {
+    case Field::gradient:
+      return run_vertices<SolidGradient<false>, 1, 3>(work, stream);
+    case Field::diagonal:
+      return run_vertices<SolidDiagonal, 1, 1>(work, stream);
+    case Field::hessian_product:
+      return run_vertices<SolidHessian, 2, 3>(work, stream);
+    case Field::element_energy:
+      return launch_field(field_elements<false, T>, work, 1, stream);
+    case Field::element_energy_product:
+      return launch_field(field_elements<true, T>, work, 2, stream);
+  }
+}
+
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    rotate(const __grid_constant__ RotationCall<T> call) {
+  const std::int64_t i = std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i >= call.count) return;
+  const auto read = [&](const T* from) {
+    return Mat3<T>{{read3(from + 9 * i), read3(from + 9 * i + 3), read3(from + 9 * i + 6)}};
+  };
+  const Mat3<T> f = read(call.matrices);
+  Mat3<T> r = nearest_rotation(f);
+  if (call.direction) r = rotation_differential(f, r, read(call.direction));
+  for (int row = 0; row < 3; ++row) write3(call.out + 9 * i + 3 * row, r.row[row]);
+}
+
+template <class T>
+void run_rotation(const RotationCall<T>& call, Stream to) {
+  const std::int64_t blocks = (call.count + field_threads - 1) / field_threads;
+  rotate<T><<<blocks_of(blocks), field_threads, 0, static_cast<cudaStream_t>(to)>>>(call);
+  check(cudaGetLastError());
+}
+
+}  // namespace pd

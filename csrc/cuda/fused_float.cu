@@ -1,0 +1,6 @@
+#include "cuda/fused.cuh"
+
+namespace pd {
+template std::int64_t fused_bytes(const DeviceStep<float>&);
+template void run_fused(const DeviceStep<float>&, void*, Stream);
+}  // namespace pd

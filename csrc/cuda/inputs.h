@@ -1,0 +1,105 @@
+// What the user gave, for one environment, by internal vertex.
+#pragma once
+#include "cuda/memory.h"
+#include "effects/contact.h"
+#include "math/chebyshev.h"
+#include "plan/views.h"
+#include "solver/vertex.h"
+
+namespace pd::inline PD_TARGET {
+
+// What decides how an environment goes on.
+struct Progress {
+  Schedule schedule;
+  double least, energy, residual, course;  // least: smallest a / D; residual and course: squares
+  int used;                                // iterations
+  bool done;
+};
+
+template <class T>
+struct Inputs {
+  const DeviceStep<T>* call;
+  std::int64_t environment;
+
+  __device__ std::int64_t row(int vertex) const {
+    const DevicePlan<T>& plan = call->plan;
+    return (environment * plan.vertices + plan.vertex_order[vertex]) * 3;
+  }
+
+  __device__ Vec3<T> at_vertex(const T* from, int vertex) const {
+    return read3(from + row(vertex));
+  }
+
+  __device__ Vec3<T> first_iterate(int vertex) const { return at_vertex(call->start, vertex); }
+
+  __device__ T mass(int vertex) const {
+    return call->material.masses.of(environment)[call->plan.vertex_order[vertex]];
+  }
+
+  __device__ int pin(int vertex) const {
+    return call->plan.pins ? call->plan.vertex_pin[vertex] : -1;
+  }
+
+  __device__ T spring(int pin) const {
+    return pin < 0 ? T(0) : call->material.pin_stiffness.of(environment)[pin];
+  }
+
+  __device__ T damping() const { return *call->material.damping.of(environment); }
+
+  // a, zero where a pin holds the vertex exactly
+  __device__ T inertia(int vertex, T h) const {
+    const T stiffness = spring(pin(vertex));
+    if (!(stiffness < T(HUGE_VAL))) return T(0);
+    return inertia_weight(mass(vertex), damping(), stiffness, h);
+  }
+
+  // s, the displacement that everything but elasticity wants
+  __device__ Vec3<T> target(int vertex, const Vec3<T>& x, const Vec3<T>& velocity, T h) const {
+    const int held = pin(vertex);
+    const T stiffness = spring(held);
+    Vec3<T> offset = {T(0), T(0), T(0)}, force = offset;
+    if (held >= 0)
+      offset = read3(call->material.pin_targets.of(environment) + 3 * std::int64_t(held)) - x;
+    if (!(stiffness < T(HUGE_VAL))) return offset;
+    if (call->forces) force = at_vertex(call->forces, vertex);
+    const T weight = inertia_weight(mass(vertex), damping(), stiffness, h);
+    const Vec3<T> gravity = read3(call->material.gravity.of(environment));
+    return inertia_target(weight, mass(vertex), velocity, gravity, force, stiffness, offset, h);
+  }
+
+  __device__ void read_contacts(Plane<T>* planes, Ball<T>* balls) const {
+    const Material<T>& material = call->material;
+    for (int c = 0; c < material.planes_count; ++c) {
+      const T* p = material.planes.of(environment) + 5 * c;
+      planes[c] = {read3(p), p[3], p[4]};
+    }
+    for (int c = 0; c < material.spheres_count; ++c) {
+      const T* p = material.spheres.of(environment) + 8 * c;
+      balls[c] = {read3(p), read3(p + 5), p[3], p[4]};
+    }
+  }
+
+  __device__ void write(int record, int vertex, const Vec3<T>& x, const Vec3<T>& velocity) const {
+    const std::int64_t at = record * call->batch * call->plan.vertices * 3 + row(vertex);
+    write3(call->out_positions + at, x);
+    write3(call->out_velocities + at, velocity);
+  }
+
+  __device__ void write_info(int record, const Progress& progress) const {
+    if (!call->info) return;
+    double* to = call->info + (record * call->batch + environment) * info_count;
+    const bool report = call->settings.report;
+    const double last = progress.residual, course = progress.course;
+    to[info_residual] = !report      ? NAN
+                        : course > 0 ? sqrt(last / course)
+                        : last > 0   ? HUGE_VAL
+                                     : 0.0;
+    to[info_energy] = report ? progress.energy : NAN;
+    to[info_iterations] = progress.used;
+    to[info_restarts] = progress.schedule.restarts;
+    to[info_converged] = progress.done;
+    to[info_rho] = progress.schedule.rho;
+  }
+};
+
+}  // namespace pd::inline PD_TARGET

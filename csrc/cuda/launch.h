@@ -1,0 +1,41 @@
+// The kernels as functions: no torch, no CUDA headers. Memory is the caller's; work goes to a stream and nobody waits.
+#pragma once
+#include "plan/views.h"
+
+#include <cstdint>
+
+namespace pd {
+
+// How a plan is run, in DevicePlan::kernel.
+enum class DeviceKernel : int {
+  block = 0,   // one block an environment, all iterations in one launch
+  grid = 1,    // one block a patch, all iterations in one launch
+  stream = 2,  // kernels for every iteration
+};
+
+constexpr int most_threads = 640;  // of a block
+
+using Stream = void*;  // cudaStream_t
+
+// Bytes of device memory that a run wants, aligned to 256. Fused: kernels block and grid.
+template <class T>
+std::int64_t fused_bytes(const DeviceStep<T>& call);
+template <class T>
+void run_fused(const DeviceStep<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t stream_bytes(const DeviceStep<T>& call);
+template <class T>
+void run_stream(const DeviceStep<T>& call, void* memory, Stream stream);
+
+template <class T>
+using DeviceField = FieldCall<T, DevicePlan<T>>;
+
+template <class T>
+std::int64_t field_bytes(const DeviceField<T>& call);
+template <class T>
+void run_field(const DeviceField<T>& call, void* memory, Stream stream);
+
+template <class T>
+void run_rotation(const RotationCall<T>& call, Stream stream);
+
+}  // namespace pd

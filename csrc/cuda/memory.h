@@ -1,0 +1,45 @@
+// Vectors as they lie in the memory of a GPU, and how one thread works on them.
+#pragma once
+#include "math/vec.h"
+
+namespace pd::inline PD_TARGET {
+
+// Three numbers and a fourth that belongs to them: one vertex, 16-byte loads and stores.
+template <class T>
+struct alignas(4 * sizeof(T) > 16 ? 16 : 4 * sizeof(T)) Quad {
+  T x, y, z, w;
+};
+
+template <class T>
+PD_HD Vec3<T> vec3(const Quad<T>& a) {
+  return {a.x, a.y, a.z};
+}
+
+template <class T>
+PD_HD Quad<T> quad(const Vec3<T>& a, T w = T(0)) {
+  return {a.x, a.y, a.z, w};
+}
+
+template <class T>
+PD_HD Vec3<T> read3(const T* p) {
+  return {p[0], p[1], p[2]};
+}
+
+template <class T>
+PD_HD void write3(T* p, const Vec3<T>& a) {
+  p[0] = a.x;
+  p[1] = a.y;
+  p[2] = a.z;
+}
+
+// Each thread has one environment: the policy for physics that the CPU runs in SIMD lanes.
+template <class T>
+struct Thread {
+  using Scalar = T;
+  using Real = T;
+  using Value = Vec3<T>;
+  PD_HD static Vec3<T> vec3(const Value& a) { return a; }
+  PD_HD static Value value(const Vec3<T>& a) { return a; }
+};
+
+}  // namespace pd::inline PD_TARGET

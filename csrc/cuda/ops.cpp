@@ -1,0 +1,54 @@
+// The ops on CUDA: memory, stream and device come from torch, everything else from the kernels.
+#include "ops.h"
+
+#include "cuda/launch.h"
+
+#include <c10/cuda/CUDAGuard.h>
+#include <c10/cuda/CUDAStream.h>
+
+namespace pd {
+namespace {
+
+struct Cuda {
+  template <class T>
+  using Plan = DevicePlan<T>;
+
+  template <class T>
+  static Plan<T> plan_view(at::TensorList arrays, const Place& place) {
+    return device_plan_view<T>(arrays, place);
+  }
+
+  template <class T>
+  static void step(const DeviceStep<T>& call, const Tensor& like) {
+    const bool stream = call.plan.kernel == int(DeviceKernel::stream);
+    run(like, call, stream ? stream_bytes<T> : fused_bytes<T>,
+        stream ? run_stream<T> : run_fused<T>);
+  }
+
+  template <class T>
+  static void field(const DeviceField<T>& call, const Tensor& like) {
+    run(like, call, field_bytes<T>, run_field<T>);
+  }
+
+  template <class T>
+  static void rotation(const RotationCall<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_rotation(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+ private:
+  // Memory goes back to torch's allocator at once; it hands it out again on the same stream only.
+  template <class Call>
+  static void run(const Tensor& like, const Call& call, std::int64_t (*bytes)(const Call&),
+                  void (*launch)(const Call&, void*, Stream)) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    const Tensor memory = at::empty({bytes(call)}, like.options().dtype(at::kByte));
+    launch(call, memory.mutable_data_ptr(), c10::cuda::getCurrentCUDAStream().stream());
+  }
+};
+
+}  // namespace
+
+TORCH_LIBRARY_IMPL(torchpd, CUDA, m) { register_ops<Cuda>(m); }
+
+}  // namespace pd

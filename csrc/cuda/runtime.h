@@ -1,0 +1,21 @@
+// What the launches ask of the CUDA runtime.
+#pragma once
+#include <cuda_runtime.h>
+
+#include <cstddef>
+#include <cstdint>
+
+namespace pd {
+
+// Throws what went wrong; the error of a launch does not stay behind to surprise others.
+void check(cudaError_t status);
+
+// Blocks of a kernel that the current device runs at once; also lets it have that much shared memory. 0: too much for it.
+int resident_blocks(const void* kernel, int threads, std::size_t shared_bytes);
+
+std::size_t shared_memory_per_multiprocessor();
+
+// A number of blocks, refused when one launch cannot have so many.
+unsigned blocks_of(std::int64_t count);
+
+}  // namespace pd

@@ -1,0 +1,224 @@
+// Runner of solver/step.h on the host: every part of a step is a launch. Covers every mesh, effect and batch.
+#pragma once
+#include "cuda/arena.h"
+#include "cuda/launch.h"
+#include "cuda/runtime.h"
+#include "cuda/stream.h"
+#include "plan/shared_memory.h"
+#include "solver/step.h"
+
+#include <stdexcept>
+#include <string>
+
+namespace pd {
+
+template <class T>
+StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
+  const DeviceStep<T>& step = call.step;
+  const DevicePlan<T>& plan = step.plan;
+  const Material<T>& material = step.material;
+  StreamMemory<T> m;
+  for (Quad<T>** array : {&m.x, &m.velocity, &m.target, &m.u, &m.before})
+    arena.place(*array, step.batch * plan.vertices);
+  for (Quad<T>** array : {&m.origin, &m.shared_force}) arena.place(*array, step.batch * plan.slots);
+  arena.place(m.weights,
+              (material.stiffness.stride ? step.batch : 1) * plan.blocks * 2 * pair_lanes);
+  arena.place(m.sums, step.batch * call.sum_rows() * sums_count);
+  arena.place(m.progress, step.batch);
+  arena.place(m.omega, step.batch * guard_period);
+  arena.place(m.shift, step.batch * plan.pieces);
+  arena.place(m.part_sum, step.batch * plan.parts * 4);
+  arena.place(m.planes, step.batch * material.planes_count);
+  arena.place(m.balls, step.batch * material.spheres_count);
+  return m;
+}
+
+// Launches on one stream, which runs them in order.
+class Launcher {
+ public:
+  explicit Launcher(cudaStream_t stream) : stream_(stream) {}
+
+  // one block of `threads` for each of `count` pieces of work
+  template <class Call, class... Arguments>
+  void run(void (*kernel)(Call, Arguments...), std::int64_t count, int threads, std::size_t shared,
+           const Call& call, Arguments... arguments) const {
+    if (count == 0) return;
+    kernel<<<blocks_of(count), threads, shared, stream_>>>(call, arguments...);
+    check(cudaGetLastError());
+  }
+
+ private:
+  cudaStream_t stream_;
+};
+
+template <class T, bool Touching>
+class StreamRunner {
+ public:
+  StreamRunner(const StreamCall<T>& call, cudaStream_t stream)
+      : call_(call), set_(call.step.settings), plan_(call.step.plan), launcher_(stream) {
+    patches_ = call.step.batch * plan_.patches;
+    pass_shared_ = pass_shared_bytes(sizeof(T), plan_.most_slots, plan_.most_entries, 1);
+  }
+
+  void roll() {
+    vertices<VertexTask::load>(0);
+    weigh();
+    for (int t = 0; t < set_.steps; ++t) {
+      step(*this, set_);
+      if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
+      if (Touching && t + 1 < set_.steps) environments<EnvironmentTask::move_balls>(0);
+    }
+  }
+
+  void predict() {
+    vertices<VertexTask::predict>(0);
+    launcher_.run(stream_origins<T>, patches_, vertex_threads, 0, call_);
+  }
+
+  void start() {
+    vertices<VertexTask::start>(0);
+    decide<Decision::start>(0);
+    started_ = false;
+  }
+
+  void translate() {
+    const bool first = !started_;
+    started_ = true;
+    if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
+    find<ShiftTask::moments>();
+    if constexpr (Touching) find<ShiftTask::gaps>();
+    launcher_.run(stream_shift<T>, patches_, vertex_threads, 0, call_, first);
+  }
+
+  void iterate(int k) {
+    const bool checks = k % guard_period == 0;
+    if (checks && set_.schedule == ScheduleKind::guarded) {
+      pass<Visit::update_guarded>(k);
+    } else {
+      pass<Visit::update>(k);
+    }
+    if (checks || set_.tolerance > 0) decide<Decision::iterate>(k);
+  }
+
+  // environments that are done skip what is still launched: asking would mean waiting
+  bool finished() const { return false; }
+
+  void measure_course() {
+    vertices<VertexTask::course>(0);
+    pass<Visit::measure>(0);
+    decide<Decision::course>(0);
+  }
+
+  void measure() {
+    pass<Visit::measure>(0);
+    decide<Decision::measure>(0);
+  }
+
+  void finish() { vertices<VertexTask::finish>(0); }
+
+ private:
+  void weigh() {
+    const bool own = call_.step.material.stiffness.stride != 0;
+    const std::int64_t sets = own ? patches_ : plan_.patches;
+    launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, set_.weighted);
+    // the pass starts from u = 0 at no particular place
+    launcher_.run(stream_origins<T>, patches_, vertex_threads, 0, call_);
+    pass<Visit::weigh>(0);
+    decide<Decision::weigh>(0);
+    if (set_.weighted) launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, false);
+  }
+
+  void store(int record) {
+    vertices<VertexTask::store>(record);
+    if (call_.step.info) environments<EnvironmentTask::store>(record);
+  }
+
+  template <Visit What>
+  void pass(int k) {
+    launcher_.run(stream_patches<What, T, Touching>, patches_, vertex_threads, pass_shared_, call_,
+                  k);
+    launcher_.run(stream_shared<What, T, Touching>, call_.step.batch * call_.shared_blocks(),
+                  vertex_threads, 0, call_, k);
+  }
+
+  template <Decision What>
+  void decide(int k) {
+    launcher_.run(stream_decide<What, T>, call_.step.batch, vertex_threads, 0, call_, k);
+  }
+
+  template <VertexTask What>
+  void vertices(int record) {
+    const std::int64_t blocks = (plan_.vertices + vertex_threads - 1) / vertex_threads;
+    launcher_.run(stream_vertices<What, T, Touching>, call_.step.batch * blocks, vertex_threads, 0,
+                  call_, record);
+  }
+
+  template <EnvironmentTask What>
+  void environments(int record) {
+    launcher_.run(stream_environments<What, T>, blocks_for(call_.step.batch), vertex_threads, 0,
+                  call_, record);
+  }
+
+  template <ShiftTask What>
+  void find() {
+    const std::int64_t batch = call_.step.batch;
+    launcher_.run(stream_parts<What, T>, blocks_for(batch * plan_.parts * warp_size),
+                  vertex_threads, 0, call_);
+    launcher_.run(stream_pieces<What, T>, blocks_for(batch * plan_.pieces * warp_size),
+                  vertex_threads, 0, call_);
+  }
+
+  static std::int64_t blocks_for(std::int64_t threads) {
+    return (threads + vertex_threads - 1) / vertex_threads;
+  }
+
+  const StreamCall<T>& call_;
+  const Settings& set_;
+  const DevicePlan<T>& plan_;
+  Launcher launcher_;
+  std::int64_t patches_;  // of all environments
+  std::size_t pass_shared_;
+  bool started_ = false;
+};
+
+template <class T>
+std::int64_t stream_bytes(const DeviceStep<T>& step) {
+  Arena arena(nullptr);
+  arrange(arena, StreamCall<T>{step, {}});
+  return arena.size();
+}
+
+// lets the kernels of a pass have more shared memory than the usual 48 KB
+template <class T, bool Touching>
+void allow_shared_memory(std::size_t bytes) {
+  for (const auto kernel :
+       {stream_patches<Visit::weigh, T, Touching>, stream_patches<Visit::update, T, Touching>,
+        stream_patches<Visit::update_guarded, T, Touching>,
+        stream_patches<Visit::measure, T, Touching>}) {
+    if (resident_blocks(reinterpret_cast<const void*>(kernel), vertex_threads, bytes) == 0)
+      throw std::runtime_error("torchpd: a patch of the plan wants " + std::to_string(bytes) +
+                               " bytes of shared memory, more than this device has");
+  }
+}
+
+template <class T, bool Touching>
+void run_stream_with(const StreamCall<T>& call, cudaStream_t stream) {
+  allow_shared_memory<T, Touching>(
+      pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 1));
+  StreamRunner<T, Touching>(call, stream).roll();
+}
+
+template <class T>
+void run_stream(const DeviceStep<T>& step, void* memory, Stream to) {
+  const auto stream = static_cast<cudaStream_t>(to);
+  StreamCall<T> call{step, {}};
+  Arena arena(memory);
+  call.memory = arrange(arena, call);
+  if (step.material.planes_count + step.material.spheres_count > 0) {
+    run_stream_with<T, true>(call, stream);
+  } else {
+    run_stream_with<T, false>(call, stream);
+  }
+}
+
+}  // namespace pd

@@ -1,0 +1,378 @@
+// Kernels of one pass each, for meshes of any size: what a step does, patch by patch and vertex by vertex, in global memory.
+#pragma once
+#include "cuda/momentum.h"
+#include "cuda/patch.h"
+#include "cuda/vertices.h"
+
+namespace pd::inline PD_TARGET {
+
+constexpr int vertex_threads = 256;  // of a block of the kernels over vertices
+
+template <class T>
+struct StreamMemory {
+  Quad<T>*x, *velocity, *target, *u, *before;  // [batch, vertices]
+  Quad<T>*origin, *shared_force;               // [batch, slots]
+  T* weights;                                  // [batch or 1, blocks, 2, 32] w V
+  double* sums;        // [batch, patches + blocks of shared vertices, sums_count]
+  Progress* progress;  // [batch]
+  double* omega;       // [batch, guard_period] of the next iterations
+  Quad<T>* shift;      // [batch, pieces]
+  double* part_sum;    // [batch, parts, 4]
+  Plane<T>* planes;    // [batch, planes]
+  Ball<T>* balls;      // [batch, balls]
+};
+
+template <class T>
+struct StreamCall {
+  DeviceStep<T> step;
+  StreamMemory<T> memory;
+
+  PD_HD int shared_blocks() const {
+    return (step.plan.shared + vertex_threads - 1) / vertex_threads;
+  }
+  PD_HD int sum_rows() const { return step.plan.patches + shared_blocks(); }
+};
+
+// One environment of a call.
+template <class T, bool Touching>
+struct StreamWork {
+  const StreamCall<T>& call;
+  const DevicePlan<T>& plan;
+  std::int64_t environment;
+  Vertices<T, Touching> v;
+  Quad<T>*origin, *shared_force;
+  T* weights;
+  Progress& progress;
+  Contacts<T> contacts;
+  Inputs<T> in;
+  T h;
+
+  __device__ StreamWork(const StreamCall<T>& c, std::int64_t e)
+      : call(c),
+        plan(c.step.plan),
+        environment(e),
+        v{c.memory.x + e * plan.vertices, c.memory.velocity + e * plan.vertices,
+          c.memory.target + e * plan.vertices, c.memory.u + e * plan.vertices,
+          c.memory.before + e * plan.vertices},
+        origin(c.memory.origin + e * plan.slots),
+        shared_force(c.memory.shared_force + e * plan.slots),
+        weights(c.memory.weights +
+                (c.step.material.stiffness.stride ? e * plan.blocks * 2 * pair_lanes : 0)),
+        progress(c.memory.progress[e]),
+        contacts{c.memory.planes + e * c.step.material.planes_count,
+                 c.memory.balls + e * c.step.material.spheres_count, c.step.material.planes_count,
+                 c.step.material.spheres_count},
+        in{&c.step, e},
+        h(T(c.step.settings.time_step)) {}
+
+  __device__ const Settings& settings() const { return call.step.settings; }
+  __device__ T omega(int k) const {
+    return T(call.memory.omega[environment * guard_period + k % guard_period]);
+  }
+  __device__ double* sum_row(int row) const {
+    return call.memory.sums + (environment * call.sum_rows() + row) * sums_count;
+  }
+  __device__ Quad<T>& shift(int piece) const {
+    return call.memory.shift[environment * plan.pieces + piece];
+  }
+  __device__ double* part_sum(int part) const {
+    return call.memory.part_sum + (environment * plan.parts + part) * 4;
+  }
+};
+
+// What a pass does with a vertex once the force of the elements on it is known.
+enum class Visit { weigh, update, update_guarded, measure };
+
+template <Visit What>
+struct ElementOf {
+  using type = SolidGradient<What == Visit::update_guarded || What == Visit::measure>;
+};
+template <>
+struct ElementOf<Visit::weigh> {
+  using type = SolidDiagonal;
+};
+
+struct ThreadSums {
+  double value[sums_count];
+};
+
+template <Visit What, class T, bool Touching>
+__device__ void visit(const StreamWork<T, Touching>& w, int i, const Vec3<T>& force, int k,
+                      ThreadSums& sums) {
+  double (&sum)[sums_count] = sums.value;
+  if constexpr (What == Visit::weigh) {
+    sum[0] = Least{}(sum[0], w.v.weigh(i, force.x));
+  } else if constexpr (What == Visit::measure) {
+    sum[0] += w.v.energy(i);
+    sum[1] += w.v.residual(i, w.contacts, force);
+  } else {
+    if constexpr (What == Visit::update_guarded) sum[0] += w.v.energy(i);
+    const Vec3<T> u = vec3(w.v.u[i]);
+    const Vec3<T> next = w.v.next(i, w.contacts, force, T(w.settings().relaxation), w.omega(k));
+    if (w.settings().tolerance > 0) {
+      const Vec3<T> change = next - u;
+      sum[1] += double(dot(change, change));
+      sum[2] += double(dot(next, next));
+    }
+    w.v.set_before(i, u);
+    w.v.set(i, next);
+  }
+}
+
+template <Visit What>
+__device__ ThreadSums no_sums() {
+  if constexpr (What == Visit::weigh) return {{HUGE_VAL, HUGE_VAL, HUGE_VAL}};
+  return {{0, 0, 0}};
+}
+
+// The sums of a block, to its row.
+template <Visit What>
+__device__ void write_sums(const ThreadSums& sums, double* row) {
+  using Op = std::conditional_t<What == Visit::weigh, Least, Add>;
+  __shared__ double warp_sum[sums_count][warp_size];
+  const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
+  for (int n = 0; n < sums_count; ++n) {
+    const double sum = across_warp(sums.value[n], Op{});
+    if (lane == 0) warp_sum[n][warp] = sum;
+  }
+  __syncthreads();
+  if (warp != 0) return;
+  for (int n = 0; n < sums_count; ++n) {
+    const bool used = lane < int(blockDim.x) / warp_size;
+    const double sum = across_warp(used ? warp_sum[n][lane] : Op::none, Op{});
+    if (lane == 0) row[n] = sum;
+  }
+}
+
+template <Visit What, class T, bool Touching>
+__device__ bool wants_sums(const StreamWork<T, Touching>& w) {
+  return What != Visit::update || w.settings().tolerance > 0;
+}
+
+template <Visit What, class T, bool Touching>
+__device__ bool skips(const StreamWork<T, Touching>& w) {
+  constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
+  return updates && w.settings().tolerance > 0 && w.progress.done;
+}
+
+// Elements of every patch, and the vertices inside it.
+template <Visit What, class T, bool Touching>
+__global__ void __launch_bounds__(vertex_threads)
+    stream_patches(const __grid_constant__ StreamCall<T> call, int k) {
+  extern __shared__ __align__(16) std::byte shared[];
+  const int number = int(blockIdx.x % call.step.plan.patches);
+  const StreamWork<T, Touching> w(call, blockIdx.x / call.step.plan.patches);
+  if (skips<What>(w)) return;
+  const Patch<T> patch(w.plan, number);
+  Quad<T>*position = reinterpret_cast<Quad<T>*>(shared), *entries = position + w.plan.most_slots;
+  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x)
+    position[s] = quad(vec3(w.origin[patch.first_slot + s]) + vec3(w.v.u[patch.vertex(s)]));
+  __syncthreads();
+
+  ThreadSums sums = no_sums<What>();
+  const Quad<T>* const fields[1] = {position};
+  const double energy =
+      double(each_pair(patch, fields, w.weights, entries, typename ElementOf<What>::type{}));
+  if constexpr (What != Visit::weigh) sums.value[0] += energy;
+  __syncthreads();
+  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
+    const int slot = patch.first_slot + s;
+    const Vec3<T> force = sum_entries(entries, w.plan.slot_row[slot]);
+    if (s < patch.interior) {
+      visit<What>(w, patch.first_vertex + s, force, k, sums);
+    } else {
+      w.shared_force[slot] = quad(force);
+    }
+  }
+  if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));
+}
+
+// Vertices that patches share: what the patches left, in their order.
+template <Visit What, class T, bool Touching>
+__global__ void __launch_bounds__(vertex_threads)
+    stream_shared(const __grid_constant__ StreamCall<T> call, int k) {
+  const int blocks = call.shared_blocks(), number = int(blockIdx.x % blocks);
+  const StreamWork<T, Touching> w(call, blockIdx.x / blocks);
+  if (skips<What>(w)) return;
+  ThreadSums sums = no_sums<What>();
+  const int i = number * vertex_threads + int(threadIdx.x);
+  if (i < w.plan.shared) {
+    Vec3<T> force = {T(0), T(0), T(0)};
+    for (int at = w.plan.shared_start[i]; at < w.plan.shared_start[i + 1]; ++at)
+      force = force + vec3(w.shared_force[w.plan.shared_slot[at]]);
+    visit<What>(w, w.plan.patch_vertex[w.plan.patches] + i, force, k, sums);
+  }
+  if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(w.plan.patches + number));
+}
+
+// What follows from the sums of a pass, an environment a block.
+enum class Decision { start, weigh, iterate, course, measure };
+
+template <Decision What, class T>
+__global__ void __launch_bounds__(vertex_threads)
+    stream_decide(const __grid_constant__ StreamCall<T> call, int k) {
+  using Op = std::conditional_t<What == Decision::weigh, Least, Add>;
+  const StreamWork<T, false> w(call, blockIdx.x);
+  __shared__ double total[sums_count];
+  if constexpr (What != Decision::start) {
+    ThreadSums sums = {{Op::none, Op::none, Op::none}};
+    for (int row = threadIdx.x; row < call.sum_rows(); row += blockDim.x) {
+      for (int n = 0; n < sums_count; ++n) sums.value[n] = Op{}(sums.value[n], w.sum_row(row)[n]);
+    }
+    write_sums<What == Decision::weigh ? Visit::weigh : Visit::measure>(sums, total);
+  }
+  if (threadIdx.x != 0) return;
+  const Settings& set = call.step.settings;
+  Progress& p = w.progress;
+  double* omega = call.memory.omega + w.environment * guard_period;
+  if constexpr (What == Decision::weigh) {
+    p.least = total[0];
+  } else if constexpr (What == Decision::start) {
+    p.schedule = Schedule(set, p.least, w.contacts.friction() > T(0));
+    p.used = set.tolerance > 0 ? 0 : set.iterations;
+    p.done = false;
+    omega[0] = p.schedule.next(0);
+  } else if constexpr (What == Decision::iterate) {
+    const bool soft = set.tolerance > 0;
+    if (p.done) return;
+    p.used += soft;
+    if (p.schedule.wants_energy(k)) p.schedule.check(total[0]);
+    p.done = soft && total[1] <= set.tolerance * set.tolerance * total[2];
+    // where nothing is asked in between, until the next look at the energy
+    for (int next = k + 1; next <= k + (soft ? 1 : guard_period); ++next)
+      omega[next % guard_period] = p.schedule.next(next);
+  } else {
+    p.energy = total[0];
+    (What == Decision::course ? p.course : p.residual) = total[1];
+  }
+}
+
+template <class T>
+__global__ void __launch_bounds__(vertex_threads)
+    stream_weights(const __grid_constant__ StreamCall<T> call, bool bounded) {
+  const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
+  const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
+  weigh_pairs(patch, call.step.material.stiffness.of(w.environment), bounded, w.weights);
+}
+
+// ---- vertex by vertex
+
+enum class VertexTask { load, predict, course, start, finish, store };
+
+template <VertexTask What, class T, bool Touching>
+__global__ void __launch_bounds__(vertex_threads)
+    stream_vertices(const __grid_constant__ StreamCall<T> call, int record) {
+  const int blocks = (call.step.plan.vertices + vertex_threads - 1) / vertex_threads;
+  const StreamWork<T, Touching> w(call, blockIdx.x / blocks);
+  const int i = int(blockIdx.x % blocks) * vertex_threads + int(threadIdx.x);
+  if constexpr (What == VertexTask::load && Touching) {
+    if (i == 0)
+      w.in.read_contacts(const_cast<Plane<T>*>(w.contacts.planes),
+                         const_cast<Ball<T>*>(w.contacts.balls));
+  }
+  if (i >= w.plan.vertices) return;
+  if constexpr (What == VertexTask::load) w.v.load(i, w.in, i, w.h);
+  if constexpr (What == VertexTask::predict) w.v.predict(i, w.in, i, w.h);
+  if constexpr (What == VertexTask::course)
+    w.v.set(i, w.v.at(i).first(w.contacts, w.v.straight(i, w.h)));
+  if constexpr (What == VertexTask::start) {
+    const Vec3<T> u = w.v.first(i, w.in, i, w.contacts);
+    w.v.set(i, u);
+    w.v.set_before(i, u);
+  }
+  if constexpr (What == VertexTask::finish) w.v.finish(i, w.h);
+  if constexpr (What == VertexTask::store)
+    w.in.write(record, i, vec3(w.v.x[i]), vec3(w.v.velocity[i]));
+}
+
+// Positions relative to the first vertex of each patch, which keep their last bits however far from the origin.
+template <class T>
+__global__ void __launch_bounds__(vertex_threads)
+    stream_origins(const __grid_constant__ StreamCall<T> call) {
+  const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
+  const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
+  const Vec3<T> anchor = vec3(w.v.x[patch.vertex(0)]);
+  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x)
+    w.origin[patch.first_slot + s] = quad(vec3(w.v.x[patch.vertex(s)]) - anchor);
+}
+
+// ---- momentum: a warp for each part, then for each piece
+
+enum class ShiftTask { moments, gaps };
+
+template <ShiftTask What, class T>
+__global__ void __launch_bounds__(vertex_threads)
+    stream_parts(const __grid_constant__ StreamCall<T> call) {
+  const int parts = call.step.plan.parts;
+  const std::int64_t warp = (std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x) / warp_size;
+  if (warp >= call.step.batch * parts) return;
+  const StreamWork<T, true> w(call, warp / parts);
+  const int part = int(warp % parts);
+  const int begin = w.plan.part_start[part], end = w.plan.part_start[part + 1];
+  const auto index = [&](int at) { return w.plan.slot_vertex[w.plan.part_slot[at]]; };
+  double sum[4] = {0, 0, 0, 0};
+  if constexpr (What == ShiftTask::moments) {
+    sum_part(w.v, begin, end, index, sum);
+  } else {
+    const Vec3<T> shift = vec3(w.shift(w.plan.slot_piece[w.plan.part_slot[begin]]));
+    sum[0] = least_gap(w.v, w.contacts, begin, end, index, shift);
+  }
+  if (threadIdx.x % warp_size != 0) return;
+  for (int c = 0; c < 4; ++c) w.part_sum(part)[c] = sum[c];
+}
+
+template <ShiftTask What, class T>
+__global__ void __launch_bounds__(vertex_threads)
+    stream_pieces(const __grid_constant__ StreamCall<T> call) {
+  const int pieces = call.step.plan.pieces;
+  const std::int64_t warp = (std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x) / warp_size;
+  if (warp >= call.step.batch * pieces) return;
+  const StreamWork<T, true> w(call, warp / pieces);
+  const int piece = int(warp % pieces);
+  const auto read = [&](int part, int c) { return w.part_sum(part)[c]; };
+  const bool leader = threadIdx.x % warp_size == 0;
+  if constexpr (What == ShiftTask::moments) {
+    double sum[4];
+    over_parts(w.plan, piece, Add{}, read, sum);
+    if (leader) w.shift(piece) = shift_of<T>(sum);
+  } else {
+    double least[1];
+    over_parts(w.plan, piece, Least{}, read, least);
+    if (leader && !(least[0] > 0)) w.shift(piece) = {};
+  }
+}
+
+// `first`: before any iteration, which has no iterate before it
+template <class T>
+__global__ void __launch_bounds__(vertex_threads)
+    stream_shift(const __grid_constant__ StreamCall<T> call, bool first) {
+  const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
+  const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
+  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
+    const int piece = w.plan.slot_piece[patch.first_slot + s], i = patch.vertex(s);
+    if (piece < 0 || !patch.owns(s)) continue;
+    const Vec3<T> u = vec3(w.v.u[i]) + vec3(w.shift(piece));
+    w.v.set(i, u);
+    if (first) w.v.set_before(i, u);
+  }
+}
+
+// ---- environment by environment
+
+enum class EnvironmentTask { move_balls, store };
+
+template <EnvironmentTask What, class T>
+__global__ void __launch_bounds__(vertex_threads)
+    stream_environments(const __grid_constant__ StreamCall<T> call, int record) {
+  const std::int64_t e = std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (e >= call.step.batch) return;
+  const StreamWork<T, true> w(call, e);
+  if constexpr (What == EnvironmentTask::store) w.in.write_info(record, w.progress);
+  if constexpr (What == EnvironmentTask::move_balls) {
+    Ball<T>* balls = const_cast<Ball<T>*>(w.contacts.balls);
+    for (int b = 0; b < w.contacts.ball_count; ++b)
+      balls[b].center = balls[b].center + balls[b].motion;
+  }
+}
+
+}  // namespace pd::inline PD_TARGET

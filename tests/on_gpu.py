@@ -1,0 +1,115 @@
+"""What the tests of the CUDA kernels share: a simulator with a given kernel, scenes of the sizes that these are for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cases import Case, box
+from runs import simulate, simulator, small
+
+import torchpd as pd
+
+KERNELS = ("block", "grid", "stream")
+GPU = torch.device("cuda", 0)
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+def on_gpu(case: Case, dtype: torch.dtype, kernel: str, **options: Any) -> pd.Simulator:
+    """The scene of a case, compiled for one of the kernels."""
+    return with_kernel(simulator(case, dtype, GPU, kernel=kernel, **options), kernel)
+
+
+def full_on_gpu(dtype: torch.dtype, kernel: str, **options: Any) -> pd.Simulator:
+    """`runs.full_scene` for one of the kernels."""
+    return with_kernel(simulate(dtype, GPU, kernel=kernel, **options), kernel)
+
+
+def small_on_gpu(dtype: torch.dtype, kernel: str, batch: int = 3) -> tuple[pd.Simulator, pd.State]:
+    """`runs.small` for one of the kernels."""
+    sim, state = small(dtype, GPU, batch, kernel=kernel)
+    return with_kernel(sim, kernel), state
+
+
+def with_kernel(sim: pd.Simulator, kernel: str) -> pd.Simulator:
+    assert sim.plan.kernel == kernel
+    assert sim.device == GPU
+    return sim
+
+
+def bar(cells: tuple[int, int, int], *parts: Any, pinned: bool = True, youngs: float = 1e5) -> Case:
+    """A bar of 1 x 0.2 x 0.2 m that swings, held at x = 0 or free."""
+    vertices, tets = box((1.0, 0.2, 0.2), cells)
+    body = pd.Solid(pd.TetMesh(vertices, tets), youngs)
+    held = (pd.Pin(body, vertices[:, 0] == 0.0),) if pinned else ()
+    velocities = np.zeros_like(vertices)
+    velocities[:, 1] = -3.0 * vertices[:, 0] ** 2
+    return Case(pd.Scene(body, *held, *parts), vertices, velocities, 1.0 / 60.0)
+
+
+def crowd() -> Case:
+    """Forty free tetrahedra and a held one: more pieces than warps, patches with several of them."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    bodies = [
+        pd.Solid(pd.TetMesh(corners + [2.0 * (n % 7), 2.0 * (n // 7), 0.0], [[0, 1, 2, 3]]), 1e4 * (1 + n))
+        for n in range(41)
+    ]
+    scene = pd.Scene(*bodies, pd.Pin(bodies[20], [0]), pd.Gravity(), pd.Ground(1.0, friction=0.3))
+    rest = scene.values().rest_positions
+    rng = np.random.default_rng(0)
+    x, v = rest + 0.03 * rng.standard_normal(rest.shape), 0.9 * rng.standard_normal(rest.shape)
+    return Case(scene, x, v, 1.0 / 60.0)
+
+
+def moved(state: pd.State, device: torch.device | str, dtype: torch.dtype | None = None) -> pd.State:
+    return pd.State(*(t.to(device=device, dtype=dtype or t.dtype) for t in state))
+
+
+def relative(found: torch.Tensor, expected: torch.Tensor) -> float:
+    """Largest difference, relative to the largest number."""
+    want = expected.detach().double().cpu()
+    difference = (found.detach().double().cpu() - want).abs().max()
+    return float(difference) / max(float(want.abs().max()), 1e-300)
+
+
+@contextmanager
+def nobody_waits() -> Iterator[None]:
+    """Every synchronisation that torch knows of is an error, and one that it does not know of shows in the time.
+
+    The device is kept busy meanwhile; who waited for it would come back after it is done.
+    """
+    torch.cuda.synchronize()
+    done = torch.cuda.Event()
+    torch.cuda._sleep(400_000_000)  # cycles: a fifth of a second
+    done.record()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        yield
+        waited = done.query()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+        torch.cuda.synchronize()
+    assert not waited, "the host has waited for the device"
+
+
+def device_work(call: Callable[[], object]) -> list[str]:
+    """Names of the kernels, copies and fills that a call gives to the device."""
+
+    def names(work: Callable[[], object]) -> list[str]:
+        activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
+        with torch.profiler.profile(activities=activities) as profile:
+            work()
+            torch.cuda.synchronize()
+        return [e.name for e in profile.events() if e.device_type == torch.autograd.DeviceType.CUDA]
+
+    call()  # first: loading modules and allocating is not what is counted
+    torch.cuda.synchronize()
+    ones = torch.ones(8, device=GPU)
+    names(lambda: ones.add(1.0))  # and the profiler's own start
+    if len(names(lambda: ones.add(1.0))) != 1:
+        pytest.skip("the profiler does not see the kernels of this machine")
+    return names(call)

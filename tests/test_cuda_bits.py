@@ -1,0 +1,225 @@
+"""Every kernel gives the same bits: on every run, alone or in a batch, step by step or in a rollout, in a graph."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+from devices import require_gpu
+from on_gpu import DTYPES, GPU, KERNELS, bar, full_on_gpu, moved, nobody_waits, on_gpu, small_on_gpu
+from runs import moving, noise, same_bits, state_of
+from test_determinism import assert_same_bits, different_environments, run
+from test_determinism import scene as scene_of_all_effects
+from torch import Tensor
+
+import torchpd as pd
+from torchpd.state import Info
+
+require_gpu()
+
+# more than fit on the device at once for the block and the grid, an odd number for the stream
+BATCH = {"block": 4096, "grid": 300, "stream": 17}
+pytestmark = pytest.mark.parametrize("precision", DTYPES)
+
+
+def unlike(sim: pd.Simulator, batch: int) -> tuple[pd.State, Tensor]:
+    """Environments no two of which are alike, and forces."""
+    rest = sim.rest_state(batch)
+    return (
+        pd.State(rest.positions + 0.01 * noise(rest.positions, 1), noise(rest.positions, 2)),
+        0.1 * noise(rest.positions, 3),
+    )
+
+
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize("tolerance", [0.0, 0.03])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_runs_and_batches_do_not_matter(kernel: str, tolerance: float, precision: str) -> None:
+    sim = on_gpu(scene_of_all_effects(), DTYPES[precision], kernel, iterations=14, tolerance=tolerance)
+    state, forces = unlike(sim, BATCH[kernel])
+    together = run(sim, state, forces)
+    for _ in range(3):
+        assert_same_bits(run(sim, state, forces), together)
+    for item in sorted({0, 1, 7, 131, 132, 299, 2047, BATCH[kernel] - 1}):
+        if item < BATCH[kernel]:
+            alone = run(sim, state, forces, slice(item, item + 1))
+            assert_same_bits([t[item : item + 1] for t in together], alone)
+    some = torch.tensor([5, 3, 16, 0], device=GPU)
+    assert_same_bits(run(sim, state, forces, some), [t[some] for t in together])
+
+
+@pytest.mark.parametrize("kernel", ["grid", "stream"])
+def test_many_patches_many_times(kernel: str, precision: str) -> None:
+    """What blocks of a grid say to each other arrives in any order; a hundred runs are the same."""
+    case = bar((24, 5, 5), pd.Gravity(), pd.Ground(-0.02, friction=0.4), pinned=False)
+    sim = on_gpu(case, DTYPES[precision], kernel, iterations=20)
+    assert sim.plan.patches > 1
+    state = state_of(case, sim)
+    first, info = sim(state, return_info=True)
+    assert not bool(first.positions.isnan().any())
+    for _ in range(100):
+        after, rows = sim(state, return_info=True)
+        assert same_bits(after, first)
+        assert all(torch.equal(one, other) for one, other in zip(rows, info, strict=True))
+
+
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize("batch", [1, 5, 150])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_rollout_is_repeated_steps(kernel: str, batch: int, precision: str) -> None:
+    sim = on_gpu(scene_of_all_effects(), DTYPES[precision], kernel, iterations=9)
+    state, forces = unlike(sim, batch)
+    track = sim.rollout(state, 7, 2, forces=forces, return_info=True)
+    inplace = pd.State(*(t.clone() for t in state))
+    rows = torch.full((batch, 6), float("nan"), dtype=torch.float64, device=GPU)
+    for step in range(6):
+        state, info = sim(state, forces, return_info=True)
+        sim.step_(inplace, forces, info=rows)
+        assert same_bits(inplace, state)
+        assert all(torch.equal(one, other) for one, other in zip(Info.from_rows(rows), info, strict=True))
+        if step % 2 == 1:
+            assert same_bits(track.state(step // 2), state)
+            columns = [column[step // 2] for column in track.info]
+            assert all(torch.equal(one, other) for one, other in zip(columns, info, strict=True))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_start_may_be_the_state_that_is_overwritten(kernel: str, precision: str) -> None:
+    sim = full_on_gpu(DTYPES[precision], kernel)
+    state = moving(sim, 5)
+    expected = sim(state, start=state.positions)
+    sim.step_(state, start=state.positions)
+    assert same_bits(state, expected)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_broken_environment_ends_and_breaks_alone(kernel: str, precision: str) -> None:
+    """NaN must not hold up the blocks that wait for each other."""
+    sim = full_on_gpu(DTYPES[precision], kernel, tolerance=1e-4)
+    clean = moving(sim, 9)
+    for value in (float("nan"), float("inf"), 1e30):
+        sick = pd.State(clean.positions.clone(), clean.velocities.clone())
+        sick.positions[1, 20, 1] = value
+        expected, found = (sim.rollout(state, 3, return_info=True) for state in (clean, sick))
+        others = [item for item in range(9) if item != 1]
+        for one, other in zip([*found[:2], *found.info], [*expected[:2], *expected.info], strict=True):
+            assert torch.equal(one[:, others], other[:, others])
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_nobody_waits_for_the_device(kernel: str, precision: str) -> None:
+    sim, state = small_on_gpu(DTYPES[precision], kernel)
+    forces = noise(state.positions)
+    own = pd.State(*(t.clone() for t in state))
+    calls = (
+        lambda: sim(state, forces),
+        lambda: sim(state, return_info=True),
+        lambda: sim.step_(own, forces, start="inertial"),
+        lambda: sim.rollout(state, 3, forces=forces),
+        lambda: sim.energy(state),
+        lambda: sim.gradient(state.positions),
+    )
+    for call in calls:
+        call()  # modules are loaded and memory is allocated by the first one
+    for call in calls:
+        with nobody_waits():
+            call()
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_step_in_place_allocates_nothing_new(kernel: str, precision: str) -> None:
+    sim, state = small_on_gpu(DTYPES[precision], kernel)
+    rows = torch.empty((3, 6), dtype=torch.float64, device=GPU)
+
+    def allocated() -> tuple[int, int]:
+        stats = torch.cuda.memory_stats(GPU)
+        return stats.get("num_device_alloc", 0), stats["segment.all.allocated"]
+
+    sim.step_(state)
+    sim.step_(state, info=rows)
+    before = allocated()
+    for _ in range(50):
+        sim.step_(state)
+        sim.step_(state, info=rows)
+    assert allocated() == before
+    held = torch.cuda.memory_allocated(GPU)
+    sim.step_(state)
+    assert torch.cuda.memory_allocated(GPU) == held
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_stream_of_the_callers_is_used(kernel: str, precision: str) -> None:
+    """Work that another stream is busy with is waited for, and the default stream is not touched."""
+    sim, state = small_on_gpu(DTYPES[precision], kernel)
+    expected = sim(state)
+    torch.cuda.synchronize()
+    side = torch.cuda.Stream()
+    late = pd.State(*(torch.zeros_like(t) for t in state))
+    torch.cuda.synchronize()
+    with torch.cuda.stream(side):
+        torch.cuda._sleep(200_000_000)  # a tenth of a second, in which nothing that runs elsewhere may overtake
+        for to, value in zip(late, state, strict=True):
+            to.copy_(value)
+        after = sim(late)
+    side.synchronize()
+    assert same_bits(after, expected)
+
+
+@pytest.mark.parametrize("side", [False, True], ids=["torch's stream", "a stream of its own"])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_graph_replays_the_step(kernel: str, side: bool, precision: str) -> None:
+    sim, state = small_on_gpu(DTYPES[precision], kernel)
+    sim.tolerance = 1e-3
+    other = moved(pd.State(state.positions.flip(0) + 0.01, 0.5 * state.velocities.flip(0)), GPU)
+    forces = noise(state.positions)
+    expected = [(sim(s, forces), sim.rollout(s, 3)) for s in (state, other)]
+    inputs = pd.State(*(t.clone() for t in state))
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):  # warm up as torch.cuda.graph wants it
+        sim(inputs, forces)
+        sim.rollout(inputs, 3)
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=stream if side else None):
+        after, track = sim(inputs, forces), sim.rollout(inputs, 3)
+    for given, (want, record) in itertools.chain(*[zip((state, other), expected, strict=True)] * 2):
+        with torch.cuda.stream(stream if side else torch.cuda.current_stream()):
+            for to, value in zip(inputs, given, strict=True):
+                to.copy_(value)
+            graph.replay()
+        torch.cuda.synchronize()
+        assert same_bits(after, want)
+        assert same_bits(track, record)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_graph_of_steps_in_place_goes_on(kernel: str, precision: str) -> None:
+    sim, start = small_on_gpu(DTYPES[precision], kernel)
+    eager, own = (pd.State(*(t.clone() for t in start)) for _ in range(2))
+    sim.step_(eager)
+    graph = torch.cuda.CUDAGraph()
+    torch.cuda.synchronize()
+    with torch.cuda.graph(graph):
+        sim.step_(own)
+    assert same_bits(own, start)  # a capture runs nothing
+    for _ in range(4):
+        graph.replay()
+        assert same_bits(own, eager)
+        sim.step_(eager)
+
+
+@pytest.mark.usefixtures("poisoned")
+def test_kernels_agree(precision: str) -> None:
+    """They add up in different orders; nothing else is different."""
+    dtype = DTYPES[precision]
+    found = []
+    for kernel in KERNELS:
+        sim = on_gpu(scene_of_all_effects(), dtype, kernel, iterations=12)
+        state, forces = different_environments(sim, 4)
+        found.append(sim(state, forces).velocities)
+    for one in found[1:]:
+        # rounding of some fifty operations an iteration, of random sign
+        limit = 50 * 12 * torch.finfo(dtype).eps * float(found[0].abs().max())
+        assert float((one - found[0]).abs().max()) <= limit

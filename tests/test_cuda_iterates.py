@@ -1,0 +1,216 @@
+"""Every kernel computes the iterates of the reference and of the CPU: any mesh, effect, solver and precision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from cases import Array, Case, box, slivers
+from devices import require_gpu
+from on_gpu import DTYPES, GPU, KERNELS, bar, crowd, full_on_gpu, moved, on_gpu, relative
+from runs import arguments_of, displacement, moving, reference_run, rounded_problem, simulate, simulator, state_of
+from test_determinism import different_environments
+from test_determinism import scene as scene_of_all_effects
+from test_same_iterates import CASES as SAME_CASES
+from test_same_iterates import SOLVERS, in_a_corner, stirred
+
+import torchpd as pd
+from torchpd.reference import StepProblem
+from torchpd.reference_solvers import Iterates
+
+require_gpu()
+pytestmark = pytest.mark.usefixtures("poisoned")
+
+# As in test_same_iterates: some fifty roundings an iteration that the extrapolation lets grow like k^2 at worst are
+# 50 * 20^2 u, 1e-3 and 2e-12; random signs stay well below, and a fiftieth of it is asked for in float32.
+TOLERANCE = {torch.float64: 1e-12, torch.float32: 2e-5}
+# The nearest rotation of an inverted element turns by |dF| / (s_2 - |s_3|), here 1 / 0.3 at the start and again in
+# every iteration until the element is upright: a digit more.
+LOOSE = {"inverted": 10.0, "flat": 10.0}
+COUNTS = (1, 2, 5, 9, 20)
+
+
+def graded() -> Case:
+    """Cells that grow by 1.4 from one end to the other, 20 times in all: weights of very different sizes."""
+    vertices, tets = box((9.0, 0.2, 0.2), (9, 3, 3))
+    vertices[:, 0] = 0.02 * (1.4 ** vertices[:, 0] - 1.0) / 0.4
+    body = pd.Solid(pd.TetMesh(vertices, tets), 10.0 ** np.linspace(4.0, 6.0, len(tets)))
+    scene = pd.Scene(body, pd.Pin(body, vertices[:, 0] == 0.0), pd.Gravity())
+    # moving on the scale of the bar: float32 rounds its positions of 1 m whatever the size of a cell
+    velocities = np.outer(-6.0 * vertices[:, 0] ** 2, [0.0, 1.0, 0.0])
+    return stirred(Case(scene, vertices, velocities, 1.0 / 60.0), size=0.001)
+
+
+def deformed(scales: tuple[float, float, float], noise: tuple[float, float, float]) -> Case:
+    """A free bar whose elements all have nearly the singular values `scales`."""
+    case = bar((5, 2, 2), pd.Gravity(), pinned=False, youngs=2e4)
+    shift = np.random.default_rng(3).standard_normal(case.positions.shape) * noise
+    return Case(case.scene, case.positions * scales + shift, 0.0 * case.positions, case.time_step)
+
+
+def one_tetrahedron() -> Case:
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    body = pd.Solid(pd.TetMesh(vertices, [[0, 1, 2, 3]]), 1e4)
+    return stirred(Case(pd.Scene(body, pd.Gravity()), vertices, 0.0 * vertices, 1.0 / 60.0), size=0.03)
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    **SAME_CASES,
+    "exact beam, shortened": lambda: bar((12, 3, 3), pd.Gravity(), youngs=1e6),
+    "slivers": slivers,
+    "graded": graded,
+    "inverted": lambda: deformed((1.0, -0.5, 0.9), (0.004, 0.004, 0.004)),
+    "flat": lambda: deformed((1.0, 0.0, 0.9), (0.004, 0.0, 0.004)),
+    "one tetrahedron": one_tetrahedron,
+    "crowd": crowd,
+    "several patches, ground and pieces": lambda: stirred(
+        bar((20, 4, 4), pd.Ground(-0.01, friction=0.5), pd.Gravity(), pinned=False), size=0.002
+    ),
+}
+
+
+@cache
+def problem_of(name: str, dtype: torch.dtype) -> tuple[Case, StepProblem, Array]:
+    case = CASES[name]()
+    problem = rounded_problem(case, dtype)
+    return case, problem, problem.first_iterate(case.start)
+
+
+@cache
+def reference(name: str, dtype: torch.dtype, solver: str, iterations: int) -> Iterates:
+    _, problem, first = problem_of(name, dtype)
+    return reference_run(problem, first, SOLVERS[solver], iterations)
+
+
+def check(sim: pd.Simulator, name: str, solver: str) -> None:
+    case, problem, _ = problem_of(name, sim.dtype)
+    tolerance = TOLERANCE[sim.dtype] * LOOSE.get(name, 1.0)
+    for sim.iterations in COUNTS:
+        expected = reference(name, sim.dtype, solver, sim.iterations)
+        scale = np.abs(expected.displacement).max()
+        for batch in (1, 5):
+            after, info = sim(state_of(case, sim, batch), **arguments_of(case, sim, batch), return_info=True)
+            u, item = displacement(sim, after, batch - 1), batch - 1
+            assert np.abs(u - expected.displacement).max() <= tolerance * scale, (sim.iterations, batch)
+            x = after.positions[item].double().cpu().numpy()
+            # one more rounding, of the sum x + u
+            assert np.abs(x - problem.positions - u).max() <= 2 * torch.finfo(sim.dtype).eps * np.abs(x).max()
+            assert int(info.iterations[item]) == sim.iterations
+            assert int(info.restarts[item]) == len(expected.restarts)
+            # sums of squares, which the iterate moves by its own relative error; |r| is 1e-3 of its start or more
+            energy = problem.energy(expected.displacement)
+            assert float(info.energy[item]) == pytest.approx(energy, rel=4 * tolerance)
+            assert float(info.residual[item]) == pytest.approx(expected.residual, rel=1e3 * tolerance)
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("name", CASES)
+def test_iterates_are_those_of_the_reference(name: str, kernel: str, precision: str) -> None:
+    if name.startswith("several patches") and kernel == "block":
+        pytest.skip("more than a block's shared memory")
+    case, _, _ = problem_of(name, DTYPES[precision])
+    check(on_gpu(case, DTYPES[precision], kernel), name, "guarded")
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("solver", sorted(set(SOLVERS) - {"guarded"}))
+@pytest.mark.parametrize("name", ["pins, inertial start", "given start", "corner"])
+def test_every_schedule_and_start(name: str, solver: str, kernel: str, precision: str) -> None:
+    case, _, _ = problem_of(name, DTYPES[precision])
+    check(on_gpu(case, DTYPES[precision], kernel, solver=SOLVERS[solver]), name, solver)
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("start", ["velocity", "inertial", "given"])
+def test_any_number_of_iterations_is_that_of_the_cpu(start: str, kernel: str, precision: str) -> None:
+    dtype = DTYPES[precision]
+    case = in_a_corner()
+    sim, plain = on_gpu(case, dtype, kernel), simulator(case, torch.float64)
+    state = state_of(case, sim, 2)
+    exact = moved(state, "cpu", torch.float64)
+    guess = state.positions + 0.01
+    for count in range(10):
+        sim.iterations = plain.iterations = count
+        given = guess if start == "given" else start
+        after, info = sim(state, start=given, return_info=True)
+        expected, facts = plain(exact, start=guess.cpu().double() if start == "given" else start, return_info=True)
+        assert relative(after.velocities, expected.velocities) <= 2 * TOLERANCE[dtype], count
+        assert torch.equal(info.iterations.cpu(), facts.iterations)
+        # twice the error of the iterate, for E is quadratic
+        assert relative(info.energy, facts.energy) <= 8 * TOLERANCE[dtype], count
+        assert relative(info.rho, facts.rho) <= 16 * torch.finfo(dtype).eps
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_material_of_each_environment(kernel: str, precision: str) -> None:
+    dtype, batch = DTYPES[precision], 5
+    case = scene_of_all_effects()
+    sim, plain = on_gpu(case, dtype, kernel, iterations=12), simulator(case, torch.float64, iterations=12)
+    factor = torch.linspace(0.5, 2.0, batch, dtype=dtype)
+    shift = torch.arange(3 * batch, dtype=dtype).reshape(batch, 3) * 0.01
+    own = {name: getattr(sim, name).detach().cpu() for name in sim.state_dict()}
+    varied = {
+        "stiffness": own["stiffness"] * factor[:, None],
+        "masses": own["masses"] * factor.flip(0)[:, None],
+        "gravity": own["gravity"] + shift,
+        "damping": own["damping"] * factor,
+        "pin_stiffness": own["pin_stiffness"] * factor[:, None],
+        "pin_targets": own["pin_targets"] + shift[:, None],
+        "planes": own["planes"] + factor[:, None, None] * torch.tensor([0, 0, 0, 0.01, 0.1]).to(dtype),
+        "spheres": own["spheres"] + factor[:, None, None] * torch.tensor([0.01, 0, 0, 0.02, 0.1, 0.5, 0, 0]).to(dtype),
+    }
+    for name, value in varied.items():  # one at a time, then all together
+        sim.set_material(**own)
+        plain.set_material(**own)
+        sim.set_material(**{name: value})
+        plain.set_material(**{name: value})
+        compare_all_effects(sim, plain, batch)
+    sim.set_material(**varied)
+    plain.set_material(**varied)
+    compare_all_effects(sim, plain, batch)
+
+
+def compare_all_effects(sim: pd.Simulator, plain: pd.Simulator, batch: int) -> None:
+    state, forces = different_environments(sim, batch)
+    after = sim(state, forces)
+    expected = plain(moved(state, "cpu", torch.float64), forces.cpu().double())
+    assert relative(after.velocities, expected.velocities) <= 2 * TOLERANCE[sim.dtype]
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("solver", [pd.Jacobi(), pd.Chebyshev(), pd.Chebyshev("classic", rho=0.97, delay=3)])
+def test_tolerance_stops_where_the_cpu_stops(solver: pd.Jacobi | pd.Chebyshev, kernel: str) -> None:
+    options = {"iterations": 300, "tolerance": 1e-3, "solver": solver}
+    sim, plain = full_on_gpu(torch.float64, kernel, **options), simulate(torch.float64, **options)
+    state = moving(plain, 9)
+    after, info = sim(moved(state, GPU), return_info=True)
+    expected, facts = plain(state, return_info=True)
+    if isinstance(solver, pd.Jacobi):
+        assert len(facts.iterations.unique()) > 1
+    for name in ("iterations", "restarts", "converged"):
+        assert torch.equal(getattr(info, name).cpu(), getattr(facts, name)), name
+    assert relative(after.velocities, expected.velocities) <= TOLERANCE[torch.float64] * 10  # 100 iterations and more
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_moving_sphere_of_a_rollout(kernel: str, precision: str) -> None:
+    """The sphere goes on by itself within a launch, and as on the CPU."""
+    dtype = DTYPES[precision]
+    sim, plain = full_on_gpu(dtype, kernel), simulate(torch.float64)
+    (ball,), (twin,) = sim.scene.spheres, plain.scene.spheres
+    row = torch.tensor([0.4, -0.24, 0.1, 0.3, 0.2, 0.0], dtype=dtype)
+    state = moving(sim, 3)
+    track = sim.rollout(state, 4, targets={ball: row.to(GPU)})
+    expected = plain.rollout(moved(state, "cpu", torch.float64), 4, targets={twin: row.double()})
+    # four steps, each of which passes on what the one before has rounded
+    assert relative(track.velocities, expected.velocities) <= 8 * TOLERANCE[dtype]
+    still = plain.rollout(moved(state, "cpu", torch.float64), 4)
+    assert relative(still.velocities, expected.velocities) > 1e-3

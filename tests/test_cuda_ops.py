@@ -1,0 +1,342 @@
+"""The ops on a GPU as citizens of PyTorch: fields, derivatives, compile, opcheck, launches, refusals, large tensors."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from devices import require_gpu
+from on_gpu import DTYPES, GPU, KERNELS, bar, crowd, device_work, full_on_gpu, moved, on_gpu, relative, small_on_gpu
+from runs import ULP, moving, noise, numbers_of, plan_of, same_bits, simulate, simulator, small, small_case, state_of
+from test_ops import OPS, samples
+from test_rotation import CLASSES
+from torch import Tensor
+
+import torchpd as pd
+
+require_gpu()
+ops = torch.ops.torchpd
+
+# ---- fields and rotations
+
+
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("batch", [1, 7])
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("name", ["small", "several patches", "crowd"])
+def test_fields_are_those_of_the_cpu(name: str, kernel: str, batch: int, precision: str) -> None:
+    """Energies, gradient, Hessian product and diagonal, with one stiffness for all and one for each environment."""
+    dtype = DTYPES[precision]
+    case = {"small": small_case, "several patches": lambda: bar((20, 3, 3)), "crowd": crowd}[name]()
+    sim, exact = on_gpu(case, dtype, kernel), simulator(case, torch.float64)
+    rest = exact.rest_state(batch).positions
+    x = (rest + 0.01 * noise(rest, 1)).to(dtype)
+    direction = noise(rest, 2).to(dtype)
+    plan, sure = plan_of(sim), plan_of(exact)
+    own = (exact.stiffness.detach() * torch.linspace(0.5, 2.0, batch).double()[:, None]).to(dtype)
+    # as in test_ops: grad N of slivers is up to 40 times the inverse of an edge, and some fifty operations follow
+    limit = 40 * 50 * ULP[dtype]
+    for w in (sim.stiffness.detach().cpu(), own):
+        here = [t.to(GPU) for t in (x, direction, w)]
+        there = [t.double() for t in (x, direction, w)]
+        for field in ("gradient", "element_energy"):
+            found = getattr(ops, field)(here[0], here[2], plan)
+            assert relative(found, getattr(ops, field)(there[0], there[2], sure)) <= limit, field
+        for field in ("hessian_product", "element_energy_product"):
+            found = getattr(ops, field)(*here, plan)
+            assert relative(found, getattr(ops, field)(*there, sure)) <= limit, field
+        for weighted in (True, False):
+            found = ops.elastic_diagonal(here[2], plan, weighted=weighted)
+            expected = ops.elastic_diagonal(there[2], sure, weighted=weighted)
+            assert found.shape == expected.shape
+            # positive terms only: nothing cancels, in no entry
+            error = ((found.cpu().double() - expected) / expected).abs().max()
+            assert float(error) <= 50 * ULP[dtype] + 1e3 * ULP[torch.float64]
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_fields_have_the_same_bits_in_any_batch(kernel: str, precision: str) -> None:
+    sim, state = small_on_gpu(DTYPES[precision], kernel, batch=300)
+    x, d, w, plan = state.positions, noise(state.positions), sim.stiffness.detach(), plan_of(sim)
+    fields: tuple[Callable[[slice], Tensor], ...] = (
+        lambda s: ops.gradient(x[s], w, plan),
+        lambda s: ops.element_energy(x[s], w, plan),
+        lambda s: ops.hessian_product(x[s], d[s], w, plan),
+        lambda s: ops.element_energy_product(x[s], d[s], w, plan),
+    )
+    for field in fields:
+        together = field(slice(None))
+        assert torch.equal(field(slice(None)), together)
+        for item in (0, 149, 299):
+            assert torch.equal(field(slice(item, item + 1))[0], together[item])
+
+
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("count", [1, 7, 3000])
+def test_rotations_are_those_of_the_cpu(count: int, precision: str) -> None:
+    """Singular values of 0.1 and more: sums of two above 0.2 divide the rounding of F, 4 ulp of |F| = 6."""
+    dtype = DTYPES[precision]
+    given = torch.tensor(CLASSES["large strain"][:count], dtype=dtype)
+    found, expected = pd.nearest_rotation(given.to(GPU)), pd.nearest_rotation(given.double())
+    limit = 4 * 6 / 0.2 * torch.finfo(dtype).eps
+    assert float((found.cpu() - expected).abs().max()) <= limit
+    d = noise(given)
+    found = ops.rotation_differential(given.to(GPU), d.to(GPU))
+    expected = ops.rotation_differential(given.double(), d.double())
+    # divided by the sum once more, and |dF| is up to 5
+    assert relative(found, expected) <= 5 / 0.2 * limit
+
+
+# ---- derivatives
+
+
+def gradients(sim: pd.Simulator, state: pd.State, forces: Tensor) -> dict[str, Tensor]:
+    """Of a step and of a rollout, for everything that has them."""
+    inputs = {"positions": state.positions, "velocities": state.velocities, "forces": forces}
+    leaves = {name: t.detach().clone().requires_grad_() for name, t in inputs.items()}
+    trained = ("stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets")
+    for name in trained:
+        getattr(sim, name).requires_grad_()
+        leaves[name] = getattr(sim, name)
+    start = pd.State(leaves["positions"], leaves["velocities"])
+    after = sim(start, leaves["forces"])
+    track = sim.rollout(start, 3, forces=leaves["forces"])
+    weights = [noise(t, 10 + n) for n, t in enumerate((*after, *track[:2]))]
+    loss = sum((w * t).sum() for w, t in zip(weights, (*after, *track[:2]), strict=True))
+    loss = loss + 1e-3 * sim.energy(after.positions).sum()
+    found = torch.autograd.grad(loss, list(leaves.values()))
+    for name in trained:
+        getattr(sim, name).requires_grad_(False)
+    return dict(zip(leaves, found, strict=True))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_gradients_are_those_of_the_cpu(kernel: str) -> None:
+    """float64, near the equilibrium of every step: the adjoint's error follows the residual, and that of its solve."""
+    case = bar((6, 2, 2), pd.Gravity(), pd.Damping(0.5))
+    body = case.scene.solids[0]
+    scene = pd.Scene(*case.scene.parts, pd.Pin(body, [len(case.positions) - 1], 1e3))
+    options = {"dtype": torch.float64, "iterations": 600, "progress": False}
+    sim = pd.Simulator(scene, 1 / 60, kernel=kernel, **options).to(GPU)
+    plain = pd.Simulator(scene, 1 / 60, **options)
+    state = plain.rest_state(2)
+    state = pd.State(state.positions + 0.002 * noise(state.positions, 4), 0.3 * noise(state.positions, 5))
+    forces = noise(state.positions, 6)
+    found, expected = gradients(sim, moved(state, GPU), forces.to(GPU)), gradients(plain, state, forces)
+    for name, want in expected.items():
+        finite = want.isfinite().cpu()
+        assert torch.equal(found[name].isfinite().cpu(), finite), name
+        assert relative(found[name].cpu()[finite], want[finite]) <= 1e-6, name
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_gradcheck_of_the_energy(kernel: str) -> None:
+    sim, state = small_on_gpu(torch.float64, kernel, batch=2)
+    x = state.positions.clone().requires_grad_()
+    unit = (sim.stiffness.detach() / 1e4).clone().requires_grad_()
+    plan = plan_of(sim)
+
+    def energy(positions: Tensor, w: Tensor) -> Tensor:
+        return ops.element_energy(positions, 1e4 * w, plan).sum(-1)
+
+    assert torch.autograd.gradcheck(energy, (x, unit), fast_mode=True, rtol=1e-5)
+    assert torch.autograd.gradgradcheck(energy, (x, unit), fast_mode=True, rtol=1e-4)
+
+
+# ---- torch.compile and opcheck
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("name", OPS)
+def test_opcheck(name: str, kernel: str) -> None:
+    for dtype in DTYPES.values():
+        arguments, keywords = samples(name, dtype, GPU, kernel=kernel)
+        report = torch.library.opcheck(getattr(ops, name).default, arguments, keywords)
+        assert set(report.values()) == {"SUCCESS"}
+
+
+@pytest.mark.parametrize("dynamic", [False, True])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_compiled_step_and_rollout(kernel: str, dynamic: bool) -> None:
+    torch._dynamo.reset()
+    sim, state = small_on_gpu(torch.float32, kernel)
+    forces = noise(state.positions)
+
+    def advance(x: Tensor, v: Tensor, f: Tensor) -> tuple[Tensor, Tensor]:
+        after = sim(pd.State(2.0 * x - x, v), 1.0 * f)
+        return after.positions + 1.0, sim.rollout(after, 4, every=2).velocities
+
+    compiled = torch.compile(advance, fullgraph=True, backend="aot_eager", dynamic=dynamic)
+    for found, expected in zip(compiled(*state, forces), advance(*state, forces), strict=True):
+        assert torch.equal(found, expected)
+
+
+# ---- what is launched
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+def test_a_step_is_one_launch(precision: str) -> None:
+    dtype = DTYPES[precision]
+    sim, state = small_on_gpu(dtype, "block", batch=9)
+    assert len(device_work(lambda: sim(state))) == 1
+    assert len(device_work(lambda: sim.step_(state))) == 1
+    assert len(device_work(lambda: sim.rollout(state, 20))) == 1
+    assert len(device_work(lambda: sim(state, return_info=True))) <= 1 + 6  # and the columns of the report
+    case = bar((20, 4, 4))
+    sim = on_gpu(case, dtype, "grid")
+    assert sim.plan.patches > 1
+    state = state_of(case, sim, 5)
+    for call in (lambda: sim(state), lambda: sim.step_(state), lambda: sim.rollout(state, 20, 10)):
+        names = device_work(call)
+        assert len(names) == 2, names
+        assert "memset" in names[0].lower(), names
+
+
+def launches(*parts: Any, pinned: bool = True, steps: int = 1) -> int:
+    case = bar((8, 2, 2), *parts, pinned=pinned)
+    sim = on_gpu(case, torch.float32, "stream", iterations=4)
+    state = state_of(case, sim)
+    return len(device_work(lambda: sim.rollout(state, steps)))
+
+
+def test_what_a_scene_does_not_have_is_not_launched() -> None:
+    ground, ball = pd.Ground(-0.1, friction=0.5), pd.Sphere((0.5, -0.5, 0.1), 0.1)
+    bare = launches()
+    assert launches(pd.Gravity(), pd.Damping(1.0)) == bare
+    assert launches(ground, ball) == bare  # contacts are within the passes
+    free = launches(pinned=False)
+    assert free > bare
+    assert launches(ground, pinned=False) > free  # gaps of the shifted piece
+    two, touching = launches(steps=2), launches(ball, steps=2)
+    assert bare < two < 2 * bare + 1  # loading and weighing are done once
+    assert touching > two  # balls move on between steps
+
+
+# ---- refusals
+
+
+def still_works() -> None:
+    """No error has stayed behind in the context, and no kernel is broken."""
+    torch.cuda.synchronize()
+    sim, state = small_on_gpu(torch.float32, "block")
+    expected = small(torch.float32)[0](moved(state, "cpu"))
+    assert relative(sim(state).velocities, expected.velocities) <= 1e-4
+
+
+def test_plan_and_state_must_be_together() -> None:
+    sim, state = small_on_gpu(torch.float32, "block")
+    plain, there = small(torch.float32)
+    with pytest.raises(TypeError, match=r"state must be torch.float32 on cpu"):
+        plain(state)
+    with pytest.raises(TypeError, match=r"state must be torch.float32 on cuda:0"):
+        sim(there)
+    numbers = numbers_of(sim)
+    with pytest.raises((ValueError, TypeError), match="plan"):
+        ops.step(*state, None, None, sim.material(), plan_of(plain), **numbers)
+    with pytest.raises((ValueError, TypeError), match="plan"):
+        ops.step(*there, None, None, plain.material(), plan_of(sim), **numbers)
+    with pytest.raises(ValueError, match="must be on cuda:0 like positions"):
+        ops.step(*state, None, None, plain.material(), plan_of(sim), **numbers)
+    with pytest.raises((ValueError, RuntimeError), match=r"cuda|same device"):
+        ops.step(there.positions, state.velocities, None, None, sim.material(), plan_of(sim), **numbers)
+    with pytest.raises((ValueError, RuntimeError), match=r"cuda|same device"):
+        ops.step(*state, noise(there.positions), None, sim.material(), plan_of(sim), **numbers)
+    arrays = plan_of(sim)
+    for number, array in enumerate(arrays[1:], start=1):
+        wrong = [array.cpu() if n == number else a for n, a in enumerate(arrays)]
+        with pytest.raises(ValueError, match=r"plan\.\w+ must be on cuda:0 like positions"):
+            ops.step(*state, None, None, sim.material(), wrong, **numbers)
+    with pytest.raises(ValueError, match=r"plan\.sizes must be on cpu"):
+        ops.step(*state, None, None, sim.material(), [arrays[0].cuda(), *arrays[1:]], **numbers)
+    still_works()
+
+
+def test_other_precisions_are_refused() -> None:
+    sim, state = small_on_gpu(torch.float32, "block")
+    for wrong in (torch.float16, torch.bfloat16):
+        with pytest.raises(TypeError, match="float32 or"):
+            sim.to(wrong)
+        with pytest.raises(TypeError, match=r"state must be torch\.float32"):
+            sim(moved(state, GPU, wrong))
+        with pytest.raises(TypeError, match="float32 or float64"):
+            ops.gradient(state.positions.to(wrong), sim.stiffness, plan_of(sim))
+        with pytest.raises(TypeError, match="float32 or float64"):
+            pd.nearest_rotation(torch.eye(3, device=GPU, dtype=wrong))
+    still_works()
+
+
+def test_a_mesh_that_does_not_fit_is_refused_and_auto_finds_a_kernel() -> None:
+    case = bar((40, 8, 8))  # 15360 tetrahedra: no block has the memory
+    with pytest.raises((ValueError, RuntimeError), match="block"):  # when it is compiled for the device, or moved there
+        simulator(case, torch.float32, GPU, kernel="block")
+    still_works()
+    sim = simulator(case, torch.float32, GPU)
+    assert sim.plan.kernel in ("grid", "stream")
+    assert bool(sim(state_of(case, sim)).positions.isfinite().all())
+    assert simulator(bar((6, 2, 2)), torch.float32, GPU).plan.kernel == "block"
+    with pytest.raises((ValueError, TypeError), match="kernel"):
+        simulator(case, torch.float32, GPU, kernel="wide")
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_strides_do_not_matter(kernel: str) -> None:
+    sim, state = small_on_gpu(torch.float32, kernel)
+    forces = noise(state.positions)
+    expected = sim(state, forces, start=state.positions)
+
+    def strided(t: Tensor) -> Tensor:
+        return t.permute(2, 0, 1).contiguous().permute(1, 2, 0)
+
+    x, v, f = (strided(t) for t in (*state, forces))
+    assert not x.is_contiguous()
+    assert same_bits(sim(pd.State(x, v), f, start=x), expected)
+    with pytest.raises(ValueError, match="step_: positions and velocities must be contiguous"):
+        sim.step_(pd.State(x, v))
+    assert sim(sim.rest_state(0)).positions.shape == (0, sim.vertices, 3)
+    still_works()
+
+
+def test_there_and_back_again() -> None:
+    """A simulator that comes back to the CPU is the one that never left."""
+    sim = simulate(torch.float32)
+    state = moving(sim)
+    expected = sim(state)
+    there = sim.to(GPU)
+    assert there.material()[0].is_cuda
+    there(moved(state, GPU))
+    back = there.to("cpu")
+    assert back.plan.device.type == "cpu"
+    assert same_bits(back(state), expected)
+
+
+# ---- large tensors
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("TORCHPD_LARGE_TESTS" not in os.environ, reason="TORCHPD_LARGE_TESTS=1 runs it; needs 40 GB")
+@pytest.mark.parametrize("kernel", ["block", "grid", "stream"])
+def test_more_numbers_than_32_bits_count(kernel: str) -> None:
+    sim = full_on_gpu(torch.float32, kernel, iterations=2)
+    batch = (1 << 31) // (3 * sim.vertices) + 1000
+    needed = batch * sim.vertices * (24 + (100 if kernel == "stream" else 0)) + batch * 48
+    free, _ = torch.cuda.mem_get_info()
+    if free < 1.1 * needed:
+        pytest.skip(f"needs {needed / 1e9:.0f} GB")
+    one = moving(sim, 1)
+    expected = sim(one)
+    state = pd.State(*(t.expand(batch, -1, -1).clone() for t in one))
+    sim.step_(state)
+    for item in (0, batch // 2, batch - 1):
+        assert torch.equal(state.positions[item], expected.positions[0])
+        assert torch.equal(state.velocities[item], expected.velocities[0])
+    # a difference anywhere shows in the sum over environments of what should be zero
+    worst = max(float((part - expected.positions[0]).abs().max()) for part in state.positions.split(1 << 16))
+    assert worst == 0.0
+    assert np.isfinite(worst)

@@ -1,0 +1,166 @@
+"""Which kernel a GPU gets follows from the mesh, the precision and what the device has: no GPU is needed to know."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from cases import box
+
+import torchpd as pd
+from torchpd import _C, placing
+from torchpd.gpu import Properties, refuse_full_memory, why_not
+from torchpd.plan import KERNELS, Plan, compile_plan
+from torchpd.regimes import choose_plan, shared_bytes
+from torchpd.scene import SceneValues
+from torchpd.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
+
+H100 = Properties(132, 232_448)
+SMALL = Properties(20, 101_376)
+REAL = {torch.float32: 4, torch.float64: 8}
+
+
+def values_of(cells: tuple[int, int, int], *parts: pd.Ground | pd.Sphere) -> SceneValues:
+    return pd.Scene(pd.Solid(pd.TetMesh(*box((1.0, 1.0, 1.0), cells)), 1e5), *parts).values()
+
+
+def test_auto_takes_the_first_that_fits() -> None:
+    """Just enough memory for a kernel chooses it, one byte less the next one."""
+    values = values_of((6, 6, 6))
+    for dtype in REAL:
+        needs = {}
+        for name in ("block", "grid"):
+            needs[name] = shared_bytes(choose_plan(values, dtype, H100, name), 0, 0)
+        assert needs["grid"] < needs["block"]
+        for shared, kernel in (
+            (needs["block"], "block"),
+            (needs["block"] - 1, "grid"),
+            (needs["grid"], "grid"),
+            (needs["grid"] - 1, "stream"),
+        ):
+            plan = choose_plan(values, dtype, Properties(132, shared))
+            assert plan.kernel == kernel
+            assert f"{shared:,} B are there" in plan.why
+            assert all(f"{name} needs" in plan.why for name in KERNELS[: KERNELS.index(kernel)])
+
+
+def test_number_of_patches() -> None:
+    values = values_of((6, 6, 6))
+    tets = len(values.tets)
+    assert tets == 1296
+    for dtype, stream in ((torch.float32, 2), (torch.float64, 3)):
+        assert choose_plan(values, dtype, H100, "block").patches == 1
+        assert choose_plan(values, dtype, H100, "grid").patches == 12
+        assert choose_plan(values, dtype, Properties(5, 232_448), "grid").patches == 5
+        assert choose_plan(values, dtype, H100, "stream").patches == stream
+    one = pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e5)).values()
+    assert [choose_plan(one, torch.float32, H100, name).patches for name in KERNELS] == [1, 1, 1]
+
+
+def test_a_kernel_that_does_not_fit_is_refused_with_numbers() -> None:
+    values = values_of((12, 12, 12))
+    with pytest.raises(
+        ValueError, match=r"'block' does not fit this GPU: it needs at least [\d,]+ B .*101,376 B.*grid"
+    ):
+        choose_plan(values, torch.float32, SMALL, "block")
+    with pytest.raises(
+        ValueError, match=r"'grid' does not fit this GPU: it needs (at least )?[\d,]+ B .*5,000 B are there.*stream"
+    ):
+        choose_plan(values, torch.float32, Properties(132, 5000), "grid")
+    with pytest.raises(ValueError, match=r"kernel must be \"auto\""):
+        choose_plan(values, torch.float32, H100, "team")
+
+
+def test_what_is_refused_unbuilt_does_not_fit_when_built() -> None:
+    """The bound from the numbers of vertices and tetrahedra never exceeds what the plan then needs."""
+    for cells in ((1, 1, 1), (5, 4, 3), (9, 9, 2)):
+        values = values_of(cells, pd.Ground(), pd.Sphere((0, -3, 0), 1.0))
+        for dtype, real in REAL.items():
+            plan = choose_plan(values, dtype, Properties(2, 10**9), "block")
+            least = _C.fused_shared_bytes(real, len(values.rest_positions), 5 * len(values.tets) // 2, 1, 1)
+            assert least <= shared_bytes(plan, 1, 1)
+
+
+def test_a_patch_with_a_busy_vertex_is_split_until_it_fits() -> None:
+    """Hundreds of tetrahedra around one vertex want eight entries each: more patches share the sum."""
+    ring = np.linspace(0.0, 2.0 * np.pi, 901)[:-1]
+    around = np.stack([np.cos(ring), np.sin(ring), 0.0 * ring], axis=1)
+    vertices = np.concatenate([[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], around])
+    numbers = np.arange(900)
+    tets = np.stack([0 * numbers, 2 + numbers, 2 + (numbers + 1) % 900, 0 * numbers + 1], axis=1)
+    values = pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e5)).values()
+    plan = choose_plan(values, torch.float32, SMALL, "stream")
+    assert plan.patches > 1
+    assert shared_bytes(plan, 0, 0) <= SMALL.shared
+
+
+def test_contacts_take_shared_memory() -> None:
+    values = values_of((3, 3, 3))
+    plan = choose_plan(values, torch.float32, H100, "block")
+    assert shared_bytes(plan, 2, 3) - shared_bytes(plan, 0, 0) == 4 * (2 * 5 + 3 * 8)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_one_class_for_both_plans(kernel: str, dtype: torch.dtype) -> None:
+    values = values_of((4, 3, 3))
+    plan, cpu = choose_plan(values, dtype, H100, kernel), compile_plan(values, dtype=dtype)
+    assert (plan.kernel, cpu.kernel) == (kernel, None)
+    assert plan.vertices == cpu.vertices == len(values.rest_positions)
+    assert plan.dtype == dtype
+    assert plan.to(dtype=torch.float64).dtype == torch.float64
+    assert plan.bytes == sum(array.numel() * array.element_size() for array in plan.arrays)
+    assert len(DEVICE_SIZES) == len(plan.sizes)
+    assert (plan.size("tets"), plan.size("patches")) == (len(values.tets), plan.patches)
+    for row, array in zip(DEVICE_PLAN_TABLE, plan.arrays, strict=True):
+        assert getattr(plan, row.name) is array
+    with pytest.raises(AttributeError, match="Plan has no array 'tet_rest'; it has sizes, vertex_order"):
+        plan.tet_rest  # noqa: B018
+    there = plan.to("meta")
+    assert (there.device.type, there.sizes.device.type, there.kernel) == ("meta", "cpu", kernel)
+    for twin in (copy.deepcopy(plan), pickle.loads(pickle.dumps(plan))):
+        assert isinstance(twin, Plan)
+        assert (twin.kernel, twin.why, twin.patches) == (plan.kernel, plan.why, plan.patches)
+        assert all(torch.equal(one, other) for one, other in zip(twin.arrays, plan.arrays, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("facts", "words"),
+    [
+        ((False, None, 0), ("CPU build", "install a torch for CUDA", "python -m torchpd doctor")),
+        ((False, "13.0", 1), ("no CUDA kernels", "CUDA 13.0 toolkit", "build torchpd again", "doctor")),
+        ((True, "13.0", 0), ("no CUDA device", "nvidia-smi", "CUDA_VISIBLE_DEVICES", "doctor")),
+        ((True, "13.0", 1, (7, 5)), ("capability 7.5", "need 8.0", "CPU")),
+    ],
+)
+def test_why_a_gpu_cannot_be_used(
+    facts: tuple[bool, str | None, int] | tuple[bool, str | None, int, tuple[int, int]], words: tuple[str, ...]
+) -> None:
+    for word in words:
+        assert word in why_not(*facts), word
+
+
+def test_a_gpu_that_can_be_used() -> None:
+    assert why_not(True, "13.0", 1) == why_not(True, "13.0", 2, (8, 0)) == why_not(True, "13.0", 1, (12, 0)) == ""
+
+
+def test_too_little_memory_is_a_sentence() -> None:
+    refuse_full_memory(1000, 1000)
+    with pytest.raises(RuntimeError, match="need 1,001 B of memory on the GPU and 1,000 B are free: free some"):
+        refuse_full_memory(1001, 1000)
+
+
+def test_plans_are_moved_between_alike_devices_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = {0: H100, 1: H100, 2: SMALL}
+    monkeypatch.setattr(placing, "properties_of", lambda device: kinds[device.index])
+    first, second, other = (torch.device("cuda", number) for number in kinds)
+    cpu, meta = torch.device("cpu"), torch.device("meta")
+    same = placing._same_plan
+    assert same(first, second)
+    assert same(other, other)
+    assert same(first, meta)
+    assert same(cpu, cpu)
+    for source, target in ((first, other), (cpu, first), (first, cpu), (meta, cpu), (meta, first)):
+        assert not same(source, target)

@@ -1,0 +1,75 @@
+"""What a GPU must have before a simulator moves there, and what to do where it lacks that."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+__all__ = ["LEAST_CAPABILITY", "Properties", "free_memory", "properties_of", "refuse_full_memory", "why_not"]
+
+LEAST_CAPABILITY = (8, 0)
+_DOCTOR = "`python -m torchpd doctor` says more"
+
+
+class Properties(NamedTuple):
+    """What the choice of a kernel depends on."""
+
+    multiprocessors: int
+    shared: int  # bytes of shared memory that a block may have
+
+
+def properties_of(device: torch.device) -> Properties:
+    """Those of a GPU."""
+    found = torch.cuda.get_device_properties(device)
+    # missing from the stubs of torch
+    shared: int = found.shared_memory_per_block_optin  # type: ignore[attr-defined]
+    return Properties(found.multi_processor_count, shared)
+
+
+def why_not(built: bool, torch_cuda: str | None, devices: int, capability: tuple[int, int] | None = None) -> str:
+    """Why no simulator can run on a GPU, with the way out; empty when it can.
+
+    Args:
+        built: whether the extension has CUDA kernels.
+        torch_cuda: `torch.version.cuda`, None for a CPU build of torch.
+        devices: how many torch sees.
+        capability: of the one that is wanted, if known.
+    """
+    if torch_cuda is None:
+        return (
+            "this torch is a CPU build: install a torch for CUDA (pytorch.org/get-started), then build torchpd again; "
+            f"{_DOCTOR}"
+        )
+    if not built:
+        return (
+            f"this build of torchpd has no CUDA kernels: install the CUDA {torch_cuda} toolkit or set CUDA_HOME, then "
+            f"build torchpd again; {_DOCTOR}"
+        )
+    if devices == 0:
+        return f"torch sees no CUDA device: look at the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES; {_DOCTOR}"
+    if capability is not None and capability < LEAST_CAPABILITY:
+        return (
+            f"the GPU has compute capability {_dotted(capability)} and the kernels need {_dotted(LEAST_CAPABILITY)} or "
+            'newer (Ampere): take another device, or stay on the CPU with .to("cpu")'
+        )
+    return ""
+
+
+def _dotted(capability: tuple[int, int]) -> str:
+    return ".".join(map(str, capability))
+
+
+def free_memory(device: torch.device) -> int:
+    """Bytes that torch could still hand out on a GPU."""
+    free, _ = torch.cuda.mem_get_info(device)
+    return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+
+
+def refuse_full_memory(needed: int, free: int) -> None:
+    """A sentence instead of a failed allocation halfway."""
+    if needed > free:
+        raise RuntimeError(
+            f"Simulator: plan and material need {needed:,} B of memory on the GPU and {free:,} B are free: free some "
+            "(torch.cuda.empty_cache(), other processes), take a coarser mesh or torch.float32, or stay on the CPU"
+        )

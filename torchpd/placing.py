@@ -1,0 +1,63 @@
+"""Moving a simulator: every device needs a plan of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from . import _C
+from .gpu import free_memory, properties_of, refuse_full_memory, why_not
+from .plan import Plan, compile_plan
+from .regimes import choose_plan
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+__all__ = ["check_wanted_device", "plan_on"]
+
+
+def _reason(device: torch.device | None = None) -> str:
+    capability = None if device is None else torch.cuda.get_device_capability(device)
+    return why_not(bool(_C.build_info()["cuda"]), torch.version.cuda, torch.cuda.device_count(), capability)
+
+
+def check_wanted_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor:
+    """What `fn`, which moves or converts, makes of an empty tensor; explains why a GPU cannot be had."""
+    try:
+        wanted = fn(probe)
+    except (AssertionError, RuntimeError) as error:
+        reason = _reason()
+        if not reason or not any(word in str(error) for word in ("CUDA", "NVIDIA")):
+            raise
+        raise RuntimeError(f"Simulator: no CUDA here: {reason}") from error
+    if wanted.device.type not in ("cpu", "cuda", "meta"):
+        raise RuntimeError(f"Simulator: there are no kernels for {wanted.device.type}; it runs on the CPU and on CUDA")
+    if wanted.device.type == "cuda":
+        reason = _reason(wanted.device)
+        if reason:
+            raise RuntimeError(f"Simulator: {wanted.device} cannot be used: {reason}")
+    return wanted
+
+
+def _same_plan(source: torch.device, target: torch.device) -> bool:
+    """Whether the plan of one device serves the other: nothing runs on "meta"."""
+    if source.type != "cuda" or target.type != "cuda":
+        return target.type in ("meta", source.type)
+    return source == target or properties_of(source) == properties_of(target)
+
+
+def plan_on(sim: Simulator, dtype: torch.dtype, device: torch.device) -> Plan:
+    """The plan of a simulator for a precision and a device: its own moved there where that will do."""
+    if dtype == sim.dtype and _same_plan(sim.device, device):
+        plan = sim.plan
+    elif device.type == "cuda":
+        plan = choose_plan(sim.scene.values(), dtype, properties_of(device), sim.kernel, progress=False)
+    else:
+        plan = compile_plan(sim.scene.values(), dtype=dtype, progress=False)
+    if device.type == "cuda" and device != sim.device:
+        material = sum(array.numel() for array in (*sim.material(), sim.rest_positions))
+        refuse_full_memory(plan.bytes + material * (torch.finfo(dtype).bits // 8), free_memory(device))
+    return plan.to(device)

@@ -1,0 +1,137 @@
+"""Which kernel of a GPU steps a scene, and the plan for it.
+
+    block   one thread block an environment, all iterations in one launch: the mesh fits a block's shared memory
+    grid    a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
+    stream  launches for every iteration: any mesh
+
+The batch does not enter: an environment gives the same bits alone and in any batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+
+from . import _C
+from .device_plan import compile_device_plan
+from .gpu import Properties
+from .plan import KERNELS, Plan
+from .scene import SceneValues
+from .tables import DEVICE_PLAN_TABLE
+
+__all__ = ["check_kernel", "choose_plan", "shared_bytes"]
+
+_GRID_TETS = 100  # a patch at least: smaller ones cost more in exchange than they save
+_STREAM_TETS = {torch.float32: 990, torch.float64: 480}  # a patch, so that both want as much shared memory
+_MOST_FIELDS = 2  # of a pass: the products with a second derivative
+
+
+def check_kernel(kernel: str) -> str:
+    """The name of a kernel, or "auto"."""
+    if kernel not in ("auto", *KERNELS):
+        raise ValueError(f'Simulator: kernel must be "auto", "block", "grid" or "stream", got {kernel!r}')
+    return kernel
+
+
+def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
+    """Shared memory of a block of the kernel that a plan is for."""
+    real = torch.finfo(plan.dtype).bits // 8
+    slots, entries = plan.size("most_slots"), plan.size("most_entries")
+    if plan.kernel == "stream":
+        return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS)
+    return _C.fused_shared_bytes(real, slots, entries, planes, balls)
+
+
+class _Scene(NamedTuple):
+    values: SceneValues
+    dtype: torch.dtype
+    progress: bool
+
+    @property
+    def tets(self) -> int:
+        return len(self.values.tets)
+
+    def plan(self, kernel: str, patches: int) -> Plan:
+        number = KERNELS.index(kernel)
+        arrays = compile_device_plan(self.values, patches, number, self.dtype, progress=self.progress)
+        return Plan(arrays, DEVICE_PLAN_TABLE)
+
+    def shared_bytes(self, plan: Plan) -> int:
+        return shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
+
+    def patches(self, kernel: str, gpu: Properties) -> int:
+        if kernel == "block":
+            return 1
+        if kernel == "grid":
+            return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
+        return -(-self.tets // _STREAM_TETS[self.dtype])
+
+    def least_shared_bytes(self, patches: int) -> int:
+        """Of the kernels block and grid, without building the plan: two tetrahedra have at least five entries."""
+        slots = len(self.values.rest_positions) if patches == 1 else 4
+        entries = 5 * -(-self.tets // patches) // 2
+        real = torch.finfo(self.dtype).bits // 8
+        return _C.fused_shared_bytes(real, slots, entries, len(self.values.planes), len(self.values.spheres))
+
+
+def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | None, str]:
+    """The plan, and the shared memory of a block; None where that is more than there is."""
+    patches = scene.patches(kernel, gpu)
+    least = scene.least_shared_bytes(patches)
+    if least > gpu.shared:
+        return None, f"at least {least:,} B"
+    try:
+        plan = scene.plan(kernel, patches)
+    except ValueError as error:  # more entries in a patch than 16 bits count
+        return None, f"more than can be counted ({error})"
+    needed = scene.shared_bytes(plan)
+    return (plan if needed <= gpu.shared else None), f"{needed:,} B"
+
+
+def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
+    """More patches where many tetrahedra share a vertex, whose forces one patch sums."""
+    patches = scene.patches("stream", gpu)
+    plan = scene.plan("stream", patches)
+    while scene.shared_bytes(plan) > gpu.shared and patches < scene.tets:
+        patches = min(2 * patches, scene.tets)
+        plan = scene.plan("stream", patches)
+    return plan
+
+
+def choose_plan(
+    values: SceneValues, dtype: torch.dtype, gpu: Properties, kernel: str = "auto", *, progress: bool = True
+) -> Plan:
+    """The plan of a scene for a GPU, on the CPU; move it with `Plan.to`.
+
+    Args:
+        values: the flat arrays of `Scene.values`.
+        dtype: torch.float32 or torch.float64.
+        gpu: what the device has.
+        kernel: "auto" takes the first of "block", "grid" and "stream" that fits.
+        progress: show a bar when the mesh is large.
+    """
+    check_kernel(kernel)
+    scene = _Scene(values, dtype, progress)
+    needs = []
+    for name in ("block", "grid"):
+        if kernel not in ("auto", name):
+            continue
+        plan, needed = _fused_plan(scene, name, gpu)
+        needs.append(f"{name} needs {needed}")
+        if plan is not None:
+            return replace(plan, why=_reason(kernel, needs, gpu))
+        if kernel == name:
+            others = '"stream", which always fits' if name == "grid" else '"grid" or "stream"'
+            raise ValueError(
+                f"Simulator: kernel={kernel!r} does not fit this GPU: it needs {needed} of shared memory a thread "
+                f'block, and {gpu.shared:,} B are there; take {others}, or "auto", which takes the first that fits'
+            )
+    return replace(_stream_plan(scene, gpu), why=_reason(kernel, needs, gpu))
+
+
+def _reason(kernel: str, needs: list[str], gpu: Properties) -> str:
+    if kernel != "auto":
+        return "asked for"
+    return f"shared memory a thread block: {', '.join(needs)}, {gpu.shared:,} B are there"
