@@ -115,7 +115,7 @@ GPU_SCENES = (
     ),
     *_pair("one-1200-tets", (8, 5, 5), "grid", Aim("step_microseconds", 80.0, 45.0)),
     *_pair("one-10k", (39, 15, 15), "grid", _iteration(3.0, 2.3)),
-    *_pair("one-100k", (99, 31, 31), "grid", _iteration(14.0, 11.0)),
+    *_pair("one-100k", (99, 31, 31), "auto", _iteration(14.0, 11.0)),
     *_pair("one-1M", (255, 63, 63), "stream", _iteration(130.0, 105.0)),
     *_pair("one-4M", (1023, 63, 63), "stream", _iteration(480.0, 400.0), heavy=True),
 )

@@ -39,8 +39,9 @@ def test_fields_are_those_of_the_cpu(name: str, kernel: str, batch: int, precisi
     direction = noise(rest, 2).to(dtype)
     plan, sure = plan_of(sim), plan_of(exact)
     own = (exact.stiffness.detach() * torch.linspace(0.5, 2.0, batch).double()[:, None]).to(dtype)
-    # as in test_ops: grad N of slivers is up to 40 times the inverse of an edge, and some fifty operations follow
-    limit = 40 * 50 * ULP[dtype]
+    # as in test_ops: grad N of slivers is up to 40 times the inverse of an edge, and some fifty operations follow; and
+    # the closed form of the rotation is trusted where it magnifies the rounding up to a thousand times, on either device
+    limit = (40 * 50 + 2 * 1000) * ULP[dtype]
     for w in (sim.stiffness.detach().cpu(), own):
         here = [t.to(GPU) for t in (x, direction, w)]
         there = [t.double() for t in (x, direction, w)]
@@ -181,20 +182,26 @@ def test_compiled_step_and_rollout(kernel: str, dynamic: bool) -> None:
 # ---- what is launched
 
 
+def ours(names: list[str]) -> list[str]:
+    """The work that is not torch's."""
+    return [name for name in names if "at::native" not in name]
+
+
 @pytest.mark.parametrize("precision", DTYPES)
 def test_a_step_is_one_launch(precision: str) -> None:
     dtype = DTYPES[precision]
     sim, state = small_on_gpu(dtype, "block", batch=9)
     assert len(device_work(lambda: sim(state))) == 1
     assert len(device_work(lambda: sim.step_(state))) == 1
-    assert len(device_work(lambda: sim.rollout(state, 20))) == 1
+    # torch's own kernels make the columns of the report that every track carries
+    assert len(ours(device_work(lambda: sim.rollout(state, 20)))) == 1
     assert len(device_work(lambda: sim(state, return_info=True))) <= 1 + 6  # and the columns of the report
     case = bar((20, 4, 4))
     sim = on_gpu(case, dtype, "grid")
     assert sim.plan.patches > 1
     state = state_of(case, sim, 5)
     for call in (lambda: sim(state), lambda: sim.step_(state), lambda: sim.rollout(state, 20, 10)):
-        names = device_work(call)
+        names = ours(device_work(call))
         assert len(names) == 2, names
         assert "memset" in names[0].lower(), names
 

@@ -105,31 +105,6 @@ Mat3<Pack<T, W>> load_matrices(const T* from, int count) {
   return r;
 }
 
-// One Newton step on the group of rotations, then one Newton-Schulz step back onto it: the last bits.
-template <class R>
-Mat3<R> polished_rotation(const Mat3<R>& f) {
-  using T = scalar_of<R>;
-  const Invariants<R> i = invariants(f);
-  const auto good = trusted(i, largest_root(i));
-  const Mat3<R> r = nearest_rotation(f);
-  const Mat3<R> s = transpose(r) * f;
-  const Mat3<R> turn = cross_matrix(solve_turn(s, axis_of(s)));
-  Mat3<R> turned = r * turn;
-  for (int a = 0; a < 3; ++a) turned.row[a] = turned.row[a] + r.row[a];
-  const Mat3<R> metric = transpose(turned) * turned;
-  Mat3<R> schulz = R(T(-0.5)) * metric;
-  schulz.row[0].x = schulz.row[0].x + R(T(1.5));
-  schulz.row[1].y = schulz.row[1].y + R(T(1.5));
-  schulz.row[2].z = schulz.row[2].z + R(T(1.5));
-  Mat3<R> polished = turned * schulz;
-  for (int a = 0; a < 3; ++a) {
-    polished.row[a] = {select(good, polished.row[a].x, r.row[a].x),
-                       select(good, polished.row[a].y, r.row[a].y),
-                       select(good, polished.row[a].z, r.row[a].z)};
-  }
-  return polished;
-}
-
 template <class T>
 void rotation_range(const RotationCall<T>& call, std::int64_t begin, std::int64_t end) {
   constexpr int W = native_width<T>;

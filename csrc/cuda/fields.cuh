@@ -220,7 +220,7 @@ __global__ void __launch_bounds__(field_threads)
     return Mat3<T>{{read3(from + 9 * i), read3(from + 9 * i + 3), read3(from + 9 * i + 6)}};
   };
   const Mat3<T> f = read(call.matrices);
-  Mat3<T> r = nearest_rotation(f);
+  Mat3<T> r = polished_rotation(f);
   if (call.direction) r = rotation_differential(f, r, read(call.direction));
   for (int row = 0; row < 3; ++row) write3(call.out + 9 * i + 3 * row, r.row[row]);
 }
