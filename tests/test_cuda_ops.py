@@ -39,8 +39,8 @@ def test_fields_are_those_of_the_cpu(name: str, kernel: str, batch: int, precisi
     direction = noise(rest, 2).to(dtype)
     plan, sure = plan_of(sim), plan_of(exact)
     own = (exact.stiffness.detach() * torch.linspace(0.5, 2.0, batch).double()[:, None]).to(dtype)
-    # as in test_ops: grad N of slivers is up to 40 times the inverse of an edge, and some fifty operations follow; and
-    # the closed form of the rotation is trusted where it magnifies the rounding up to a thousand times, on either device
+    # as in test_ops: grad N of slivers is up to 40 times the inverse of an edge, and some fifty operations follow; the
+    # closed form of the rotation is trusted where it magnifies the rounding up to a thousand times, on both devices
     limit = (40 * 50 + 2 * 1000) * ULP[dtype]
     for w in (sim.stiffness.detach().cpu(), own):
         here = [t.to(GPU) for t in (x, direction, w)]
