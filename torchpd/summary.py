@@ -30,6 +30,13 @@ def _solver_line(sim: Simulator) -> str:
     return f"{name}: {stop} iterations, relaxation {numbers['relaxation']:g}, {diagonal} diagonal{rho}{tolerance}"
 
 
+def _promise_lines(sim: Simulator) -> list[str]:
+    if sim.promise is None:
+        return []
+    stale = "" if sim.promise.covers(sim) else "; settings have changed since, so it no longer holds"
+    return [f"tuned: {sim.promise}{stale}"]
+
+
 def _effect_lines(sim: Simulator) -> list[str]:
     scene = sim.scene
     tets = sum(len(solid.mesh.tets) for solid in scene.solids)
@@ -106,6 +113,7 @@ def describe(sim: Simulator) -> str:
     lines = [
         f"{plan.vertices} vertices, time step {sim.time_step:.6g} s, {sim.dtype} on {where}",
         _solver_line(sim),
+        *_promise_lines(sim),
         *_effect_lines(sim),
         *([_pass_line(sim)] if plan.kernel is None else _kernel_lines(sim)),
         f"memory: plan {plan.bytes:,} B, material {material:,} B, {_step_bytes(plan, real)}",
