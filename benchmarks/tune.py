@@ -198,7 +198,6 @@ def write(options: argparse.Namespace, rows: list[Row]) -> None:
     if options.out is None:
         return
     run = describe_run(torch.device("cpu"), options.threads)
-    run["command"] = run["command"].replace("run.py", "tune.py")
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps({"schema": 1, **run, "summary": summary(rows), "rows": rows}, indent=1) + "\n")
 

@@ -42,6 +42,7 @@ class Baseline:
 
     prepare: Callable[[StepProblem, Array], Run]
     contacts: bool = False  # knows planes and spheres
+    compiled_twin: str | None = None  # the contender that has the same iterates
     iteration: str = "local step + global step"  # what one iteration is
 
 
@@ -316,9 +317,9 @@ def _lbfgs(problem: StepProblem, first: Array) -> Run:
 
 
 BASELINES: dict[str, Baseline] = {
-    "Jacobi, NumPy": Baseline(_jacobi, contacts=True),
-    "classic Chebyshev, NumPy": Baseline(_classic, contacts=True),
-    "guarded Chebyshev, NumPy": Baseline(_guarded, contacts=True),
+    "Jacobi, NumPy": Baseline(_jacobi, contacts=True, compiled_twin="Jacobi"),
+    "classic Chebyshev, NumPy": Baseline(_classic, contacts=True, compiled_twin="classic Chebyshev"),
+    "guarded Chebyshev, NumPy": Baseline(_guarded, contacts=True, compiled_twin="guarded Chebyshev"),
     "Gauss-Seidel": Baseline(_plain(GaussSeidel), iteration="local step + one sweep over the colours"),
     "Gauss-Seidel + Chebyshev": Baseline(
         _accelerated(lambda problem: GaussSeidel(problem, symmetric=True)),

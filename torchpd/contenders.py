@@ -13,7 +13,7 @@ from .state import State
 if TYPE_CHECKING:
     from .simulator import Simulator
 
-__all__ = ["CONTENDERS", "DEFAULT", "Contender", "safe_solvers"]
+__all__ = ["CONTENDERS", "DEFAULT", "DEFAULT_ITERATIONS", "Contender", "safe_solvers"]
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ CONTENDERS: dict[str, Contender] = {
     "classic Chebyshev": Contender(_classic, safe=False),
     "guarded Chebyshev": Contender(lambda sim, state: Chebyshev(), safe=True),
 }
-DEFAULT = "guarded Chebyshev"
+DEFAULT = "guarded Chebyshev"  # what `Simulator(scene)` does
+DEFAULT_ITERATIONS = 64
 
 
 def safe_solvers(sim: Simulator, state: State) -> dict[str, Solver]:
