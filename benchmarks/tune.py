@@ -29,6 +29,8 @@ from torchpd.tuning import TuningWarning
 
 JUDGED_STEPS = (1, 5, 20, 45)  # of the other motion
 SLACK = 1.2  # of a budget in milliseconds
+STEADY = 0.1  # change of the machine's speed while a budget is tuned for
+ATTEMPTS = 6
 Row = dict[str, Any]
 
 
@@ -134,19 +136,29 @@ def judge_budget(sim: pd.Simulator, start: pd.State, other: pd.State) -> Row:
     def median(stepper: pd.Simulator) -> float:
         return 1e3 * float(np.median(measure(lambda: stepper(other), sim.device, repetitions=7, seconds=0.0)))
 
-    budget = 1.5 * min(median(ruler) for _ in range(5))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", TuningWarning)
-        promise = sim.tune(start, milliseconds=budget)
-    # in turns, because the speed of a shared machine wanders
+    for attempt in range(ATTEMPTS):
+        speed = min(median(ruler) for _ in range(5))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TuningWarning)
+            promise = sim.tune(start, milliseconds=1.5 * speed)
+        # on a shared machine the speed may change meanwhile, which says nothing about the choice
+        steady = abs(min(median(ruler) for _ in range(5)) / speed - 1.0) < STEADY
+        if steady:
+            break
     ratio = float(np.median([median(sim) / (1.5 * median(ruler)) for _ in range(7)]))
-    return {"budget": budget, "share": ratio, "iterations": promise.iterations, "kept": ratio <= SLACK}
+    return {
+        "budget": 1.5 * speed, "share": ratio, "iterations": promise.iterations, "kept": ratio <= SLACK,
+        "attempts": attempt + 1, "steady": steady,
+    }  # fmt: skip
 
 
 def summary(rows: list[Row]) -> Row:
     """Counts, the two kinds of promises apart."""
     judged = [row for row in rows if row["errors"]]
-    kinds = {"attained": [r for r in judged if r["attained"]], "best reachable": [r for r in judged if not r["attained"]]}
+    kinds = {
+        "attained": [r for r in judged if r["attained"]],
+        "best reachable": [r for r in judged if not r["attained"]],
+    }
     steps = [
         (e > row["promised"], not t, a > row["promised"])
         for row in judged
@@ -159,7 +171,13 @@ def summary(rows: list[Row]) -> Row:
         "held": sum(row["held"] for row in judged) / max(len(judged), 1),
         "held of attained": sum(r["held"] for r in kinds["attained"]) / max(len(kinds["attained"]), 1),
         "held with rounding counted as error": sum(max(r["errors_with_rounding"]) <= r["promised"] for r in judged),
-        "budgets kept": sum(row["budget"]["kept"] for row in rows) / max(len(rows), 1),
+        "budgets": {
+            name: {"scenes": len(group), "kept": sum(row["budget"]["kept"] for row in group)}
+            for name, group in (
+                ("at steady speed", [row for row in rows if row["budget"]["steady"]]),
+                ("speed of the machine changed", [row for row in rows if not row["budget"]["steady"]]),
+            )
+        },
         "median share of budget used": float(np.median([row["budget"]["share"] for row in rows])),
         **{
             name: {
@@ -169,7 +187,11 @@ def summary(rows: list[Row]) -> Row:
             }
             for name, wanted in (("broken steps", True), ("kept steps", False))
         },
-        "median error / promise": float(np.median([max(r["errors"]) / r["promised"] for r in judged])) if judged else None,
+        "median error / promise": float(
+            np.median([max(row["errors_with_rounding"]) / row["promised"] for row in judged])
+        )
+        if judged
+        else None,
         "median tuning seconds": float(np.median([row["tuning_seconds"] for row in rows])),
     }
 

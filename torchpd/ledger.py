@@ -77,7 +77,9 @@ class Ledger:
         lines = path.read_text().splitlines()
         found = _parsed(lines[0]) if lines else None
         if found is None or found.get("settings") != settings:
-            raise ValueError(f"{path} holds a study with other settings; take another --out, or delete it to start anew")
+            raise ValueError(
+                f"{path} holds a study with other settings; take another --out, or delete it to start anew"
+            )
         for line in lines[1:]:
             record = _parsed(line)
             if record is not None:  # the last line of a killed study may be cut

@@ -75,8 +75,9 @@ class StudyOptions:
 
 
 def _counts(most: int) -> list[int]:
-    """1, 2, 4 ... and the count of the default."""
-    return [2**power for power in range(int(math.log2(most)) + 1)]
+    """1, 2, 3, 4, 6, 8, 12 ...: two in each doubling."""
+    powers = [2**power for power in range(int(math.log2(most)) + 1)]
+    return sorted({*powers, *(3 * power // 2 for power in powers[1:] if 3 * power // 2 <= most)})
 
 
 def _setting(subject: Subject, options: StudyOptions) -> Setting:
@@ -106,7 +107,7 @@ def _solver_tasks(bench: Bench, setting: Setting, counts: list[int]) -> dict[str
 def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
     """Everything that there is to measure, by name."""
     setting = _setting(bench.subject, options)
-    counts = _counts(min(options.iterations, 16) if options.quick else options.iterations)
+    counts = _counts(min(options.iterations, 8) if options.quick else options.iterations)
     tasks: dict[str, Task] = _solver_tasks(bench, setting, counts)
     for factor in _STIFFNESS_FACTORS:
         softer = replace(setting, youngs=factor * setting.youngs)
@@ -120,7 +121,11 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
         tasks["time step: default"] = partial(time_step_rows, bench, setting, 5)
     tasks["mesh: default"] = partial(mesh_rows, bench, setting, resolutions)
     tasks["trajectory: default"] = partial(
-        trajectory_rows, bench, setting, counts[2:], seconds=0.2 if options.quick else 1.0
+        trajectory_rows,
+        bench,
+        setting,
+        [count for count in counts if count >= 4][::2],
+        seconds=0.2 if options.quick else 1.0,
     )
     tasks["paper: table"] = partial(paper_rows, bench.device)
     return {key: task for key, task in tasks.items() if key.split(":")[0] in options.axes}

@@ -226,4 +226,3 @@ def paper_rows(device: torch.device) -> list[Row]:
             )
         )  # fmt: skip
     return rows
-

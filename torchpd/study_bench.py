@@ -50,7 +50,9 @@ class Bench:
             self._meshes[resolution] = self.subject.mesh(resolution)
         return self._meshes[resolution]
 
-    def simulator(self, setting: Setting, dtype: torch.dtype, solver: Solver | None = None, **options: Any) -> Simulator:
+    def simulator(
+        self, setting: Setting, dtype: torch.dtype, solver: Solver | None = None, **options: Any
+    ) -> Simulator:
         """A new one on the device."""
         scene = self.subject.scene(self.mesh(setting.resolution), setting.youngs)
         sim = Simulator(scene, setting.time_step, solver=solver, dtype=dtype, progress=False, **options)

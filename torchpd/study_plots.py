@@ -134,9 +134,12 @@ def _draw_solvers(rows: list[Row], path: Path, subject: str) -> Path:
             continue
         label = f"{name}, C++ float32" if own[0].compiled else name if "NumPy" in name else f"{name}, NumPy"
         for axis, xs in ((left, [row.iterations for row in timed]), (right, [row.milliseconds for row in timed])):
-            axis.plot(xs, _drawn(timed), color=color, linewidth=width, linestyle=dash, label=label if axis is left else "")
+            axis.plot(
+                xs, _drawn(timed), color=color, linewidth=width, linestyle=dash, label=label if axis is left else ""
+            )
             _mark_failures(axis, xs, timed, color)
     _mark_default(left, right, rows)
+    _mark_floor(left, rows)
     front = pareto_front([row for own in curves.values() for row in own])
     right.plot(
         [row.milliseconds for row in front], _drawn(front), color="#f0e442", linewidth=9, alpha=0.55, zorder=0,
@@ -161,7 +164,19 @@ def _mark_default(left: Any, right: Any, rows: list[Row]) -> None:
         right.plot([row.milliseconds], _drawn([row]), zorder=6, **star)
         right.annotate(
             "default: 64 iterations", (row.milliseconds, _drawn([row])[0]), xytext=(9, 6), textcoords="offset points",
-            fontsize=9, color="#d55e00",
+            fontsize=9, color="#d55e00", zorder=7,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1},
+        )  # fmt: skip
+
+
+def _mark_floor(axis: Any, rows: list[Row]) -> None:
+    """Where float32 levels off, if it does within the study."""
+    own = sorted((r for r in rows if r.method == DEFAULT and r.precision == "float32"), key=lambda r: r.iterations)
+    if len(own) > 1 and own[-1].error > 0.5 * own[-2].error > 0.0:
+        axis.axhline(own[-1].error, color="#d55e00", linewidth=0.8, linestyle="dotted")
+        axis.annotate(
+            "float32 levels off", (0.02, own[-1].error), xycoords=("axes fraction", "data"), xytext=(0, 3),
+            textcoords="offset points", fontsize=8, color="#d55e00",
         )  # fmt: skip
 
 
@@ -265,7 +280,9 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     xs = [row.iterations for row in own]
     left.plot(xs, _drawn(own), "o-", color="#d55e00", linewidth=2.4)
     _mark_failures(left, xs, own, "#d55e00")
-    _error_axis(left, [row.error for row in own], "largest distance from the converged path,\nover the length of the way")
+    _error_axis(
+        left, [row.error for row in own], "largest distance from the converged path,\nover the length of the way"
+    )
     left.set_title("how far the body is from where it should be", fontsize=10, loc="left")
     names = {
         "softness": ("too far out: false softness", "#0072b2"),

@@ -117,8 +117,15 @@ def _landing(name: str, shape: TetMesh | TriMesh, time_step: float) -> Subject:
 
 SUBJECTS: dict[str, Callable[[], Subject]] = {
     "beam": lambda: Subject(
-        "beam", _beam_mesh, _beam_scene, _beam_start, _beam_probes, resolution=5,
-        resolutions=(1, 2, 3, 4, 5, 8), youngs=1e6, time_step=1 / 30,
+        "beam",
+        _beam_mesh,
+        _beam_scene,
+        _beam_start,
+        _beam_probes,
+        resolution=5,
+        resolutions=(1, 2, 3, 4, 5, 8),
+        youngs=1e6,
+        time_step=1 / 30,
     ),  # fmt: skip
     "octopus": lambda: _landing("octopus", shapes.octopus(), 1 / 60),
 }

@@ -57,7 +57,8 @@ def first_turn(signal: Array, time_step: float) -> float:
     NaN when it does not turn, or does so within rounding.
     """
     change = np.diff(signal)
-    turned = np.flatnonzero(change[:-1] * change[1:] < 0.0)
+    # two equal samples at the top also are a turn
+    turned = np.flatnonzero((change[:-1] * change[1:] <= 0.0) & (change[:-1] != 0.0))
     if not len(turned):
         return math.nan
     k = int(turned[0]) + 1
