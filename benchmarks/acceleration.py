@@ -42,7 +42,7 @@ def count_all(most: int) -> list[dict[str, Any]]:
 
 
 def with_factors(rows: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """The rows with how many times fewer iterations than Jacobi; at least so many where Jacobi needs more than `most`."""
+    """The rows with how many times fewer iterations than Jacobi, at least so many where that needs more than `most`."""
     jacobi = {row["youngs"]: row["iterations"] for row in rows if row["solver"] == "Jacobi"}
     return [
         {

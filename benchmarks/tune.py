@@ -136,19 +136,19 @@ def judge_budget(sim: pd.Simulator, start: pd.State, other: pd.State) -> Row:
     def median(stepper: pd.Simulator) -> float:
         return 1e3 * float(np.median(measure(lambda: stepper(other), sim.device, repetitions=7, seconds=0.0)))
 
-    for attempt in range(ATTEMPTS):
+    attempts, steady = 0, False
+    while attempts < ATTEMPTS and not steady:
+        attempts += 1
         speed = min(median(ruler) for _ in range(5))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TuningWarning)
             promise = sim.tune(start, milliseconds=1.5 * speed)
         # on a shared machine the speed may change meanwhile, which says nothing about the choice
         steady = abs(min(median(ruler) for _ in range(5)) / speed - 1.0) < STEADY
-        if steady:
-            break
     ratio = float(np.median([median(sim) / (1.5 * median(ruler)) for _ in range(7)]))
     return {
         "budget": 1.5 * speed, "share": ratio, "iterations": promise.iterations, "kept": ratio <= SLACK,
-        "attempts": attempt + 1, "steady": steady,
+        "attempts": attempts, "steady": steady,
     }  # fmt: skip
 
 

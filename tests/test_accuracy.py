@@ -1,4 +1,4 @@
-"""Converged steps are converged, belong to the material that a simulator has now, and errors are what they are called."""
+"""Converged steps are converged, of the material that a simulator has now, and errors are what they are called."""
 
 from __future__ import annotations
 

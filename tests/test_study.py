@@ -7,6 +7,7 @@ import math
 import re
 import shutil
 import subprocess
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 def test_the_time_step_has_order_one(bench: Bench) -> None:
     """Implicit Euler: half the step, half the error, as far as the finest run stands for the limit (an eighth left)."""
     rows = time_step_rows(bench, Setting(1e5, 1 / 60, 1), 4)
-    ratios = [coarse.error / fine.error for coarse, fine in zip(rows, rows[1:], strict=False)]
+    ratios = [coarse.error / fine.error for coarse, fine in pairwise(rows)]
     # from h to h/2 with a reference at h_f: (h - h_f) / (h/2 - h_f), 2.08 and 2.33 for the last two pairs
     assert ratios[-2] == pytest.approx(2.0, abs=0.35)
     assert ratios[-1] == pytest.approx(2.14, abs=0.35)

@@ -143,7 +143,11 @@ def problem_of(
     spheres[:, 4] = 0.0
     values = dataclasses.replace(
         sim.scene.values(),
-        **{name: material[name] for name in ("stiffness", "masses", "gravity", "pin_stiffness", "pin_targets")},
+        stiffness=material["stiffness"],
+        masses=material["masses"],
+        gravity=material["gravity"],
+        pin_stiffness=material["pin_stiffness"],
+        pin_targets=material["pin_targets"],
         planes=planes,
         spheres=spheres[:, :5],
         damping=float(material["damping"]),

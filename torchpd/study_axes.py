@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from .scene import Scene
 from .simulator import Simulator
 from .solvers import Chebyshev
 from .state import State
-from .study_bench import Bench, Setting, Timing, measure_step, time_calls, verdict
+from .study_bench import SOLVED, Bench, Setting, Timing, measure_step, time_calls, verdict
 
 __all__ = [
     "PAPER_TESTS",
@@ -37,7 +38,6 @@ Array = NDArray[np.float64]
 _REPEATS = 3  # of a method in NumPy
 _MEMORY_ITERATIONS = 3
 _NEWTON_ITERATIONS = 25
-_SOLVED = {"iterations": 3000, "tolerance": 1e-9}  # of the motions that only the time step or the mesh may spoil
 
 # The tests of the source paper: constraints and milliseconds of 64 iterations on a GTX 470, and cells of a bar with as
 # many tetrahedra (6 a cell; 1008 and 198 are as near as a bar comes to 1000 and 200).
@@ -69,7 +69,7 @@ def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) 
     """A method in NumPy at several iteration counts, against the converged step."""
     _, exact = bench.hard_step(setting)
     most = min(max(counts), _NEWTON_ITERATIONS) if name == "Newton" else max(counts)
-    common = {
+    common: dict[str, Any] = {
         "axis": "solver", "method": name, "compiled": False, "youngs": setting.youngs, "time_step": setting.time_step,
         "vertices": len(exact.first), "tets": len(exact.problem.values.tets),
     }  # fmt: skip
@@ -95,13 +95,13 @@ def _shown(trace: Trace, counts: list[int], *, every: bool) -> list[int]:
     return sorted(k for k in wanted if 0 < k <= trace.last)
 
 
-def _baseline_row(traces: list[Trace], iterations: int, errors: tuple[float, ...], common: dict[str, object]) -> Row:
+def _baseline_row(traces: list[Trace], iterations: int, errors: tuple[float, ...], common: dict[str, Any]) -> Row:
     position, energy, residual, metres = errors
     timing = Timing.of([trace.seconds[iterations] for trace in traces])
     return Row(
         iterations=iterations, local_steps=traces[0].local_steps[iterations], status=verdict(position), error=position,
         error_energy=energy, residual=residual, error_metres=metres, **timing.columns(), **common,
-    )  # type: ignore[arg-type]  # fmt: skip
+    )  # fmt: skip
 
 
 def stiffness_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) -> list[Row]:
@@ -119,13 +119,13 @@ def float_rows(bench: Bench, setting: Setting, counts: list[int]) -> list[Row]:
     state, exact = bench.hard_step(setting)
     rows = []
     sims = [bench.simulator(setting, dtype) for dtype in (torch.float32, torch.float64)]
+    given = State(*(part.float() for part in state))
     for count in counts:
         ends = []
         for sim in sims:
             sim.iterations = count
             after = sim(State(*(part.to(sim.dtype) for part in state)))
             ends.append(after.velocities[0].double().cpu().numpy() * sim.time_step)
-        given = State(*(part.float() for part in state))
         timing = time_calls(lambda: sims[0](given), bench.device)
         off = ends[0] - ends[1]
         error = float(np.linalg.norm(off)) / exact.scale
@@ -156,7 +156,7 @@ class _Motion:
 
 @torch.no_grad()
 def _motion(bench: Bench, setting: Setting, steps: int) -> _Motion:
-    sim = bench.simulator(setting, torch.float64, Chebyshev(), **_SOLVED)
+    sim = bench.simulator(setting, torch.float64, Chebyshev(), **SOLVED)
     state = bench.start(sim)
     begin = time.perf_counter()
     end = sim.rollout(state, steps, every=steps).state()

@@ -21,8 +21,20 @@ from .state import State
 from .subjects import Subject
 from .summary import workspace_bytes
 
-__all__ = ["Bench", "Setting", "Timing", "count_kernels", "measure_step", "precision_name", "time_calls", "verdict"]
+__all__ = [
+    "SOLVED",
+    "Bench",
+    "Setting",
+    "Timing",
+    "count_kernels",
+    "measure_step",
+    "precision_name",
+    "time_calls",
+    "verdict",
+]
 
+# of motions that only the time step, the mesh or another solver's error may spoil
+SOLVED: dict[str, Any] = {"iterations": 3000, "tolerance": 1e-9}
 _DIVERGED = 2.0  # times as far from the converged step as the first iterate
 
 
@@ -98,7 +110,7 @@ class Timing:
         p5, median, p95 = np.percentile(np.array(seconds) * 1e3, [5, 50, 95]).tolist()
         return cls(median, p5, p95)
 
-    def columns(self) -> dict[str, float]:
+    def columns(self) -> dict[str, Any]:
         """As a row has them."""
         return {"milliseconds": self.median, "milliseconds_p5": self.p5, "milliseconds_p95": self.p95}
 
@@ -132,7 +144,7 @@ def count_kernels(work: Callable[[], object], device: torch.device) -> int | Non
         work()
         _wait_for(device)
     events = profile.events() or []
-    named = [e.name.lower() for e in events if e.device_type == torch.autograd.DeviceType.CUDA]
+    named = [e.name.lower() for e in events if e.device_type == torch.autograd.DeviceType.CUDA]  # type: ignore[attr-defined]
     return sum("memcpy" not in name and "memset" not in name for name in named)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ __all__ = ["STYLES", "TOP", "axis_label", "curves_of", "draw_study", "pareto_fro
 
 TOP = 2.0  # where a failure is drawn: above the first iterate, whose error is 1
 _LOWEST = 1e-7
-# Okabe and Ito's palette, told apart with every kind of colour vision: ours in strong colours and full lines, methods in
-# NumPy in thin dashed ones.
+# Okabe and Ito's palette, told apart with every kind of colour vision: ours in strong colours and full lines, methods
+# in NumPy in thin dashed ones.
 STYLES: dict[str, tuple[str, float, str]] = {
     DEFAULT: ("#d55e00", 2.8, "solid"),
     "classic Chebyshev": ("#0072b2", 2.0, "solid"),
@@ -104,7 +104,7 @@ def _drawn(rows: list[Row]) -> list[float]:
     return [min(max(row.error, _LOWEST), TOP) for row in rows]
 
 
-def _mark_failures(axis: Any, xs: list[float], rows: list[Row], color: str) -> None:
+def _mark_failures(axis: Any, xs: Sequence[float | None], rows: list[Row], color: str) -> None:
     failed = [x for x, row in zip(xs, rows, strict=True) if row.status != "ok"]
     if failed:  # an empty line that is not clipped has no bounds, which upsets the layout
         axis.plot(failed, [TOP] * len(failed), "x", color=color, markersize=7, markeredgewidth=2, zorder=5)
@@ -274,7 +274,8 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     own = sorted(rows, key=lambda row: row.iterations)
     seconds = own[0].more["seconds_of_motion"]
     figure, (left, right) = _figure(
-        2, f"{subject}: {seconds:g} s of motion at Young's modulus {_pascals(own[0].youngs)}, against the converged motion",
+        2, f"{subject}: {seconds:g} s of motion at a Young's modulus of {_pascals(own[0].youngs)}, against the "
+        "converged motion",
         width=6.2,
     )  # fmt: skip
     xs = [row.iterations for row in own]

@@ -61,7 +61,8 @@ def write_report(rows: list[Row], record: dict[str, Any], path: Path) -> Path:
 
 def _header(record: dict[str, Any]) -> str:
     machine, versions = record["machine"], record["versions"]
-    where = f"{machine['cpu']}, {machine['threads']} thread{'s' * (machine['threads'] > 1)}, {machine['simd']}; device: {machine['device']}"
+    threads = f"{machine['threads']} thread{'s' * (machine['threads'] > 1)}"
+    where = f"{machine['cpu']}, {threads}, {machine['simd']}; device: {machine['device']}"
     what = ", ".join(f"{name} {version}" for name, version in versions.items())
     return (
         f"<p>Errors are |x &minus; x*| / |x<sub>0</sub> &minus; x*| of one time step: 1 is the first iterate, 0 the "
@@ -101,7 +102,7 @@ def _figures(rows: list[Row]) -> list[Figure]:
         "time step": "Whole motions, solved to 1e-9, against 8 times shorter steps.",
         "mesh": "Whole motions on coarser meshes, against the finest one.",
         "float": "The same iterations in both precisions, relative to |x<sub>0</sub> &minus; x*|.",
-        "trajectory": "Largest distance from the converged path over the way; hover for softness, energy and turning time.",
+        "trajectory": "Largest distance from the converged path over the way; hover for softness and energy.",
     }
     for axis, title, place, label in others:
         if axis in by_axis:

@@ -126,7 +126,7 @@ SUBJECTS: dict[str, Callable[[], Subject]] = {
         resolutions=(1, 2, 3, 4, 5, 8),
         youngs=1e6,
         time_step=1 / 30,
-    ),  # fmt: skip
+    ),
     "octopus": lambda: _landing("octopus", shapes.octopus(), 1 / 60),
 }
 

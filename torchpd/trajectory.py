@@ -15,13 +15,11 @@ from .ledger import Row
 from .simulator import Simulator
 from .solvers import Chebyshev, Solver
 from .state import State
-from .study_bench import Bench, Setting, precision_name
+from .study_bench import SOLVED, Bench, Setting, precision_name
 
 __all__ = ["Trajectory", "compare_trajectories", "first_turn", "record_trajectory", "trajectory_rows"]
 
 Array = NDArray[np.float64]
-
-_SOLVED = {"iterations": 3000, "tolerance": 1e-9}
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ def trajectory_rows(
     bench: Bench, setting: Setting, counts: list[int], *, seconds: float = 1.0, name: str = DEFAULT
 ) -> list[Row]:
     """A motion at several iteration counts of a solver in float32, against the converged one in float64."""
-    solved = bench.simulator(setting, torch.float64, Chebyshev(), **_SOLVED)
+    solved = bench.simulator(setting, torch.float64, Chebyshev(), **SOLVED)
     exact = record_trajectory(bench, solved, setting.resolution, seconds)
     solver: Solver = bench.solver(name, setting)[0]
     rows = []

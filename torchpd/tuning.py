@@ -105,11 +105,12 @@ class Promise:
         """
         further = copy.copy(sim)
         further.iterations, further.tolerance = 3 * self.iterations, 0.0
-        solved = further(state, forces, start=after[0])[1] * sim.time_step
+        solved: Tensor = further(state, forces, start=after[0])[1]
         further.iterations = 0
-        first = further(state, forces)[1] * sim.time_step
-        gone = (solved - after[1] * sim.time_step).flatten(1).norm(dim=1)
-        return gone / (solved - first).flatten(1).norm(dim=1)
+        first: Tensor = further(state, forces)[1]
+        # displacements over the time step are velocities
+        error: Tensor = (solved - after[1]).flatten(1).norm(dim=1) / (solved - first).flatten(1).norm(dim=1)
+        return error
 
     def estimate(self, info: Info) -> Tensor:
         """Error of the step [B] that its residual speaks of; NaN without `return_info=True`."""
