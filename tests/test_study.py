@@ -19,9 +19,9 @@ from torchpd import study
 from torchpd.__main__ import main
 from torchpd.ledger import Row
 from torchpd.shapes import box
-from torchpd.study import AXES, StudyOptions, run_study, study_rows, study_table
+from torchpd.study import AXES, StudyOptions, cost_table, run_study, study_rows, study_table
 from torchpd.study_axes import baseline_rows, contender_rows, float_rows, mesh_rows, paper_rows, time_step_rows
-from torchpd.study_bench import Bench, Setting, time_calls
+from torchpd.study_bench import Bench, Setting, count_kernels, time_calls
 from torchpd.study_plots import pareto_front
 from torchpd.subjects import SUBJECTS, subject_of
 
@@ -122,6 +122,38 @@ def test_table_says_what_is_not_reached() -> None:
     assert lines[2].split() == ["y", "float64", *["not", "reached"] * 3]
 
 
+def test_the_cost_of_an_error_is_tabled() -> None:
+    rows = [
+        Row(
+            "stiffness",
+            "x",
+            precision="float32",
+            youngs=1e4,
+            iterations=k,
+            error=error,
+            milliseconds=0.1 * k,
+            default=k == 64,
+        )
+        for k, error in ((32, 0.02), (64, 1e-3), (128, 1e-5))
+    ]
+    assert cost_table(rows).splitlines()[1].split() == [
+        "10000",
+        "32",
+        "it.,",
+        "3.2",
+        "ms",
+        *["64", "it.,", "6.4", "ms"] * 2,
+        "1.0e-03",
+    ]
+    assert cost_table([]) == "no stiffness was studied"
+
+
+def test_kernels_are_counted_where_there_are_some(device: torch.device) -> None:
+    """A sum and a product are two kernels; the CPU has none to count."""
+    vector = torch.ones(8, device=device)
+    assert count_kernels(lambda: (vector * 2.0).exp_(), device) == (2 if device.type == "cuda" else None)
+
+
 # ---- from end to end
 
 
@@ -133,7 +165,8 @@ def test_files_and_their_schema(quick: tuple[Path, str]) -> None:
     rows = [Row.from_json(row) for row in record["rows"]]
     assert {row.axis for row in rows} == set(AXES)
     assert [row.iterations for row in rows if row.axis == "stiffness" and row.youngs == 1e4][:3] == [1, 2, 3]
-    for name in ("solver", "stiffness", "axes", "trajectory"):
+    assert record["rows"][0]["error"] == rows[0].error
+    for name in ("solver", "stiffness", "cost", "axes", "trajectory"):
         picture = np.asarray(Image.open(out / f"{name}.png").convert("RGB"))
         # mostly paper, but curves over its whole width: no collapsed panel
         inked = (picture.min(axis=2) < 200).any(axis=0)

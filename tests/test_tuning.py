@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 import warnings
@@ -108,6 +109,15 @@ def test_out_of_reach_is_said_with_the_best_there_is() -> None:
     assert promise.error > 1e-3
     assert worst_error(sim, swinging(sim)) <= promise.error
     assert "cannot be had" in repr(sim)
+
+
+def test_doubt_about_the_converged_step_counts_as_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    sim = bar()
+    unsure = [dataclasses.replace(step, uncertainty=0.2) for step in exact_steps(sim, swinging(sim))]
+    monkeypatch.setattr(tuning, "exact_steps", lambda *_: unsure * 7)
+    with pytest.warns(TuningWarning, match="cannot be had"):
+        promise = sim.tune(swinging(sim), error=0.1, most=256)
+    assert promise.studied_error >= 0.2
 
 
 def test_every_environment_counts() -> None:

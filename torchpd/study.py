@@ -35,7 +35,7 @@ from .study_bench import Bench, Setting, precision_name
 from .subjects import Subject, subject_of
 from .trajectory import trajectory_rows
 
-__all__ = ["AXES", "SCHEMA", "StudyOptions", "run_study", "study_rows", "study_table"]
+__all__ = ["AXES", "SCHEMA", "StudyOptions", "cost_table", "run_study", "study_rows", "study_table"]
 
 SCHEMA = 1
 AXES = ("solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper")
@@ -111,8 +111,9 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
     tasks: dict[str, Task] = _solver_tasks(bench, setting, counts)
     for factor in _STIFFNESS_FACTORS:
         softer = replace(setting, youngs=factor * setting.youngs)
-        for name in ("Jacobi", DEFAULT):
-            tasks[f"stiffness: {name}, {softer.youngs:g} Pa"] = partial(stiffness_rows, bench, name, softer, counts)
+        for name, dtype in (("Jacobi", torch.float64), (DEFAULT, torch.float64), (DEFAULT, torch.float32)):
+            key = f"stiffness: {name}, {precision_name(dtype)}, {softer.youngs:g} Pa"
+            tasks[key] = partial(stiffness_rows, bench, name, dtype, softer, counts)
     resolutions = bench.subject.resolutions[:3] if options.quick else bench.subject.resolutions
     tasks["float: default"] = partial(float_rows, bench, setting, counts)
     if options.quick:
@@ -170,11 +171,17 @@ def run_study(options: StudyOptions, *, progress: bool = True) -> str:
         "rows": [row.to_json() for row in rows],
     }
     written = [options.out / "study.json"]
-    written[0].write_text(json.dumps(record, indent=1) + "\n")
+    written[0].write_text(_lines_of(record) + "\n")
     written.append(write_csv(rows, options.out / "study.csv"))
     written += draw_study(rows, options.out, subject=record["subject"])
     written.append(write_report(rows, record, options.out / "report.html"))
-    return "\n".join([study_table(rows), "", "written:", *(f"  {file}" for file in written)])
+    return "\n".join([study_table(rows), "", cost_table(rows), "", "written:", *(f"  {file}" for file in written)])
+
+
+def _lines_of(record: dict[str, Any]) -> str:
+    """JSON with a row in a line."""
+    rows = ",\n".join(json.dumps(row) for row in record["rows"])
+    return json.dumps({**record, "rows": []}, indent=1).replace('"rows": []', f'"rows": [\n{rows}\n]')
 
 
 def _check(options: StudyOptions) -> None:
@@ -187,16 +194,34 @@ def _check(options: StudyOptions) -> None:
         raise ModuleNotFoundError(f"the study draws with {names}, not installed: pip install torchpd[study]")
 
 
+_GOALS = (1e-1, 1e-2, 1e-3)
+
+
 def study_table(rows: list[Row]) -> str:
     """The compiled solvers at a glance: iterations and milliseconds to three errors."""
-    goals = (1e-1, 1e-2, 1e-3)
     solver = [row for row in rows if row.axis == "solver"]
-    lines = [f"{'solver':<28}{'precision':<11}" + "".join(f"{f'to {goal:.0e}':>22}" for goal in goals)]
+    lines = [f"{'solver':<28}{'precision':<11}" + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)]
     for name, precision in dict.fromkeys((row.method, row.precision) for row in solver):
         own = [row for row in solver if (row.method, row.precision) == (name, precision)]
-        cells = []
-        for goal in goals:
-            first = next((row for row in own if row.error <= goal and row.milliseconds is not None), None)
-            cells.append("not reached" if first is None else f"{first.iterations} it., {first.milliseconds:.3g} ms")
-        lines.append(f"{name:<28}{precision:<11}" + "".join(f"{cell:>22}" for cell in cells))
+        lines.append(f"{name:<28}{precision:<11}" + "".join(f"{_first_at(own, goal):>22}" for goal in _GOALS))
     return "\n".join(lines) if solver else "no solver was studied"
+
+
+def _first_at(rows: list[Row], goal: float) -> str:
+    """The fewest iterations of the studied ones that reach an error, and their time."""
+    reached = [row for row in rows if row.error <= goal and row.milliseconds is not None]
+    if not reached:
+        return "not reached"
+    first = min(reached, key=lambda row: row.iterations)
+    return f"{first.iterations} it., {first.milliseconds:.2g} ms"
+
+
+def cost_table(rows: list[Row]) -> str:
+    """What an error costs the default in float32, at every stiffness, beside what its 64 iterations give."""
+    own = [row for row in rows if row.axis == "stiffness" and row.precision == "float32"]
+    lines = [f"{'Young [Pa]':<12}" + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS) + f"{'default: error':>18}"]
+    for youngs in sorted({row.youngs for row in own}):
+        at = [row for row in own if row.youngs == youngs]
+        default = [f"{row.error:.1e}" for row in at if row.default] or ["not studied"]
+        lines.append(f"{youngs:<12g}" + "".join(f"{_first_at(at, goal):>22}" for goal in _GOALS) + f"{default[0]:>18}")
+    return "\n".join(lines) if own else "no stiffness was studied"

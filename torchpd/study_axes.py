@@ -104,9 +104,9 @@ def _baseline_row(traces: list[Trace], iterations: int, errors: tuple[float, ...
     )  # fmt: skip
 
 
-def stiffness_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) -> list[Row]:
-    """A compiled solver in float64 against iterations, at one stiffness."""
-    rows = contender_rows(bench, name, torch.float64, setting, counts)
+def stiffness_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, counts: list[int]) -> list[Row]:
+    """A compiled solver at one stiffness."""
+    rows = contender_rows(bench, name, dtype, setting, counts)
     return [Row(**{**vars(row), "axis": "stiffness"}) for row in rows]
 
 

@@ -170,7 +170,15 @@ def verdict(error: float) -> str:
 
 
 @torch.no_grad()
-def measure_step(sim: Simulator, state: State, exact: ExactStep, iterations: int, **columns: Any) -> Row:
+def measure_step(
+    sim: Simulator,
+    state: State,
+    exact: ExactStep,
+    iterations: int,
+    *,
+    more: dict[str, float] | None = None,
+    **columns: Any,
+) -> Row:
     """One solver at one iteration count on a step whose converged end is known: errors, times, memory, kernels."""
     sim.iterations = iterations
     given = State(*(part.to(sim.dtype) for part in state))
@@ -194,5 +202,6 @@ def measure_step(sim: Simulator, state: State, exact: ExactStep, iterations: int
         bytes=held,
         bytes_by=how,
         kernels=count_kernels(lambda: sim(given), sim.device),
+        more={"uncertainty_of_converged": exact.uncertainty, **(more or {})},
         **columns,
     )

@@ -69,6 +69,7 @@ def draw_study(rows: list[Row], out: Path, *, subject: str) -> list[Path]:
     drawers: dict[str, tuple[tuple[str, ...], Callable[[list[Row], Path, str], Path]]] = {
         "solver.png": (("solver",), _draw_solvers),
         "stiffness.png": (("stiffness",), _draw_stiffness),
+        "cost.png": (("stiffness",), _draw_cost),
         "axes.png": (("time step", "mesh", "float"), _draw_axes),
         "trajectory.png": (("trajectory",), _draw_trajectory),
     }
@@ -183,11 +184,15 @@ def _mark_floor(axis: Any, rows: list[Row]) -> None:
 # ---- three stiffnesses, as in the source paper
 
 
+_SHADES = ("#56b4e9", "#0072b2", "#002b4d")  # soft to stiff
+
+
 def _draw_stiffness(rows: list[Row], path: Path, subject: str) -> Path:
+    rows = [row for row in rows if row.precision == "float64"]
     methods = list(dict.fromkeys(row.method for row in rows))
     figure, axes = _figure(len(methods), f"{subject}: error of one step at three stiffnesses, float64", width=5.6)
     stiffnesses = sorted({row.youngs for row in rows})
-    shades = dict(zip(stiffnesses, ("#56b4e9", "#0072b2", "#002b4d"), strict=False))
+    shades = dict(zip(stiffnesses, _SHADES, strict=False))
     for axis, method in zip(axes, methods, strict=True):
         for youngs in stiffnesses:
             own = sorted(
@@ -201,6 +206,44 @@ def _draw_stiffness(rows: list[Row], path: Path, subject: str) -> Path:
         axis.set_xlabel(axis_label("iterations"))
         _error_axis(axis, [row.error for row in rows], axis_label("error"))
     axes[0].legend(frameon=False, title="Young's modulus")
+    figure.savefig(path)
+    return path
+
+
+def _draw_cost(rows: list[Row], path: Path, subject: str) -> Path:
+    """The default in float32, error against milliseconds: what a user pays for accuracy."""
+    from matplotlib.ticker import FuncFormatter
+
+    own = [row for row in rows if row.precision == "float32" and row.milliseconds is not None]
+    if not own:
+        return path
+    first = own[0]
+    title = f"{subject}, {first.tets:,} tetrahedra, {first.method}, float32: what accuracy costs on this machine"
+    figure, (axis,) = _figure(1, title, width=8.2)
+    for youngs, color in zip(sorted({row.youngs for row in own}), _SHADES, strict=False):
+        curve = sorted((row for row in own if row.youngs == youngs), key=lambda row: row.iterations)
+        xs = [row.milliseconds for row in curve]
+        axis.fill_betweenx(
+            _drawn(curve), [row.milliseconds_p5 for row in curve], [row.milliseconds_p95 for row in curve], color=color,
+            alpha=0.15, linewidth=0,
+        )  # fmt: skip
+        axis.plot(xs, _drawn(curve), color=color, linewidth=2.6, solid_capstyle="round", label=_pascals(youngs))
+        _mark_failures(axis, xs, curve, color)
+        for row in (row for row in curve if row.default):
+            axis.plot(
+                [row.milliseconds], _drawn([row]), "*", color=color, markersize=18, markeredgecolor="white", zorder=6
+            )
+    axis.plot([], [], "*", color=_INK, markersize=14, markeredgecolor="white", label="the default: 64 iterations")
+    axis.axvline(1e3 * first.time_step, color=_INK, linewidth=1.0, linestyle=(0, (2, 3)))
+    axis.annotate(
+        "real time ", (1e3 * first.time_step, 1.0), xycoords=("data", "axes fraction"), va="top", ha="right",
+        fontsize=9, color=_INK,
+    )  # fmt: skip
+    axis.set_xscale("log")
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.set_xlabel(f"time of a step [ms], of {1e3 * first.time_step:.3g} ms of motion")
+    _error_axis(axis, [row.error for row in own], axis_label("error"))
+    axis.legend(frameon=False, title="Young's modulus", loc="lower left")
     figure.savefig(path)
     return path
 

@@ -177,6 +177,7 @@ def _stiffness_figure(rows: list[Row]) -> Any:
     import plotly.graph_objects as go
 
     figure = go.Figure()
+    rows = [row for row in rows if row.precision == "float64"]
     shades = dict(zip(sorted({row.youngs for row in rows}), ("#56b4e9", "#0072b2", "#002b4d"), strict=False))
     for (method, youngs), own in curves_of(rows, lambda row: (row.method, row.youngs)).items():
         dash = "dashed" if method == "Jacobi" else "solid"
