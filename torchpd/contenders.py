@@ -25,6 +25,7 @@ class Contender:
 
     make: Callable[[Simulator, State], Solver]
     safe: bool
+    devices: tuple[str, ...] = ("cpu", "cuda")  # where it runs
 
 
 def _classic(sim: Simulator, state: State) -> Solver:
@@ -48,6 +49,6 @@ DEFAULT_ITERATIONS = 64
 
 
 def safe_solvers(sim: Simulator, state: State) -> dict[str, Solver]:
-    """Those that cannot diverge, the default first."""
-    names = sorted((name for name, contender in CONTENDERS.items() if contender.safe), key=lambda n: n != DEFAULT)
-    return {name: CONTENDERS[name].make(sim, state) for name in names}
+    """Those that cannot diverge and run where the simulator is, the default first."""
+    here = {name: c for name, c in CONTENDERS.items() if c.safe and sim.device.type in c.devices}
+    return {name: here[name].make(sim, state) for name in sorted(here, key=lambda name: name != DEFAULT)}

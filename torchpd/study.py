@@ -90,7 +90,9 @@ def _setting(subject: Subject, options: StudyOptions) -> Setting:
 
 def _solver_tasks(bench: Bench, setting: Setting, counts: list[int]) -> dict[str, Task]:
     tasks: dict[str, Task] = {}
-    for name in CONTENDERS:
+    for name, contender in CONTENDERS.items():
+        if bench.device.type not in contender.devices:
+            continue
         for dtype in (torch.float32, torch.float64):
             key = f"solver: {name}, {precision_name(dtype)}"
             tasks[key] = partial(contender_rows, bench, name, dtype, setting, counts)
@@ -109,8 +111,8 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
     setting = _setting(bench.subject, options)
     counts = _counts(min(options.iterations, 8) if options.quick else options.iterations)
     tasks: dict[str, Task] = _solver_tasks(bench, setting, counts)
-    for factor in _STIFFNESS_FACTORS:
-        softer = replace(setting, youngs=factor * setting.youngs)
+    softened = [replace(setting, youngs=factor * setting.youngs) for factor in _STIFFNESS_FACTORS]
+    for softer in softened:
         for name, dtype in (("Jacobi", torch.float64), (DEFAULT, torch.float64), (DEFAULT, torch.float32)):
             key = f"stiffness: {name}, {precision_name(dtype)}, {softer.youngs:g} Pa"
             tasks[key] = partial(stiffness_rows, bench, name, dtype, softer, counts)
@@ -121,14 +123,11 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
     else:
         tasks["time step: default"] = partial(time_step_rows, bench, setting, 5)
     tasks["mesh: default"] = partial(mesh_rows, bench, setting, resolutions)
-    tasks["trajectory: default"] = partial(
-        trajectory_rows,
-        bench,
-        setting,
-        [count for count in counts if count >= 4][::2],
-        seconds=0.2 if options.quick else 1.0,
-    )
-    tasks["paper: table"] = partial(paper_rows, bench.device)
+    seconds, fewer = 0.2 if options.quick else 1.0, [count for count in counts if count >= 4][::2]
+    for softer in softened:
+        key = f"trajectory: {DEFAULT}, {softer.youngs:g} Pa"
+        tasks[key] = partial(trajectory_rows, bench, softer, fewer, seconds=seconds)
+    tasks["paper: table"] = partial(paper_rows, bench)
     return {key: task for key, task in tasks.items() if key.split(":")[0] in options.axes}
 
 
@@ -138,7 +137,7 @@ def study_rows(options: StudyOptions, *, progress: bool = True) -> list[Row]:
     device = torch.device(options.device)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    bench = Bench(subject, device)
+    bench = Bench(subject, device, series=1 if options.quick else 6)
     setting = _setting(subject, options)
     options.out.mkdir(parents=True, exist_ok=True)
     settings = {
@@ -217,11 +216,22 @@ def _first_at(rows: list[Row], goal: float) -> str:
 
 
 def cost_table(rows: list[Row]) -> str:
-    """What an error costs the default in float32, at every stiffness, beside what its 64 iterations give."""
+    """What an error costs the default in float32, at every stiffness, beside what its 64 iterations give.
+
+    The last column is how far the body is from its converged path at most, over its way, when all steps are like that.
+    """
     own = [row for row in rows if row.axis == "stiffness" and row.precision == "float32"]
-    lines = [f"{'Young [Pa]':<12}" + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS) + f"{'default: error':>18}"]
+    lines = [
+        f"{'Young [Pa]':<12}"
+        + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)
+        + f"{'default: error':>18}{'its path':>14}"
+    ]
     for youngs in sorted({row.youngs for row in own}):
         at = [row for row in own if row.youngs == youngs]
         default = [f"{row.error:.1e}" for row in at if row.default] or ["not studied"]
-        lines.append(f"{youngs:<12g}" + "".join(f"{_first_at(at, goal):>22}" for goal in _GOALS) + f"{default[0]:>18}")
+        paths = [row for row in rows if row.axis == "trajectory" and row.youngs == youngs and row.default]
+        path = f"{paths[0].error:.1e}" if paths else "not studied"
+        lines.append(
+            f"{youngs:<12g}" + "".join(f"{_first_at(at, goal):>22}" for goal in _GOALS) + f"{default[0]:>18}{path:>14}"
+        )
     return "\n".join(lines) if own else "no stiffness was studied"

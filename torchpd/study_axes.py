@@ -58,7 +58,7 @@ def contender_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting
     sim = bench.simulator(setting, dtype, solver)
     return [
         measure_step(
-            sim, state, exact, count, axis="solver", method=name, youngs=setting.youngs,
+            sim, state, exact, count, series=bench.series, axis="solver", method=name, youngs=setting.youngs,
             setup_milliseconds=setup, default=_is_default(name, dtype, count),
         )
         for count in counts
@@ -126,7 +126,7 @@ def float_rows(bench: Bench, setting: Setting, counts: list[int]) -> list[Row]:
             sim.iterations = count
             after = sim(State(*(part.to(sim.dtype) for part in state)))
             ends.append(after.velocities[0].double().cpu().numpy() * sim.time_step)
-        timing = time_calls(lambda: sims[0](given), bench.device)
+        timing = time_calls(lambda: sims[0](given), bench.device, series=bench.series)
         off = ends[0] - ends[1]
         error = float(np.linalg.norm(off)) / exact.scale
         rows.append(
@@ -208,20 +208,20 @@ def mesh_rows(bench: Bench, setting: Setting, resolutions: tuple[int, ...]) -> l
 # ---- the table of the source paper
 
 
-def paper_rows(device: torch.device) -> list[Row]:
+def paper_rows(bench: Bench) -> list[Row]:
     """A step of as many tetrahedra as the paper's tests have constraints, with its 64 iterations, in float32."""
     rows = []
     for constraints, theirs, cells in PAPER_TESTS:
         mesh = shapes.box((1.0, 0.2, 0.2), cells)
         body = Solid(mesh, youngs=1e5, density=1000.0)
         scene = Scene(body, Pin(body, mesh.vertices[:, 0] == 0.0), Gravity((0.0, -9.81, 0.0)))
-        sim = Simulator(scene, 1 / 60, progress=False).to(device)
+        sim = Simulator(scene, 1 / 60, progress=False).to(bench.device)
         state = sim.rest_state()
         state.velocities[..., 1] = -3.0 * state.positions[..., 0] ** 2
         more = {"constraints": float(constraints), "paper_milliseconds": theirs}
         rows.append(
             measure_step(
-                sim, state, exact_steps(sim, state)[0], DEFAULT_ITERATIONS, axis="paper",
+                sim, state, exact_steps(sim, state)[0], DEFAULT_ITERATIONS, series=bench.series, axis="paper",
                 method=DEFAULT, youngs=1e5, default=True, more=more,
             )
         )  # fmt: skip

@@ -314,7 +314,8 @@ def _panel(
 
 
 def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
-    own = sorted(rows, key=lambda row: row.iterations)
+    stiffest = max(row.youngs for row in rows)
+    own = sorted((row for row in rows if row.youngs == stiffest), key=lambda row: row.iterations)
     seconds = own[0].more["seconds_of_motion"]
     figure, (left, right) = _figure(
         2, f"{subject}: {seconds:g} s of motion at a Young's modulus of {_pascals(own[0].youngs)}, against the "

@@ -14,6 +14,7 @@ from .study_plots import STYLES, TOP, axis_label, curves_of, pareto_front
 __all__ = ["write_report"]
 
 _OTHER = ("#56b4e9", 2.0, "solid")
+_COLORS = ("#d55e00", "#0072b2", "#56b4e9")  # the stiffness of the study first, then softer ones
 _LOWEST_POWER = -8  # of ten, of the errors that are shown at first
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #2b2d31; max-width: 1180px; margin: 2em auto; padding: 0 1em; }
@@ -191,7 +192,9 @@ def _plain_figure(rows: list[Row], place: Callable[[Row], float], label: str) ->
 
     figure = go.Figure()
     measured = [row for row in rows if math.isfinite(row.error) or row.iterations]
-    figure.add_trace(_trace(measured, place, rows[0].method, ("#d55e00", 2.4, "solid")))
+    for youngs, color in zip(sorted({row.youngs for row in measured}, reverse=True), _COLORS, strict=False):
+        own = sorted((row for row in measured if row.youngs == youngs), key=place)
+        figure.add_trace(_trace(own, place, f"{own[0].method}, {youngs:g} Pa", (color, 2.4, "solid")))
     for row in rows:
         if row not in measured:
             figure.add_annotation(text=row.status, showarrow=False, xref="paper", yref="paper", x=0.5, y=0.5)
