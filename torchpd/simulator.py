@@ -339,10 +339,11 @@ class Simulator(nn.Module):
         """Choose solver and iterations for an error or a time, from a short study on this scene; sets them.
 
         The promise also stays in `self.promise`: `promise.holds(info)` says during a run whether to rely on it. A
-        target out of reach gets the best there is, a promise with `attained=False`, and a `TuningWarning`.
+        target out of reach gets the best there is, a promise with `attained=False`, and a `TuningWarning`. Files do not
+        keep it: times are of the machine that measured them.
 
         Args:
-            state: where typical motions start [B, V, 3], the rest state by default; up to three environments are
+            state: where typical motions start [B, V, 3], the rest state by default; up to four environments are
                 studied over 30 steps, without forces and with the targets of the scene. Times are for its batch.
             error: of a step, |x - x*| / |x_0 - x*|, x* converged and x_0 the first iterate; in (0, 1).
             milliseconds: of a step on this machine; the error is then as low as that allows.

@@ -41,7 +41,7 @@ SAFETY = 2.0
 _STUDIED_ROUNDINGS = 2.0
 _STEPS = (0, 1, 4, 12, 30)  # of the motion, whose states are studied
 _TURNED = (0, 4)  # those that are also studied with the axes of their velocities exchanged
-_ENVIRONMENTS = 3
+_ENVIRONMENTS = 3  # of a batch, and the worst conditioned one
 _HEADROOM = 0.95  # of a budget in milliseconds that is spent: times scatter
 _NEAR = 1.1  # a safer candidate wins although it takes this much longer
 
@@ -134,7 +134,6 @@ class _Study:
     sim: Simulator  # frictionless, its batch the studied states
     state: State
     exact: list[ExactStep]
-    progress: bool
 
     @torch.no_grad()
     def trial(self, solver: Solver, iterations: int) -> Trial:
@@ -164,7 +163,7 @@ def tune(
     _check_request(error, milliseconds, most)
     start = sim.rest_state() if state is None else state
     _check_start(sim, start)
-    study = _prepare(sim, start, progress=progress)
+    study = _prepare(sim, start)
     named: Mapping[str, Solver] = (
         safe_solvers(study.sim, study.state)
         if candidates is None
@@ -223,16 +222,14 @@ def _check_start(sim: Simulator, state: State) -> None:
 
 
 @torch.no_grad()
-def _prepare(sim: Simulator, start: State, *, progress: bool) -> _Study:
+def _prepare(sim: Simulator, start: State) -> _Study:
     """States of the motion from `start`, with their converged steps; those that only fall are left out."""
-    items = np.unique(np.linspace(0, len(start[0]) - 1, _ENVIRONMENTS).round().astype(int)).tolist()
+    items = _environments(sim, len(start[0]))
     smooth = _of_environments(frictionless(sim), items, len(start[0]))
     states = _motion(smooth, State(start[0][items], start[1][items]))
     everyone = _of_environments(smooth, list(range(len(items))) * len(states), len(items))
     state = State(*(torch.cat(parts) for parts in zip(*states, strict=True)))
-    with tqdm(total=1, desc="tuning: converged steps", disable=not progress, leave=False) as bar:
-        exact = exact_steps(everyone, state)
-        bar.update(1)
+    exact = exact_steps(everyone, state)
     moving = [number for number, step in enumerate(exact) if step.moves(sim.dtype)]
     if not moving:
         raise ValueError(
@@ -240,7 +237,17 @@ def _prepare(sim: Simulator, start: State, *, progress: bool) -> _Study:
             "pass a state of the motion that matters, for example sim.tune(state, error=1e-2)"
         )
     chosen = _of_environments(everyone, moving, len(exact))
-    return _Study(chosen, State(state[0][moving], state[1][moving]), [exact[number] for number in moving], progress)
+    return _Study(chosen, State(state[0][moving], state[1][moving]), [exact[number] for number in moving])
+
+
+def _environments(sim: Simulator, batch: int) -> list[int]:
+    """Some environments of a batch, evenly spread, and the one whose system is worst conditioned."""
+    items = set(np.linspace(0, batch - 1, _ENVIRONMENTS).round().astype(int).tolist())
+    inertia, diagonal = step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)
+    ratio = torch.where(inertia.isinf(), torch.ones_like(inertia), inertia / diagonal)
+    if ratio.dim() == 2 and len(ratio) == batch:
+        items.add(int(ratio.min(dim=1).values.argmin()))
+    return sorted(items)
 
 
 def _motion(sim: Simulator, start: State) -> list[State]:
@@ -363,6 +370,8 @@ def _promise(
     attained = chosen.error <= error / SAFETY if error is not None else cost <= 1.2 * (milliseconds or 0.0)
     promised = error if attained and error is not None else min(SAFETY * chosen.error, 1.0)
     largest = max(chosen.residuals)
+    # where rounding explains all of the error, the safety that is kept elsewhere
+    room = promised / chosen.error if chosen.error > 0.0 else SAFETY
     return Promise(
         asked_error=error,
         asked_milliseconds=milliseconds,
@@ -372,7 +381,7 @@ def _promise(
         error=promised,
         studied_error=chosen.error,
         milliseconds=cost,
-        residual_limit=largest * promised / max(chosen.error, 1e-300),
+        residual_limit=largest * room,
         error_per_residual=chosen.error / largest if largest > 0.0 else 0.0,
         time_step=sim.time_step,
         dtype=sim.dtype,
