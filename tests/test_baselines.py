@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from cases import Case, box, contact_block
@@ -96,3 +99,11 @@ def test_memory_is_watched_and_contacts_are_refused(problem: StepProblem) -> Non
     with pytest.raises(ValueError, match="knows no contacts"):
         run_baseline(BASELINES["Newton"], resting, resting.first_iterate(), 1)
     assert run_baseline(BASELINES["guarded Chebyshev, NumPy"], resting, resting.first_iterate(), 2).last == 2
+
+
+def test_examination_is_not_imported_with_the_library() -> None:
+    """Neither the methods to compare with nor what draws them: they are asked for by name."""
+    modules = ["torchpd.baselines", "torchpd.study", "torchpd.tuning", "torchpd.accuracy", "plotly", "matplotlib"]
+    code = f"import sys, torchpd; print([name for name in {modules} if name in sys.modules])"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout.strip() == "[]"
