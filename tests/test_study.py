@@ -166,7 +166,17 @@ def test_kernels_are_counted_where_there_are_some(device: torch.device) -> None:
 def test_files_and_their_schema(quick: tuple[Path, str]) -> None:
     out, said = quick
     record = json.loads((out / "study.json").read_text())
-    assert record.keys() == {"schema", "command", "created", "commit", "machine", "versions", "subject", "rows"}
+    assert record.keys() == {
+        "schema",
+        "command",
+        "created",
+        "commit",
+        "machine",
+        "versions",
+        "clock",
+        "subject",
+        "rows",
+    }
     assert record["command"] == f"python -m torchpd study beam --resolution 1 --out {out} --quick"
     rows = [Row.from_json(row) for row in record["rows"]]
     assert {row.axis for row in rows} == set(AXES)

@@ -74,7 +74,13 @@ class _Counted(StepProblem):
 
 
 def run_baseline(
-    method: Baseline, problem: StepProblem, first: Array, iterations: int, *, memory: bool = False
+    method: Baseline,
+    problem: StepProblem,
+    first: Array,
+    iterations: int,
+    *,
+    memory: bool = False,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> Trace:
     """Iterate from `first`, keeping every iterate.
 
@@ -84,6 +90,7 @@ def run_baseline(
         first: u_0 [V, 3] m.
         iterations: at most; methods that find the minimum earlier stop there.
         memory: watch allocations, which slows the run down; times of such a run are not to be used.
+        clock: gives seconds.
 
     Raises:
         ValueError: the scene has contacts and the method knows none.
@@ -95,17 +102,17 @@ def run_baseline(
     if memory:
         tracemalloc.start()
     try:
-        begin = time.perf_counter()
+        begin = clock()
         counted.evaluate(first)  # assembles the operator
         run = method.prepare(counted, first)
-        trace = Trace(time.perf_counter() - begin, {0: first}, {0: 0.0}, {0: 0})
+        trace = Trace(clock() - begin, {0: first}, {0: 0.0}, {0: 0})
         counted.calls[0] = 0
-        clock = _Clock()
+        stopwatch = _Stopwatch(clock)
 
         def observe(iteration: int, displacement: Array) -> None:
-            with clock.paused():
+            with stopwatch.paused():
                 trace.displacements[iteration] = np.array(displacement)
-                trace.seconds[iteration] = clock.seconds
+                trace.seconds[iteration] = stopwatch.seconds
                 trace.local_steps[iteration] = counted.calls[0]
 
         run(iterations, observe)
@@ -116,20 +123,20 @@ def run_baseline(
     return trace
 
 
-class _Clock:
+class _Stopwatch:
     """Time that passes unless it is paused [s]."""
 
-    def __init__(self) -> None:
-        self._begin, self.seconds = time.perf_counter(), 0.0
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock, self._begin, self.seconds = clock, clock(), 0.0
 
-    def paused(self) -> _Clock:
+    def paused(self) -> _Stopwatch:
         return self
 
     def __enter__(self) -> None:
-        self.seconds += time.perf_counter() - self._begin
+        self.seconds += self._clock() - self._begin
 
     def __exit__(self, *_: object) -> None:
-        self._begin = time.perf_counter()
+        self._begin = self._clock()
 
 
 # ---- splittings: u <- u_prev + omega (u - P^-1 grad E(u) - u_prev)

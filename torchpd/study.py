@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -31,7 +32,7 @@ from .study_axes import (
     stiffness_rows,
     time_step_rows,
 )
-from .study_bench import Bench, Setting, precision_name
+from .study_bench import Bench, Setting, clock_of, precision_name
 from .subjects import Subject, subject_of
 from .trajectory import trajectory_rows
 
@@ -166,6 +167,7 @@ def run_study(options: StudyOptions, *, progress: bool = True) -> str:
     record: dict[str, Any] = {
         "schema": SCHEMA,
         **describe_run(options.command(), torch.device(options.device), threads),
+        "clock": "processor time" if clock_of(torch.device(options.device)) is time.process_time else "wall time",
         "subject": Path(options.subject).name,
         "rows": [row.to_json() for row in rows],
     }

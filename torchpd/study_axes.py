@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +19,7 @@ from .scene import Scene
 from .simulator import Simulator
 from .solvers import Chebyshev
 from .state import State
-from .study_bench import SOLVED, Bench, Setting, Timing, measure_step, time_calls, verdict
+from .study_bench import SOLVED, Bench, Setting, Timing, clock_of, measure_step, time_calls, verdict
 
 __all__ = [
     "PAPER_TESTS",
@@ -75,7 +74,8 @@ def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) 
     }  # fmt: skip
     method = BASELINES[name]
     try:
-        traces = [run_baseline(method, exact.problem, exact.first, most) for _ in range(_REPEATS)]
+        clock = clock_of(bench.device)
+        traces = [run_baseline(method, exact.problem, exact.first, most, clock=clock) for _ in range(_REPEATS)]
         memory = run_baseline(method, exact.problem, exact.first, _MEMORY_ITERATIONS, memory=True)
     except ValueError as refusal:
         return [Row(status=f"refused: {refusal}", **common)]
@@ -158,10 +158,11 @@ class _Motion:
 def _motion(bench: Bench, setting: Setting, steps: int) -> _Motion:
     sim = bench.simulator(setting, torch.float64, Chebyshev(), **SOLVED)
     state = bench.start(sim)
-    begin = time.perf_counter()
+    clock = clock_of(bench.device)
+    begin = clock()
     end = sim.rollout(state, steps, every=steps).state()
     positions = end.positions[0].cpu().numpy()
-    seconds = time.perf_counter() - begin
+    seconds = clock() - begin
     mesh = bench.mesh(setting.resolution)
     places = [bench.subject.probes(mesh, x) for x in (state.positions[0].cpu().numpy(), positions)]
     brought = float(sim.energy(state)[0] - sim.energy(state.positions)[0])

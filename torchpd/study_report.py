@@ -64,6 +64,7 @@ def _header(record: dict[str, Any]) -> str:
     machine, versions = record["machine"], record["versions"]
     threads = f"{machine['threads']} thread{'s' * (machine['threads'] > 1)}"
     where = f"{machine['cpu']}, {threads}, {machine['simd']}; device: {machine['device']}"
+    where = f"{where}; milliseconds are {record['clock']}"
     what = ", ".join(f"{name} {version}" for name, version in versions.items())
     return (
         f"<p>Errors are |x &minus; x*| / |x<sub>0</sub> &minus; x*| of one time step: 1 is the first iterate, 0 the "

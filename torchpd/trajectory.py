@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ from .ledger import Row
 from .simulator import Simulator
 from .solvers import Chebyshev, Solver
 from .state import State
-from .study_bench import SOLVED, Bench, Setting, precision_name
+from .study_bench import SOLVED, Bench, Setting, clock_of, precision_name
 
 __all__ = ["Trajectory", "compare_trajectories", "first_turn", "record_trajectory", "trajectory_rows"]
 
@@ -37,10 +36,11 @@ class Trajectory:
 def record_trajectory(bench: Bench, sim: Simulator, resolution: int, seconds: float) -> Trajectory:
     """The motion of the subject from its start, for so many seconds of its time."""
     state, steps = bench.start(sim), max(1, round(seconds / sim.time_step))
-    begin = time.perf_counter()
+    clock = clock_of(bench.device)
+    begin = clock()
     track = sim.rollout(state, steps)
     positions = torch.cat([state.positions, track.positions[:, 0]]).cpu()
-    elapsed = time.perf_counter() - begin
+    elapsed = clock() - begin
     velocities = torch.cat([state.velocities, track.velocities[:, 0]])
     energies = sim.energy(State(positions.to(sim.device), velocities)).double().cpu().numpy()
     mesh = bench.mesh(resolution)
