@@ -1,4 +1,4 @@
-"""The commands of torchpd: `python -m torchpd demo` and `python -m torchpd doctor`."""
+"""The commands of torchpd: `python -m torchpd demo`, `study` and `doctor`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from .version import __version__
 
@@ -17,6 +18,13 @@ Drops an elastic body on the ground and writes pictures, films and a convergence
 
 MESH is a surface (.obj, .ply, .stl, .glb and whatever else trimesh reads), which is filled with a lattice of
 tetrahedra, or a tetrahedral mesh (.mesh, .msh, .vtk, .vtu). It is scaled to a metre. Without MESH: an octopus."""
+
+_STUDY = """\
+Measures what accuracy costs: the error of the solver against iterations, milliseconds and memory, beside methods of
+the literature; the errors of the time step, of the mesh and of float32; and what unfinished solves do to a motion.
+
+SUBJECT is beam, octopus, or the file of a mesh, which lands on the ground. Results go to --out: study.json, study.csv,
+pictures and report.html. A study that was stopped goes on where it was."""
 
 
 def _whole(text: str) -> int:
@@ -59,8 +67,38 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
     demo.add_argument("--out", type=Path, default=Path("out"), help="folder for the files (%(default)s)")
     demo.add_argument("--quick", action="store_true", help="fewer and smaller pictures")
+    _add_study(commands)
     commands.add_parser("doctor", help="print versions, devices, and what is missing")
     return parser
+
+
+def _add_study(commands: Any) -> None:
+    study = commands.add_parser(
+        "study",
+        help="measure what accuracy costs",
+        description=_STUDY,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    study.add_argument("subject", nargs="?", default="beam", metavar="SUBJECT", help="beam, octopus or a mesh")
+    study.add_argument("--youngs", type=_positive, help="Young's modulus in Pa")
+    study.add_argument("--time-step", type=_positive, help="in s")
+    study.add_argument("--resolution", type=_whole, help="cells across the beam, or along the longest side of a body")
+    study.add_argument("--iterations", type=_whole, default=1024, help="of a step, at most (%(default)s)")
+    study.add_argument("--axes", nargs="+", metavar="AXIS", help="only these: solver, stiffness, float, time-step, ...")
+    study.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
+    study.add_argument("--threads", type=_whole, help="of the CPU")
+    study.add_argument("--out", type=Path, default=Path("out/study"), help="folder for the files (%(default)s)")
+    study.add_argument("--quick", action="store_true", help="few points, to see that everything runs")
+
+
+def _study(arguments: argparse.Namespace) -> str:
+    from .study import AXES, StudyOptions, run_study
+
+    options = {name: value for name, value in vars(arguments).items() if name != "command"}
+    chosen = [axis.replace("-", " ") for axis in options.pop("axes") or AXES]
+    # in the order of the study, unknown ones last, which it names
+    axes = tuple(sorted(set(chosen), key=lambda axis: AXES.index(axis) if axis in AXES else len(AXES)))
+    return run_study(StudyOptions(**options, axes=axes))
 
 
 def _demo(arguments: argparse.Namespace) -> str:
@@ -86,7 +124,7 @@ def main(words: Sequence[str] | None = None) -> int:
             warnings.showwarning = lambda message, *_, **__: print(f"note: {message}", file=sys.stderr)
             if arguments.command == "doctor":
                 return _doctor()
-            print(_demo(arguments))
+            print(_study(arguments) if arguments.command == "study" else _demo(arguments))
     except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
         print(f"torchpd: {_one_line(error)}", file=sys.stderr)
         return 2

@@ -44,6 +44,7 @@ REQUIRED = (
 OPTIONAL = (
     Package("mitsuba", "mitsuba", "pictures"),
     Package("matplotlib", "matplotlib", "plots"),
+    Package("plotly", "plotly", "reports of studies"),
     Package("PIL", "pillow", "pictures"),
     Package("imageio", "imageio", "GIF"),
     Package("imageio_ffmpeg", "imageio-ffmpeg", "MP4"),

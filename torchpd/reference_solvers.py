@@ -211,7 +211,12 @@ def _free_rows(problem: StepProblem) -> NDArray[np.int64]:
 
 
 def newton(
-    problem: StepProblem, first: Array | None = None, *, tolerance: float = 1e-10, iterations: int = 200
+    problem: StepProblem,
+    first: Array | None = None,
+    *,
+    tolerance: float = 1e-10,
+    iterations: int = 200,
+    observe: Observer | None = None,
 ) -> Array:
     """The minimiser near `first` of a step without contact: |grad E(u)| <= tolerance |grad E(0)|, then on to rounding.
 
@@ -223,7 +228,7 @@ def newton(
     u = problem.first_iterate() if first is None else first
     rows, scale = _free_rows(problem), _force_scale(problem)
     energy, gradient = problem.evaluate(u)
-    for _ in range(iterations):
+    for k in range(iterations):
         size = float(np.linalg.norm(gradient))
         direction = _newton_direction(problem, u, gradient, rows) if size > 0.0 else gradient
         trial, trial_energy, trial_gradient = _descend(problem, u, energy, gradient, direction)
@@ -233,6 +238,8 @@ def newton(
         if gain == 0.0:
             break
         u, energy, gradient = trial, trial_energy, trial_gradient
+        if observe is not None:
+            observe(k + 1, u)
     raise RuntimeError(f"newton: stopped at |grad E| = {size:.3e} N, wanted {tolerance * scale:.3e} N")
 
 

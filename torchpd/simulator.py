@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +22,9 @@ from .solvers import Chebyshev, Jacobi, Solver
 from .state import Info, State, Track
 from .summary import describe
 from .targets import Anchors, Targets
+
+if TYPE_CHECKING:
+    from .tuning import Promise
 
 __all__ = ["Simulator", "Targets"]
 
@@ -82,6 +85,7 @@ class Simulator(nn.Module):
         self.tolerance = float(tolerance)
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
+        self.promise: Promise | None = None  # of `tune`
         self.kernel = check_kernel(kernel)
         values = scene.values()
         self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
@@ -321,6 +325,46 @@ class Simulator(nn.Module):
             return_info: fill in `CapturedStep.info`.
         """
         return CapturedStep(self, state, forces, targets, start, report=return_info)
+
+    def tune(
+        self,
+        state: State | None = None,
+        *,
+        error: float | None = None,
+        milliseconds: float | None = None,
+        candidates: Sequence[Solver] | None = None,
+        most: int = 2048,
+        progress: bool = False,
+    ) -> Promise:
+        """Choose solver and iterations for an error or a time, from a short study on this scene; sets them.
+
+        The promise also stays in `self.promise`: `promise.holds(info)` says during a run whether to rely on it. A
+        target out of reach gets the best there is, a promise with `attained=False`, and a `TuningWarning`. Files do not
+        keep it: times are of the machine that measured them.
+
+        Args:
+            state: where typical motions start [B, V, 3], the rest state by default; up to four environments are
+                studied over 30 steps, without forces and with the targets of the scene. Times are for its batch.
+            error: of a step, |x - x*| / |x_0 - x*|, x* converged and x_0 the first iterate; in (0, 1).
+            milliseconds: of a step on this machine; the error is then as low as that allows.
+            candidates: solvers to choose from; by default those that cannot diverge.
+            most: iterations of a step, at most.
+            progress: show a bar.
+
+        Raises:
+            ValueError: states that are not finite, a singular system, a scene without motion.
+        """
+        from .tuning import tune
+
+        return tune(
+            self,
+            state,
+            error=error,
+            milliseconds=milliseconds,
+            candidates=candidates,
+            most=most,
+            progress=progress,
+        )
 
     # ---- energies
 

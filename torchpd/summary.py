@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .plan import Plan
     from .simulator import Simulator
 
-__all__ = ["describe"]
+__all__ = ["describe", "workspace_bytes"]
 
 # What each effect adds to a step; folded ones are part of the weights and targets that every vertex has anyway.
 _FOLDED = "folded into the inertia of a vertex: nothing per iteration"
@@ -28,6 +28,13 @@ def _solver_line(sim: Simulator) -> str:
     diagonal = "weighted" if numbers["weighted"] else "plain"
     tolerance = f", tolerance {sim.tolerance:g}" if sim.tolerance else ""
     return f"{name}: {stop} iterations, relaxation {numbers['relaxation']:g}, {diagonal} diagonal{rho}{tolerance}"
+
+
+def _promise_lines(sim: Simulator) -> list[str]:
+    if sim.promise is None:
+        return []
+    stale = "" if sim.promise.covers(sim) else "; settings have changed since, so it no longer holds"
+    return [f"tuned: {sim.promise}{stale}"]
 
 
 def _effect_lines(sim: Simulator) -> list[str]:
@@ -84,11 +91,16 @@ def _kernel_lines(sim: Simulator) -> list[str]:
     ]
 
 
+def workspace_bytes(plan: Plan, real: int) -> int:
+    """Memory of a step on the CPU beside plan, material and states, of one environment; `real` bytes a number."""
+    # five vectors of four numbers, two weights, and the slots of the patches
+    return real * (22 * plan.vertices + 8 * len(plan.slot_vertex))
+
+
 def _step_bytes(plan: Plan, real: int) -> str:
     """Memory that a step takes beside plan, material and states."""
     if plan.kernel is None:
-        # five vectors of four numbers, two weights, and the slots of the patches
-        return f"{real * (22 * plan.vertices + 8 * len(plan.slot_vertex)):,} B an environment during a step"
+        return f"{workspace_bytes(plan, real):,} B an environment during a step"
     slots = plan.size("slots")
     if plan.kernel == "stream":
         return f"{4 * real * (5 * plan.vertices + 2 * slots):,} B an environment during a step"
@@ -106,6 +118,7 @@ def describe(sim: Simulator) -> str:
     lines = [
         f"{plan.vertices} vertices, time step {sim.time_step:.6g} s, {sim.dtype} on {where}",
         _solver_line(sim),
+        *_promise_lines(sim),
         *_effect_lines(sim),
         *([_pass_line(sim)] if plan.kernel is None else _kernel_lines(sim)),
         f"memory: plan {plan.bytes:,} B, material {material:,} B, {_step_bytes(plan, real)}",

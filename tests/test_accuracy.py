@@ -1,0 +1,110 @@
+"""Converged steps are converged, of the material that a simulator has now, and errors are what they are called."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from cases import beam, contact_block
+from runs import full_scene, moving, simulate, simulator, state_of
+
+import torchpd as pd
+from torchpd.accuracy import exact_steps, frictionless, problem_of, scene_without_friction, select_state
+from torchpd.reference_solvers import newton
+
+
+def test_the_first_iterate_has_error_one_and_the_solution_none() -> None:
+    case = beam(1e5)
+    sim = simulator(case, torch.float64)
+    step = exact_steps(sim, state_of(case, sim), start="inertial")[0]
+    assert step.judge(step.first) == pytest.approx(
+        (1.0, 1.0, step.judge(step.first).residual, step.judge(step.first).metres)
+    )
+    at_end = step.judge(step.solution)
+    assert at_end.position == at_end.metres == 0.0
+    assert abs(at_end.energy) < 1e-12
+    # |grad E| / min a bounds the error; Newton's method ends near rounding, here a condition of 1e5 above it
+    assert step.uncertainty < 1e5 * 2.0**-52 * 100
+    # halfway along the line, half the error: the definition is linear
+    assert step.judge(0.5 * (step.first + step.solution)).position == pytest.approx(0.5, rel=1e-12)
+    assert np.abs(step.solution - newton(case.problem(), case.problem().first_iterate("inertial"))).max() < 1e-10
+
+
+def test_a_start_that_is_not_finite_is_infinitely_wrong() -> None:
+    case = beam(1e4)
+    sim = simulator(case, torch.float64)
+    step = exact_steps(sim, state_of(case, sim))[0]
+    assert step.judge(np.full_like(step.first, np.nan)) == (np.inf,) * 4
+
+
+def test_uncertainty_bounds_the_error() -> None:
+    """|grad E(u)| / min a >= |u - u*| where the elements are stable: for any u near u*, from the gradient alone."""
+    case = beam(1e5)
+    sim = simulator(case, torch.float64)
+    step = exact_steps(sim, state_of(case, sim))[0]
+    off = 1e-6 * np.where(step.problem.free[:, None], np.random.default_rng(0).standard_normal(step.first.shape), 0.0)
+    bound = np.linalg.norm(step.problem.gradient(step.solution + off)) / step.problem.weight[step.problem.free].min()
+    assert bound >= np.linalg.norm(off)
+
+
+def test_material_of_every_environment_is_that_of_now() -> None:
+    sim = simulate(torch.float64)
+    stiffness = sim.stiffness * torch.tensor([[0.5], [1.0], [3.0]], dtype=torch.float64)
+    sim.set_material(stiffness=stiffness, damping=2.0)
+    state = moving(sim)
+    for item in range(3):
+        problem = problem_of(sim, state, item)
+        assert np.array_equal(problem.values.stiffness, stiffness[item].numpy())
+        assert problem.values.damping == 2.0
+    steps = exact_steps(sim, state)
+    converged = frictionless(sim)
+    converged.iterations = 4000
+    after = converged(state).velocities * sim.time_step
+    for step, u in zip(steps, after.numpy(), strict=True):
+        assert step.judge(u).position < 1e-9
+    alone = exact_steps(sim_of_one(sim, 2), select_state(state, [2]))[0]
+    assert np.abs(alone.solution - steps[2].solution).max() < 1e-12
+
+
+def sim_of_one(sim: pd.Simulator, item: int) -> pd.Simulator:
+    """The simulator of one environment."""
+    one = simulate(torch.float64)
+    one.set_material(stiffness=sim.stiffness[item], damping=sim.damping)
+    return one
+
+
+def test_contacts_are_solved_without_friction() -> None:
+    case = contact_block(pd.Ground(0.0, friction=0.7), velocity=(1.0, -1.0, 0.0))
+    sim = simulator(case, torch.float64)
+    step = exact_steps(sim, state_of(case, sim))[0]
+    assert not step.problem.values.planes[:, 4].any()
+    assert step.judge(step.solution).residual < 1e-10
+    assert step.uncertainty < 1e-6
+    # it slides: without friction the momentum along the ground is kept
+    masses = step.problem.values.masses
+    assert masses @ step.solution[:, 0] == pytest.approx(masses.sum() * sim.time_step * 1.0, rel=1e-9)
+
+
+def test_friction_is_left_out_of_a_copy() -> None:
+    sim = pd.Simulator(full_scene(), progress=False)
+    assert float(frictionless(sim).planes[:, 4].sum()) == 0.0
+    assert float(sim.planes[:, 4].sum()) > 0.0
+    smooth = scene_without_friction(sim.scene)
+    assert [ground.friction for ground in smooth.grounds] == [0.0]
+    assert [sphere.friction for sphere in smooth.spheres] == [0.0]
+    assert len(smooth.parts) == len(sim.scene.parts)
+
+
+def test_rounding_is_told_from_motion() -> None:
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (4, 1, 1))
+    sim = pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e5), pd.Gravity()), progress=False)
+    falling = exact_steps(sim, sim.rest_state())[0]
+    assert not falling.moves(torch.float32)
+    turned = sim.rest_state()
+    turned.velocities[..., 0] = turned.positions[..., 1]
+    step = exact_steps(sim, turned)[0]
+    assert step.moves(torch.float32)
+    # ten times eps |x|, from an error of one
+    slack = 10.0 * 2.0**-23 * np.linalg.norm(step.problem.positions) / step.scale
+    assert step.error_beyond_rounding(step.first, torch.float32) == pytest.approx(1.0 - slack, rel=1e-9)
+    assert step.error_beyond_rounding(step.solution, torch.float32) == 0.0

@@ -1,0 +1,109 @@
+"""Methods of the literature end at the same minimum, and do what their textbooks say on a linear problem."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from cases import Case, box, contact_block
+
+import torchpd as pd
+from torchpd.baselines import BASELINES, GaussSeidel, colour_vertices, run_baseline, two_stage_rho
+from torchpd.reference import StepProblem
+from torchpd.reference_solvers import newton, relative_error
+
+
+@pytest.fixture(scope="module")
+def problem() -> StepProblem:
+    """A short beam that swings: spectral radius of Jacobi about 0.98."""
+    mesh = pd.TetMesh(*box((0.6, 0.2, 0.2), (6, 2, 2)))
+    body = pd.Solid(mesh, youngs=3e4)
+    velocities = np.zeros_like(mesh.vertices)
+    velocities[:, 1] = -5.0 * mesh.vertices[:, 0] ** 2
+    scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+    return Case(scene, np.array(mesh.vertices), velocities, 1 / 30).problem()
+
+
+@pytest.fixture(scope="module")
+def solution(problem: StepProblem) -> np.ndarray:
+    return newton(problem)
+
+
+# Iterations to a relative error of 1e-6, rounded up generously; a method that stalls needs many times more.
+ENOUGH = {
+    "Jacobi, NumPy": 1500,
+    "classic Chebyshev, NumPy": 300,
+    "guarded Chebyshev, NumPy": 300,
+    "Gauss-Seidel": 800,
+    "Gauss-Seidel + Chebyshev": 200,
+    "PCG global step": 60,
+    "direct global step": 60,
+    "Newton": 12,
+    "L-BFGS": 120,
+}
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_every_method_finds_the_minimum(name: str, problem: StepProblem, solution: np.ndarray) -> None:
+    first = problem.first_iterate()
+    trace = run_baseline(BASELINES[name], problem, first, ENOUGH[name])
+    assert relative_error(trace.displacements[trace.last], solution, first) < 1e-6
+    assert trace.local_steps[trace.last] >= trace.last > 1
+    seconds = [trace.seconds[k] for k in sorted(trace.seconds)]
+    assert seconds == sorted(seconds)
+    assert seconds[0] == 0.0
+    # pins stay where they are
+    assert not trace.displacements[trace.last][~problem.free].any()
+
+
+def test_colours_separate_neighbours(problem: StepProblem) -> None:
+    colours = colour_vertices(problem.matrix)
+    entries = problem.matrix.tocoo()
+    apart = entries.row != entries.col
+    assert (colours[entries.row[apart]] != colours[entries.col[apart]]).all()
+    # greedy colouring needs no more than the largest degree + 1; Kuhn's grid has 14 neighbours
+    assert colours.max() + 1 <= 15
+
+
+def test_a_sweep_is_the_triangle_of_the_coloured_matrix(problem: StepProblem) -> None:
+    """One sweep from zero solves (L + D) d = r in the order of the colours; there and back is the symmetric form."""
+    sweep, both = GaussSeidel(problem), GaussSeidel(problem, symmetric=True)
+    order = np.concatenate(sweep.groups)
+    matrix = problem.matrix[sweep.free][:, sweep.free].toarray()[np.ix_(order, order)]
+    residual = np.where(problem.free[:, None], np.random.default_rng(0).standard_normal((len(problem.free), 3)), 0.0)
+    lower, diagonal = np.tril(matrix), np.diag(np.diag(matrix))
+    right = residual[sweep.free][order]
+    expected = np.linalg.solve(lower, right)
+    assert np.allclose(sweep(residual)[sweep.free][order], expected, rtol=1e-12)
+    # (U + D)^-1 D (L + D)^-1
+    assert np.allclose(both(residual)[both.free][order], np.linalg.solve(lower.T, diagonal @ expected), rtol=1e-12)
+
+
+def test_two_stage_rho_lies_below_the_spectral_radius(problem: StepProblem) -> None:
+    """And near it, for Jacobi with the plain diagonal near the solution, where the iteration is linear."""
+    free, diagonal = problem.free, problem.plain_diagonal
+    half = 1.0 / np.sqrt(diagonal[free])
+    scaled = half[:, None] * problem.matrix[free][:, free].toarray() * half
+    largest = 1.0 - np.linalg.eigvalsh(scaled)[0]
+    rho = two_stage_rho(problem, problem.first_iterate(), lambda g: g / diagonal[:, None], iterations=64)
+    assert 2.0 * largest - 1.0 < rho < 0.5 * (1.0 + largest)
+
+
+def test_memory_is_watched_and_contacts_are_refused(problem: StepProblem) -> None:
+    trace = run_baseline(BASELINES["direct global step"], problem, problem.first_iterate(), 2, memory=True)
+    # at least the iterates that are kept, and the sparse operator
+    assert trace.peak_bytes > problem.operator.data.nbytes
+    resting = contact_block(pd.Ground(0.0)).problem()
+    with pytest.raises(ValueError, match="knows no contacts"):
+        run_baseline(BASELINES["Newton"], resting, resting.first_iterate(), 1)
+    assert run_baseline(BASELINES["guarded Chebyshev, NumPy"], resting, resting.first_iterate(), 2).last == 2
+
+
+def test_examination_is_not_imported_with_the_library() -> None:
+    """Neither the methods to compare with nor what draws them: they are asked for by name."""
+    modules = ["torchpd.baselines", "torchpd.study", "torchpd.tuning", "torchpd.accuracy", "plotly", "matplotlib"]
+    code = f"import sys, torchpd; print([name for name in {modules} if name in sys.modules])"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout.strip() == "[]"

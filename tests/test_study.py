@@ -1,0 +1,262 @@
+"""The study runs from end to end, goes on where it was, measures known orders, and its report opens in a browser."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import subprocess
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torchpd import study
+from torchpd.__main__ import main
+from torchpd.ledger import Row
+from torchpd.shapes import box
+from torchpd.study import AXES, StudyOptions, cost_table, paper_table, run_study, study_rows, study_table
+from torchpd.study_axes import baseline_rows, contender_rows, float_rows, mesh_rows, paper_rows, time_step_rows
+from torchpd.study_bench import Bench, Setting, Timing, count_kernels, time_calls
+from torchpd.study_plots import pareto_front
+from torchpd.subjects import SUBJECTS, subject_of
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def bench() -> Bench:
+    return Bench(SUBJECTS["beam"](), CPU, series=1)
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A quick study of a coarse beam, and what it says."""
+    out = tmp_path_factory.mktemp("study")
+    return out, run_study(StudyOptions(resolution=1, quick=True, out=out), progress=False)
+
+
+# ---- what is measured
+
+
+def test_the_time_step_has_order_one(bench: Bench) -> None:
+    """Implicit Euler: half the step, half the error, as far as the finest run stands for the limit (an eighth left)."""
+    rows = time_step_rows(bench, Setting(1e5, 1 / 60, 1), 4)
+    ratios = [coarse.error / fine.error for coarse, fine in pairwise(rows)]
+    # from h to h/2 with a reference at h_f: (h - h_f) / (h/2 - h_f), 2.08 and 2.33 for the last two pairs
+    assert ratios[-2] == pytest.approx(2.0, abs=0.35)
+    assert ratios[-1] == pytest.approx(2.14, abs=0.35)
+    assert [row.time_step for row in rows] == [1 / 60, 1 / 120, 1 / 240, 1 / 480]
+
+
+def test_a_finer_mesh_is_nearer(bench: Bench) -> None:
+    rows = mesh_rows(bench, Setting(1e5, 1 / 60, 1), (1, 2, 4))
+    assert [row.tets for row in rows] == [30, 240]
+    assert rows[0].error > 2.0 * rows[1].error
+    assert mesh_rows(bench, Setting(1e5, 1 / 60, 1), (1,))[0].status.startswith("refused: a tetrahedral mesh")
+
+
+def test_float32_differs_by_rounding(bench: Bench) -> None:
+    once, often = float_rows(bench, Setting(1e5, 1 / 60, 1), [1, 32])
+    # a few operations on positions of a metre, over |u_0 - u*| of the whole body
+    assert once.error_metres is not None
+    assert 0.0 < once.error_metres < 8 * 2.0**-24
+    assert often.error < 1e-4
+
+
+def test_solvers_and_methods_meet_at_the_converged_step(bench: Bench) -> None:
+    setting = Setting(1e5, 1 / 60, 1)
+    (ours,) = contender_rows(bench, "guarded Chebyshev", torch.float64, setting, [300])
+    *_, theirs = baseline_rows(bench, "Newton", setting, [30])
+    assert max(ours.error, theirs.error) < 1e-9
+    assert (ours.compiled, theirs.compiled) == (True, False)
+    assert (ours.bytes_by, theirs.bytes_by) == ("layout", "tracemalloc")
+    assert ours.milliseconds_p5 <= ours.milliseconds <= ours.milliseconds_p95
+    (same,) = [row for row in baseline_rows(bench, "guarded Chebyshev, NumPy", setting, [8]) if row.iterations == 8]
+    (compiled,) = contender_rows(bench, "guarded Chebyshev", torch.float64, setting, [8])
+    # the same iterates in two languages
+    assert same.error == pytest.approx(compiled.error, rel=1e-9)
+
+
+def test_refusals_and_divergence_become_rows() -> None:
+    landing = Bench(SUBJECTS["octopus"](), CPU, series=1)
+    (row,) = baseline_rows(landing, "Newton", Setting(3e4, 1 / 60, 8), [4])
+    assert row.status == "refused: this method knows no contacts; only the Jacobi family projects vertices out of them"
+    assert math.isinf(row.error)
+    (plain,) = contender_rows(landing, "Jacobi", torch.float32, Setting(3e4, 1 / 60, 8), [4])
+    assert plain.status == "ok"
+
+
+def test_the_tests_of_the_paper_are_solved(bench: Bench) -> None:
+    rows = paper_rows(bench)
+    assert [row.more["constraints"] for row in rows] == [1200.0, 1000.0, 200.0]
+    assert [row.tets for row in rows] == [1200, 1008, 198]
+    assert max(row.error for row in rows) < 1e-3
+
+
+def test_times_are_percentiles_of_calls() -> None:
+    calls: list[int] = []
+    timing = time_calls(lambda: calls.append(1), CPU, least=9, seconds=0.0, series=6)
+    # one that is not counted, and up to six series where times scatter
+    assert (len(calls) - 1) % 9 == 0
+    assert 10 <= len(calls) <= 55
+    assert timing.p5 <= timing.median <= timing.p95
+    assert Timing.of([1.0, 2.0, 3.0]).median == 2000.0
+    assert Timing(2.0, 1.0, 4.0).scatter == 4.0
+
+
+def test_the_front_has_what_nothing_beats() -> None:
+    points = [(1.0, 0.5), (2.0, 0.1), (3.0, 0.2), (4.0, 0.01), (0.5, math.inf)]
+    rows = [
+        Row("solver", "x", error=error, milliseconds=ms, status="ok" if error < 1 else "diverged")
+        for ms, error in points
+    ]
+    assert pareto_front(rows) == [rows[0], rows[1], rows[3]]
+
+
+def test_table_says_what_is_not_reached() -> None:
+    rows = [Row("solver", "x", iterations=4, error=0.05, milliseconds=2.0), Row("solver", "y", error=math.inf)]
+    lines = study_table(rows).splitlines()
+    assert lines[1].split() == ["x", "float64", "4", "it.,", "2", "ms", *["not", "reached"] * 2]
+    assert lines[2].split() == ["y", "float64", *["not", "reached"] * 3]
+
+
+def test_the_cost_of_an_error_is_tabled() -> None:
+    rows = [
+        Row(
+            "stiffness",
+            "x",
+            precision="float32",
+            youngs=1e4,
+            iterations=k,
+            error=error,
+            milliseconds=0.1 * k,
+            default=k == 64,
+        )
+        for k, error in ((32, 0.02), (64, 1e-3), (128, 1e-5))
+    ]
+    assert cost_table(rows).splitlines()[1].split() == [
+        "10000",
+        "32",
+        "it.,",
+        "3.2",
+        "ms",
+        *["64", "it.,", "6.4", "ms"] * 2,
+        "1.0e-03",
+        "not",
+        "studied",
+    ]
+    assert cost_table([]) == study_table([]) == paper_table([]) == ""
+
+
+def test_kernels_are_counted_where_there_are_some(device: torch.device) -> None:
+    """A sum and a product are two kernels; the CPU has none to count."""
+    vector = torch.ones(8, device=device)
+    assert count_kernels(lambda: (vector * 2.0).exp_(), device) == (2 if device.type == "cuda" else None)
+
+
+# ---- from end to end
+
+
+def test_files_and_their_schema(quick: tuple[Path, str]) -> None:
+    out, said = quick
+    record = json.loads((out / "study.json").read_text())
+    assert record.keys() == {
+        "schema",
+        "command",
+        "created",
+        "commit",
+        "machine",
+        "versions",
+        "clock",
+        "subject",
+        "rows",
+    }
+    assert record["command"] == f"python -m torchpd study beam --resolution 1 --out {out} --quick"
+    rows = [Row.from_json(row) for row in record["rows"]]
+    assert {row.axis for row in rows} == set(AXES)
+    assert [row.iterations for row in rows if row.axis == "stiffness" and row.youngs == 1e4][:3] == [1, 2, 3]
+    assert record["rows"][0]["error"] == rows[0].error
+    for name in ("solver", "stiffness", "cost", "axes", "trajectory"):
+        picture = np.asarray(Image.open(out / f"{name}.png").convert("RGB"))
+        # mostly paper, but curves over its whole width: no collapsed panel
+        inked = (picture.min(axis=2) < 200).any(axis=0)
+        assert inked.mean() > 0.6, name
+        assert f"{out / name}.png" in said
+
+
+def test_a_killed_study_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = StudyOptions(resolution=1, quick=True, axes=("stiffness", "float"), out=tmp_path)
+
+    def killed(*_: object) -> list[Row]:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(study, "float_rows", killed)
+        with pytest.raises(KeyboardInterrupt):
+            study_rows(options, progress=False)
+    monkeypatch.setattr(study, "stiffness_rows", lambda *_: pytest.fail("measured again"))
+    rows = study_rows(options, progress=False)
+    assert {row.axis for row in rows} == {"stiffness", "float"}
+    with pytest.raises(ValueError, match="other settings"):
+        study_rows(StudyOptions(resolution=2, quick=True, out=tmp_path), progress=False)
+
+
+def test_report_opens_in_a_browser(quick: tuple[Path, str]) -> None:
+    """Its title, a drawn figure for every section, and a silent console."""
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if browser is None:
+        pytest.skip(f"no browser is installed ({', '.join(BROWSERS)}): apt-get install chromium")
+    out, _ = quick
+    command = [
+        browser, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--enable-logging=stderr",
+        f"--user-data-dir={out / 'browser'}", "--virtual-time-budget=10000", "--dump-dom",
+        (out / "report.html").as_uri(),
+    ]  # fmt: skip
+    ended = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert "<title>What accuracy costs: beam</title>" in ended.stdout
+    # plotly turns a div into a plot, with a line for every trace
+    assert len(re.findall(r'id="figure-\d+" class="[^"]*js-plotly-plot', ended.stdout)) == 7
+    assert len(re.findall(r'class="trace scatter', ended.stdout)) > 30
+    assert [line for line in ended.stderr.splitlines() if "CONSOLE" in line] == []
+    text = (out / "report.html").read_text(encoding="utf-8")
+    # nothing is fetched: no script or style from elsewhere
+    assert not re.search(r'<(script|link)[^>]+(src|href)="http', text)
+
+
+def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["study", "beam", "--resolution", "1", "--quick", "--axes", "paper", "time-step", "--out", str(tmp_path)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "27 ms" in said
+    assert "default: error" not in said
+    assert {row["axis"] for row in json.loads((tmp_path / "study.json").read_text())["rows"]} == {"paper", "time step"}
+    assert main(["study", "beam", "--axes", "colour", "--out", str(tmp_path)]) == 2
+    assert "no axis colour; there are solver, stiffness" in capsys.readouterr().err
+    assert main(["study", "nothing.obj", "--out", str(tmp_path)]) == 2
+    assert "neither a file of a mesh nor one of beam, octopus" in capsys.readouterr().err
+
+
+def test_a_tetrahedral_mesh_lands(tmp_path: Path) -> None:
+    import meshio
+
+    mesh = box((2.0, 0.5, 0.5), (4, 1, 1))
+    meshio.write_points_cells(tmp_path / "bar.mesh", mesh.vertices, {"tetra": mesh.tets})
+    subject = subject_of(str(tmp_path / "bar.mesh"))
+    assert subject.name == "bar.mesh"
+    low, high = subject.mesh(14).bounds
+    assert (high - low).max() == pytest.approx(1.0)
+    assert low[1] == pytest.approx(0.002)
+    assert len(subject.resolutions) == 1
+
+
+def test_missing_packages_are_said_before_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(study, "missing_packages", lambda found: [p for p in found if p.module == "plotly"])
+    with pytest.raises(ModuleNotFoundError, match=r"plotly, not installed: pip install torchpd\[study\]"):
+        run_study(StudyOptions(out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()

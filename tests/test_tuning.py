@@ -1,0 +1,208 @@
+"""`Simulator.tune` reaches what it promises, says what it cannot, and refuses what cannot be studied."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import warnings
+
+import pytest
+import torch
+
+import torchpd as pd
+from torchpd import tuning
+from torchpd.accuracy import exact_steps, frictionless
+from torchpd.tuning import Promise, Trial, TuningWarning
+
+
+def bar(youngs: float = 1e5, time_step: float = 1 / 60, **options: object) -> pd.Simulator:
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (6, 2, 2))
+    body = pd.Solid(mesh, youngs=youngs)
+    scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+    return pd.Simulator(scene, time_step, progress=False, **options)  # type: ignore[arg-type]
+
+
+def swinging(sim: pd.Simulator, batch: int = 1, speed: float = 5.0) -> pd.State:
+    state = sim.rest_state(batch)
+    state.velocities[..., 1] = -speed * state.positions[..., 0] ** 2
+    return state
+
+
+def worst_error(sim: pd.Simulator, state: pd.State) -> float:
+    """Of one step of each environment."""
+    smooth = frictionless(sim)
+    after = smooth(state).velocities.double().numpy() * sim.time_step
+    steps = exact_steps(sim, state)
+    return max(step.error_beyond_rounding(u, sim.dtype) for step, u in zip(steps, after, strict=True))
+
+
+@pytest.fixture(scope="module")
+def tuned() -> tuple[pd.Simulator, Promise]:
+    sim = bar()
+    return sim, sim.tune(swinging(sim), error=1e-2)
+
+
+@pytest.mark.parametrize("error", [1e-1, 1e-3])
+@pytest.mark.parametrize("youngs", [1e3, 1e6])
+def test_a_promised_error_holds_in_another_motion(error: float, youngs: float) -> None:
+    sim = bar(youngs)
+    promise = sim.tune(swinging(sim), error=error)
+    assert promise.attained
+    assert promise.error == error
+    assert (sim.solver, sim.iterations, sim.promise) == (promise.solver, promise.iterations, promise)
+    other = swinging(sim, speed=-2.0)
+    other.velocities[..., 2] = other.positions[..., 0]
+    for _ in range(8):
+        other = sim(other)
+    assert worst_error(sim, other) <= error
+    # a solver that is hardly more than accurate enough: an eighth of the iterations cannot be
+    sim.iterations //= 8
+    assert worst_error(sim, swinging(sim)) > error
+
+
+def test_less_error_costs_more_iterations() -> None:
+    sim = bar()
+    counts = [sim.tune(swinging(sim), error=error).iterations for error in (1e-1, 1e-2, 1e-3)]
+    assert counts == sorted(set(counts))
+
+
+def test_the_promise_is_printed_and_goes_stale(tuned: tuple[pd.Simulator, Promise]) -> None:
+    sim, promise = tuned
+    assert promise.covers(sim)
+    assert "tuned: error 1.0e-02" in repr(sim)
+    assert "no longer holds" not in repr(sim)
+    sim.iterations += 1
+    assert not promise.covers(sim)
+    assert "no longer holds" in repr(sim)
+    sim.iterations -= 1
+
+
+def test_residuals_are_watched(tuned: tuple[pd.Simulator, Promise]) -> None:
+    sim, promise = tuned
+    _, info = sim(swinging(sim, batch=2), return_info=True)
+    assert promise.holds(info).tolist() == [True, True]
+    # the estimate is proportional, and calibrated at the worst studied state
+    assert promise.estimate(info)[0] == pytest.approx(promise.error_per_residual * float(info.residual[0]))
+    doubted = info._replace(residual=torch.tensor([2.0 * promise.residual_limit, math.nan]))
+    assert promise.holds(doubted).tolist() == [False, False]
+
+
+def test_an_audit_finds_the_error(tuned: tuple[pd.Simulator, Promise]) -> None:
+    """Three times as many iterations later hardly any error is left, so the way there is the error that was."""
+    sim, promise = tuned
+    state = swinging(sim, batch=2)
+    after = sim(state)
+    found = promise.audit(sim, state, after)
+    true = worst_error(sim, state)
+    assert found.shape == (2,)
+    assert float(found.max()) == pytest.approx(true, rel=0.3)
+    assert sim.iterations == promise.iterations
+
+
+def test_out_of_reach_is_said_with_the_best_there_is() -> None:
+    sim = bar(youngs=1e8, time_step=1 / 30)
+    with pytest.warns(TuningWarning, match=r"\(error 0.001 cannot be had\)"):
+        promise = sim.tune(swinging(sim), error=1e-3, most=32)
+    assert not promise.attained
+    assert promise.iterations <= 32
+    assert promise.error > 1e-3
+    assert worst_error(sim, swinging(sim)) <= promise.error
+    assert "cannot be had" in repr(sim)
+
+
+def test_doubt_about_the_converged_step_counts_as_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    sim = bar()
+    unsure = [dataclasses.replace(step, uncertainty=0.2) for step in exact_steps(sim, swinging(sim))]
+    monkeypatch.setattr(tuning, "exact_steps", lambda *_: unsure * 7)
+    with pytest.warns(TuningWarning, match="cannot be had"):
+        promise = sim.tune(swinging(sim), error=0.1, most=256)
+    assert promise.studied_error >= 0.2
+
+
+def test_every_environment_counts() -> None:
+    """The stiffest one of a batch decides."""
+    soft, mixed = bar(1e4), bar(1e4)
+    # not the first, the middle or the last of the batch
+    mixed.set_material(stiffness=mixed.stiffness * torch.tensor([1.0, 100.0, 1.0, 1.0, 1.0, 1.0, 1.0])[:, None])
+    few = soft.tune(swinging(soft), error=1e-2).iterations
+    many = mixed.tune(swinging(mixed, batch=7), error=1e-2).iterations
+    assert many > 2 * few
+    assert mixed.stiffness.shape[0] == 7
+
+
+def test_without_a_state_the_motion_starts_at_rest() -> None:
+    sim = bar()
+    assert sim.tune(error=1e-1).attained
+
+
+def test_candidates_may_be_given() -> None:
+    sim = bar()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert sim.tune(swinging(sim), error=0.3, candidates=[pd.Jacobi()]).solver == pd.Jacobi()
+    with pytest.raises(ValueError, match="candidates must hold at least one solver"):
+        sim.tune(error=0.1, candidates=[])
+
+
+# A step that takes 0.1 ms and 10 us an iteration: (0.95 budget - 0.1) / 0.01 iterations.
+@pytest.mark.parametrize(
+    ("budget", "iterations", "attained"), [(1.005, 85, True), (0.505, 37, True), (0.09, 1, False), (1e3, 200, True)]
+)
+def test_a_budget_is_spent(budget: float, iterations: int, attained: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tuning, "_milliseconds", lambda sim, start, trial: 0.1 + 0.01 * trial.iterations)
+    sim = bar()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        promise = sim.tune(swinging(sim), milliseconds=budget, most=200, candidates=[pd.Chebyshev()])
+    assert (promise.iterations, promise.attained) == (iterations, attained)
+    assert [entry.category for entry in said] == [] if attained else [TuningWarning]
+    assert worst_error(sim, swinging(sim)) <= promise.error
+
+
+def test_a_real_budget_is_near() -> None:
+    """As a ratio in one run: twice the time buys about twice the iterations, less what a call costs."""
+    sim = bar()
+    trial = Trial(pd.Chebyshev(), 64, 0.0, ())
+    budget = tuning._milliseconds(sim, swinging(sim), trial)
+    assert sim.tune(swinging(sim), milliseconds=4.0 * budget, candidates=[pd.Chebyshev()]).iterations > 64
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({}, "takes one of error and milliseconds, got error=None and milliseconds=None"),
+        ({"error": 0.1, "milliseconds": 1.0}, "takes one of error and milliseconds"),
+        ({"error": 0.0}, "error must lie in (0, 1)"),
+        ({"error": 1.5}, "error must lie in (0, 1)"),
+        ({"milliseconds": -1.0}, "milliseconds must be positive and finite"),
+        ({"error": 0.1, "most": 0}, "most must be at least one iteration"),
+    ],
+)
+def test_bad_requests_are_named(request_: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        bar().tune(**request_)  # type: ignore[arg-type]
+
+
+def test_states_that_are_not_finite_are_named() -> None:
+    sim = bar()
+    state = swinging(sim, batch=3)
+    state.velocities[1, 4, 2] = math.nan
+    with pytest.raises(ValueError, match=r"state\.velocities must be finite, got NaN or infinity in environment 1"):
+        sim.tune(state, error=0.1)
+
+
+def test_a_singular_system_is_named() -> None:
+    sim = bar()
+    with torch.no_grad():
+        sim.masses[20] = 0.0
+    with pytest.raises(ValueError, match=r"the system is singular: vertex 20 has inertia 0 N/m"):
+        sim.tune(swinging(sim), error=0.1)
+
+
+def test_a_scene_without_motion_is_named() -> None:
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (4, 1, 1))
+    free = pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e5), pd.Gravity()), progress=False)
+    with pytest.raises(ValueError, match="no motion that needs solving"):
+        free.tune(error=0.1)
+    assert free.promise is None

@@ -1,0 +1,54 @@
+"""The compiled solvers that studies compare and that `Simulator.tune` chooses from: a further one is one more entry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from .solvers import Chebyshev, Jacobi, Solver
+from .spectrum import estimate_rho
+from .state import State
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+__all__ = ["CONTENDERS", "DEFAULT", "DEFAULT_ITERATIONS", "Contender", "safe_solvers"]
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A solver by the name that figures give it.
+
+    `make(sim, state)` may run trials from the state; `safe` ones cannot diverge, on any mesh and at any stiffness.
+    """
+
+    make: Callable[[Simulator, State], Solver]
+    safe: bool
+    devices: tuple[str, ...] = ("cpu", "cuda")  # where it runs
+
+
+def _classic(sim: Simulator, state: State) -> Solver:
+    """The schedule of the papers, with the two-stage estimate of rho that goes with it."""
+    own = sim.solver
+    sim.solver = Jacobi(diagonal="plain")
+    try:
+        return Chebyshev("classic", rho=estimate_rho(sim, state))
+    finally:
+        sim.solver = own
+
+
+CONTENDERS: dict[str, Contender] = {
+    "Jacobi": Contender(lambda sim, state: Jacobi(diagonal="plain"), safe=False),
+    "damped Jacobi": Contender(lambda sim, state: Jacobi(relaxation=1.9), safe=True),
+    "classic Chebyshev": Contender(_classic, safe=False),
+    "guarded Chebyshev": Contender(lambda sim, state: Chebyshev(), safe=True),
+}
+DEFAULT = "guarded Chebyshev"  # what `Simulator(scene)` does
+DEFAULT_ITERATIONS = 64
+
+
+def safe_solvers(sim: Simulator, state: State) -> dict[str, Solver]:
+    """Those that cannot diverge and run where the simulator is, the default first."""
+    here = {name: c for name, c in CONTENDERS.items() if c.safe and sim.device.type in c.devices}
+    return {name: here[name].make(sim, state) for name in sorted(here, key=lambda name: name != DEFAULT)}

@@ -1,0 +1,252 @@
+"""The study of what accuracy costs: `python -m torchpd study`. Which tasks there are, and what is written of them.
+
+A study is a list of tasks, each of which gives rows; finished tasks are kept in `study.jsonl`, so that a killed study
+goes on where it was. From the rows come `study.json`, `study.csv`, pictures and one report in HTML.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from .baselines import BASELINES
+from .contenders import CONTENDERS, DEFAULT
+from .doctor import OPTIONAL, missing_packages
+from .ledger import Ledger, Row, write_csv
+from .provenance import describe_run
+from .study_axes import (
+    baseline_rows,
+    contender_rows,
+    float_rows,
+    mesh_rows,
+    paper_rows,
+    stiffness_rows,
+    time_step_rows,
+)
+from .study_bench import Bench, Setting, clock_of, precision_name
+from .subjects import Subject, subject_of
+from .trajectory import trajectory_rows
+
+__all__ = ["AXES", "SCHEMA", "StudyOptions", "cost_table", "paper_table", "run_study", "study_rows", "study_table"]
+
+SCHEMA = 1
+AXES = ("solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper")
+_PACKAGES = ("matplotlib", "plotly")
+_STIFFNESS_FACTORS = (0.01, 0.1, 1.0)
+_NUMPY_MOST = 256  # iterations of methods in NumPy
+
+Task = Callable[[], list[Row]]
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """What `python -m torchpd study` takes."""
+
+    subject: str = "beam"  # or "octopus", or the file of a mesh
+    youngs: float | None = None  # Pa; that of the subject by default
+    time_step: float | None = None  # s
+    resolution: int | None = None  # cells across the beam, or lattice cells along the longest side
+    iterations: int = 1024  # of a step, at most
+    axes: tuple[str, ...] = AXES
+    device: str = "cpu"
+    threads: int | None = None  # of the CPU
+    out: Path = Path("out/study")
+    quick: bool = False  # few points: shows that everything runs
+
+    def command(self) -> str:
+        """That does this study again."""
+        words = ["python -m torchpd study", self.subject]
+        plain = StudyOptions()
+        for name in ("youngs", "time_step", "resolution", "iterations", "device", "threads", "out"):
+            value = getattr(self, name)
+            if value != getattr(plain, name):
+                words.append(f"--{name.replace('_', '-')} {value}")
+        if self.axes != AXES:
+            words.append("--axes " + " ".join(axis.replace(" ", "-") for axis in self.axes))
+        return " ".join([*words, *(["--quick"] if self.quick else [])])
+
+
+def _counts(most: int) -> list[int]:
+    """1, 2, 3, 4, 6, 8, 12 ...: two in each doubling."""
+    powers = [2**power for power in range(int(math.log2(most)) + 1)]
+    return sorted({*powers, *(3 * power // 2 for power in powers[1:] if 3 * power // 2 <= most)})
+
+
+def _setting(subject: Subject, options: StudyOptions) -> Setting:
+    return Setting(
+        options.youngs or subject.youngs,
+        options.time_step or subject.time_step,
+        options.resolution or subject.resolution,
+    )
+
+
+def _solver_tasks(bench: Bench, setting: Setting, counts: list[int]) -> dict[str, Task]:
+    tasks: dict[str, Task] = {}
+    for name, contender in CONTENDERS.items():
+        if bench.device.type not in contender.devices:
+            continue
+        for dtype in (torch.float32, torch.float64):
+            key = f"solver: {name}, {precision_name(dtype)}"
+            tasks[key] = partial(contender_rows, bench, name, dtype, setting, counts)
+    if bench.device.type == "cpu":
+        fewer = [count for count in counts if count <= _NUMPY_MOST]
+        for name, method in BASELINES.items():
+            # one twin is enough to show what the language costs
+            if method.compiled_twin not in (None, DEFAULT):
+                continue
+            tasks[f"solver: {name}"] = partial(baseline_rows, bench, name, setting, fewer)
+    return tasks
+
+
+def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
+    """Everything that there is to measure, by name."""
+    setting = _setting(bench.subject, options)
+    counts = _counts(min(options.iterations, 8) if options.quick else options.iterations)
+    tasks: dict[str, Task] = _solver_tasks(bench, setting, counts)
+    softened = [replace(setting, youngs=factor * setting.youngs) for factor in _STIFFNESS_FACTORS]
+    for softer in softened:
+        for name, dtype in (("Jacobi", torch.float64), (DEFAULT, torch.float64), (DEFAULT, torch.float32)):
+            key = f"stiffness: {name}, {precision_name(dtype)}, {softer.youngs:g} Pa"
+            tasks[key] = partial(stiffness_rows, bench, name, dtype, softer, counts)
+    resolutions = bench.subject.resolutions[:3] if options.quick else bench.subject.resolutions
+    tasks["float: default"] = partial(float_rows, bench, setting, counts)
+    if options.quick:
+        tasks["time step: default"] = partial(time_step_rows, bench, setting, 2, finer=1)
+    else:
+        tasks["time step: default"] = partial(time_step_rows, bench, setting, 5)
+    tasks["mesh: default"] = partial(mesh_rows, bench, setting, resolutions)
+    seconds, fewer = 0.2 if options.quick else 1.0, [count for count in counts if count >= 4][::2]
+    for softer in softened:
+        key = f"trajectory: {DEFAULT}, {softer.youngs:g} Pa"
+        tasks[key] = partial(trajectory_rows, bench, softer, fewer, seconds=seconds)
+    tasks["paper: table"] = partial(paper_rows, bench)
+    return {key: task for key, task in tasks.items() if key.split(":")[0] in options.axes}
+
+
+def study_rows(options: StudyOptions, *, progress: bool = True) -> list[Row]:
+    """Measure what is not yet in the ledger of `options.out`, and return all rows."""
+    subject = subject_of(options.subject)
+    device = torch.device(options.device)
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    bench = Bench(subject, device, series=1 if options.quick else 6)
+    setting = _setting(subject, options)
+    options.out.mkdir(parents=True, exist_ok=True)
+    settings = {
+        "schema": SCHEMA, "subject": options.subject, **asdict(setting), "iterations": options.iterations,
+        "device": options.device, "threads": torch.get_num_threads(), "quick": options.quick,
+    }  # fmt: skip
+    ledger = Ledger(options.out / "study.jsonl", settings)
+    rows: list[Row] = []
+    tasks = _tasks(bench, options)
+    with tqdm(total=len(tasks), desc="study", unit="task", disable=not progress, leave=False) as bar:
+        for key, task in tasks.items():
+            bar.set_postfix_str(key)
+            rows += ledger.rows_of(key, task)
+            bar.update(1)
+    return rows
+
+
+def run_study(options: StudyOptions, *, progress: bool = True) -> str:
+    """Measure and write everything to `options.out`; the table to print."""
+    _check(options)
+    rows = study_rows(options, progress=progress)
+    from .study_plots import draw_study
+    from .study_report import write_report
+
+    threads = torch.get_num_threads()
+    record: dict[str, Any] = {
+        "schema": SCHEMA,
+        **describe_run(options.command(), torch.device(options.device), threads),
+        "clock": "processor time" if clock_of(torch.device(options.device)) is time.process_time else "wall time",
+        "subject": Path(options.subject).name,
+        "rows": [row.to_json() for row in rows],
+    }
+    written = [options.out / "study.json"]
+    written[0].write_text(_lines_of(record) + "\n")
+    written.append(write_csv(rows, options.out / "study.csv"))
+    written += draw_study(rows, options.out, subject=record["subject"])
+    written.append(write_report(rows, record, options.out / "report.html"))
+    tables = [table for table in (study_table(rows), cost_table(rows), paper_table(rows)) if table]
+    return "\n".join(["\n\n".join(tables), "", "written:", *(f"  {file}" for file in written)])
+
+
+def _lines_of(record: dict[str, Any]) -> str:
+    """JSON with a row in a line."""
+    rows = ",\n".join(json.dumps(row) for row in record["rows"])
+    return json.dumps({**record, "rows": []}, indent=1).replace('"rows": []', f'"rows": [\n{rows}\n]')
+
+
+def _check(options: StudyOptions) -> None:
+    unknown = set(options.axes) - set(AXES)
+    if unknown:
+        raise ValueError(f"study: no axis {', '.join(sorted(unknown))}; there are {', '.join(AXES)}")
+    missing = missing_packages(package for package in OPTIONAL if package.module in _PACKAGES)
+    if missing:  # said before the work, not after it
+        names = ", ".join(package.pip_name for package in missing)
+        raise ModuleNotFoundError(f"the study draws with {names}, not installed: pip install torchpd[study]")
+
+
+_GOALS = (1e-1, 1e-2, 1e-3)
+
+
+def study_table(rows: list[Row]) -> str:
+    """The compiled solvers at a glance: iterations and milliseconds to three errors."""
+    solver = [row for row in rows if row.axis == "solver"]
+    lines = [f"{'solver':<28}{'precision':<11}" + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)]
+    for name, precision in dict.fromkeys((row.method, row.precision) for row in solver):
+        own = [row for row in solver if (row.method, row.precision) == (name, precision)]
+        lines.append(f"{name:<28}{precision:<11}" + "".join(f"{_first_at(own, goal):>22}" for goal in _GOALS))
+    return "\n".join(lines) if solver else ""
+
+
+def _first_at(rows: list[Row], goal: float) -> str:
+    """The fewest iterations of the studied ones that reach an error, and their time."""
+    reached = [row for row in rows if row.error <= goal and row.milliseconds is not None]
+    if not reached:
+        return "not reached"
+    first = min(reached, key=lambda row: row.iterations)
+    return f"{first.iterations} it., {first.milliseconds:.2g} ms"
+
+
+def cost_table(rows: list[Row]) -> str:
+    """What an error costs the default in float32, at every stiffness, beside what its 64 iterations give.
+
+    The last column is how far the body is from its converged path at most, over its way, when all steps are like that.
+    """
+    own = [row for row in rows if row.axis == "stiffness" and row.precision == "float32"]
+    lines = [
+        f"{'Young [Pa]':<12}"
+        + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)
+        + f"{'default: error':>18}{'its path':>14}"
+    ]
+    for youngs in sorted({row.youngs for row in own}):
+        at = [row for row in own if row.youngs == youngs]
+        default = [f"{row.error:.1e}" for row in at if row.default] or ["not studied"]
+        paths = [row for row in rows if row.axis == "trajectory" and row.youngs == youngs and row.default]
+        path = f"{paths[0].error:.1e}" if paths else "not studied"
+        lines.append(
+            f"{youngs:<12g}" + "".join(f"{_first_at(at, goal):>22}" for goal in _GOALS) + f"{default[0]:>18}{path:>14}"
+        )
+    return "\n".join(lines) if own else ""
+
+
+def paper_table(rows: list[Row]) -> str:
+    """The tests of the source paper beside steps of as many tetrahedra, 64 iterations each."""
+    tests = [row for row in rows if row.axis == "paper" and row.milliseconds is not None]
+    lines = [f"{'constraints':<13}{'tetrahedra':>12}{'paper, GTX 470':>18}{'here':>12}{'error':>12}"]
+    lines += [
+        f"{row.more['constraints']:<13.0f}{row.tets:>12}{row.more['paper_milliseconds']:>15.0f} ms"
+        f"{row.milliseconds:>9.2g} ms{row.error:>12.1e}"
+        for row in tests
+    ]
+    return "\n".join(lines) if tests else ""

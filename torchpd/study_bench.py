@@ -1,0 +1,232 @@
+"""The workbench of a study: a subject compiled as asked for, its converged steps, and clocks for both."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from .accuracy import ExactStep, exact_steps
+from .contenders import CONTENDERS
+from .ledger import Row
+from .mesh import TetMesh
+from .simulator import Simulator
+from .solvers import Chebyshev, Solver
+from .state import State
+from .subjects import Subject
+from .summary import workspace_bytes
+
+__all__ = [
+    "SOLVED",
+    "Bench",
+    "Setting",
+    "Timing",
+    "clock_of",
+    "count_kernels",
+    "measure_step",
+    "precision_name",
+    "time_calls",
+    "verdict",
+]
+
+# of motions that only the time step, the mesh or another solver's error may spoil
+SOLVED: dict[str, Any] = {"iterations": 3000, "tolerance": 1e-9}
+_SCATTER = 1.3  # 95th over 5th percentile, of a machine that does something else too
+_DIVERGED = 2.0  # times as far from the converged step as the first iterate
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is studied at once: a body of some stiffness and resolution, and a time step."""
+
+    youngs: float  # Pa
+    time_step: float  # s
+    resolution: int
+
+
+@dataclass
+class Bench:
+    """Compiles the subject and keeps what several tasks need."""
+
+    subject: Subject
+    device: torch.device
+    series: int = 6  # of times, where they scatter
+    _meshes: dict[int, TetMesh] = field(default_factory=dict)
+    _steps: dict[Setting, tuple[State, ExactStep]] = field(default_factory=dict)
+
+    def mesh(self, resolution: int) -> TetMesh:
+        """Of the subject."""
+        if resolution not in self._meshes:
+            self._meshes[resolution] = self.subject.mesh(resolution)
+        return self._meshes[resolution]
+
+    def simulator(
+        self, setting: Setting, dtype: torch.dtype, solver: Solver | None = None, **options: Any
+    ) -> Simulator:
+        """A new one on the device."""
+        scene = self.subject.scene(self.mesh(setting.resolution), setting.youngs)
+        sim = Simulator(scene, setting.time_step, solver=solver, dtype=dtype, progress=False, **options)
+        return sim.to(self.device)
+
+    def start(self, sim: Simulator) -> State:
+        """The beginning of the motion in the precision of the simulator, as float32 holds it."""
+        state = self.subject.start(sim)
+        return State(*(part.float().to(sim.dtype) for part in state))
+
+    @torch.no_grad()
+    def hard_step(self, setting: Setting) -> tuple[State, ExactStep]:
+        """A state within the motion, rounded to float32 but in float64, and the converged step from there."""
+        if setting not in self._steps:
+            sim = self.simulator(setting, torch.float64, Chebyshev(), iterations=1000, tolerance=1e-9)
+            state = self.start(sim)
+            for _ in range(self.subject.steps_before):
+                state = sim(state)
+            state = State(*(part.float().double() for part in state))
+            self._steps[setting] = (state, exact_steps(sim, state)[0])
+        return self._steps[setting]
+
+    def solver(self, name: str, setting: Setting) -> tuple[Solver, float]:
+        """A contender for the hard step, and the milliseconds that choosing its parameters took."""
+        sim = self.simulator(setting, torch.float64)
+        state, _ = self.hard_step(setting)
+        clock = clock_of(self.device)
+        begin = clock()
+        solver = CONTENDERS[name].make(sim, state)
+        return solver, 1e3 * (clock() - begin)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds of repeated calls."""
+
+    median: float
+    p5: float
+    p95: float
+
+    @classmethod
+    def of(cls, seconds: list[float]) -> Timing:
+        """Percentiles of measured times."""
+        p5, median, p95 = np.percentile(np.array(seconds) * 1e3, [5, 50, 95]).tolist()
+        return cls(median, p5, p95)
+
+    @property
+    def scatter(self) -> float:
+        """95th over 5th percentile."""
+        return self.p95 / self.p5
+
+    def columns(self) -> dict[str, Any]:
+        """As a row has them."""
+        return {"milliseconds": self.median, "milliseconds_p5": self.p5, "milliseconds_p95": self.p95}
+
+
+def clock_of(device: torch.device) -> Callable[[], float]:
+    """Seconds: with one thread on the CPU those of the processor, which others on the machine hardly disturb."""
+    alone = device.type == "cpu" and torch.get_num_threads() == 1
+    return time.process_time if alone else time.perf_counter
+
+
+def time_calls(
+    work: Callable[[], object], device: torch.device, *, least: int = 7, seconds: float = 0.05, series: int = 1
+) -> Timing:
+    """At least so many calls and so much time; the first call is not counted.
+
+    Where times scatter, somebody else used the machine: up to `series` are measured, and the steadiest one counts.
+    """
+    clock = clock_of(device)
+    work()
+    found: list[Timing] = []
+    while not found or (len(found) < series and found[-1].scatter > _SCATTER):
+        times: list[float] = []
+        while len(times) < least or sum(times) < seconds:
+            _wait_for(device)
+            begin = clock()
+            work()
+            _wait_for(device)
+            times.append(clock() - begin)
+        found.append(Timing.of(times))
+    return min(found, key=lambda timing: timing.scatter)
+
+
+def _wait_for(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def count_kernels(work: Callable[[], object], device: torch.device) -> int | None:
+    """Kernels that a call launches on a GPU, by the profiler; None on the CPU, which has none."""
+    if device.type != "cuda":
+        return None
+    work()
+    _wait_for(device)
+    kinds = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=kinds) as profile:
+        work()
+        _wait_for(device)
+    events = profile.events() or []
+    named = [e.name.lower() for e in events if e.device_type == torch.autograd.DeviceType.CUDA]  # type: ignore[attr-defined]
+    return sum("memcpy" not in name and "memset" not in name for name in named)
+
+
+def _peak_bytes(sim: Simulator, work: Callable[[], object]) -> tuple[int, str]:
+    if sim.device.type == "cuda":
+        _wait_for(sim.device)
+        torch.cuda.reset_peak_memory_stats(sim.device)
+        work()
+        _wait_for(sim.device)
+        return int(torch.cuda.max_memory_allocated(sim.device)), "torch.cuda"
+    real = torch.finfo(sim.dtype).bits // 8
+    return sim.plan.bytes + workspace_bytes(sim.plan, real), "layout"
+
+
+def precision_name(dtype: torch.dtype) -> str:
+    """float32 or float64."""
+    return str(dtype).removeprefix("torch.")
+
+
+def verdict(error: float) -> str:
+    """The status of a row with this error."""
+    return "ok" if math.isfinite(error) and error <= _DIVERGED else "diverged"
+
+
+@torch.no_grad()
+def measure_step(
+    sim: Simulator,
+    state: State,
+    exact: ExactStep,
+    iterations: int,
+    *,
+    series: int = 1,
+    more: dict[str, float] | None = None,
+    **columns: Any,
+) -> Row:
+    """One solver at one iteration count on a step whose converged end is known: errors, times, memory, kernels."""
+    sim.iterations = iterations
+    given = State(*(part.to(sim.dtype) for part in state))
+    after = sim(given)
+    errors = exact.judge(after.velocities[0].double().cpu().numpy() * sim.time_step)
+    timing = time_calls(lambda: sim(given), sim.device, series=series)
+    held, how = _peak_bytes(sim, lambda: sim(given))
+    return Row(
+        precision=precision_name(sim.dtype),
+        iterations=iterations,
+        local_steps=iterations,
+        status=verdict(errors.position),
+        vertices=sim.vertices,
+        tets=len(exact.problem.values.tets),
+        time_step=sim.time_step,
+        error=errors.position,
+        error_energy=errors.energy,
+        error_metres=errors.metres,
+        residual=errors.residual,
+        **timing.columns(),
+        bytes=held,
+        bytes_by=how,
+        kernels=count_kernels(lambda: sim(given), sim.device),
+        more={"uncertainty_of_converged": exact.uncertainty, **(more or {})},
+        **columns,
+    )

@@ -1,0 +1,242 @@
+"""The report of a study: one HTML file with interactive figures that works without a network (plotly)."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from .ledger import Row
+from .study_plots import STYLES, TOP, axis_label, curves_of, pareto_front
+
+__all__ = ["write_report"]
+
+_OTHER = ("#56b4e9", 2.0, "solid")
+_COLORS = ("#d55e00", "#0072b2", "#56b4e9")  # the stiffness of the study first, then softer ones
+_LOWEST_POWER = -8  # of ten, of the errors that are shown at first
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #2b2d31; max-width: 1180px; margin: 2em auto; padding: 0 1em; }
+h1 { font-size: 1.6em; margin-bottom: .2em } h2 { font-size: 1.15em; margin: 2.2em 0 .2em }
+p { margin: .4em 0 } code, pre { background: #f3f4f6; border-radius: 4px; padding: .15em .4em; font-size: .9em }
+pre { padding: .7em 1em; overflow-x: auto } table { border-collapse: collapse; font-size: .82em; margin: .6em 0 }
+th, td { text-align: right; padding: .18em .7em; border-bottom: 1px solid #e4e5e8 }
+th:first-child, td:first-child, th:nth-child(2), td:nth-child(2) { text-align: left } .bad { color: #b3261e }
+details summary { cursor: pointer; margin-top: 2em }
+"""
+
+
+def write_report(rows: list[Row], record: dict[str, Any], path: Path) -> Path:
+    """Write the report.
+
+    Args:
+        rows: of the study.
+        record: command, machine, versions and subject, as in study.json.
+        path: of the file.
+    """
+    try:
+        from plotly.io import to_html
+    except ImportError:
+        raise ModuleNotFoundError("the report needs plotly: pip install torchpd[study]") from None
+    figures = _figures(rows)
+    parts = []
+    for number, (title, words, figure) in enumerate(figures):
+        drawn = to_html(
+            figure,
+            full_html=False,
+            include_plotlyjs="inline" if number == 0 else False,
+            config={"displaylogo": False, "responsive": True},
+            div_id=f"figure-{number}",
+        )
+        parts.append(f"<h2>{html.escape(title)}</h2>\n<p>{words}</p>\n{drawn}")
+    title = f"What accuracy costs: {record['subject']}"
+    path.write_text(
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
+        f'<link rel="icon" href="data:,">\n<style>{_STYLE}</style>\n</head>\n<body>\n<h1>{html.escape(title)}</h1>\n'
+        f"{_header(record)}\n{_paper_table(rows)}\n{''.join(parts)}\n{_all_rows(rows)}\n</body>\n</html>\n",
+        encoding="utf-8",
+    )
+    return path
+
+
+def _header(record: dict[str, Any]) -> str:
+    machine, versions = record["machine"], record["versions"]
+    threads = f"{machine['threads']} thread{'s' * (machine['threads'] > 1)}"
+    where = f"{machine['cpu']}, {threads}, {machine['simd']}; device: {machine['device']}"
+    where = f"{where}; milliseconds are {record['clock']}"
+    what = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return (
+        f"<p>Errors are |x &minus; x*| / |x<sub>0</sub> &minus; x*| of one time step: 1 is the first iterate, 0 the "
+        f"converged step. Full lines are the compiled solvers of this library; dashed ones are NumPy and SciPy, whose "
+        f"iterations compare exactly and whose milliseconds are indications. Failures are crosses at the top. Click a "
+        f"name in a legend to hide it.</p>\n<pre>{html.escape(record['command'])}</pre>\n"
+        f"<p>{html.escape(where)}<br>{html.escape(what)}<br>commit {html.escape(record['commit'][:12])}, "
+        f"{html.escape(record['created'])}</p>"
+    )
+
+
+# ---- figures
+
+Figure = tuple[str, str, Any]
+
+
+def _figures(rows: list[Row]) -> list[Figure]:
+    """Title, words and figure of everything that the rows have data for."""
+    by_axis = curves_of(rows, lambda row: row.axis)
+    found = []
+    if "solver" in by_axis:
+        own = by_axis["solver"]
+        found.append(("Error against time", "The star is the default; the yellow band is the Pareto front.",
+                      _solver_figure(own, lambda row: row.milliseconds, "milliseconds")))  # fmt: skip
+        found.append(("Error against iterations", "An iteration of another method may cost many of ours: hover.",
+                      _solver_figure(own, lambda row: row.iterations, "iterations")))  # fmt: skip
+    if "stiffness" in by_axis:
+        found.append(("Three stiffnesses", "Plain Jacobi (dashed) and the accelerated default (full), float64.",
+                      _stiffness_figure(by_axis["stiffness"])))  # fmt: skip
+    others: list[tuple[str, str, Callable[[Row], float], str]] = [
+        ("time step", "Error of the time step", lambda row: row.time_step, "time step [s]"),
+        ("mesh", "Error of the mesh", lambda row: row.tets, "tetrahedra"),
+        ("float", "Float32 against float64", lambda row: row.iterations, axis_label("iterations")),
+        ("trajectory", "A second of motion", lambda row: row.iterations, axis_label("iterations")),
+    ]
+    words = {
+        "time step": "Whole motions, solved to 1e-9, against 8 times shorter steps.",
+        "mesh": "Whole motions on coarser meshes, against the finest one.",
+        "float": "The same iterations in both precisions, relative to |x<sub>0</sub> &minus; x*|.",
+        "trajectory": "Largest distance from the converged path over the way; hover for softness and energy.",
+    }
+    for axis, title, place, label in others:
+        if axis in by_axis:
+            found.append((title, words[axis], _plain_figure(by_axis[axis], place, label)))
+    return found
+
+
+def _layout(figure: Any, label: str, rows: list[Row]) -> Any:
+    lowest = min((row.error for row in rows if 0.0 < row.error < math.inf), default=1e-2)
+    figure.update_layout(
+        template="plotly_white", height=480, margin={"l": 70, "r": 20, "t": 20, "b": 60}, hovermode="closest",
+        xaxis={"type": "log", "title": {"text": label}, "dtick": 1, "exponentformat": "power"},
+        yaxis={"type": "log", "title": {"text": "error"}, "dtick": 1, "exponentformat": "power",
+               "range": [max(math.floor(math.log10(lowest)), _LOWEST_POWER), 0.5]},
+    )  # fmt: skip
+    return figure
+
+
+def _trace(rows: list[Row], place: Callable[[Row], float | None], name: str, style: tuple[str, float, str]) -> Any:
+    import plotly.graph_objects as go
+
+    color, width, dash = style
+    drawn = [row for row in rows if place(row) is not None]
+    return go.Scatter(
+        x=[place(row) for row in drawn],
+        y=[min(row.error, TOP) for row in drawn],
+        mode="lines+markers",
+        name=name,
+        line={"color": color, "width": width, "dash": {"solid": "solid", "dashed": "dash"}[dash]},
+        marker={
+            "size": [18 if row.default else 10 if row.status != "ok" else 5 for row in drawn],
+            "symbol": ["star" if row.default else "x" if row.status != "ok" else "circle" for row in drawn],
+        },
+        hovertext=[_words(row) for row in drawn],
+        hoverinfo="text",
+    )
+
+
+def _words(row: Row) -> str:
+    """What a point says when it is pointed at."""
+    number = ("error", "error_energy", "error_metres", "residual", "milliseconds", "milliseconds_p5",
+              "milliseconds_p95", "setup_milliseconds", "bytes", "kernels", "local_steps")  # fmt: skip
+    values = [(name, getattr(row, name)) for name in number] + list(row.more.items())
+    shown = [f"{name.replace('_', ' ')}: {value:.4g}" for name, value in values if value is not None]
+    head = f"<b>{row.method}</b>, {row.precision}, {row.iterations} iterations"
+    return "<br>".join([head, *([row.status] if row.status != "ok" else []), *shown])
+
+
+def _solver_figure(rows: list[Row], place: Callable[[Row], float | None], axis: str) -> Any:
+    import plotly.graph_objects as go
+
+    figure = go.Figure()
+    if axis == "milliseconds":
+        front = pareto_front(rows)
+        figure.add_scatter(
+            x=[row.milliseconds for row in front], y=[row.error for row in front], mode="lines", name="Pareto front",
+            line={"color": "rgba(240, 228, 66, .55)", "width": 14}, hoverinfo="skip",
+        )  # fmt: skip
+    for (name, precision, compiled), own in curves_of(rows, lambda r: (r.method, r.precision, r.compiled)).items():
+        color, width, dash = STYLES.get(name, _OTHER)
+        if compiled:
+            width, name = (width, f"{name}, float32") if precision == "float32" else (1.0, f"{name}, float64")
+        if any(place(row) for row in own):
+            figure.add_trace(_trace(own, place, name, (color, width, dash)))
+        else:
+            figure.add_scatter(x=[None], y=[None], mode="markers", marker={"symbol": "x", "color": color},
+                               name=f"{name} ({own[0].status.split(':')[0]}: no contacts)")  # fmt: skip
+    return _layout(figure, axis_label(axis), rows)
+
+
+def _stiffness_figure(rows: list[Row]) -> Any:
+    import plotly.graph_objects as go
+
+    figure = go.Figure()
+    rows = [row for row in rows if row.precision == "float64"]
+    shades = dict(zip(sorted({row.youngs for row in rows}), ("#56b4e9", "#0072b2", "#002b4d"), strict=False))
+    for (method, youngs), own in curves_of(rows, lambda row: (row.method, row.youngs)).items():
+        dash = "dashed" if method == "Jacobi" else "solid"
+        style = (shades.get(youngs, _OTHER[0]), 2.0, dash)
+        figure.add_trace(_trace(own, lambda row: row.iterations, f"{method}, {youngs:g} Pa", style))
+    return _layout(figure, axis_label("iterations"), rows)
+
+
+def _plain_figure(rows: list[Row], place: Callable[[Row], float], label: str) -> Any:
+    import plotly.graph_objects as go
+
+    figure = go.Figure()
+    measured = [row for row in rows if math.isfinite(row.error) or row.iterations]
+    for youngs, color in zip(sorted({row.youngs for row in measured}, reverse=True), _COLORS, strict=False):
+        own = sorted((row for row in measured if row.youngs == youngs), key=place)
+        figure.add_trace(_trace(own, place, f"{own[0].method}, {youngs:g} Pa", (color, 2.4, "solid")))
+    for row in rows:
+        if row not in measured:
+            figure.add_annotation(text=row.status, showarrow=False, xref="paper", yref="paper", x=0.5, y=0.5)
+    return _layout(figure, label, rows)
+
+
+# ---- tables
+
+
+def _table(head: list[str], lines: list[list[str]]) -> str:
+    cells = "".join(f"<th>{html.escape(name)}</th>" for name in head)
+    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in line) + "</tr>\n" for line in lines)
+    return f"<table>\n<tr>{cells}</tr>\n{body}</table>"
+
+
+def _paper_table(rows: list[Row]) -> str:
+    tests = [row for row in rows if row.axis == "paper"]
+    if not tests:
+        return ""
+    lines = [
+        [f"{row.more['constraints']:.0f} constraints", f"{row.tets:,} tetrahedra", f"{row.iterations}",
+         f"{row.more['paper_milliseconds']:.0f}", f"{row.milliseconds:.2f}", f"{row.error:.1e}"]
+        for row in tests
+    ]  # fmt: skip
+    head = ["test of the paper", "here", "iterations", "paper, GTX 470 [ms]", "this machine [ms]", "error of the step"]
+    return f"<h2>The tests of the source paper</h2>\n{_table(head, lines)}"
+
+
+def _all_rows(rows: list[Row]) -> str:
+    def number(value: float | None) -> str:
+        return "" if value is None else f"{value:.3g}"
+
+    lines = []
+    for row in rows:
+        status = row.status if row.status == "ok" else f'<span class="bad">{html.escape(row.status)}</span>'
+        lines.append(
+            [row.axis, html.escape(row.method), row.precision, f"{row.iterations}", f"{row.youngs:g}",
+             number(row.time_step), f"{row.tets}", number(row.error if math.isfinite(row.error) else None),
+             number(row.error_energy), number(row.residual), number(row.milliseconds), number(row.milliseconds_p5),
+             number(row.milliseconds_p95), "" if row.bytes is None else f"{row.bytes:,}", status]
+        )  # fmt: skip
+    head = ["axis", "method", "precision", "iterations", "Young's modulus [Pa]", "time step [s]", "tets", "error",
+            "energy error", "residual", "ms", "p5", "p95", "bytes", "status"]  # fmt: skip
+    return f"<details><summary>All {len(rows)} rows</summary>\n{_table(head, lines)}</details>"

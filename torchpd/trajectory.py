@@ -1,0 +1,115 @@
+"""What unfinished solves do to a motion: false softness, damping and growth of energy, against the converged motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from .contenders import DEFAULT, DEFAULT_ITERATIONS
+from .ledger import Row
+from .simulator import Simulator
+from .solvers import Chebyshev, Solver
+from .state import State
+from .study_bench import SOLVED, Bench, Setting, clock_of, precision_name
+
+__all__ = ["Trajectory", "compare_trajectories", "first_turn", "record_trajectory", "trajectory_rows"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A motion, sampled at every time step, the start first."""
+
+    time_step: float  # s
+    probes: Array  # [T + 1, n, 3] m
+    energies: Array  # [T + 1] mechanical, J
+    brought: float  # kinetic energy at the start, J
+    milliseconds: float  # a step, mean
+
+
+@torch.no_grad()
+def record_trajectory(bench: Bench, sim: Simulator, resolution: int, seconds: float) -> Trajectory:
+    """The motion of the subject from its start, for so many seconds of its time."""
+    state, steps = bench.start(sim), max(1, round(seconds / sim.time_step))
+    clock = clock_of(bench.device)
+    begin = clock()
+    track = sim.rollout(state, steps)
+    positions = torch.cat([state.positions, track.positions[:, 0]]).cpu()
+    elapsed = clock() - begin
+    velocities = torch.cat([state.velocities, track.velocities[:, 0]])
+    energies = sim.energy(State(positions.to(sim.device), velocities)).double().cpu().numpy()
+    mesh = bench.mesh(resolution)
+    probes = np.stack([bench.subject.probes(mesh, x) for x in positions.double().numpy()])
+    brought = float(sim.energy(state)[0] - sim.energy(state.positions)[0])
+    return Trajectory(sim.time_step, probes, energies, brought, 1e3 * elapsed / steps)
+
+
+def first_turn(signal: Array, time_step: float) -> float:
+    """When a signal first turns back [s], half a period of a swing from rest: by a parabola through three samples.
+
+    NaN when it does not turn, or does so within rounding.
+    """
+    change = np.diff(signal)
+    # two equal samples at the top also are a turn
+    turned = np.flatnonzero((change[:-1] * change[1:] <= 0.0) & (change[:-1] != 0.0))
+    if not len(turned):
+        return math.nan
+    k = int(turned[0]) + 1
+    left, middle, right = signal[k - 1 : k + 2]
+    return float(time_step * (k + 0.5 * (left - right) / (left - 2.0 * middle + right)))
+
+
+def compare_trajectories(motion: Trajectory, exact: Trajectory) -> dict[str, float]:
+    """How a motion differs from the converged one.
+
+    path: largest distance of a probe from its converged place, over the largest way of any probe.
+    turn: time of the first turning point of the swing, relative to the converged one, less one.
+    softness: how far it swings out, relative to the converged motion, less one: positive is too soft.
+    energy: at the end, less that of the converged motion, over the kinetic energy of the start: negative is false
+        damping, positive is energy out of nothing.
+    growth: largest rise above the energy of the start, over the kinetic energy of the start; implicit Euler has none.
+    """
+    ways = exact.probes - exact.probes[0]
+    far = int(np.linalg.norm(ways, axis=2).max(axis=0).argmax())
+    # along the direction in which the farthest probe swings most
+    direction = np.linalg.svd(ways[:, far] - ways[:, far].mean(axis=0))[2][0]
+    swings = [(t.probes[:, far] - t.probes[0, far]) @ direction for t in (motion, exact)]
+    turns = [first_turn(swing, t.time_step) for swing, t in zip(swings, (motion, exact), strict=True)]
+    reach = [float(np.abs(swing).max()) for swing in swings]
+    return {
+        "path": float(np.linalg.norm(motion.probes - exact.probes, axis=2).max() / np.linalg.norm(ways, axis=2).max()),
+        "turn": turns[0] / turns[1] - 1.0,
+        "softness": reach[0] / reach[1] - 1.0,
+        "energy": float(motion.energies[-1] - exact.energies[-1]) / exact.brought,
+        "growth": float((motion.energies - motion.energies[0]).max()) / exact.brought,
+    }
+
+
+def trajectory_rows(
+    bench: Bench, setting: Setting, counts: list[int], *, seconds: float = 1.0, name: str = DEFAULT
+) -> list[Row]:
+    """A motion at several iteration counts of a solver in float32, against the converged one in float64."""
+    solved = bench.simulator(setting, torch.float64, Chebyshev(), **SOLVED)
+    exact = record_trajectory(bench, solved, setting.resolution, seconds)
+    solver: Solver = bench.solver(name, setting)[0]
+    rows = []
+    for count in counts:
+        sim = bench.simulator(setting, torch.float32, solver, iterations=count)
+        motion = record_trajectory(bench, sim, setting.resolution, seconds)
+        found = compare_trajectories(motion, exact)
+        finite = math.isfinite(found["path"])
+        rows.append(
+            Row(
+                axis="trajectory", method=name, precision=precision_name(sim.dtype), iterations=count,
+                local_steps=count, status="ok" if finite else "diverged", youngs=setting.youngs,
+                time_step=setting.time_step, vertices=sim.vertices, tets=len(bench.mesh(setting.resolution).tets),
+                error=found["path"] if finite else math.inf, milliseconds=motion.milliseconds,
+                default=name == DEFAULT and count == DEFAULT_ITERATIONS, more={**found, "seconds_of_motion": seconds},
+            )
+        )  # fmt: skip
+    return rows

@@ -1,0 +1,391 @@
+"""Choose solver and iterations for an error or a time, from a short study on the user's own scene: `Simulator.tune`.
+
+The study takes a few states of the motion, solves each to convergence in float64 (`accuracy.exact_steps`), and runs
+every candidate at doubling iteration counts from the same states. What it promises is kept as a `Promise`, whose
+`holds(info)` watches a run by the residual: error and residual of one scene fall together, and the study measures by
+how much.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from .accuracy import ExactStep, exact_steps, frictionless
+from .contenders import safe_solvers
+from .diagonal import step_diagonal
+from .material import MATERIAL_ROWS
+from .solvers import Chebyshev, Solver
+from .state import Info, State
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+__all__ = ["Promise", "Trial", "TuningWarning", "tune"]
+
+MOST_ITERATIONS = 2048
+# The study aims this much below what is promised, because states that it has not seen may be harder, and allows itself
+# that share of the rounding.
+SAFETY = 2.0
+_STUDIED_ROUNDINGS = 2.0
+_STEPS = (0, 1, 4, 12, 30)  # of the motion, whose states are studied
+_TURNED = (0, 4)  # those that are also studied with the axes of their velocities exchanged
+_ENVIRONMENTS = 3  # of a batch, and the worst conditioned one
+_HEADROOM = 0.95  # of a budget in milliseconds that is spent: times scatter
+_NEAR = 1.1  # a safer candidate wins although it takes this much longer
+
+
+class TuningWarning(UserWarning):
+    """The target of `tune` cannot be reached; the promise says what can."""
+
+
+class Trial(NamedTuple):
+    """One candidate at one iteration count."""
+
+    solver: Solver
+    iterations: int
+    error: float  # worst over the states, beyond rounding
+    residuals: tuple[float, ...]  # of the states
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What `Simulator.tune` chose and what may be expected of it, for motions like the studied one.
+
+    |x - x*| <= error |x_0 - x*| + 10 eps |x|: x* the converged step, x_0 the first iterate, friction left out, eps of
+    the precision. The last term matters to steps that hardly change anything, as of a body that comes to rest.
+    """
+
+    asked_error: float | None
+    asked_milliseconds: float | None
+    attained: bool  # whether what was asked for can be had; if not, error and milliseconds say what can
+    solver: Solver
+    iterations: int
+    error: float  # promised, of a step
+    studied_error: float  # worst of the study
+    milliseconds: float  # median of a step of the batch that tune saw, on the machine where it ran
+    residual_limit: float  # `info.residual` above which the promise is not to be relied on
+    error_per_residual: float  # largest ratio in the study
+    time_step: float  # s
+    dtype: torch.dtype
+    device: str
+    batch: int
+    trials: tuple[Trial, ...]
+
+    def holds(self, info: Info) -> Tensor:
+        """Whether the error may still be relied on [B] (bool), from the residual that `return_info=True` reports.
+
+        An estimate, calibrated on the studied states: the promise is doubted when the residual is larger than theirs by
+        more than the safety that was kept, and when it is not a number.
+        """
+        return info.residual <= self.residual_limit
+
+    @torch.no_grad()
+    def audit(self, sim: Simulator, state: State, after: State, forces: Tensor | None = None) -> Tensor:
+        """Error of a step [B], from solving it on: |x' - x| / |x' - x_0| with x' three times as many iterations later.
+
+        Costs three steps and calibrates nothing: for now and then. Low where even those iterations change little.
+
+        Args:
+            sim: the tuned simulator.
+            state: where the step started.
+            after: where it ended.
+            forces: that the step was given.
+        """
+        further = copy.copy(sim)
+        further.iterations, further.tolerance = 3 * self.iterations, 0.0
+        solved: Tensor = further(state, forces, start=after[0])[1]
+        further.iterations = 0
+        first: Tensor = further(state, forces)[1]
+        # displacements over the time step are velocities
+        error: Tensor = (solved - after[1]).flatten(1).norm(dim=1) / (solved - first).flatten(1).norm(dim=1)
+        return error
+
+    def estimate(self, info: Info) -> Tensor:
+        """Error of the step [B] that its residual speaks of; NaN without `return_info=True`."""
+        return info.residual * self.error_per_residual
+
+    def covers(self, sim: Simulator) -> bool:
+        """Whether the simulator still has the settings that were promised for; the material is not compared."""
+        now = (sim.solver, sim.iterations, sim.time_step, sim.dtype, str(sim.device), sim.tolerance)
+        return now == (self.solver, self.iterations, self.time_step, self.dtype, self.device, 0.0)
+
+    def __str__(self) -> str:
+        wanted = f"error {self.asked_error:g}" if self.asked_error is not None else f"{self.asked_milliseconds:g} ms"
+        verdict = "" if self.attained else f" ({wanted} cannot be had)"
+        return f"error {self.error:.1e}, {self.milliseconds:.2g} ms a step of {self.batch}{verdict}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Study:
+    """What every trial needs."""
+
+    sim: Simulator  # frictionless, its batch the studied states
+    state: State
+    exact: list[ExactStep]
+
+    @torch.no_grad()
+    def trial(self, solver: Solver, iterations: int) -> Trial:
+        """Worst error of some iterations."""
+        self.sim.solver, self.sim.iterations = solver, iterations
+        after, info = self.sim(self.state, return_info=True)
+        displacements = after.velocities.double().cpu().numpy() * self.sim.time_step
+        pairs = zip(self.exact, displacements, strict=True)
+        # what the converged steps themselves may be wrong by counts as error
+        errors = [
+            step.error_beyond_rounding(u, self.sim.dtype, _STUDIED_ROUNDINGS) + step.uncertainty for step, u in pairs
+        ]
+        return Trial(solver, iterations, max(errors), tuple(info.residual.tolist()))
+
+
+def tune(
+    sim: Simulator,
+    state: State | None = None,
+    *,
+    error: float | None = None,
+    milliseconds: float | None = None,
+    candidates: Sequence[Solver] | None = None,
+    most: int = MOST_ITERATIONS,
+    progress: bool = False,
+) -> Promise:
+    """See `Simulator.tune`."""
+    _check_request(error, milliseconds, most)
+    start = sim.rest_state() if state is None else state
+    _check_start(sim, start)
+    study = _prepare(sim, start)
+    named: Mapping[str, Solver] = (
+        safe_solvers(study.sim, study.state)
+        if candidates is None
+        else {str(number): solver for number, solver in enumerate(candidates)}
+    )
+    if not named:
+        raise ValueError("tune: candidates must hold at least one solver, got none")
+    seek = _for_error(study, error, most) if error is not None else _for_time(sim, study, start, milliseconds, most)
+    with tqdm(named.values(), desc="tuning", unit="solver", disable=not progress, leave=False) as bar:
+        found = [seek(solver) for solver in bar]
+    timed = [(trials, _milliseconds(sim, start, trials[-1])) for trials in found]
+    trials, cost = _cheapest(timed, error) if error is not None else min(timed, key=lambda pair: pair[0][-1].error)
+    promise = _promise(sim, start, trials, cost, error, milliseconds)
+    sim.solver, sim.iterations, sim.tolerance, sim.promise = promise.solver, promise.iterations, 0.0, promise
+    if not promise.attained:
+        warnings.warn(f"tune: {promise}", TuningWarning, stacklevel=3)
+    return promise
+
+
+# ---- what is refused
+
+
+def _check_request(error: float | None, milliseconds: float | None, most: int) -> None:
+    if (error is None) == (milliseconds is None):
+        raise ValueError(
+            f"tune takes one of error and milliseconds, got error={error} and milliseconds={milliseconds}; "
+            "for example sim.tune(error=1e-2)"
+        )
+    if error is not None and not 0.0 < error < 1.0:
+        raise ValueError(f"tune: error must lie in (0, 1), 1 being the first iterate; got {error}")
+    if milliseconds is not None and not 0.0 < milliseconds < math.inf:
+        raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
+    if most < 1:
+        raise ValueError(f"tune: most must be at least one iteration, got {most}")
+
+
+def _check_start(sim: Simulator, state: State) -> None:
+    sim.check_state(state)
+    if state[0].dim() != 3 or not len(state[0]):
+        raise ValueError(f"tune: state must hold environments [B, V, 3], at least one, got {list(state[0].shape)}")
+    for name, part in zip(State._fields, state, strict=True):
+        bad = (~part.isfinite()).flatten(1).any(1).nonzero()
+        if len(bad):
+            raise ValueError(f"tune: state.{name} must be finite, got NaN or infinity in environment {int(bad[0])}")
+    inertia, diagonal = step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)
+    bad = ~((inertia > 0) & (diagonal > 0)).reshape(-1, sim.vertices).all(0)
+    if bool(bad.any()):
+        vertex = int(bad.nonzero()[0])
+        raise ValueError(
+            f"tune: the system is singular: vertex {vertex} has inertia {float(inertia[..., vertex].min()):g} N/m and "
+            f"diagonal {float(diagonal[..., vertex].min()):g} N/m, which must be positive; look at masses and stiffness"
+        )
+
+
+# ---- the study
+
+
+@torch.no_grad()
+def _prepare(sim: Simulator, start: State) -> _Study:
+    """States of the motion from `start`, with their converged steps; those that only fall are left out."""
+    items = _environments(sim, len(start[0]))
+    smooth = _of_environments(frictionless(sim), items, len(start[0]))
+    states = _motion(smooth, State(start[0][items], start[1][items]))
+    everyone = _of_environments(smooth, list(range(len(items))) * len(states), len(items))
+    state = State(*(torch.cat(parts) for parts in zip(*states, strict=True)))
+    exact = exact_steps(everyone, state)
+    moving = [number for number, step in enumerate(exact) if step.moves(sim.dtype)]
+    if not moving:
+        raise ValueError(
+            "tune: this scene has no motion that needs solving: from the given state the bodies rest or fall freely; "
+            "pass a state of the motion that matters, for example sim.tune(state, error=1e-2)"
+        )
+    chosen = _of_environments(everyone, moving, len(exact))
+    return _Study(chosen, State(state[0][moving], state[1][moving]), [exact[number] for number in moving])
+
+
+def _environments(sim: Simulator, batch: int) -> list[int]:
+    """Some environments of a batch, evenly spread, and the one whose system is worst conditioned."""
+    items = set(np.linspace(0, batch - 1, _ENVIRONMENTS).round().astype(int).tolist())
+    inertia, diagonal = step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)
+    ratio = torch.where(inertia.isinf(), torch.ones_like(inertia), inertia / diagonal)
+    if ratio.dim() == 2 and len(ratio) == batch:
+        items.add(int(ratio.min(dim=1).values.argmin()))
+    return sorted(items)
+
+
+def _motion(sim: Simulator, start: State) -> list[State]:
+    """The states before the steps `_STEPS`, solved well enough to be those of the true motion, and a few turned ones.
+
+    These have the same shape and speeds in other directions: as likely a motion, whose steps err in other modes.
+    """
+    mover = copy.copy(sim)
+    mover.solver, mover.iterations = Chebyshev(), 512
+    states, state = [], start
+    for step in range(max(_STEPS) + 1):
+        if step in _STEPS:
+            states.append(state)
+        if step in _TURNED:
+            states.append(State(state[0], state[1].roll(1, -1)))
+        state = mover(state)
+        if not bool(state[0].isfinite().all()):
+            break
+    return states
+
+
+def _of_environments(sim: Simulator, items: list[int], batch: int) -> Simulator:
+    """The simulator for some environments of a batch: material that each has its own of is picked."""
+    own = {
+        name: getattr(sim, name).detach()[items]
+        for name, row in MATERIAL_ROWS.items()
+        if getattr(sim, name).dim() > row.dims and len(getattr(sim, name)) == batch
+    }
+    picked = copy.deepcopy(sim)
+    picked.set_material(**own)
+    return picked
+
+
+Seek = Callable[[Solver], list[Trial]]
+
+
+def _for_error(study: _Study, error: float, most: int) -> Seek:
+    """The fewest iterations that bring the worst state below error / SAFETY, and some more; the chosen trial last.
+
+    The additional ones cost little where few are needed, which is where another state is most likely to need more.
+    """
+
+    def seek(solver: Solver) -> list[Trial]:
+        goal = error / SAFETY
+        trials = [study.trial(solver, 1)]
+        while trials[-1].error > goal and trials[-1].iterations < most:
+            trials.append(study.trial(solver, min(2 * trials[-1].iterations, most)))
+        if trials[-1].error > goal:
+            return [*trials, min(trials, key=lambda trial: trial.error)]
+        low, high = trials[-2].iterations if len(trials) > 1 else 0, trials[-1]
+        while high.iterations - low > max(1, high.iterations // 32):
+            middle = study.trial(solver, (low + high.iterations) // 2)
+            trials.append(middle)
+            low, high = (low, middle) if middle.error <= goal else (middle.iterations, high)
+        return [*trials, study.trial(solver, min(high.iterations + 2 + high.iterations // 8, most))]
+
+    return seek
+
+
+def _for_time(sim: Simulator, study: _Study, start: State, budget: float | None, most: int) -> Seek:
+    """The most iterations of a solver that a budget [ms] pays for, from the times of two counts."""
+    assert budget is not None
+    spend = _HEADROOM * budget
+
+    def seek(solver: Solver) -> list[Trial]:
+        few, many = 4, 68
+        times = {count: _milliseconds(sim, start, Trial(solver, count, 0.0, ())) for count in (few, many)}
+        slope = max((times[many] - times[few]) / (many - few), 1e-9)
+        count = int(np.clip((spend - times[few]) / slope + few, 1, most))
+        for _ in range(4):  # times of long runs differ from those of short ones
+            measured = _milliseconds(sim, start, Trial(solver, count, 0.0, ()))
+            if count == 1 or (measured <= budget and (count == most or measured > 0.85 * budget)):
+                break
+            count = int(np.clip(round(count * spend / measured), 1, most))
+        return [study.trial(solver, count)]
+
+    return seek
+
+
+def _milliseconds(sim: Simulator, start: State, trial: Trial) -> float:
+    """A step of the whole batch: the lowest median of three series, so that a disturbance of one does not count."""
+    timed = copy.copy(sim)
+    timed.solver, timed.iterations, timed.tolerance = trial.solver, trial.iterations, 0.0
+    state = State(start[0].clone(), start[1].clone())
+    timed.step_(state)
+    medians = []
+    for _ in range(3):
+        times: list[float] = []
+        while len(times) < 5 or (sum(times) < 0.05 and len(times) < 50):
+            _wait_for(sim)
+            begin = time.perf_counter()
+            timed.step_(state)
+            _wait_for(sim)
+            times.append(time.perf_counter() - begin)
+        medians.append(statistics.median(times))
+    return 1e3 * min(medians)
+
+
+def _wait_for(sim: Simulator) -> None:
+    if sim.device.type == "cuda":
+        torch.cuda.synchronize(sim.device)
+
+
+# ---- the choice
+
+
+def _cheapest(timed: list[tuple[list[Trial], float]], error: float) -> tuple[list[Trial], float]:
+    """The first candidate that takes hardly longer than the fastest of those that reach the error; else the best."""
+    reached = [(trials, cost) for trials, cost in timed if trials[-1].error <= error / SAFETY]
+    if not reached:
+        return min(timed, key=lambda pair: pair[0][-1].error)
+    fastest = min(cost for _, cost in reached)
+    return next((trials, cost) for trials, cost in reached if cost <= _NEAR * fastest)
+
+
+def _promise(
+    sim: Simulator, start: State, trials: list[Trial], cost: float, error: float | None, milliseconds: float | None
+) -> Promise:
+    chosen = trials[-1]
+    attained = chosen.error <= error / SAFETY if error is not None else cost <= 1.2 * (milliseconds or 0.0)
+    promised = error if attained and error is not None else min(SAFETY * chosen.error, 1.0)
+    largest = max(chosen.residuals)
+    # where rounding explains all of the error, the safety that is kept elsewhere
+    room = promised / chosen.error if chosen.error > 0.0 else SAFETY
+    return Promise(
+        asked_error=error,
+        asked_milliseconds=milliseconds,
+        attained=attained,
+        solver=chosen.solver,
+        iterations=chosen.iterations,
+        error=promised,
+        studied_error=chosen.error,
+        milliseconds=cost,
+        residual_limit=largest * room,
+        error_per_residual=chosen.error / largest if largest > 0.0 else 0.0,
+        time_step=sim.time_step,
+        dtype=sim.dtype,
+        device=str(sim.device),
+        batch=len(start[0]),
+        trials=tuple(trials),
+    )
