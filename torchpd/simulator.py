@@ -12,13 +12,14 @@ from torch import Tensor, nn
 from .adjoint import AdjointCall, step_gradient
 from .capture import CapturedStep
 from .material import MATERIAL_ROWS, check_material, material_of
+from .multilevel import has_levels, precondition_plan, reference_of, without_levels
 from .ops import INFO_WIDTH, refuse_tangents
 from .placing import check_wanted_device, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .rollout import PerStep, Rollout, roll
 from .scene import Scene
-from .solvers import Chebyshev, Jacobi, Solver
+from .solvers import Chebyshev, Jacobi, Multilevel, Solver
 from .state import Info, State, Track
 from .summary import describe
 from .targets import Anchors, Targets
@@ -40,7 +41,7 @@ class Simulator(nn.Module):
         scene: what there is.
         time_step: h [s], positive.
         iterations: local and global steps of one time step, at most.
-        solver: `Chebyshev()` or `Jacobi()`.
+        solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "grid" or "stream", see `torchpd.regimes`;
@@ -76,9 +77,7 @@ class Simulator(nn.Module):
         self.scene = scene
         self.time_step = _positive("time_step", time_step, "s")
         self.iterations = _whole("iterations", iterations, 0)
-        self.solver = Chebyshev() if solver is None else solver
-        if not isinstance(self.solver, Jacobi | Chebyshev):
-            raise TypeError(f"Simulator: solver must be Jacobi or Chebyshev, got {type(solver).__name__}")
+        solver = _checked_solver(Chebyshev() if solver is None else solver)
         self.tolerance = float(tolerance)
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
@@ -89,6 +88,7 @@ class Simulator(nn.Module):
         self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
         for name, value in material_of(values, dtype).items():
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
+        self.solver = solver
 
     # ---- what a simulation is made of
 
@@ -107,6 +107,32 @@ class Simulator(nn.Module):
         """Where states have to be."""
         return self.plan.device
 
+    @property
+    def solver(self) -> Solver:
+        """How a step is solved. A multilevel one is prepared when it is set."""
+        return self._solver
+
+    @solver.setter
+    def solver(self, solver: Solver) -> None:
+        wanted = isinstance(_checked_solver(solver), Multilevel)
+        if wanted and self.device.type == "cuda":
+            raise RuntimeError(f"Simulator: {_CPU_ONLY}")
+        self._solver = solver
+        if wanted != has_levels(self.plan.arrays):
+            self.prepare_solver()
+
+    def prepare_solver(self) -> None:
+        """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`.
+
+        Worth it after the material has changed unevenly, which `Info.rho` and `Info.residual` tell, or time_step has. New
+        hard pins, by `set_material`, do it by themselves. Takes 0.3 s for 8 thousand vertices, seconds for a million
+        tetrahedra. Other solvers prepare nothing.
+        """
+        self.plan = without_levels(self.plan)
+        if isinstance(self.solver, Multilevel):
+            reference = reference_of(self.plan, self.material(), self.time_step)
+            self.plan = precondition_plan(self.plan, self.scene.values(), *reference)
+
     def material(self) -> list[Tensor]:
         """The differentiable arrays in the order of the ops."""
         return [getattr(self, name) for name in MATERIAL_ROWS]
@@ -120,6 +146,7 @@ class Simulator(nn.Module):
             arrays: by name, see the class. Shapes and values are checked here, once.
         """
         checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
+        held = self.pin_stiffness.isinf()
         with torch.no_grad():
             for name, tensor in checked.items():
                 own = getattr(self, name)
@@ -127,6 +154,9 @@ class Simulator(nn.Module):
                     own.copy_(tensor)
                 else:
                     setattr(self, name, nn.Parameter(tensor.clone(), requires_grad=own.requires_grad))
+        # what is held belongs to the structure of a preconditioner
+        if has_levels(self.plan.arrays) and not torch.equal(held, self.pin_stiffness.isinf()):
+            self.prepare_solver()
 
     def _checked_material(self, name: str, value: Tensor | float) -> Tensor:
         if name not in MATERIAL_ROWS:
@@ -164,6 +194,8 @@ class Simulator(nn.Module):
         wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
+        if wanted.device.type == "cuda" and isinstance(self.solver, Multilevel):
+            raise RuntimeError(f"Simulator: {_CPU_ONLY}")
         changes_precision = wanted.dtype != self.dtype
         # first, because it may refuse
         plan = plan_on(self, wanted.dtype, wanted.device)
@@ -409,6 +441,15 @@ class Simulator(nn.Module):
         pins, spheres = self.anchors.place(targets, self.pin_targets, self.spheres, batch)
         replaced = {"pin_targets": pins, "spheres": spheres}
         return [replaced.get(name, getattr(self, name)).contiguous() for name in MATERIAL_ROWS]
+
+
+_CPU_ONLY = "Multilevel runs on the CPU; on a GPU take Chebyshev, by sim.solver = torchpd.Chebyshev()"
+
+
+def _checked_solver(solver: Solver) -> Solver:
+    if not isinstance(solver, Jacobi | Chebyshev | Multilevel):
+        raise TypeError(f"Simulator: solver must be Jacobi, Chebyshev or Multilevel, got {type(solver).__name__}")
+    return solver
 
 
 def _first_iterate(start: str | Tensor) -> tuple[Tensor | None, bool]:

@@ -22,9 +22,9 @@ class Info(NamedTuple):
     residual: Tensor  # |grad E| / |grad E at x + h v|, less what contacts balance; NaN unless asked for
     energy: Tensor  # objective of the step at the last iterate [J]; NaN unless asked for
     iterations: Tensor  # used
-    restarts: Tensor  # of the acceleration, because the energy rose
+    restarts: Tensor  # of the acceleration, because the energy rose; of Multilevel, trials that were taken back
     converged: Tensor  # bool: the tolerance was met before the iterations ran out
-    rho: Tensor  # spectral radius that the schedule used
+    rho: Tensor  # spectral radius that the schedule used; of Multilevel, 1 - q/s: q A_0 <= A <= s A_0, A_0 what M was made of
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:
