@@ -64,9 +64,7 @@ def _diagonal_vmap(
 
 
 @torch.library.register_vmap("torchpd::precondition")
-def _precondition_vmap(
-    info: Any, in_dims: tuple[Any, ...], field: Tensor, plan: list[Tensor]
-) -> tuple[Tensor, int]:
+def _precondition_vmap(info: Any, in_dims: tuple[Any, ...], field: Tensor, plan: list[Tensor]) -> tuple[Tensor, int]:
     _check_plan(in_dims[1])
     mapped = field.movedim(in_dims[0], 0)
     return _split(_ops.precondition(mapped.flatten(0, 1), plan), info.batch_size), 0

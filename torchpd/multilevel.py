@@ -1,4 +1,4 @@
-"""The multilevel preconditioner of a scene: made once, of the material at the time, as arrays that follow the plan's."""
+"""The multilevel preconditioner of a scene: made once, of the material then, as arrays that follow the plan's."""
 
 from __future__ import annotations
 
@@ -17,12 +17,20 @@ from .plan import Plan, compiling
 from .scene import SceneValues
 from .tables import MULTILEVEL_TABLE, PLAN_TABLE
 
-__all__ = ["has_levels", "precondition_plan", "reference_of", "without_levels"]
+__all__ = ["has_levels", "inertia_of_levels", "precondition_plan", "reference_of", "without_levels"]
 
 
 def has_levels(plan: Sequence[Tensor]) -> bool:
     """Whether the arrays of a plan include those of a preconditioner."""
     return len(plan) == len(PLAN_TABLE) + len(MULTILEVEL_TABLE)
+
+
+def inertia_of_levels(plan: Sequence[Tensor]) -> Tensor:
+    """Inertia a that a preconditioner was made of [V] N/m, in the user's order; inf where held."""
+    row = next(number for number, row in enumerate(MULTILEVEL_TABLE) if row.name == "reference_inertia")
+    _, vertex_order, *_ = plan
+    stored = plan[len(PLAN_TABLE) + row]
+    return torch.empty_like(stored).index_copy(0, vertex_order.long(), stored)
 
 
 def without_levels(plan: Plan) -> Plan:
@@ -31,7 +39,7 @@ def without_levels(plan: Plan) -> Plan:
 
 
 def reference_of(plan: Plan, material: Sequence[Tensor], time_step: float) -> tuple[Tensor, Tensor]:
-    """What a matrix that serves all environments is made of: stiffness [E] Pa and inertia a [V] N/m, the largest of each.
+    """What a matrix for all environments is made of: the largest stiffness [E] Pa and inertia a [V] N/m of any.
 
     A vertex counts as held (inf) where a hard pin holds it in every environment. Inertia stands in internal order. An
     environment whose values are all s times these loses nothing: M / s serves it exactly.

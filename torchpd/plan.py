@@ -28,7 +28,8 @@ KERNELS = ("block", "grid", "stream")
 class Plan:
     """Constant arrays of a scene in the order of a table that C++ declares, also by name: `plan.vertex_order`.
 
-    The CPU and GPUs have a table each; that of a multilevel preconditioner may follow the CPU's. `why` says in words why a GPU's plan is for the kernel that it is for.
+    The CPU and GPUs have a table each; that of a multilevel preconditioner may follow the CPU's. `why` says in words
+    why a GPU's plan is for the kernel that it is for.
     """
 
     arrays: tuple[Tensor, ...]

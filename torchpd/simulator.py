@@ -124,9 +124,9 @@ class Simulator(nn.Module):
     def prepare_solver(self) -> None:
         """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`.
 
-        Worth it after the material has changed unevenly, which `Info.rho` and `Info.residual` tell, or time_step has. New
-        hard pins, by `set_material`, do it by themselves. Takes 0.3 s for 8 thousand vertices, seconds for a million
-        tetrahedra. Other solvers prepare nothing.
+        Worth it after the material has changed unevenly, which `Info.rho` and `Info.residual` tell, or time_step has.
+        `set_material` does it by itself when it pins other vertices hard, or frees some. Takes 0.3 s for 8 thousand
+        vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
         """
         self.plan = without_levels(self.plan)
         if isinstance(self.solver, Multilevel):

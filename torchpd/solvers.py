@@ -120,9 +120,10 @@ class Chebyshev:
 
 @dataclass(frozen=True)
 class Multilevel:
-    """Iterations with a multilevel approximation M of A^-1, A the constant matrix of projective dynamics: for stiff and
-    for accurate steps. They need a few dozen iterations however stiff or fine the mesh, at two to three times the cost of
-    one; the scene takes longer to compile. CPU only.
+    """Iterations with a multilevel approximation M of A^-1, A the constant matrix of projective dynamics.
+
+    For stiff and for accurate steps: a few dozen iterations do, however stiff or fine the mesh, each at three times the
+    cost of a Jacobi iteration. The scene takes longer to compile. CPU only.
 
     Every iterate is judged by its energy before the next one starts from it. Contacts project every iterate; while they
     hold vertices M fits less well. With friction, which has no energy, the judgement allows a rise of 1 %.

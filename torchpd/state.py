@@ -17,14 +17,18 @@ class State(NamedTuple):
 
 
 class Info(NamedTuple):
-    """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it."""
+    """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it.
+
+    Of `Multilevel`, `restarts` counts trials that were taken back, and `rho` is 1 - q / s, where q A_0 <= A <= s A_0
+    and M was made of A_0: 0 where M fits, near 1 where it does not (`Simulator.prepare_solver` makes it anew).
+    """
 
     residual: Tensor  # |grad E| / |grad E at x + h v|, less what contacts balance; NaN unless asked for
     energy: Tensor  # objective of the step at the last iterate [J]; NaN unless asked for
     iterations: Tensor  # used
-    restarts: Tensor  # of the acceleration, because the energy rose; of Multilevel, trials that were taken back
+    restarts: Tensor  # of the acceleration, because the energy rose
     converged: Tensor  # bool: the tolerance was met before the iterations ran out
-    rho: Tensor  # spectral radius that the schedule used; of Multilevel, 1 - q/s: q A_0 <= A <= s A_0, A_0 what M was made of
+    rho: Tensor  # spectral radius that the schedule used
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:

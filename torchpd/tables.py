@@ -6,7 +6,15 @@ from typing import NamedTuple
 
 from . import _C
 
-__all__ = ["DEVICE_PLAN_TABLE", "DEVICE_SIZES", "MATERIAL_TABLE", "MULTILEVEL_TABLE", "PLAN_TABLE", "MaterialRow", "PlanRow"]
+__all__ = [
+    "DEVICE_PLAN_TABLE",
+    "DEVICE_SIZES",
+    "MATERIAL_TABLE",
+    "MULTILEVEL_TABLE",
+    "PLAN_TABLE",
+    "MaterialRow",
+    "PlanRow",
+]
 
 
 class PlanRow(NamedTuple):

@@ -1,60 +1,10 @@
 // Runner of solver/multilevel.h on the CPU: what Stepper does of a step, and another way to the next iterate.
 #pragma once
-#include "cpu/cycle.h"
+#include "cpu/misfit.h"
+#include "cpu/outer_work.h"
 #include "cpu/stepper.h"
 
 namespace pd::inline PD_TARGET {
-
-// Vectors of the outer iteration, beside those of a Workspace, in which u is the trial.
-template <class Lanes>
-struct OuterWork {
-  using Real = typename Lanes::Real;
-  using Value = typename Lanes::Value;
-  using Wide = typename Lanes::Wide;
-
-  static constexpr int dots = 2 * history + 3;  // sums that one pass may make
-  static constexpr int chunk = 256;             // vertices that one of them covers
-
-  Cycle<Lanes> cycle;
-  Value *base, *pull, *fresh, *direction;  // [vertices] iterate to go on from, residuals there and at the trial
-  Value *s[history], *y[history];          // [vertices] L-BFGS pairs
-  Mat3<Real>*free, *fresh_free;            // [vertices] directions that contacts leave; none without contacts
-  Wide (*sums)[dots];                      // [chunks]
-  double (*ratios)[2];                     // [threads] least and largest, of the material to that of M
-  int chunks;
-
-  OuterWork(const StepCall<typename Lanes::Scalar>& call, bool touching, int threads)
-      : cycle(call.plan.levels), chunks((call.plan.vertices + chunk - 1) / chunk) {
-    const bool pairs = call.settings.schedule == ScheduleKind::lbfgs;
-    const std::int64_t n = call.plan.vertices, vectors = 4 + (pairs ? 2 * history : 0);
-    const std::int64_t projectors = touching ? 2 * n : 0;
-    storage_ = allocate_zeroed(vectors * n * sizeof(Value) + projectors * sizeof(Mat3<Real>) +
-                               chunks * sizeof(*sums) + threads * sizeof(*ratios) + 4 * alignment);
-    std::byte* at = storage_.get();
-    for (Value** field : {&base, &pull, &fresh, &direction}) *field = place<Value>(at, n);
-    for (int i = 0; i < history; ++i) {
-      s[i] = place<Value>(at, pairs ? n : 0);
-      y[i] = place<Value>(at, pairs ? n : 0);
-    }
-    sums = place<Wide[dots]>(at, chunks);
-    free = place<Mat3<Real>>(at, projectors / 2);
-    fresh_free = place<Mat3<Real>>(at, projectors / 2);
-    ratios = place<double[2]>(at, threads);
-  }
-
- private:
-  static constexpr std::size_t alignment = 64;
-
-  template <class Item>
-  static Item* place(std::byte*& at, std::int64_t count) {
-    const auto address = reinterpret_cast<std::uintptr_t>(at);
-    Item* items = reinterpret_cast<Item*>((address + alignof(Item) - 1) / alignof(Item) * alignof(Item));
-    at = reinterpret_cast<std::byte*>(items + count);
-    return items;
-  }
-
-  Storage storage_;
-};
 
 // `Touching`: see solver/vertex.h.
 template <class Lanes, bool Touching>
@@ -94,11 +44,11 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
       outer_[lane] = {};
-      outer_[lane].scale = scale_[lane];
+      outer_[lane].scale = misfit_[lane].scale;
       outer_[lane].friction = Lanes::lane(friction, lane) > 0;
       outer_[lane].slack = outer_[lane].friction ? guard_slack_friction : energy_noise<T>();
       pairs_[lane] = {};
-      schedule_[lane].rho = misfit_[lane];
+      schedule_[lane].rho = misfit_[lane].spread;
     }
   }
 
@@ -108,7 +58,13 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       const auto v = vertex(i);
       sums.energy = v.add_energy(w_.u[i], sums.energy);
       o_.fresh[i] = v.unbalanced(contacts_, w_.u[i], force);
-      if constexpr (Touching) o_.fresh_free[i] = v.free_directions(contacts_, w_.u[i], force);
+      if constexpr (Touching) {
+        o_.fresh_free[i] = v.free_directions(contacts_, w_.u[i], force);
+        o_.fresh_gradient[i] = v.gradient(w_.u[i], force);
+        // work against the friction of the base
+        const Value friction = open(i, o_.pull[i] - o_.gradient[i]);
+        sums.first = multiply_add(friction, w_.u[i] - o_.base[i], sums.first);
+      }
     });
   }
 
@@ -120,8 +76,11 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
         Lanes::set_lane(accepted_, lane, T(0));
         continue;
       }
-      const double energy = Lanes::lane(sum.energy, lane);
+      const double work = outer_[lane].known ? Lanes::lane(sum.first, lane) : 0;
+      const double energy = Lanes::lane(sum.energy, lane) + work;
       const bool accepted = outer_[lane].accept(energy, lbfgs_);
+      // the friction of another base does other work
+      if (accepted) outer_[lane].energy -= work;
       Lanes::set_lane(accepted_, lane, T(accepted ? 1 : 0));
       Lanes::set_lane(finite_, lane, T(energy < HUGE_VAL ? 1 : 0));
     }
@@ -130,21 +89,20 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   // The pair from the base to the trial, kept or not: it holds for the curvature on the way. Then the base moves on.
   void learn(int k) {
     newest_ = (newest_ + 1) % history;
-    const Real zero(T(0));
-    const Value none = Lanes::value({zero, zero, zero});
     pass([&](std::int64_t i, Value(&sum)[dots]) {
-      const Value s = w_.u[i] - o_.base[i], y = o_.fresh[i] - o_.pull[i];
+      const Value change = w_.u[i] - o_.base[i];
+      const Value s = let_through(i, change), y = let_through(i, o_.fresh[i] - o_.pull[i]);
       if constexpr (Touching) keep_directions(i);
       // what momentum goes on along
       w_.before[i] = choose(o_.base[i], w_.before[i]);
       o_.base[i] = choose(w_.u[i], o_.base[i]);
       o_.pull[i] = choose(o_.fresh[i], o_.pull[i]);
-      sum[2 * history] = multiply_add(s, s, sum[2 * history]);
+      sum[2 * history] = multiply_add(change, change, sum[2 * history]);
       sum[2 * history + 1] = multiply_add(w_.u[i], w_.u[i], sum[2 * history + 1]);
       if (!lbfgs_) return;
       // a trial out of range must not poison sums in which it has no part
-      o_.s[newest_][i] = pick(finite_, s, none);
-      o_.y[newest_][i] = pick(finite_, y, none);
+      o_.s[newest_][i] = pick(finite_, s, none_);
+      o_.y[newest_][i] = pick(finite_, y, none_);
       const Value g = let_through(i, o_.pull[i]);
       for (int j = 0; j < history; ++j) {
         sum[j] = multiply_add(o_.s[j][i], y, sum[j]);
@@ -164,7 +122,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       }
       pairs_[lane].valid[newest_] = false;
       if (k > 0) pairs_[lane].add(newest_, with, total[2 * history], total[2 * history + 2]);
-      if (outer_[lane].plain) pairs_[lane].clear();
+      if (outer_[lane].plain || outer_[lane].diagonal) pairs_[lane].clear();
       pairs_[lane].first_loop(newest_);
     }
     team_.barrier();
@@ -187,27 +145,38 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       in[i] = scale * q;
     });
     o_.cycle.run(team_);
-    lbfgs_ ? correct() : take_result();
+    if (lbfgs_) return correct();
+    each_vertex([&](std::int64_t i) { o_.direction[i] = o_.cycle.result()[i]; });
   }
 
-  // next trial: P(u + beta (u - before) - (1 + beta) t d), or a plain iteration
+  // next trial: P(u + beta (u - before) - (1 + beta) t d), or a plain or accelerated Jacobi iteration
   void advance() {
-    Real beta, length, plain;
+    Real beta, length, plain, diagonal;
+    bool some_plain = false, some_diagonal = false;
     for (int lane = 0; lane < width; ++lane) {
       Outer& outer = outer_[lane];
-      const double limit = outer_limit();
-      const double b = lbfgs_ || outer.plain || done_[lane] ? 0 : outer.extrapolation(limit);
+      const bool goes = !done_[lane], accelerates = goes && outer.diagonal && !outer.plain;
+      const double limit = accelerates ? schedule_[lane].limit : momentum_limit();
+      const double b =
+          accelerates || (goes && !lbfgs_ && !outer.plain) ? outer.extrapolation(limit) : 0;
       Lanes::set_lane(beta, lane, T(b));
-      Lanes::set_lane(length, lane, T(done_[lane] ? 0 : (1 + b) * outer.length()));
-      Lanes::set_lane(plain, lane, T(outer.plain && !done_[lane] ? 1 : 0));
-      used_[lane] += done_[lane] ? 0 : 1;
+      Lanes::set_lane(length, lane, T(goes ? (1 + b) * outer.length() : 0));
+      Lanes::set_lane(plain, lane, T(goes && outer.plain ? 1 : 0));
+      Lanes::set_lane(diagonal, lane, T(accelerates ? 1 : 0));
+      some_plain = some_plain || (goes && outer.plain);
+      some_diagonal = some_diagonal || accelerates;
+      used_[lane] += goes ? 1 : 0;
     }
+    const Real theta(T(set_.relaxation)), one(T(1));
     each_vertex([&](std::int64_t i) {
       const auto v = vertex(i);
-      const Value u = o_.base[i];
-      const Value way = pick(plain, v.inverse * o_.pull[i], length * o_.direction[i]);
-      Value next = u - way;
-      if (!lbfgs_) next = multiply_add(beta, u - w_.before[i], next);
+      const Value u = o_.base[i], before = w_.before[i];
+      Value next = u - way(i, length * o_.direction[i] - beta * (u - before));
+      if (some_plain) next = pick(plain, subtract_product(u, v.inverse, o_.pull[i]), next);
+      if (some_diagonal) {
+        const Value& g = Touching ? o_.gradient[i] : o_.pull[i];
+        next = pick(diagonal, accelerate(u, before, g, theta * v.inverse, one + beta), next);
+      }
       w_.u[i] = v.hold(v.target, v.project(contacts_, next, u));
     });
   }
@@ -221,9 +190,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   }
 
  private:
-  static constexpr double momentum_rho = 0.9995;
-
-  static double outer_limit() {
+  static double momentum_limit() {
     const double b = (1 - sqrt(1 - momentum_rho * momentum_rho)) / momentum_rho;
     return b * b;
   }
@@ -232,7 +199,11 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   Value choose(const Value& a, const Value& b) const { return pick(accepted_, a, b); }
 
   static Value pick(const Real& flag, const Value& a, const Value& b) {
-    const auto take = flag > Real(T(0));
+    return pick_if(flag > Real(T(0)), a, b);
+  }
+
+  template <class Condition>
+  static Value pick_if(const Condition& take, const Value& a, const Value& b) {
     const Vec3<Real> x = Lanes::vec3(a), y = Lanes::vec3(b);
     return Lanes::value({select(take, x.x, y.x), select(take, x.y, y.y), select(take, x.z, y.z)});
   }
@@ -246,11 +217,9 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   // visit(vertex, sums), chunk by chunk: neither threads nor the batch change the order of a sum
   template <class Visit>
   void pass(Visit visit) {
-    const Real zero(T(0));
-    const Value none = Lanes::value({zero, zero, zero});
     for (std::int64_t c = team_.begin(o_.chunks); c < team_.end(o_.chunks); ++c) {
       Value sum[dots];
-      for (Value& s : sum) s = none;
+      for (Value& s : sum) s = none_;
       const std::int64_t end = std::min<std::int64_t>(plan_.vertices, (c + 1) * Work::chunk);
       for (std::int64_t i = c * Work::chunk; i < end; ++i) visit(i, sum);
       for (int d = 0; d < dots; ++d) o_.sums[c][d] = Sweep<Lanes>::add_components(sum[d]);
@@ -265,31 +234,36 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
   }
 
-  // the part of a field that contacts let through
-  Value let_through(std::int64_t i, const Value& field) const {
+  auto is_stranger(std::int64_t i) const {
+    return w_.inertia[i] > Real(T(known_inertia) * plan_.levels.reference_inertia[i]) * trusted_;
+  }
+
+  // the part of a field along which contacts let a vertex go
+  Value open(std::int64_t i, const Value& field) const {
     if constexpr (!Touching) return field;
     return Lanes::value(o_.free[i] * Lanes::vec3(field));
   }
 
+  // the part of a field that M is to work on: not across contacts, nor where it knows nothing of a pin
+  Value let_through(std::int64_t i, const Value& field) const {
+    return open(i, strangers_ ? pick_if(is_stranger(i), none_, field) : field);
+  }
+
   void keep_directions(std::int64_t i) {
+    o_.gradient[i] = choose(o_.fresh_gradient[i], o_.gradient[i]);
     for (int a = 0; a < 3; ++a) {
-      o_.free[i].row[a] = Lanes::vec3(choose(Lanes::value(o_.fresh_free[i].row[a]),
-                                             Lanes::value(o_.free[i].row[a])));
+      o_.free[i].row[a] = Lanes::vec3(
+          choose(Lanes::value(o_.fresh_free[i].row[a]), Lanes::value(o_.free[i].row[a])));
     }
   }
 
-  // what of a direction a vertex takes: along the pull by the diagonal where M has no say
-  Value mixed(std::int64_t i, const Value& d) const {
-    const auto v = vertex(i);
-    const Value plain = v.inverse * o_.pull[i];
+  // A way that M has a say on, where it has: the rest goes along the pull, by the diagonal.
+  Value way(std::int64_t i, const Value& d) const {
+    const Value plain = vertex(i).inverse * o_.pull[i];
     if (!(plan_.levels.fine_inverse[i] > T(0))) return plain;
-    if constexpr (!Touching) return d;
-    return let_through(i, d) + (plain - let_through(i, plain));
-  }
-
-  void take_result() {
-    const Value* z = o_.cycle.result();
-    each_vertex([&](std::int64_t i) { o_.direction[i] = mixed(i, z[i]); });
+    Value mixed = d;
+    if constexpr (Touching) mixed = open(i, d) + (plain - open(i, plain));
+    return strangers_ ? pick_if(is_stranger(i), plain, mixed) : mixed;
   }
 
   // the second loop of L-BFGS, and the slope g.d
@@ -310,14 +284,14 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     pass([&](std::int64_t i, Value(&sum)[dots]) {
       Value d = z[i];
       for (int j = 0; j < history; ++j) d = multiply_add(factor[j], o_.s[j][i], d);
-      o_.direction[i] = d = mixed(i, d);
-      sum[0] = multiply_add(o_.pull[i], d, sum[0]);
+      o_.direction[i] = d;
+      sum[0] = multiply_add(o_.pull[i], way(i, d), sum[0]);
     });
     for (int lane = 0; lane < width; ++lane) {
       add_up(lane, total);
       outer_[lane].slope = total[0];
       // not downhill: what was learnt does not hold here
-      if (total[0] >= 0 || done_[lane] || outer_[lane].plain) continue;
+      if (total[0] >= 0 || done_[lane] || outer_[lane].plain || outer_[lane].diagonal) continue;
       pairs_[lane].clear();
       outer_[lane].plain = true;
       ++outer_[lane].restarts;
@@ -332,40 +306,24 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       done_[lane] = true;
   }
 
-  // least and largest ratio of the material to that of M, per lane: A <= largest A_0
+  // how far the material is from that of M, per lane
   void compare_with_reference() {
+    const MisfitMeter<T> meter{plan_, call_.material.stiffness, team_, o_.ratios};
     for (int lane = 0; lane < width; ++lane) {
-      double least = HUGE_VAL, largest = 0;
-      const auto count = [&](double ratio) {
-        least = ratio < least ? ratio : least;
-        largest = ratio > largest ? ratio : largest;
-      };
-      const T* stiffness = call_.material.stiffness.of(in_.environment(lane));
-      const Levels<T>& levels = plan_.levels;
-      for (std::int64_t t = team_.begin(plan_.tets); t < team_.end(plan_.tets); ++t)
-        count(double(stiffness[t]) / double(levels.reference_stiffness[t]));
-      for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-        const double a = Lanes::lane(Lanes::widen(w_.inertia[i]), lane);
-        if (a > 0 && levels.fine_inverse[i] > T(0)) count(a / double(levels.reference_inertia[i]));
-      }
-      o_.ratios[team_.rank][0] = least;
-      o_.ratios[team_.rank][1] = largest;
-      team_.barrier();
-      for (int rank = 0; rank < team_.size; ++rank) {
-        least = o_.ratios[rank][0] < least ? o_.ratios[rank][0] : least;
-        largest = o_.ratios[rank][1] > largest ? o_.ratios[rank][1] : largest;
-      }
-      scale_[lane] = largest;
-      misfit_[lane] = 1 - least / largest;
-      team_.barrier();
+      misfit_[lane] = meter.measure(in_.environment(lane), [&](std::int64_t i) {
+        return Lanes::lane(Lanes::widen(w_.inertia[i]), lane);
+      });
+      Lanes::set_lane(trusted_, lane, T(misfit_[lane].trusted));
+      strangers_ = strangers_ || misfit_[lane].strangers;
     }
   }
 
   Work& o_;
-  bool lbfgs_;
+  bool lbfgs_, strangers_ = false;  // strangers: vertices that M knows too little of, in any lane
   int newest_ = 0;
-  Real accepted_{T(1)}, finite_{T(1)};
-  double scale_[width] = {}, misfit_[width] = {};
+  Value none_ = Lanes::value({Real(T(0)), Real(T(0)), Real(T(0))});
+  Real accepted_{T(1)}, finite_{T(1)}, trusted_{T(1)};
+  Misfit misfit_[width];
   Outer outer_[width];
   Pairs pairs_[width];
 };

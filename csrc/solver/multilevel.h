@@ -4,7 +4,13 @@
 // to rounding, so u - theta M grad E with theta < 2 lowers E by at least theta (1 - theta / 2) g^T M g. With another one,
 // A <= s A_0 for the largest ratio s of its inertias and stiffnesses to those M was made for: theta M / s does.
 // What accelerates that step may overshoot, so every trial is judged by its energy before the next one starts from it.
-// Trials that fail go back, and after a few of them a plain Jacobi iteration takes over, which descends by the proof there.
+// Trials that fail go back, and after a few of them a plain Jacobi iteration takes over, which descends by the proof there:
+// once with L-BFGS, which has learnt from the failures; accelerated and for the rest of the step with momentum, which has not,
+// and with friction, whose forces no energy has.
+//
+// Contacts hold vertices in directions that M does not know of. M is applied to what is out of balance in the others, and
+// its result taken in the others, while the held ones go by the diagonal (two-metric projection, Bertsekas 1982), as does a
+// vertex that a spring holds much harder than M knows. Friction enters the judgement as the force that it has at the base.
 #pragma once
 #include "math/scalar.h"
 #include "plan/views.h"
@@ -58,16 +64,16 @@ struct Level {
 
 template <class T>
 PD_HD Level<1, T> fine_level(const Levels<T>& l) {
-  return {l.vertices,        l.fine_nodes,     l.fine_start,       l.fine_column,
-          l.fine_value,      l.fine_inverse,   l.fine_lift_start,  l.fine_lift_node,
-          l.fine_lift_weight, l.fine_node_start, l.fine_node_row, l.fine_node_lift};
+  return {l.vertices,         l.fine_nodes,      l.fine_start,      l.fine_column,
+          l.fine_value,       l.fine_inverse,    l.fine_lift_start, l.fine_lift_node,
+          l.fine_lift_weight, l.fine_node_start, l.fine_node_row,   l.fine_node_lift};
 }
 
 template <class T>
 PD_HD Level<4, T> middle_level(const Levels<T>& l) {
-  return {l.fine_nodes,         l.middle_nodes,     l.middle_start,      l.middle_column,
-          l.middle_value,       l.middle_inverse,   l.middle_lift_start, l.middle_lift_node,
-          l.middle_lift_weight, l.middle_node_start, l.middle_node_row,  l.middle_node_lift};
+  return {l.fine_nodes,         l.middle_nodes,      l.middle_start,      l.middle_column,
+          l.middle_value,       l.middle_inverse,    l.middle_lift_start, l.middle_lift_node,
+          l.middle_lift_weight, l.middle_node_start, l.middle_node_row,   l.middle_node_lift};
 }
 
 // sum -= A x, one row
@@ -89,8 +95,7 @@ PD_HD void add_lift(const Level<B, T>& level, const Value* x, int row, Value (&s
     const Value* from = x + std::int64_t(level.lift_node[p]) * 4;
     const T* weight = level.lift_weight + std::int64_t(p) * B * 4;
     for (int i = 0; i < B; ++i) {
-      for (int j = 0; j < 4; ++j)
-        sum[i] = multiply_add(Real(weight[i * 4 + j]), from[j], sum[i]);
+      for (int j = 0; j < 4; ++j) sum[i] = multiply_add(Real(weight[i * 4 + j]), from[j], sum[i]);
     }
   }
 }
@@ -102,18 +107,20 @@ PD_HD void add_restriction(const Level<B, T>& level, const Value* x, int node, V
     const Value* from = x + std::int64_t(level.node_row[p]) * B;
     const T* weight = level.lift_weight + std::int64_t(level.node_lift[p]) * B * 4;
     for (int i = 0; i < B; ++i) {
-      for (int j = 0; j < 4; ++j)
-        sum[j] = multiply_add(Real(weight[i * 4 + j]), from[i], sum[j]);
+      for (int j = 0; j < 4; ++j) sum[j] = multiply_add(Real(weight[i * 4 + j]), from[i], sum[j]);
     }
   }
 }
 
 // ---- the outer iteration of one environment: numbers only
 
-constexpr int history = 8;             // pairs that L-BFGS remembers
-constexpr int patience = 4;            // trials that may fail before a plain iteration
-constexpr double sufficient = 1e-4;    // of the decrease that the slope promises (Armijo)
+constexpr int history = 8;                 // pairs that L-BFGS remembers
+constexpr int patience = 4;                // trials that may fail before a plain iteration
+constexpr double sufficient = 1e-4;        // of the decrease that the slope promises (Armijo)
 constexpr double least_curvature = 1e-12;  // s.y of a pair, in |s| |y|
+constexpr double known_inertia =
+    4;  // times what M was made of and the elements have become: more is left to the diagonal
+constexpr double momentum_rho = 0.9995;  // that of M A is not known, and this limit serves all
 
 // Rounding of E, relative: a rise that says nothing.
 template <class T>
@@ -128,26 +135,27 @@ struct Outer {
   double slack = 0;
   int failures = 0, restarts = 0, momentum = 0;
   bool plain = false, friction = false, accepted = true, known = false;
+  bool diagonal = false;  // momentum with 1 / D in place of M, to the end of the step
 
   // how much of the direction the next trial takes
   PD_HD double length() const { return failures > 1 ? 1.0 / double(1 << (failures - 1)) : 1.0; }
 
   // Whether to go on from a trial of this energy. False for NaN, unless there is nothing to go back to.
   PD_HD bool accept(double trial, bool armijo) {
-    const double demanded = armijo && !plain ? sufficient * length() * slope : 0;
-    accepted = !known || trial <= energy - demanded + slack * absolute(energy);
+    const double demanded = armijo && !plain && !diagonal ? sufficient * length() * slope : 0;
+    const bool fell = !known || trial <= energy - demanded + slack * absolute(energy);
     // friction has no energy: there the plain iteration is a fixed-point map, and goes on regardless
-    accepted = accepted || (plain && friction && trial < HUGE_VAL);
+    accepted = fell || ((plain || diagonal) && friction && trial < HUGE_VAL);
+    restarts += !fell;
+    failures = accepted ? 0 : failures + 1;
+    if (!fell) momentum = 0;
     if (accepted) {
       known = true;
       energy = trial;
-      failures = 0;
-    } else {
-      ++failures;
-      ++restarts;
-      momentum = 0;
     }
     plain = failures >= patience;
+    // with the momentum gone M alone descends, if it fits; and pairs learn nothing of sliding
+    diagonal = diagonal || (armijo ? friction && restarts > patience : failures > 1);
     return accepted;
   }
 
