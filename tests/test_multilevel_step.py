@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ def run(sim: pd.Simulator, case: Case, iterations: int) -> tuple[Array, pd.Info]
 
 
 def errors(sim: pd.Simulator, case: Case, solution: Array, counts: list[int]) -> list[float]:
-    """|x - x*| / |x_0 - x*| after some numbers of iterations; of those up to a tenth may be spent on trials that fail."""
+    """|x - x*| / |x_0 - x*| after some numbers of iterations, of which up to a tenth may be trials that fail."""
     first, found = case.problem().first_iterate(case.start), []
     for count in counts:
         u, info = run(sim, case, count)
@@ -93,7 +94,7 @@ def test_irregular_meshes_with_random_stiffness(name: str) -> None:
     assert errors(sim, case, solution, [40])[0] <= 1e-4
     sim.solver = pd.Chebyshev()
     u, _ = run(sim, case, 160)
-    assert relative_error(u, solution, case.problem().first_iterate(case.start)) > 1e-2
+    assert relative_error(u, solution, case.problem().first_iterate(case.start)) > 1e-3
 
 
 def test_iterates_are_those_of_the_reference(dtype: torch.dtype) -> None:
@@ -120,7 +121,7 @@ def test_hard_first_iterates(kind: str, outer: str, dtype: torch.dtype) -> None:
     sim = simulator(case, dtype, solver=pd.Multilevel(outer))  # type: ignore[arg-type]
     energies = [float(run(sim, case, count)[1].energy) for count in range(0, 60, 3)]
     noise = 1e-5 if dtype == torch.float32 else 1e-12
-    assert all(after <= before * (1 + 3 * noise) for before, after in zip(energies, energies[1:], strict=False))
+    assert all(after <= before * (1 + 3 * noise) for before, after in pairwise(energies))
     u, _ = run(sim, case, 150)
     assert relative_error(u, solution, problem.first_iterate(case.start)) <= 3.4e-4
 
@@ -131,7 +132,7 @@ def test_energy_never_rises_on_slivers(outer: str, dtype: torch.dtype) -> None:
     sim = simulator(case, dtype, solver=pd.Multilevel(outer))  # type: ignore[arg-type]
     energies = [float(run(sim, case, count)[1].energy) for count in range(40)]
     noise = 1e-5 if dtype == torch.float32 else 1e-12
-    assert all(after <= before * (1 + noise) for before, after in zip(energies, energies[1:], strict=False))
+    assert all(after <= before * (1 + noise) for before, after in pairwise(energies))
 
 
 def test_free_body_keeps_its_momentum(dtype: torch.dtype) -> None:
@@ -154,7 +155,7 @@ def test_tolerance_stops_each_environment_by_itself(outer: str, batch: int) -> N
     case = beam(1e5)
     sim = simulator(case, torch.float64, solver=pd.Multilevel(outer), tolerance=1e-4, iterations=100)  # type: ignore[arg-type]
     state = state_of(case, sim, batch)
-    state = pd.State(state.positions, state.velocities * torch.linspace(1.0, 0.3, batch)[:, None, None])
+    state = pd.State(state.positions, state.velocities * torch.linspace(3.0, 0.0, batch)[:, None, None])
     _, info = sim(state, return_info=True)
     assert bool(info.converged.all())
     assert int(info.iterations.max()) < 60

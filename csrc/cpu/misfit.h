@@ -50,13 +50,24 @@ struct MisfitMeter {
     });
     meet(common);
     m.scale = std::max(elements.largest, common.largest);
-    m.spread =
-        1 - std::min(elements.least, common.least) / std::max(elements.largest, inertias.largest);
+    const double least = std::min(elements.least, common.least);
+    m.spread = other_pins(inertia) ? 1 : 1 - least / std::max(elements.largest, inertias.largest);
     m.strangers = inertias.largest > most;
     return m;
   }
 
  private:
+  // whether the step holds other vertices than M does
+  template <class Inertia>
+  bool other_pins(const Inertia& inertia) const {
+    Range differ;
+    for (std::int64_t i = team.begin(plan.vertices); i < team.end(plan.vertices); ++i) {
+      if ((inertia(i) > 0) != (plan.levels.fine_inverse[i] > T(0))) differ.count(1);
+    }
+    meet(differ);
+    return differ.largest > 0;
+  }
+
   // visit(a / a_0) of this thread's vertices that neither the step nor M holds
   template <class Inertia, class Visit>
   void each_inertia(const Inertia& inertia, Visit visit) const {

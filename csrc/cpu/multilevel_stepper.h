@@ -41,6 +41,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   void start() {
     Base::start();
+    newest_ = 0;
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
       outer_[lane] = {};
@@ -90,6 +91,10 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   void learn(int k) {
     newest_ = (newest_ + 1) % history;
     pass([&](std::int64_t i, Value(&sum)[dots]) {
+      if (k == 0) {
+        o_.base[i] = w_.u[i];
+        o_.pull[i] = o_.fresh[i];
+      }
       const Value change = w_.u[i] - o_.base[i];
       const Value s = let_through(i, change), y = let_through(i, o_.fresh[i] - o_.pull[i]);
       if constexpr (Touching) keep_directions(i);

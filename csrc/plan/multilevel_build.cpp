@@ -13,11 +13,12 @@ namespace pd {
 
 namespace {
 
-constexpr int functions = 4;           // 1, x, y, z
-constexpr int most_coarse_nodes = 256;  // 1024 unknowns of the dense level
+constexpr int functions = 4;                        // 1, x, y, z
+constexpr int most_coarse_nodes = 256;              // 1024 unknowns of the dense level
 constexpr std::int32_t most_of_two_levels = 12000;  // free vertices that two levels serve
 constexpr double fine_smoothing = 1.14, middle_smoothing = 1.333;  // omega of I - omega D^-1 A
 constexpr double weakest_coupling = 0.02;  // of middle nodes, of their scaled blocks
+constexpr double coarse_shift = 1e-12;  // of the diagonal: above what rounding takes from a pivot
 constexpr double dependent = 1e-8;  // what orthogonalisation leaves of a column that adds nothing
 
 // Diagonal of a matrix of square blocks.
@@ -45,7 +46,8 @@ std::vector<Coupling> couplings(const BlockMatrix& a, const std::vector<double>&
       for (int i = 0; i < a.height; ++i) {
         for (int j = 0; j < a.width; ++j) {
           const double v = a.value[p * a.block() + i * a.width + j];
-          const double scale = d[std::size_t(row) * a.height + i] * d[std::size_t(column) * a.width + j];
+          const double scale =
+              d[std::size_t(row) * a.height + i] * d[std::size_t(column) * a.width + j];
           if (scale > 0) sum += v * v / scale;
         }
       }
@@ -162,7 +164,8 @@ std::vector<double> scaled_inverse(const BlockMatrix& a, int threads) {
     for (double& v : x) v /= std::sqrt(after);
   }
   std::vector<double> inverse(d.size());
-  for (std::size_t i = 0; i < d.size(); ++i) inverse[i] = d[i] > 0 ? 1 / (1.05 * largest * d[i]) : 0;
+  for (std::size_t i = 0; i < d.size(); ++i)
+    inverse[i] = d[i] > 0 ? 1 / (1.05 * largest * d[i]) : 0;
   return inverse;
 }
 
@@ -189,7 +192,7 @@ std::vector<double> coarse_factor(const BlockMatrix& a, int threads) {
   }
   for (int i = 0; i < n; ++i) {
     double& d = dense[std::size_t(i) * n + i];
-    d = d > 0 ? d * (1 + 1e-10) : 1;
+    d = d > 0 ? d * (1 + coarse_shift) : 1;
   }
   return inverse_cholesky_factor(std::move(dense), n, threads);
 }
@@ -225,8 +228,8 @@ Affine affine(const MultilevelScene& s) {
   return result;
 }
 
-std::vector<std::array<double, 3>> mean_positions(const std::vector<std::array<double, 3>>& position,
-                                                  const Aggregates& groups) {
+std::vector<std::array<double, 3>> mean_positions(
+    const std::vector<std::array<double, 3>>& position, const Aggregates& groups) {
   std::vector<std::array<double, 3>> mean(groups.count, {0, 0, 0});
   std::vector<int> count(groups.count, 0);
   for (std::size_t i = 0; i < position.size(); ++i) {
@@ -259,8 +262,8 @@ Step coarsen(const BlockMatrix& matrix, const std::vector<double>& inverse, doub
 // The nodes below the middle level.
 Aggregates group_nodes(const BlockMatrix& matrix,
                        const std::vector<std::array<double, 3>>& position) {
-  const Graph graph = coupling_graph(
-      matrix.rows, couplings(matrix, diagonal(matrix), position, weakest_coupling));
+  const Graph graph =
+      coupling_graph(matrix.rows, couplings(matrix, diagonal(matrix), position, weakest_coupling));
   const int wanted = std::clamp(matrix.rows / 8, 1, most_coarse_nodes);
   return limited(aggregate(graph, Mask(matrix.rows, 0), wanted), most_coarse_nodes);
 }
