@@ -146,7 +146,7 @@ class Simulator(nn.Module):
             arrays: by name, see the class. Shapes and values are checked here, once.
         """
         checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
-        held = self.pin_stiffness.isinf()
+        held = self._held_everywhere()
         with torch.no_grad():
             for name, tensor in checked.items():
                 own = getattr(self, name)
@@ -155,8 +155,13 @@ class Simulator(nn.Module):
                 else:
                     setattr(self, name, nn.Parameter(tensor.clone(), requires_grad=own.requires_grad))
         # what is held belongs to the structure of a preconditioner
-        if has_levels(self.plan.arrays) and not torch.equal(held, self.pin_stiffness.isinf()):
+        if has_levels(self.plan.arrays) and not torch.equal(held, self._held_everywhere()):
             self.prepare_solver()
+
+    def _held_everywhere(self) -> Tensor:
+        """Whether each pin holds exactly in all environments [P]."""
+        hard = self.pin_stiffness.isinf()
+        return hard.all(0) if hard.dim() == 2 else hard
 
     def _checked_material(self, name: str, value: Tensor | float) -> Tensor:
         if name not in MATERIAL_ROWS:
