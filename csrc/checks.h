@@ -111,9 +111,9 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = first;
   using real = T;
-#define X(name, type, width, rows, meaning)                                                  \
+#define X(name, type, width, rows, meaning)                                                   \
   check_array(arrays[at], scalar_type<type>, count.rows, width, at == first ? on_cpu : place, \
-              "plan." #name, meaning);                                                       \
+              "plan." #name, meaning);                                                        \
   levels.name = arrays[at++].const_data_ptr<type>();
 #include "plan/multilevel.def"
 #undef X

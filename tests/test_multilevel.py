@@ -143,6 +143,28 @@ def test_a_plan_without_it_is_as_before(dtype: torch.dtype) -> None:
     assert all(one is other for one, other in zip(sim.plan.arrays, arrays, strict=True))
 
 
+def test_arrays_are_those_of_the_table(dtype: torch.dtype) -> None:
+    kinds = {"real": dtype, "int32": torch.int32}
+    for case in (swing(3, 1e6), many_bodies()):
+        plan = prepared(case, dtype).plan
+        for row, array in zip(MULTILEVEL_TABLE, plan.arrays[len(PLAN_TABLE) :], strict=True):
+            assert getattr(plan, row.name) is array
+            assert array.dtype == kinds[row.type], row.name
+            assert array.is_contiguous(), row.name
+            assert array.shape[1:] == ((row.width,) if row.width > 1 else ()), row.name
+        sizes = plan.level_sizes.tolist()
+        assert sizes[0] == len(plan.fine_column) == int(plan.fine_start[-1])
+        assert sizes[1] == len(plan.fine_lift_node) == int(plan.fine_node_start[-1])
+        assert sizes[2] == len(plan.fine_node_start) - 1
+        middle = bool(sizes[5])
+        assert sizes[3] == len(plan.middle_column)
+        assert sizes[4] == len(plan.middle_lift_node)
+        assert sizes[5] == (len(plan.middle_node_start) - 1 if middle else 0)
+        moved = plan.to("meta")
+        on_cpu = [row.name for row, array in zip(moved.table, moved.arrays, strict=True) if array.device.type == "cpu"]
+        assert on_cpu == ["sizes", "level_sizes"]
+
+
 def test_reference_is_what_it_was_made_of(dtype: torch.dtype) -> None:
     """The stiffest environment and the largest inertia; held only where all hold."""
     vertices, tets = box((0.3, 0.1, 0.1), (3, 1, 1))

@@ -271,6 +271,16 @@ def test_precision_can_be_changed() -> None:
     assert float((after.positions - expected.positions).abs().max()) <= 1e-4
 
 
+def test_other_devices_are_refused(device: torch.device) -> None:
+    sim = simulate(torch.float32, solver=pd.Multilevel())
+    if device.type == "cuda":
+        with pytest.raises(RuntimeError, match="Multilevel runs on the CPU; on a GPU take Chebyshev"):
+            sim.to(device)
+    there = simulate(torch.float32).to("meta")
+    with pytest.raises(RuntimeError, match="Multilevel runs on the CPU"):
+        there.solver = pd.Multilevel()
+
+
 def test_print_says_what_it_prepared() -> None:
     text = str(simulate(torch.float32, solver=pd.Multilevel()))
     for fact in (

@@ -115,7 +115,7 @@ class Simulator(nn.Module):
     @solver.setter
     def solver(self, solver: Solver) -> None:
         wanted = isinstance(_checked_solver(solver), Multilevel)
-        if wanted and self.device.type == "cuda":
+        if wanted and self.device.type != "cpu":
             raise RuntimeError(f"Simulator: {_CPU_ONLY}")
         self._solver = solver
         if wanted != has_levels(self.plan.arrays):

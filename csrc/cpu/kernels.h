@@ -31,8 +31,7 @@ class Runner {
     if (call.settings.multilevel()) outer_.emplace(call, Touching, threads);
   }
 
-  void roll(Workspace<Lanes>& work, Scratch<Lanes>& scratch, const Team& team,
-            std::int64_t first) {
+  void roll(Workspace<Lanes>& work, Scratch<Lanes>& scratch, const Team& team, std::int64_t first) {
     if (outer_) {
       MultilevelStepper<Lanes, Touching>(call_, work, scratch, team, first, *outer_).roll();
     } else {
@@ -56,8 +55,7 @@ void step_batches(const StepCall<T>& call, int threads) {
     Scratch<Lanes> scratch(call.plan.most_slots);
     Runner<Lanes, Touching, T> runner(call, 1);
     const Team alone;
-    for (std::int64_t g = next++; g < groups; g = next++)
-      runner.roll(work, scratch, alone, g * W);
+    for (std::int64_t g = next++; g < groups; g = next++) runner.roll(work, scratch, alone, g * W);
   });
 }
 

@@ -12,7 +12,8 @@ namespace pd {
 namespace {
 
 constexpr int sweeps = 6;
-constexpr double weakest = 0.01;  // clip of the relative strength: no edge is more than 100 times its distance long
+constexpr double weakest =
+    0.01;  // clip of the relative strength: no edge is more than 100 times its distance long
 constexpr double never = std::numeric_limits<double>::infinity();
 
 // Dijkstra's method from any number of sources; ties fall to the lower number, so that every platform agrees.
@@ -63,8 +64,7 @@ void join_nearest(Fronts& fronts, std::vector<std::int32_t>& centres,
                   const std::vector<std::uint8_t>& left_out) {
   const auto anywhere = [](std::int32_t, std::int32_t) { return true; };
   fronts.clear();
-  for (std::size_t i = 0; i < centres.size(); ++i)
-    fronts.add_source(centres[i], std::int32_t(i));
+  for (std::size_t i = 0; i < centres.size(); ++i) fronts.add_source(centres[i], std::int32_t(i));
   fronts.advance(anywhere);
   for (std::size_t v = 0; v < left_out.size(); ++v) {
     if (left_out[v] || fronts.label[v] >= 0) continue;

@@ -109,14 +109,16 @@ Transposed transpose(const BlockMatrix& a) {
       t.from[to] = p;
       for (int i = 0; i < a.height; ++i) {
         for (int j = 0; j < a.width; ++j)
-          t.matrix.value[to * a.block() + j * a.height + i] = a.value[p * a.block() + i * a.width + j];
+          t.matrix.value[to * a.block() + j * a.height + i] =
+              a.value[p * a.block() + i * a.width + j];
       }
     }
   }
   return t;
 }
 
-void apply(const BlockMatrix& a, const std::vector<double>& x, std::vector<double>& y, int threads) {
+void apply(const BlockMatrix& a, const std::vector<double>& x, std::vector<double>& y,
+           int threads) {
   y.assign(std::size_t(a.rows) * a.height, 0.0);
   run_team(threads, [&](const Team& team) {
     for (std::int64_t row = team.begin(a.rows); row < team.end(a.rows); ++row) {
