@@ -62,8 +62,8 @@ def plan_on(sim: Simulator, dtype: torch.dtype, device: torch.device) -> Plan:
         if has_levels(sim.plan.arrays):
             # coming from "meta" the values of the material are lost
             lost = sim.device.type == "meta"
-            material = material_of(sim.scene.values(), dtype).values() if lost else sim.material()
-            reference = reference_of(plan, [array.to(dtype=dtype) for array in material], sim.time_step)
+            arrays = list(material_of(sim.scene.values(), dtype).values()) if lost else sim.material()
+            reference = reference_of(plan, [array.to(dtype=dtype) for array in arrays], sim.time_step)
             plan = precondition_plan(plan, sim.scene.values(), *reference)
     if device.type == "cuda" and device != sim.device:
         material = sum(array.numel() for array in (*sim.material(), sim.rest_positions))
