@@ -19,7 +19,7 @@ from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .rollout import PerStep, Rollout, roll
 from .scene import Scene
-from .solvers import Chebyshev, Jacobi, Multilevel, Solver
+from .solvers import Chebyshev, Multilevel, Solver, check_solver
 from .state import Info, State, Track
 from .summary import describe
 from .targets import Anchors, Targets
@@ -77,7 +77,7 @@ class Simulator(nn.Module):
         self.scene = scene
         self.time_step = _positive("time_step", time_step, "s")
         self.iterations = _whole("iterations", iterations, 0)
-        solver = _checked_solver(Chebyshev() if solver is None else solver)
+        solver = check_solver(Chebyshev() if solver is None else solver, torch.device("cpu"))
         self.tolerance = float(tolerance)
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
@@ -114,11 +114,8 @@ class Simulator(nn.Module):
 
     @solver.setter
     def solver(self, solver: Solver) -> None:
-        wanted = isinstance(_checked_solver(solver), Multilevel)
-        if wanted and self.device.type != "cpu":
-            raise RuntimeError(f"Simulator: {_CPU_ONLY}")
-        self._solver = solver
-        if wanted != has_levels(self.plan.arrays):
+        self._solver = check_solver(solver, self.device)
+        if isinstance(solver, Multilevel) != has_levels(self.plan.arrays):
             self.prepare_solver()
 
     def prepare_solver(self) -> None:
@@ -199,8 +196,8 @@ class Simulator(nn.Module):
         wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
-        if wanted.device.type == "cuda" and isinstance(self.solver, Multilevel):
-            raise RuntimeError(f"Simulator: {_CPU_ONLY}")
+        if wanted.device.type == "cuda":
+            check_solver(self.solver, wanted.device)
         changes_precision = wanted.dtype != self.dtype
         # first, because it may refuse
         plan = plan_on(self, wanted.dtype, wanted.device)
@@ -446,15 +443,6 @@ class Simulator(nn.Module):
         pins, spheres = self.anchors.place(targets, self.pin_targets, self.spheres, batch)
         replaced = {"pin_targets": pins, "spheres": spheres}
         return [replaced.get(name, getattr(self, name)).contiguous() for name in MATERIAL_ROWS]
-
-
-_CPU_ONLY = "Multilevel runs on the CPU; on a GPU take Chebyshev, by sim.solver = torchpd.Chebyshev()"
-
-
-def _checked_solver(solver: Solver) -> Solver:
-    if not isinstance(solver, Jacobi | Chebyshev | Multilevel):
-        raise TypeError(f"Simulator: solver must be Jacobi, Chebyshev or Multilevel, got {type(solver).__name__}")
-    return solver
 
 
 def _first_iterate(start: str | Tensor) -> tuple[Tensor | None, bool]:
