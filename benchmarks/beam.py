@@ -17,6 +17,11 @@ from torchpd.reference_solvers import newton
 
 STIFFNESSES = (1e4, 1e5, 1e6)
 ERRORS = (1e-2, 1e-3, 1e-6)
+SOLVERS = {
+    "Multilevel": pd.Multilevel(),
+    "guarded Chebyshev": pd.Chebyshev(),
+    "plain Jacobi": pd.Jacobi(diagonal="plain"),
+}
 
 
 def beam(youngs: float) -> tuple[pd.Simulator, pd.State]:
@@ -60,7 +65,7 @@ def main() -> None:
     for youngs in STIFFNESSES:
         sim, state = beam(youngs)
         solved = solution(sim, state)
-        for name, solver in (("guarded Chebyshev", pd.Chebyshev()), ("plain Jacobi", pd.Jacobi(diagonal="plain"))):
+        for name, solver in SOLVERS.items():
             sim.solver = solver
             counts = [iterations_to(sim, state, solved, error, most) for error in ERRORS]
             print(f"{youngs:>8.0e}  {name:<20}" + "".join(f"{count:>10}" for count in counts))

@@ -69,11 +69,64 @@ struct PlanRows {
   std::int64_t size, vertex, group, pin, block, patch_end, slot, shared_end, shared_slot;
 };
 
+#define X(name, type, width, rows, meaning) +1
+constexpr int level_arrays = 0
+#include "plan/multilevel.def"
+    ;
+#undef X
+
+// Lengths of the arrays, by the names in multilevel.def.
+struct LevelRows {
+  std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_lift, fine_node_end, middle_end,
+      middle_entry, middle, middle_lift, middle_node_end, coarse_entry;
+};
+
+// The preconditioner's arrays, which begin at `first`.
+template <class T>
+Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
+                      const Place& place) {
+  check_array(arrays[first], at::kInt, level_size_count, 1, {at::kCPU, "every plan's sizes"},
+              "plan.level_sizes", "counts");
+  const int32* size = arrays[first].const_data_ptr<int32>();
+  Levels<T> levels;
+  levels.vertices = vertices;
+  levels.fine_nodes = size[level_fine_nodes];
+  levels.middle_nodes = size[level_middle_nodes];
+  const bool middle = levels.has_middle();
+  const std::int64_t coarse = 4 * std::int64_t(levels.coarse_nodes());
+  LevelRows count{};
+  count.level_size = level_size_count;
+  count.tet = tets;
+  count.vertex = vertices;
+  count.fine_end = vertices + 1;
+  count.fine_entry = size[level_fine_entries];
+  count.fine_lift = size[level_fine_lifts];
+  count.fine_node_end = levels.fine_nodes + 1;
+  count.middle_end = middle ? levels.fine_nodes + 1 : 0;
+  count.middle_entry = size[level_middle_entries];
+  count.middle = middle ? levels.fine_nodes : 0;
+  count.middle_lift = size[level_middle_lifts];
+  count.middle_node_end = middle ? levels.middle_nodes + 1 : 0;
+  count.coarse_entry = coarse * (coarse + 1) / 2;
+  const Place on_cpu{at::kCPU, "every plan's sizes"};
+  int at = first;
+  using real = T;
+#define X(name, type, width, rows, meaning)                                                   \
+  check_array(arrays[at], scalar_type<type>, count.rows, width, at == first ? on_cpu : place, \
+              "plan." #name, meaning);                                                        \
+  levels.name = arrays[at++].const_data_ptr<type>();
+#include "plan/multilevel.def"
+#undef X
+  return levels;
+}
+
 // What the arrays hold is trusted; how long they are is not.
 template <class T>
 Plan<T> plan_view(at::TensorList arrays, const Place& place) {
-  TORCH_CHECK_VALUE(arrays.size() == plan_arrays, "plan must be the ", plan_arrays,
-                    " arrays of Plan.arrays, got ", arrays.size());
+  constexpr int with_levels = plan_arrays + level_arrays;
+  TORCH_CHECK_VALUE(arrays.size() == plan_arrays || arrays.size() == with_levels,
+                    "plan must be the ", plan_arrays, " arrays of Plan.arrays, or ", with_levels,
+                    " with those of a multilevel preconditioner, got ", arrays.size());
   const int32* size = sizes_view(arrays[0], plan_size_count);
   Plan<T> plan;
   plan.vertices = size[plan_vertices];
@@ -102,7 +155,22 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   plan.name = arrays[at++].const_data_ptr<type>();
 #include "plan/plan.def"
 #undef X
+  if (arrays.size() == with_levels)
+    plan.levels = levels_view<T>(arrays, plan_arrays, plan.vertices, plan.tets, place);
   return plan;
+}
+
+// A multilevel schedule needs the arrays of its preconditioner, which only plans of the CPU have.
+template <class P>
+void check_levels(const P& plan, bool wanted) {
+  if (!wanted) return;
+  if constexpr (requires { plan.levels; }) {
+    TORCH_CHECK_VALUE(plan.levels.there(),
+                      "plan has no multilevel preconditioner; a Simulator with solver=Multilevel() "
+                      "makes one");
+  } else {
+    TORCH_CHECK_NOT_IMPLEMENTED(false, "the multilevel solver runs on the CPU only");
+  }
 }
 
 #define X(name, type, width, rows, meaning) +1
@@ -312,8 +380,10 @@ struct Numbers {
 
 inline Settings settings_of(const Numbers& n, bool given, std::int64_t steps, std::int64_t every) {
   constexpr std::int64_t most = 1'000'000'000;
-  TORCH_CHECK_VALUE(n.schedule >= 0 && n.schedule <= 2,
-                    "schedule must be 0 (jacobi), 1 (classic) or 2 (guarded), got ", n.schedule);
+  TORCH_CHECK_VALUE(n.schedule >= 0 && n.schedule <= 4,
+                    "schedule must be 0 (jacobi), 1 (classic), 2 (guarded), 3 (lbfgs) or 4 "
+                    "(momentum), got ",
+                    n.schedule);
   TORCH_CHECK_VALUE(n.iterations >= 0 && n.iterations <= most, "iterations must be 0..1e9, got ",
                     n.iterations);
   TORCH_CHECK_VALUE(n.time_step > 0 && std::isfinite(n.time_step),

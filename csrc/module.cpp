@@ -2,6 +2,7 @@
 #include "cpu/dispatch.h"
 #include "plan/build.h"
 #include "plan/device_build.h"
+#include "plan/multilevel_build.h"
 #include "plan/shared_memory.h"
 
 #include <pybind11/functional.h>
@@ -99,11 +100,42 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets, int pa
   return arrays;
 }
 
+py::dict build_multilevel(const Doubles& positions, const Indices& tets, const Numbers& order,
+                          const Doubles& stiffness, const Doubles& inertia, int threads,
+                          const std::function<void(double)>& progress) {
+  check_mesh(positions, tets);
+  const py::ssize_t vertices = positions.shape(0);
+  if (order.ndim() != 1 || order.shape(0) != vertices)
+    throw py::value_error("vertex_order must be int32 [vertices], a permutation");
+  if (stiffness.ndim() != 1 || stiffness.shape(0) != tets.shape(0))
+    throw py::value_error("stiffness must be float64 [tets]");
+  if (inertia.ndim() != 1 || inertia.shape(0) != vertices)
+    throw py::value_error("inertia must be float64 [vertices]");
+  if (threads < 1) throw py::value_error("threads must be at least 1");
+  auto tables = pd::build_multilevel({positions.data(), vertices, tets.data(), tets.shape(0),
+                                      order.data(), stiffness.data(), inertia.data()},
+                                     threads, progress);
+  py::dict arrays;
+#define X(name, type, width, rows, meaning) arrays[#name] = as_array(tables.name, width);
+#include "plan/multilevel.def"
+#undef X
+  return arrays;
+}
+
 py::list plan_table() {
   py::list rows;
 #define X(name, type, width, rows_, meaning) \
   rows.append(py::make_tuple(#name, #type, width, #rows_, meaning));
 #include "plan/plan.def"
+#undef X
+  return rows;
+}
+
+py::list multilevel_table() {
+  py::list rows;
+#define X(name, type, width, rows_, meaning) \
+  rows.append(py::make_tuple(#name, #type, width, #rows_, meaning));
+#include "plan/multilevel.def"
 #undef X
   return rows;
 }
@@ -166,8 +198,13 @@ PYBIND11_MODULE(_C, m) {
         py::arg("progress"));
   m.def("build_device_plan", &build_device_plan, py::arg("positions"), py::arg("tets"),
         py::arg("patches"), py::arg("piece"), py::arg("progress"));
+  m.def("build_multilevel", &build_multilevel, py::arg("positions"), py::arg("tets"),
+        py::arg("vertex_order"), py::arg("stiffness"), py::arg("inertia"), py::arg("threads"),
+        py::arg("progress"));
   m.def("plan_table", &plan_table,
         "Rows (name, type, width, rows, meaning) of the constant arrays, in op order.");
+  m.def("multilevel_table", &multilevel_table,
+        "Rows (name, type, width, rows, meaning) of a preconditioner's arrays, in op order.");
   m.def("device_plan_table", &device_plan_table,
         "Rows (name, type, width, rows, meaning) of the constant arrays on a GPU, in op order.");
   m.def("material_table", &material_table,

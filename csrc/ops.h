@@ -28,6 +28,7 @@ void step_typed(const StepTensors& t, const Settings& settings) {
   call.plan = Backend::template plan_view<T>(t.plan, place);
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
+  check_levels(call.plan, settings.multilevel());
   call.material =
       material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch, place);
   check_tets(t.material[0], call.plan.tets);

@@ -136,6 +136,18 @@ def test_beam_counts_iterations() -> None:
     assert soft.split()[-4:] == ["22", "38", ">", "40"]
 
 
+def test_multilevel_counts_iterations() -> None:
+    command = [sys.executable, "benchmarks/multilevel.py", "--cells", "3", "--youngs", "1e6"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    name, lbfgs, momentum, chebyshev = result.stdout.splitlines()
+    assert name.startswith("box 3, 1e+06 Pa: 256 vertices")
+    for line, outer in ((lbfgs, "lbfgs"), (momentum, "momentum")):
+        counts = line.split()[1:4]
+        assert line.split()[0] == outer
+        assert sorted(counts, key=int) == counts
+    assert chebyshev.split()[:4] == ["512", "iterations", "of", "guarded"]
+
+
 @pytest.fixture
 def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmarks are scripts, which find each other in their folder."""

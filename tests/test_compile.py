@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Literal, cast
 
 import pytest
 import torch
@@ -10,6 +10,7 @@ from runs import ULP, noise, small
 from torch import Tensor
 
 import torchpd as pd
+from torchpd.solvers import Solver
 
 ops = torch.ops.torchpd
 BATCH = 3
@@ -31,8 +32,24 @@ def test_compiled_step_is_the_step(dynamic: bool) -> None:
     assert torch.equal(v, expected.velocities + 1.0)
 
 
-def test_compiled_rollout_is_the_rollout() -> None:
-    sim, state = small(torch.float32)
+@pytest.mark.parametrize("outer", ["lbfgs", "momentum"])
+def test_compiled_multilevel_step_has_its_gradient(outer: Literal["lbfgs", "momentum"]) -> None:
+    sim, state = small(torch.float64, solver=pd.Multilevel(outer), iterations=60)
+    sim.stiffness.requires_grad_()
+
+    def loss(v: Tensor) -> Tensor:
+        after = sim(pd.State(state.positions, 1.0 * v))
+        return after.positions.square().sum() + after.velocities.sum()
+
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    (expected,) = torch.autograd.grad(loss(state.velocities), sim.stiffness)
+    (found,) = torch.autograd.grad(compiled(state.velocities), sim.stiffness)
+    assert float((found - expected).abs().max()) <= 64 * ULP[torch.float64] * float(expected.abs().max())
+
+
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["Chebyshev", "Multilevel"])
+def test_compiled_rollout_is_the_rollout(solver: Solver) -> None:
+    sim, state = small(torch.float32, solver=solver)
 
     def play(x: Tensor, v: Tensor) -> Tensor:
         return sim.rollout(pd.State(x, v), 6, every=2).positions.mean(dim=2)

@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save_file
 
 import torchpd as pd
 from torchpd.io import FORMAT_VERSION
+from torchpd.solvers import Solver
 
 
 def everything() -> pd.Scene:
@@ -54,12 +55,14 @@ SOLVERS = [
     pd.Chebyshev(),
     pd.Jacobi(relaxation=0.7, diagonal="plain"),
     pd.Chebyshev(schedule="classic", rho=0.9921, delay=7, relaxation=0.9),
+    pd.Multilevel(),
+    pd.Multilevel("momentum", relaxation=1.5),
 ]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("solver", SOLVERS, ids=["guarded", "jacobi", "classic"])
-def test_takes_the_same_steps(tmp_path: Path, solver: pd.Chebyshev | pd.Jacobi, dtype: torch.dtype) -> None:
+@pytest.mark.parametrize("solver", SOLVERS, ids=["guarded", "jacobi", "classic", "lbfgs", "momentum"])
+def test_takes_the_same_steps(tmp_path: Path, solver: Solver, dtype: torch.dtype) -> None:
     sim = pd.Simulator(everything(), 1 / 70, 13, solver, dtype, tolerance=1e-7)
     sim.save(tmp_path / "sim.safetensors")
     loaded = pd.Simulator.load(tmp_path / "sim.safetensors")

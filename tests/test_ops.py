@@ -71,6 +71,24 @@ def test_opcheck(name: str, dtype: torch.dtype, device: torch.device) -> None:
     assert set(report.values()) == {"SUCCESS"}
 
 
+@pytest.mark.parametrize("outer", ["lbfgs", "momentum"])
+@pytest.mark.parametrize("name", ["step", "step_", "rollout", "step_vjp"])
+def test_opcheck_of_the_multilevel_solver(name: str, outer: str, dtype: torch.dtype) -> None:
+    arguments, keywords = samples(name, dtype, torch.device("cpu"), solver=pd.Multilevel(outer))  # type: ignore[arg-type]
+    report = torch.library.opcheck(getattr(ops, name).default, arguments, keywords)
+    assert set(report.values()) == {"SUCCESS"}
+
+
+def test_opcheck_of_the_preconditioner(dtype: torch.dtype) -> None:
+    sim, state = small(dtype, solver=pd.Multilevel())
+    field = noise(state.positions).requires_grad_()
+    assert set(torch.library.opcheck(ops.precondition.default, (field, plan_of(sim))).values()) == {"SUCCESS"}
+    if dtype == torch.float64:
+        plan = plan_of(sim)
+        assert torch.autograd.gradcheck(lambda f: ops.precondition(f, plan), field[:1], fast_mode=True)
+    assert ops.precondition(field[:0], plan_of(sim)).shape == (0, sim.vertices, 3)
+
+
 @pytest.mark.usefixtures("poisoned")
 @pytest.mark.parametrize("scale", [0.01, 3.0], ids=["small strains", "tumbled elements"])
 def test_fields_are_those_of_the_reference(scale: float, dtype: torch.dtype, device: torch.device) -> None:

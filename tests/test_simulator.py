@@ -14,6 +14,7 @@ from runs import moving, same_bits, simulate
 
 import torchpd as pd
 from torchpd.placing import check_wanted_device
+from torchpd.solvers import Solver
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -111,14 +112,15 @@ def test_kernel_changes_nothing_on_the_cpu(dtype: torch.dtype) -> None:
         simulate(dtype, kernel="warp")
 
 
-def test_meta_and_back_is_compiled_again(dtype: torch.dtype) -> None:
-    sim = simulate(dtype)
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["Chebyshev", "Multilevel"])
+def test_meta_and_back_is_compiled_again(solver: Solver, dtype: torch.dtype) -> None:
+    sim = simulate(dtype, solver=solver)
     state, arrays = moving(sim), sim.plan.arrays
     there = sim.to("meta")
     assert there.device.type == there.plan.vertex_order.device.type == "meta"
     back = there.to_empty(device="cpu")
     assert all(torch.equal(one, other) for one, other in zip(back.plan.arrays, arrays, strict=True))
-    fresh = simulate(dtype)
+    fresh = simulate(dtype, solver=solver)
     back.load_state_dict(fresh.state_dict())
     assert same_bits(back(state), fresh(state))
 

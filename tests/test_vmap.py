@@ -9,6 +9,8 @@ import torch
 from runs import noise, numbers_of, plan_of, small
 from torch import Tensor
 
+import torchpd as pd
+
 ops = torch.ops.torchpd
 BATCH = 3
 
@@ -74,6 +76,22 @@ def test_vmap_of_rollout_fields_and_rotations(dtype: torch.dtype, device: torch.
         mapped = torch.vmap(function)(*given)
         single = torch.stack([function(*(t[m] for t in given)) for m in range(4)])
         assert torch.equal(mapped, single), number
+
+
+def test_vmap_of_the_multilevel_solver(dtype: torch.dtype) -> None:
+    sim, state = small(dtype, solver=pd.Multilevel())
+    plan, material, numbers = plan_of(sim), sim.material(), numbers_of(sim)
+    field = noise(torch.empty(4, *state.positions.shape, dtype=dtype))
+    assert torch.equal(
+        torch.vmap(lambda f: ops.precondition(f, plan))(field), torch.stack([ops.precondition(f, plan) for f in field])
+    )
+    moved = torch.vmap(lambda f: ops.precondition(f, plan), in_dims=2)(field.movedim(0, 2))
+    assert torch.equal(moved, torch.stack([ops.precondition(f, plan) for f in field]))
+
+    def step(forces: Tensor) -> Tensor:
+        return cast(Tensor, ops.step(*state, forces, None, material, plan, **numbers)[0])
+
+    assert torch.equal(torch.vmap(step)(field), torch.stack([step(f) for f in field]))
 
 
 def test_vmap_over_the_plan_is_refused() -> None:

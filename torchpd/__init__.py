@@ -10,7 +10,7 @@ from .embedding import Embedding, embed
 from .extension import extension_error, load_extension
 from .mesh import MeshWarning, TetMesh, TriMesh
 from .scene import Scene
-from .solvers import Chebyshev, Jacobi
+from .solvers import Chebyshev, Jacobi, Multilevel
 from .state import Info, State, Track
 from .tetrahedralize import tetrahedralize
 from .version import __version__
@@ -39,6 +39,7 @@ __all__ = [
     "Info",
     "Jacobi",
     "MeshWarning",
+    "Multilevel",
     "Pin",
     "Plan",
     "Scene",

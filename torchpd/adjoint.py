@@ -5,8 +5,8 @@ At a converged step r(x') = a (x' - x - s) + dE/dx'(x') = 0 on the vertices that
     H l = dL/dx' + dL/dv' / h,     dL/dp = -l . dr/dp          for every input p of the step,
 
 H the exact Hessian of the step's objective (the rotations' derivative included), solved by conjugate gradients with
-the weighted diagonal. The error of the gradient follows the error of the step: iterate far enough, and look at the
-residual.
+the weighted diagonal, or with the multilevel preconditioner of a plan that has one. The error of the gradient follows
+the error of the step: iterate far enough, and look at the residual.
 
 Contacts: the normal direction of a vertex that a contact holds is taken out of the system; a vertex that friction holds
 moves with its start. A sliding vertex counts as frictionless: its friction force is taken as constant.
@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from .diagonal import named_material, pinned_vertices, step_diagonal
+from .multilevel import has_levels, inertia_of_levels
 from .tables import MATERIAL_TABLE
 
 __all__ = ["AdjointCall", "step_adjoint", "step_gradient"]
@@ -53,7 +54,10 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def conjugate_gradients(
-    product: Callable[[Tensor], Tensor], diagonal: Tensor, right: Tensor, tolerance: float
+    product: Callable[[Tensor], Tensor],
+    precondition: Callable[[Tensor], Tensor],
+    right: Tensor,
+    tolerance: float,
 ) -> tuple[Tensor, Tensor]:
     """Solve for each environment of [B, V, 3]; returns the solution and the relative residual [B].
 
@@ -61,7 +65,7 @@ def conjugate_gradients(
     one that is done: the host asks every tenth iteration only whether any goes on.
     """
     solution, residual = torch.zeros_like(right), right
-    preconditioned = residual / diagonal
+    preconditioned = precondition(residual)
     direction, rho = preconditioned, _dot(residual, preconditioned)
     scale = _dot(right, right).sqrt()
     active = scale > 0
@@ -75,7 +79,7 @@ def conjugate_gradients(
         solution = solution + step[:, None, None] * direction
         residual = residual - step[:, None, None] * image
         active = active & (_dot(residual, residual).sqrt() > tolerance * scale)
-        preconditioned = residual / diagonal
+        preconditioned = precondition(residual)
         last, rho = rho, _dot(residual, preconditioned)
         ratio = torch.where(active, rho / last.where(active, torch.ones_like(last)), torch.zeros_like(rho))
         direction = torch.where(active[:, None, None], preconditioned + ratio[:, None, None] * direction, direction)
@@ -183,9 +187,17 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
     def majoriser(field: Tensor) -> Tensor:
         return allowed(inertia * field + _elastic_product(call, field, _STRETCH * call.after))
 
+    def precondition(field: Tensor) -> Tensor:
+        plain = field / diagonal
+        if not has_levels(call.plan):
+            return plain
+        # M has no say on vertices that were held when it was made
+        known = torch.isfinite(inertia_of_levels(call.plan)).unsqueeze(-1)
+        return allowed(torch.where(known, torch.ops.torchpd.precondition(field, call.plan), plain))
+
     tolerance = _TOLERANCE[right.dtype]
     right = allowed(right)
-    multiplier, error = conjugate_gradients(product, diagonal, right, tolerance)
+    multiplier, error = conjugate_gradients(product, precondition, right, tolerance)
     failed = ~(error <= 1e3 * tolerance)
     if bool(failed.any()):
         warnings.warn(
@@ -194,7 +206,7 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
             "in the step help) or at an unstable one. Their gradients take the rotations as constant.",
             stacklevel=2,
         )
-        instead, _ = conjugate_gradients(majoriser, diagonal, right * failed[:, None, None], tolerance)
+        instead, _ = conjugate_gradients(majoriser, precondition, right * failed[:, None, None], tolerance)
         multiplier = torch.where(failed[:, None, None], instead, multiplier)
     return multiplier.contiguous(), held
 

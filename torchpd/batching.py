@@ -63,6 +63,13 @@ def _diagonal_vmap(
     return rows.unflatten(0, mapped.shape[:-1]), 0
 
 
+@torch.library.register_vmap("torchpd::precondition")
+def _precondition_vmap(info: Any, in_dims: tuple[Any, ...], field: Tensor, plan: list[Tensor]) -> tuple[Tensor, int]:
+    _check_plan(in_dims[1])
+    mapped = field.movedim(in_dims[0], 0)
+    return _split(_ops.precondition(mapped.flatten(0, 1), plan), info.batch_size), 0
+
+
 def _rotation_vmap(op: Any) -> Callable[..., tuple[Tensor, int]]:
     def rule(info: Any, in_dims: tuple[int | None, ...], *matrices: Tensor) -> tuple[Tensor, int]:
         moved = [

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from .solvers import Chebyshev, Jacobi, Solver
+from .solvers import Chebyshev, Jacobi, Multilevel, Solver
 from .spectrum import estimate_rho
 from .state import State
 
@@ -43,6 +43,7 @@ CONTENDERS: dict[str, Contender] = {
     "damped Jacobi": Contender(lambda sim, state: Jacobi(relaxation=1.9), safe=True),
     "classic Chebyshev": Contender(_classic, safe=False),
     "guarded Chebyshev": Contender(lambda sim, state: Chebyshev(), safe=True),
+    "Multilevel": Contender(lambda sim, state: Multilevel(), safe=True, devices=("cpu",)),
 }
 DEFAULT = "guarded Chebyshev"  # what `Simulator(scene)` does
 DEFAULT_ITERATIONS = 64

@@ -24,9 +24,10 @@ from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .embedding import Embedding
 from .mesh import TetMesh, TriMesh
 from .mesh_checks import store
+from .multilevel import precondition_plan
 from .scene import Part, Scene
 from .simulator import Simulator
-from .solvers import Chebyshev, Jacobi, Solver
+from .solvers import Chebyshev, Jacobi, Multilevel, Solver
 from .tables import MATERIAL_TABLE
 from .version import __version__
 
@@ -35,7 +36,9 @@ __all__ = ["FORMAT_VERSION", "load_simulation", "save_simulation"]
 FORMAT_VERSION = 1
 _KEY = "torchpd"  # of the metadata, beside which others may write theirs
 _KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in (Solid, Pin, Gravity, Ground, Sphere, Damping)}
-_SOLVERS: dict[str, type[Jacobi] | type[Chebyshev]] = {"Jacobi": Jacobi, "Chebyshev": Chebyshev}
+_SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel)}
+# what a preconditioner was made of: together with the mesh it decides its bits
+_REFERENCE = ("reference_stiffness", "reference_inertia")
 _DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in (torch.float32, torch.float64)}
 
 Record = dict[str, Any]
@@ -59,6 +62,8 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         tensors.update(_tensors(f"part.{number}", _part_arrays(part)))
     material = dict(zip((name for name, *_ in MATERIAL_TABLE), sim.material(), strict=True))
     tensors.update({f"material.{name}": value.detach().cpu().contiguous() for name, value in material.items()})
+    if isinstance(sim.solver, Multilevel):
+        tensors.update({f"solver.{name}": getattr(sim.plan, name).cpu().contiguous() for name in _REFERENCE})
     record: Record = {
         "format": FORMAT_VERSION,
         "written_by": f"torchpd {__version__}",
@@ -203,6 +208,10 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
     sim.set_material(**{name: tensors[f"material.{name}"] for name, *_ in MATERIAL_TABLE})
     for name in record["trained"]:
         getattr(sim, name).requires_grad_()
+    if isinstance(sim.solver, Multilevel):
+        reference = [tensors[f"solver.{name}"] for name in _REFERENCE]
+        if not all(torch.equal(getattr(sim.plan, name), own) for name, own in zip(_REFERENCE, reference, strict=True)):
+            sim.plan = precondition_plan(sim.plan, sim.scene.values(), *reference)
     return sim
 
 

@@ -96,6 +96,11 @@ def _(stiffness: Tensor, plan: Sequence[Tensor], *, weighted: bool) -> Tensor:
     return stiffness.new_empty((*stiffness.shape[:-1], vertex_order.shape[0]))
 
 
+@torch.library.register_fake("torchpd::precondition")
+def _(field: Tensor, plan: Sequence[Tensor]) -> Tensor:
+    return field.new_empty(field.shape)
+
+
 @torch.library.register_fake("torchpd::nearest_rotation")
 def _(matrices: Tensor) -> Tensor:
     return matrices.new_empty(matrices.shape)
@@ -184,6 +189,15 @@ def _diagonal_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict
 
 def _diagonal_backward(ctx: Any, grad: Tensor) -> tuple[None, None]:
     raise RuntimeError("torchpd: the elastic diagonal, a preconditioner, has no derivative; detach stiffness")
+
+
+def _precondition_setup(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+    ctx.plan = inputs[1]
+
+
+def _precondition_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, list[None]]:
+    # it is linear and symmetric
+    return _ops.precondition(grad, ctx.plan), _for_plan(ctx)
 
 
 def _rotation_differential(F: Tensor, direction: Tensor) -> Tensor:
@@ -320,6 +334,7 @@ def _rollout_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor,
 _CONTACTS = ("planes", "spheres")
 torch.library.register_autograd("torchpd::rollout", _rollout_backward, setup_context=_rollout_setup)
 torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_diagonal_setup)
+torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)
 torch.library.register_autograd("torchpd::step", _step_backward, setup_context=_step_setup)
 
 for _name, _backward, _inputs in (

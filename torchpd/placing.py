@@ -10,6 +10,8 @@ from torch import Tensor
 
 from . import _C
 from .gpu import free_memory, properties_of, refuse_full_memory, why_not
+from .material import material_of
+from .multilevel import has_levels, precondition_plan, reference_of
 from .plan import Plan, compile_plan
 from .regimes import choose_plan
 
@@ -57,6 +59,12 @@ def plan_on(sim: Simulator, dtype: torch.dtype, device: torch.device) -> Plan:
         plan = choose_plan(sim.scene.values(), dtype, properties_of(device), sim.kernel, progress=False)
     else:
         plan = compile_plan(sim.scene.values(), dtype=dtype, progress=False)
+        if has_levels(sim.plan.arrays):
+            # coming from "meta" the values of the material are lost
+            lost = sim.device.type == "meta"
+            arrays = list(material_of(sim.scene.values(), dtype).values()) if lost else sim.material()
+            reference = reference_of(plan, [array.to(dtype=dtype) for array in arrays], sim.time_step)
+            plan = precondition_plan(plan, sim.scene.values(), *reference)
     if device.type == "cuda" and device != sim.device:
         material = sum(array.numel() for array in (*sim.material(), sim.rest_positions))
         refuse_full_memory(plan.bytes + material * (torch.finfo(dtype).bits // 8), free_memory(device))

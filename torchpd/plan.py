@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from . import _C
 from .scene import SceneValues
-from .tables import DEVICE_SIZES, PLAN_TABLE, PlanRow
+from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, PLAN_TABLE, PlanRow
 
 __all__ = ["KERNELS", "Plan", "compile_plan", "compiling", "free_pieces", "internal_numbers"]
 
@@ -28,7 +28,8 @@ KERNELS = ("block", "grid", "stream")
 class Plan:
     """Constant arrays of a scene in the order of a table that C++ declares, also by name: `plan.vertex_order`.
 
-    The CPU and GPUs have a table each. `why` says in words why a GPU's plan is for the kernel that it is for.
+    The CPU and GPUs have a table each; that of a multilevel preconditioner may follow the CPU's. `why` says in words
+    why a GPU's plan is for the kernel that it is for.
     """
 
     arrays: tuple[Tensor, ...]
@@ -45,7 +46,7 @@ class Plan:
     @property
     def kernel(self) -> str | None:
         """Which kernel of a GPU the plan is for: "block", "grid" or "stream"; None for the CPU."""
-        return None if self.table == PLAN_TABLE else KERNELS[self.size("kernel")]
+        return KERNELS[self.size("kernel")] if self.table == DEVICE_PLAN_TABLE else None
 
     def size(self, name: str) -> int:
         """A number of a GPU's plan by its name in DEVICE_SIZES."""
@@ -82,9 +83,13 @@ class Plan:
         The kernels of a GPU and of the CPU need different plans: `Simulator.to` compiles the right one. `sizes` stay on
         the CPU: the host reads them, and must not wait for a device.
         """
-        sizes, *others = self.arrays
-        moved = (array.to(device=device, dtype=dtype if array.is_floating_point() else None) for array in others)
-        return replace(self, arrays=(sizes, *moved))
+
+        def moved(row: PlanRow, array: Tensor) -> Tensor:
+            if row.rows.endswith("size"):
+                return array
+            return array.to(device=device, dtype=dtype if array.is_floating_point() else None)
+
+        return replace(self, arrays=tuple(map(moved, self.table, self.arrays)))
 
 
 @contextmanager

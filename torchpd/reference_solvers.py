@@ -21,6 +21,7 @@ __all__ = [
     "jacobi",
     "local_global",
     "newton",
+    "preconditioned_lbfgs",
     "relative_error",
     "solve_with_contact",
     "spectrum",
@@ -184,6 +185,52 @@ def guarded_chebyshev(
     schedule = _Guarded(radius, guard_tolerance(problem) if check_tolerance is None else check_tolerance)
     return _iterate(problem, first, schedule, diagonal=problem.weighted_diagonal, relaxation=relaxation,
                     iterations=iterations, tolerance=tolerance, observe=observe)  # fmt: skip
+
+
+def preconditioned_lbfgs(
+    problem: StepProblem,
+    first: Array,
+    precondition: Callable[[Array], Array],
+    *,
+    iterations: int,
+    relaxation: float = 1.8,
+    memory: int = 8,
+    observe: Observer | None = None,
+) -> Array:
+    """L-BFGS from H_0 = relaxation M, two loops over its pairs (Nocedal 1980), in a step without contact.
+
+    Every iteration takes a full step. One that fails the decrease of Armijo, 1e-4, is an error: what the library then
+    does is not textbook.
+
+    Args:
+        problem: the step.
+        first: u_0 [V, 3].
+        precondition: M of a gradient [V, 3], zero at hard pins.
+        iterations: to carry out.
+        relaxation: of M, in (0, 2).
+        memory: pairs that are kept.
+        observe: sees (k, u_k) from the first update on.
+    """
+    u, pairs = first, list[tuple[Array, Array]]()
+    energy, gradient = problem.evaluate(u)
+    for k in range(iterations):
+        direction, weights = gradient, []
+        for s, y in reversed(pairs):
+            weights.append(float((s * direction).sum()) / float((s * y).sum()))
+            direction = direction - weights[-1] * y
+        direction = relaxation * precondition(direction)
+        for (s, y), weight in zip(pairs, reversed(weights), strict=True):
+            direction = direction + (weight - float((y * direction).sum()) / float((s * y).sum())) * s
+        following = u - direction
+        last, before = energy, gradient
+        energy, gradient = problem.evaluate(following)
+        if energy > last - 1e-4 * float((before * direction).sum()) + 1e-12 * abs(last):
+            raise RuntimeError(f"preconditioned_lbfgs: iteration {k} fails to lower the energy enough")
+        pairs = [*pairs, (following - u, gradient - before)][-memory:]
+        u = following
+        if observe is not None:
+            observe(k + 1, u)
+    return u
 
 
 def guard_tolerance(problem: StepProblem) -> float:

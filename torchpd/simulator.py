@@ -12,13 +12,14 @@ from torch import Tensor, nn
 from .adjoint import AdjointCall, step_gradient
 from .capture import CapturedStep
 from .material import MATERIAL_ROWS, check_material, material_of
+from .multilevel import has_levels, precondition_plan, reference_of, without_levels
 from .ops import INFO_WIDTH, refuse_tangents
 from .placing import check_wanted_device, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .rollout import PerStep, Rollout, roll
 from .scene import Scene
-from .solvers import Chebyshev, Jacobi, Solver
+from .solvers import Chebyshev, Multilevel, Solver, check_solver
 from .state import Info, State, Track
 from .summary import describe
 from .targets import Anchors, Targets
@@ -43,7 +44,7 @@ class Simulator(nn.Module):
         scene: what there is.
         time_step: h [s], positive.
         iterations: local and global steps of one time step, at most.
-        solver: `Chebyshev()` or `Jacobi()`.
+        solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "grid" or "stream", see `torchpd.regimes`;
@@ -79,9 +80,7 @@ class Simulator(nn.Module):
         self.scene = scene
         self.time_step = _positive("time_step", time_step, "s")
         self.iterations = _whole("iterations", iterations, 0)
-        self.solver = Chebyshev() if solver is None else solver
-        if not isinstance(self.solver, Jacobi | Chebyshev):
-            raise TypeError(f"Simulator: solver must be Jacobi or Chebyshev, got {type(solver).__name__}")
+        solver = check_solver(Chebyshev() if solver is None else solver, torch.device("cpu"))
         self.tolerance = float(tolerance)
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
@@ -93,6 +92,7 @@ class Simulator(nn.Module):
         self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
         for name, value in material_of(values, dtype).items():
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
+        self.solver = solver
 
     # ---- what a simulation is made of
 
@@ -111,6 +111,29 @@ class Simulator(nn.Module):
         """Where states have to be."""
         return self.plan.device
 
+    @property
+    def solver(self) -> Solver:
+        """How a step is solved. A multilevel one is prepared when it is set."""
+        return self._solver
+
+    @solver.setter
+    def solver(self, solver: Solver) -> None:
+        self._solver = check_solver(solver, self.device)
+        if isinstance(solver, Multilevel) != has_levels(self.plan.arrays):
+            self.prepare_solver()
+
+    def prepare_solver(self) -> None:
+        """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`.
+
+        Worth it after the material has changed unevenly, which `Info.rho` and `Info.residual` tell, or time_step has.
+        `set_material` does it by itself when it pins other vertices hard, or frees some. Takes 0.3 s for 8 thousand
+        vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
+        """
+        self.plan = without_levels(self.plan)
+        if isinstance(self.solver, Multilevel):
+            reference = reference_of(self.plan, self.material(), self.time_step)
+            self.plan = precondition_plan(self.plan, self.scene.values(), *reference)
+
     def material(self) -> list[Tensor]:
         """The differentiable arrays in the order of the ops."""
         return [getattr(self, name) for name in MATERIAL_ROWS]
@@ -124,6 +147,7 @@ class Simulator(nn.Module):
             arrays: by name, see the class. Shapes and values are checked here, once.
         """
         checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
+        held = self._held_everywhere()
         with torch.no_grad():
             for name, tensor in checked.items():
                 own = getattr(self, name)
@@ -131,6 +155,14 @@ class Simulator(nn.Module):
                     own.copy_(tensor)
                 else:
                     setattr(self, name, nn.Parameter(tensor.clone(), requires_grad=own.requires_grad))
+        # what is held belongs to the structure of a preconditioner
+        if has_levels(self.plan.arrays) and not torch.equal(held, self._held_everywhere()):
+            self.prepare_solver()
+
+    def _held_everywhere(self) -> Tensor:
+        """Whether each pin holds exactly in all environments [P]."""
+        hard = self.pin_stiffness.isinf()
+        return hard.all(0) if hard.dim() == 2 else hard
 
     def _checked_material(self, name: str, value: Tensor | float) -> Tensor:
         if name not in MATERIAL_ROWS:
@@ -168,6 +200,8 @@ class Simulator(nn.Module):
         wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
+        if wanted.device.type == "cuda":
+            check_solver(self.solver, wanted.device)
         changes_precision = wanted.dtype != self.dtype
         # first, because it may refuse
         plan = plan_on(self, wanted.dtype, wanted.device)

@@ -17,7 +17,11 @@ class State(NamedTuple):
 
 
 class Info(NamedTuple):
-    """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it."""
+    """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it.
+
+    Of `Multilevel`, `restarts` counts trials that were taken back, and `rho` is 1 - q / s, where q A_0 <= A <= s A_0
+    and M was made of A_0: 0 where M fits, near 1 where it does not (`Simulator.prepare_solver` makes it anew).
+    """
 
     residual: Tensor  # |grad E| / |grad E at x + h v|, less what contacts balance; NaN unless asked for
     energy: Tensor  # objective of the step at the last iterate [J]; NaN unless asked for

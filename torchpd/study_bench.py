@@ -180,7 +180,7 @@ def _peak_bytes(sim: Simulator, work: Callable[[], object]) -> tuple[int, str]:
         _wait_for(sim.device)
         return int(torch.cuda.max_memory_allocated(sim.device)), "torch.cuda"
     real = torch.finfo(sim.dtype).bits // 8
-    return sim.plan.bytes + workspace_bytes(sim.plan, real), "layout"
+    return sim.plan.bytes + workspace_bytes(sim.plan, real, sim.solver), "layout"
 
 
 def precision_name(dtype: torch.dtype) -> str:

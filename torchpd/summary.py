@@ -8,7 +8,8 @@ import torch
 
 from . import _C
 from .regimes import shared_bytes
-from .solvers import Chebyshev
+from .solvers import Chebyshev, Multilevel, Solver
+from .tables import PLAN_TABLE
 
 if TYPE_CHECKING:
     from .plan import Plan
@@ -22,7 +23,11 @@ _FOLDED = "folded into the inertia of a vertex: nothing per iteration"
 
 def _solver_line(sim: Simulator) -> str:
     numbers = sim.solver.numbers()
-    name = f"Chebyshev {sim.solver.schedule}" if isinstance(sim.solver, Chebyshev) else "Jacobi"
+    name = "Jacobi"
+    if isinstance(sim.solver, Chebyshev):
+        name = f"Chebyshev {sim.solver.schedule}"
+    if isinstance(sim.solver, Multilevel):
+        name = f"Multilevel {sim.solver.outer}"
     stop = f"at most {sim.iterations}" if sim.tolerance else f"{sim.iterations}"
     rho = f", rho {numbers['rho']:g}" if numbers["rho"] else ""
     diagonal = "weighted" if numbers["weighted"] else "plain"
@@ -35,6 +40,17 @@ def _promise_lines(sim: Simulator) -> list[str]:
         return []
     stale = "" if sim.promise.covers(sim) else "; settings have changed since, so it no longer holds"
     return [f"tuned: {sim.promise}{stale}"]
+
+
+def _preconditioner_lines(sim: Simulator) -> list[str]:
+    """Levels and bytes of what `Multilevel` prepared."""
+    plan = sim.plan
+    if not isinstance(sim.solver, Multilevel):
+        return []
+    nodes, below = int(plan.level_sizes[2]), int(plan.level_sizes[5])
+    steps = [f"{plan.vertices} vertices", f"{nodes} nodes", *([f"{below} nodes"] if below else [])]
+    own = sum(array.numel() * array.element_size() for array in plan.arrays[len(PLAN_TABLE) :])
+    return [f"preconditioner: {' > '.join(steps)}, the last solved directly; {own:,} B of the plan"]
 
 
 def _effect_lines(sim: Simulator) -> list[str]:
@@ -91,16 +107,21 @@ def _kernel_lines(sim: Simulator) -> list[str]:
     ]
 
 
-def workspace_bytes(plan: Plan, real: int) -> int:
+def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     """Memory of a step on the CPU beside plan, material and states, of one environment; `real` bytes a number."""
     # five vectors of four numbers, two weights, and the slots of the patches
-    return real * (22 * plan.vertices + 8 * len(plan.slot_vertex))
+    numbers = 22 * plan.vertices + 8 * len(plan.slot_vertex)
+    if isinstance(solver, Multilevel):
+        # four vectors of the outer iteration, four of a cycle, and eight pairs
+        numbers += 4 * plan.vertices * (8 + (16 if solver.outer == "lbfgs" else 0))
+    return real * numbers
 
 
-def _step_bytes(plan: Plan, real: int) -> str:
+def _step_bytes(sim: Simulator, real: int) -> str:
     """Memory that a step takes beside plan, material and states."""
+    plan = sim.plan
     if plan.kernel is None:
-        return f"{workspace_bytes(plan, real):,} B an environment during a step"
+        return f"{workspace_bytes(plan, real, sim.solver):,} B an environment during a step"
     slots = plan.size("slots")
     if plan.kernel == "stream":
         return f"{4 * real * (5 * plan.vertices + 2 * slots):,} B an environment during a step"
@@ -119,8 +140,9 @@ def describe(sim: Simulator) -> str:
         f"{plan.vertices} vertices, time step {sim.time_step:.6g} s, {sim.dtype} on {where}",
         _solver_line(sim),
         *_promise_lines(sim),
+        *_preconditioner_lines(sim),
         *_effect_lines(sim),
         *([_pass_line(sim)] if plan.kernel is None else _kernel_lines(sim)),
-        f"memory: plan {plan.bytes:,} B, material {material:,} B, {_step_bytes(plan, real)}",
+        f"memory: plan {plan.bytes:,} B, material {material:,} B, {_step_bytes(sim, real)}",
     ]
     return "\n  ".join(lines)

@@ -6,11 +6,19 @@ from typing import NamedTuple
 
 from . import _C
 
-__all__ = ["DEVICE_PLAN_TABLE", "DEVICE_SIZES", "MATERIAL_TABLE", "PLAN_TABLE", "MaterialRow", "PlanRow"]
+__all__ = [
+    "DEVICE_PLAN_TABLE",
+    "DEVICE_SIZES",
+    "MATERIAL_TABLE",
+    "MULTILEVEL_TABLE",
+    "PLAN_TABLE",
+    "MaterialRow",
+    "PlanRow",
+]
 
 
 class PlanRow(NamedTuple):
-    """One line of csrc/plan/plan.def, or of device.def: a constant array."""
+    """One line of csrc/plan/plan.def, of multilevel.def, or of device.def: a constant array."""
 
     name: str
     type: str
@@ -34,6 +42,7 @@ class MaterialRow(NamedTuple):
 
 
 PLAN_TABLE = tuple(PlanRow(*row) for row in _C.plan_table())
+MULTILEVEL_TABLE = tuple(PlanRow(*row) for row in _C.multilevel_table())
 DEVICE_PLAN_TABLE = tuple(PlanRow(*row) for row in _C.device_plan_table())
 MATERIAL_TABLE = tuple(MaterialRow(*row) for row in _C.material_table())
 # numbers of a GPU plan's `sizes`: DeviceSize of csrc/plan/views.h

@@ -16,6 +16,8 @@ struct Kernels {
   void (*field64)(const FieldCall<double>&, int threads);
   void (*rotation32)(const RotationCall<float>&, int threads);
   void (*rotation64)(const RotationCall<double>&, int threads);
+  void (*precondition32)(const PreconditionCall<float>&, int threads);
+  void (*precondition64)(const PreconditionCall<double>&, int threads);
   void (*flops)(float* seconds, std::int64_t* operations);  // multiply-add loop, for calibration
 };
 

@@ -1,6 +1,7 @@
 // The compiled physics of one instruction set. Included once by each cpu/isa_*.cpp, after PD_TARGET is set.
 #pragma once
 #include "cpu/fields.h"
+#include "cpu/multilevel_stepper.h"
 #include "cpu/stepper.h"
 
 #include <algorithm>
@@ -22,6 +23,27 @@ struct CleanRegisters {
 // Fewest environments for which lanes run over environments instead of elements.
 constexpr std::int64_t least_batch = 8;
 
+// The stepper that the call's solver needs, with the memory that it alone needs.
+template <class Lanes, bool Touching, class T>
+class Runner {
+ public:
+  Runner(const StepCall<T>& call, int threads) : call_(call) {
+    if (call.settings.multilevel()) outer_.emplace(call, Touching, threads);
+  }
+
+  void roll(Workspace<Lanes>& work, Scratch<Lanes>& scratch, const Team& team, std::int64_t first) {
+    if (outer_) {
+      MultilevelStepper<Lanes, Touching>(call_, work, scratch, team, first, *outer_).roll();
+    } else {
+      Stepper<Lanes, Touching>(call_, work, scratch, team, first).roll();
+    }
+  }
+
+ private:
+  const StepCall<T>& call_;
+  std::optional<OuterWork<Lanes>> outer_;
+};
+
 template <class Lanes, bool Touching, class T>
 void step_batches(const StepCall<T>& call, int threads) {
   constexpr int W = Lanes::environments;
@@ -31,9 +53,9 @@ void step_batches(const StepCall<T>& call, int threads) {
     const CleanRegisters clean;
     Workspace<Lanes> work(call);
     Scratch<Lanes> scratch(call.plan.most_slots);
+    Runner<Lanes, Touching, T> runner(call, 1);
     const Team alone;
-    for (std::int64_t g = next++; g < groups; g = next++)
-      Stepper<Lanes, Touching>(call, work, scratch, alone, g * W).roll();
+    for (std::int64_t g = next++; g < groups; g = next++) runner.roll(work, scratch, alone, g * W);
   });
 }
 
@@ -53,10 +75,11 @@ void step_singles(const StepCall<T>& call, int threads) {
   Workspace<Lanes> work(call);
   // before the team starts: a member without memory would keep the others waiting
   auto scratches = make_scratches<Lanes>(call.plan, threads);
+  Runner<Lanes, Touching, T> runner(call, threads);
   run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
     const CleanRegisters clean;
     for (std::int64_t e = 0; e < call.batch; ++e) {
-      Stepper<Lanes, Touching>(call, work, scratches[team.rank], team, e).roll();
+      runner.roll(work, scratches[team.rank], team, e);
       team.barrier();
     }
   });
@@ -88,6 +111,30 @@ void field_any(const FieldCall<T>& call, int threads) {
     const CleanRegisters clean;
     FieldPass<T> pass(call, work, scratches[team.rank], team);
     for (std::int64_t e = 0; e < call.batch; ++e) pass.run(e);
+  });
+}
+
+// M of the fields, environment by environment.
+template <class T>
+void precondition_any(const PreconditionCall<T>& call, int threads) {
+  using Lanes = Single<T>;
+  const Cycle<Lanes> cycle(call.levels);
+  const std::int64_t n = call.levels.vertices;
+  run_team(threads, [&](const Team& team) {
+    const CleanRegisters clean;
+    for (std::int64_t e = 0; e < call.batch; ++e) {
+      for (std::int64_t i = team.begin(n); i < team.end(n); ++i) {
+        const T* from = call.field + (e * n + call.vertex_order[i]) * 3;
+        cycle.input()[i] = to_quad(from[0], from[1], from[2]);
+      }
+      team.barrier();
+      cycle.run(team);
+      for (std::int64_t i = team.begin(n); i < team.end(n); ++i) {
+        T* to = call.out + (e * n + call.vertex_order[i]) * 3;
+        for (int c = 0; c < 3; ++c) to[c] = cycle.result()[i].q.v[c];
+      }
+      team.barrier();
+    }
   });
 }
 
@@ -166,6 +213,8 @@ const Kernels PD_KERNELS = {PD_NAME,
                             &field_any<double>,
                             &rotation_any<float>,
                             &rotation_any<double>,
+                            &precondition_any<float>,
+                            &precondition_any<double>,
                             &multiply_add_loop};
 
 }  // namespace pd

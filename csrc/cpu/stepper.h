@@ -12,6 +12,7 @@ namespace pd::inline PD_TARGET {
 // `Touching`: see solver/vertex.h.
 template <class Lanes, bool Touching>
 class Stepper {
+ protected:
   using T = typename Lanes::Scalar;
   using Real = typename Lanes::Real;
   using Value = typename Lanes::Value;
@@ -150,7 +151,7 @@ class Stepper {
     team_.barrier();
   }
 
- private:
+ protected:
   Value target(std::int64_t i, const Real& spring, const Value& pin) const {
     const Real h(h_), mass = in_.number(call_.material.masses, plan_.vertex_order[i]);
     const Real weight = inertia_weight(mass, damping_, spring, h);

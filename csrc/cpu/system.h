@@ -11,7 +11,9 @@
 #include <cstring>
 #include <memory>
 #include <new>
+#include <optional>
 #include <type_traits>
+#include <utility>
 #include <vector>
 
 #include "cpu/dispatch.h"

@@ -8,8 +8,8 @@
 // A ball acts as its tangent plane at the iterate that the step leaves from (`around`): the normal of the free iterate would
 // make the fixed point depend on relaxation and acceleration.
 #pragma once
+#include "math/mat.h"
 #include "math/scalar.h"
-#include "math/vec.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -63,6 +63,26 @@ PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, 
   return subtract_product(pushed, grip, tangential);
 }
 
+// What a contact leaves of the directions `free`, a projector, to a vertex that it pushes out from `u`: not its normal, and
+// nothing where friction takes back all slip.
+template <class R>
+PD_HD void take_directions(Mat3<R>& free, const Vec3<R>& u, const Vec3<R>& normal, const R& depth,
+                           const R& friction, const Vec3<R>& motion) {
+  const R none(0), one(1);
+  const Vec3<R> slip = multiply_add(depth, normal, u) - motion;
+  const Vec3<R> tangential = subtract_product(slip, dot(normal, slip), normal);
+  const auto sticks = friction * depth > square_root(dot(tangential, tangential));
+  const Vec3<R> left = free * normal;
+  const R size = dot(left, left);
+  // a normal that earlier ones span but for a thousandth takes nothing more
+  const auto takes = depth > none && size > R(1e-6);
+  const R scale = select(takes, one / select(takes, size, one), none);
+  const R kept = select(sticks, none, one);
+  free = {{kept * subtract_product(free.row[0], scale * left.x, left),
+           kept * subtract_product(free.row[1], scale * left.y, left),
+           kept * subtract_product(free.row[2], scale * left.z, left)}};
+}
+
 // `x` is the vertex at the start of the step, `u` its displacement since then.
 template <class R>
 PD_HD Vec3<R> project(const Plane<R>& plane, const Vec3<R>& x, const Vec3<R>& u, const Vec3<R>&) {
@@ -89,6 +109,26 @@ struct Contacts {
     for (int i = 0; i < plane_count; ++i) u = pd::project(planes[i], x, u, around);
     for (int i = 0; i < ball_count; ++i) u = pd::project(balls[i], x, u, around);
     return u;
+  }
+
+  // Projector on the directions in which a vertex may go from a free iterate `u`, off the contacts that push it out.
+  PD_HD Mat3<R> free_directions(const Vec3<R>& x, Vec3<R> u, const Vec3<R>& around) const {
+    const R one(1), none(0);
+    const Vec3<R> still = {none, none, none};
+    Mat3<R> free = {{{one, none, none}, {none, one, none}, {none, none, one}}};
+    for (int i = 0; i < plane_count; ++i) {
+      const Plane<R>& p = planes[i];
+      take_directions(free, u, p.normal, penetration(gap(p, x + u)), p.friction, still);
+      u = pd::project(p, x, u, around);
+    }
+    for (int i = 0; i < ball_count; ++i) {
+      const Ball<R>& b = balls[i];
+      const Vec3<R> normal = outward(b, x + around);
+      const R depth = penetration(dot(normal, (x + u) - b.center) - b.radius);
+      take_directions(free, u, normal, depth, b.friction, b.motion);
+      u = pd::project(b, x, u, around);
+    }
+    return free;
   }
 
   // the largest coefficient of any contact

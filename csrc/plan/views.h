@@ -24,6 +24,31 @@ enum PlanSize : int {
   plan_size_count
 };
 
+// Numbers of a preconditioner's array of sizes; without a middle level its numbers are 0.
+enum LevelSize : int {
+  level_fine_entries,
+  level_fine_lifts,
+  level_fine_nodes,  // below the fine level
+  level_middle_entries,
+  level_middle_lifts,
+  level_middle_nodes,  // below the middle level
+  level_size_count
+};
+
+// A multilevel approximation of A^-1: see plan/multilevel_build.h and solver/multilevel.h. All null where there is none.
+template <class T>
+struct Levels {
+  using real = T;
+#define X(name, type, width, rows, meaning) const type* name = nullptr;
+#include "plan/multilevel.def"
+#undef X
+  int vertices = 0, fine_nodes = 0, middle_nodes = 0;
+
+  PD_HD bool there() const { return fine_start != nullptr; }
+  PD_HD bool has_middle() const { return middle_nodes > 0; }
+  PD_HD int coarse_nodes() const { return has_middle() ? middle_nodes : fine_nodes; }
+};
+
 template <class T>
 struct Plan {
   using real = T;
@@ -32,6 +57,7 @@ struct Plan {
 #undef X
   int vertices = 0, tets = 0, pins = 0, groups = 0, blocks = 0, patches = 0, slots = 0, shared = 0;
   int most_slots = 0;  // of any patch
+  Levels<T> levels;
 };
 
 // Numbers of DevicePlan::sizes; most_*: the largest of any patch.
@@ -83,7 +109,8 @@ struct Material {
   int planes_count = 0, spheres_count = 0;
 };
 
-enum class ScheduleKind : int { jacobi = 0, classic = 1, guarded = 2 };
+// the last two are multilevel
+enum class ScheduleKind : int { jacobi = 0, classic = 1, guarded = 2, lbfgs = 3, momentum = 4 };
 enum class StartKind : int { velocity = 0, inertial = 1, given = 2 };
 
 struct Settings {
@@ -98,6 +125,8 @@ struct Settings {
   int delay = 0;          // iterations before the classic schedule accelerates
   bool weighted = true;   // the diagonal that cannot diverge, else the plain one
   bool report = false;    // residual and energy cost two more local steps
+
+  PD_HD bool multilevel() const { return schedule >= ScheduleKind::lbfgs; }
 };
 
 // Numbers of an info row, double each.
@@ -150,6 +179,16 @@ struct FieldCall {
   const T* direction = nullptr;  // [batch, vertices, 3], by the products
   T* out =
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, vertices] of the diagonal
+};
+
+// The approximation of A^-1 of a vector for each vertex.
+template <class T>
+struct PreconditionCall {
+  Levels<T> levels;
+  const int32* vertex_order = nullptr;
+  std::int64_t batch = 0;
+  const T* field = nullptr;  // [batch, vertices, 3]
+  T* out = nullptr;          // [batch, vertices, 3]
 };
 
 template <class T>

@@ -93,6 +93,13 @@ struct Vertex {
     const Real diagonal = one / select(inverse > none, inverse, one);
     return hold(zero, diagonal * (u - project(contacts, subtract_product(u, inverse, free), u)));
   }
+
+  // where contacts let the vertex go from u: see effects/contact.h
+  PD_HD Mat3<Real> free_directions(const Contacts<Real>& contacts, const Value& u,
+                                   const Value& force) const {
+    const Value next = subtract_product(u, inverse, gradient(u, force));
+    return contacts.free_directions(Lanes::vec3(x), Lanes::vec3(next), Lanes::vec3(u));
+  }
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -1,0 +1,134 @@
+"""What the multilevel solver needs: iterations to an error, set-up, memory and time, on boxes and on your own mesh.
+
+Boxes of 5r x r x r cells (1 x 0.2 x 0.2 m, six tetrahedra a cell), held at x = 0, thrown with v_y = -10 x^2, time step
+1/30 s, float64, start "inertial". Error |x - x*| / |x_0 - x*|; x* is the solver's own after 400 iterations, whose
+residual is printed. A mesh is held where it is low, thrown sideways, and has stiffness random over 1e4..1e6 Pa from tet
+to tet.
+
+    python benchmarks/multilevel.py --cells 11 26 --youngs 1e6 1e8
+    python benchmarks/multilevel.py --mesh bunny.mesh
+    python benchmarks/multilevel.py --setup 32
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchpd as pd
+from torchpd.tables import PLAN_TABLE
+
+ERRORS = (1e-2, 1e-3, 1e-4)
+OUTERS: tuple[Literal["lbfgs", "momentum"], ...] = ("lbfgs", "momentum")
+MOST = 160
+CHEBYSHEV = 512
+
+
+def box(cells: int, youngs: float) -> tuple[pd.Scene, pd.State]:
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (5 * cells, cells, cells))
+    solid = pd.Solid(mesh, youngs=youngs, density=1000.0)
+    scene = pd.Scene(solid, pd.Pin(solid, mesh.vertices[:, 0] == 0.0), pd.Gravity((0.0, -9.8, 0.0)))
+    x = torch.tensor(mesh.vertices)
+    v = torch.zeros_like(x)
+    v[:, 1] = -10.0 * x[:, 0] ** 2
+    return scene, pd.State(x[None], v[None])
+
+
+def loaded(path: str) -> tuple[pd.Scene, pd.State]:
+    mesh = pd.TetMesh.from_file(path)
+    low, size = mesh.vertices.min(axis=0), np.ptp(mesh.vertices, axis=0)
+    up = int(np.argmax(size))
+    height = (mesh.vertices[:, up] - low[up]) / size[up]
+    stiffness = 10.0 ** np.random.default_rng(0).uniform(4.0, 6.0, len(mesh.tets))
+    solid = pd.Solid(mesh, youngs=stiffness, density=1000.0)
+    x = torch.tensor(mesh.vertices)
+    v = torch.zeros_like(x)
+    v[:, (up + 1) % 3] = torch.tensor(10.0 * size[up] * height**2)
+    return pd.Scene(solid, pd.Pin(solid, height < 0.05), pd.Gravity((0.0, -9.8, 0.0))), pd.State(x[None], v[None])
+
+
+def moved(sim: pd.Simulator, state: pd.State, iterations: int) -> tuple[Tensor, pd.Info]:
+    """Displacement, from the velocity, which keeps more digits, and how it was found."""
+    sim.iterations = iterations
+    after, info = sim(state, start="inertial", return_info=True)
+    return after.velocities * sim.time_step, info
+
+
+def fewest(sim: pd.Simulator, state: pd.State, solution: Tensor, goals: list[float]) -> list[int]:
+    """Iterations after which the distance from the solution first is within each goal, as far as MOST reaches."""
+    found: list[int] = []
+    for count in range(1, MOST + 1):
+        distance = float((moved(sim, state, count)[0] - solution).norm())
+        found += [count for goal in goals[len(found) :] if distance <= goal]
+        if len(found) == len(goals):
+            break
+    return found
+
+
+def measure(name: str, scene: pd.Scene, state: pd.State) -> None:
+    sim = pd.Simulator(scene, 1 / 30, dtype=torch.float64, progress=False)
+    start = time.perf_counter()
+    sim.solver = pd.Multilevel()
+    setup = time.perf_counter() - start
+    solution, info = moved(sim, state, 400)
+    own = sum(array.numel() * array.element_size() for array in sim.plan.arrays[len(PLAN_TABLE) :])
+    print(f"{name}: {sim.vertices} vertices, set-up {setup:.2f} s, {own / 1e6:.1f} MB, "
+          f"residual of x* {float(info.residual):.0e}")  # fmt: skip
+    scale = float((moved(sim, state, 0)[0] - solution).norm())
+    for outer in OUTERS:
+        sim.solver = pd.Multilevel(outer)
+        counts = fewest(sim, state, solution, [error * scale for error in ERRORS])
+        failed = int(moved(sim, state, counts[-1] if counts else MOST)[1].restarts)
+        columns = [str(count) for count in counts] + [f"> {MOST}"] * (len(ERRORS) - len(counts))
+        print(f"    {outer:<10}" + "".join(f"{column:>8}" for column in columns) + f"   trials taken back: {failed}")
+    sim.solver = pd.Chebyshev()
+    left = float((moved(sim, state, CHEBYSHEV)[0] - solution).norm()) / scale
+    print(f"    {CHEBYSHEV} iterations of guarded Chebyshev leave {left:.1e}")
+
+
+def setup_of(cells: int) -> None:
+    """Set-up, memory and time of an iteration in float32."""
+    scene, state = box(cells, 1e6)
+    sim = pd.Simulator(scene, 1 / 30, 16, progress=False)
+    start = time.perf_counter()
+    sim.solver = pd.Multilevel()
+    setup = time.perf_counter() - start
+    own = sum(array.numel() * array.element_size() for array in sim.plan.arrays[len(PLAN_TABLE) :])
+    tets = len(scene.values().tets)
+    print(f"{tets} tetrahedra, {sim.vertices} vertices: set-up {setup:.2f} s on {torch.get_num_threads()} threads, "
+          f"{own / 1e6:.1f} MB beside a plan of {(sim.plan.bytes - own) / 1e6:.1f} MB")  # fmt: skip
+    single = pd.State(state.positions.float(), state.velocities.float())
+    for solver in (pd.Multilevel(), pd.Multilevel("momentum"), pd.Chebyshev()):
+        sim.solver = solver
+        best = np.inf
+        for _ in range(4):
+            start = time.perf_counter()
+            sim(single)
+            best = min(best, time.perf_counter() - start)
+        print(f"    {solver}: {1e3 * best / sim.iterations:.2f} ms an iteration")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--cells", type=int, nargs="*", default=[11], help="r of the boxes")
+    parser.add_argument("--youngs", type=float, nargs="*", default=[1e6, 1e8], help="Young's moduli of the boxes [Pa]")
+    parser.add_argument("--mesh", nargs="*", default=[], help="tetrahedral meshes, in place of the boxes")
+    parser.add_argument("--setup", type=int, nargs="*", default=[], help="r of boxes to set up in float32 instead")
+    arguments = parser.parse_args()
+    for path in arguments.mesh:
+        measure(path, *loaded(path))
+    for cells in arguments.setup:
+        setup_of(cells)
+    if not arguments.mesh and not arguments.setup:
+        for cells in arguments.cells:
+            for youngs in arguments.youngs:
+                measure(f"box {cells}, {youngs:g} Pa", *box(cells, youngs))
+
+
+if __name__ == "__main__":
+    main()

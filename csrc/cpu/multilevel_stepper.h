@@ -1,0 +1,336 @@
+// Runner of solver/multilevel.h on the CPU: what Stepper does of a step, and another way to the next iterate.
+#pragma once
+#include "cpu/misfit.h"
+#include "cpu/outer_work.h"
+#include "cpu/stepper.h"
+
+namespace pd::inline PD_TARGET {
+
+// `Touching`: see solver/vertex.h.
+template <class Lanes, bool Touching>
+class MultilevelStepper : public Stepper<Lanes, Touching> {
+  using Base = Stepper<Lanes, Touching>;
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Value = typename Lanes::Value;
+  using Wide = typename Lanes::Wide;
+  using Sum = Sums<Lanes>;
+  using Work = OuterWork<Lanes>;
+  static constexpr int width = Lanes::environments, dots = Work::dots;
+  using Base::call_, Base::contacts_, Base::done_, Base::in_, Base::plan_, Base::schedule_,
+      Base::set_, Base::sweep_, Base::team_, Base::used_, Base::vertex, Base::w_;
+
+ public:
+  MultilevelStepper(const StepCall<T>& call, Workspace<Lanes>& work, Scratch<Lanes>& scratch,
+                    const Team& team, std::int64_t first, Work& outer)
+      : Base(call, work, scratch, team, first),
+        o_(outer),
+        lbfgs_(set_.schedule == ScheduleKind::lbfgs) {}
+
+  // All steps of the call, with a record every `set_.every`.
+  void roll() {
+    this->load();
+    this->weigh();
+    compare_with_reference();
+    for (int t = 0; t < set_.steps; ++t) {
+      multilevel_step(*this, set_);
+      if ((t + 1) % set_.every == 0) this->store((t + 1) / set_.every - 1);
+      this->move_balls();
+    }
+  }
+
+  void start() {
+    Base::start();
+    newest_ = 0;
+    const Wide friction = Lanes::widen(contacts_.friction());
+    for (int lane = 0; lane < width; ++lane) {
+      outer_[lane] = {};
+      outer_[lane].scale = misfit_[lane].scale;
+      outer_[lane].friction = Lanes::lane(friction, lane) > 0;
+      outer_[lane].slack = outer_[lane].friction ? guard_slack_friction : energy_noise<T>();
+      pairs_[lane] = {};
+      schedule_[lane].rho = misfit_[lane].spread;
+    }
+  }
+
+  // E and what is out of balance at the trial u
+  void evaluate(int k) {
+    sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
+      const auto v = vertex(i);
+      sums.energy = v.add_energy(w_.u[i], sums.energy);
+      o_.fresh[i] = v.unbalanced(contacts_, w_.u[i], force);
+      if constexpr (Touching) {
+        o_.fresh_free[i] = v.free_directions(contacts_, w_.u[i], force);
+        o_.fresh_gradient[i] = v.gradient(w_.u[i], force);
+        // work against the friction of the base
+        const Value friction = open(i, o_.pull[i] - o_.gradient[i]);
+        sums.first = multiply_add(friction, w_.u[i] - o_.base[i], sums.first);
+      }
+    });
+  }
+
+  // every thread decides from the same sums, so all decide alike
+  void judge(int k) {
+    const auto sum = this->total(k & 1);
+    for (int lane = 0; lane < width; ++lane) {
+      if (done_[lane]) {
+        Lanes::set_lane(accepted_, lane, T(0));
+        continue;
+      }
+      const double work = outer_[lane].known ? Lanes::lane(sum.first, lane) : 0;
+      const double energy = Lanes::lane(sum.energy, lane) + work;
+      const bool accepted = outer_[lane].accept(energy, lbfgs_);
+      // the friction of another base does other work
+      if (accepted) outer_[lane].energy -= work;
+      Lanes::set_lane(accepted_, lane, T(accepted ? 1 : 0));
+      Lanes::set_lane(finite_, lane, T(energy < HUGE_VAL ? 1 : 0));
+    }
+  }
+
+  // The pair from the base to the trial, kept or not: it holds for the curvature on the way. Then the base moves on.
+  void learn(int k) {
+    newest_ = (newest_ + 1) % history;
+    pass([&](std::int64_t i, Value(&sum)[dots]) {
+      if (k == 0) {
+        o_.base[i] = w_.u[i];
+        o_.pull[i] = o_.fresh[i];
+      }
+      const Value change = w_.u[i] - o_.base[i];
+      const Value s = let_through(i, change), y = let_through(i, o_.fresh[i] - o_.pull[i]);
+      if constexpr (Touching) keep_directions(i);
+      // what momentum goes on along
+      w_.before[i] = choose(o_.base[i], w_.before[i]);
+      o_.base[i] = choose(w_.u[i], o_.base[i]);
+      o_.pull[i] = choose(o_.fresh[i], o_.pull[i]);
+      sum[2 * history] = multiply_add(change, change, sum[2 * history]);
+      sum[2 * history + 1] = multiply_add(w_.u[i], w_.u[i], sum[2 * history + 1]);
+      if (!lbfgs_) return;
+      // a trial out of range must not poison sums in which it has no part
+      o_.s[newest_][i] = pick(finite_, s, none_);
+      o_.y[newest_][i] = pick(finite_, y, none_);
+      const Value g = let_through(i, o_.pull[i]);
+      for (int j = 0; j < history; ++j) {
+        sum[j] = multiply_add(o_.s[j][i], y, sum[j]);
+        sum[history + j] = multiply_add(o_.s[j][i], g, sum[history + j]);
+      }
+      sum[2 * history + 2] = multiply_add(y, y, sum[2 * history + 2]);
+    });
+    double total[dots];
+    for (int lane = 0; lane < width; ++lane) {
+      add_up(lane, total);
+      stop(lane, k, total[2 * history], total[2 * history + 1]);
+      if (!lbfgs_) continue;
+      double with[history];
+      for (int j = 0; j < history; ++j) {
+        with[j] = total[j];
+        pairs_[lane].pulled[j] = total[history + j];
+      }
+      pairs_[lane].valid[newest_] = false;
+      if (k > 0) pairs_[lane].add(newest_, with, total[2 * history], total[2 * history + 2]);
+      if (outer_[lane].plain || outer_[lane].diagonal) pairs_[lane].clear();
+      pairs_[lane].first_loop(newest_);
+    }
+    team_.barrier();
+  }
+
+  // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
+  void precondition() {
+    Real alpha[history], scale;
+    for (int lane = 0; lane < width; ++lane) {
+      for (int j = 0; j < history; ++j) Lanes::set_lane(alpha[j], lane, T(pairs_[lane].alpha[j]));
+      Lanes::set_lane(scale, lane, T(set_.relaxation / outer_[lane].scale));
+    }
+    Value* in = o_.cycle.input();
+    each_vertex([&](std::int64_t i) {
+      Value q = let_through(i, o_.pull[i]);
+      if (lbfgs_) {
+        for (int j = 0; j < history; ++j) q = subtract_product(q, alpha[j], o_.y[j][i]);
+        q = let_through(i, q);
+      }
+      in[i] = scale * q;
+    });
+    o_.cycle.run(team_);
+    if (lbfgs_) return correct();
+    each_vertex([&](std::int64_t i) { o_.direction[i] = o_.cycle.result()[i]; });
+  }
+
+  // next trial: P(u + beta (u - before) - (1 + beta) t d), or a plain or accelerated Jacobi iteration
+  void advance() {
+    Real beta, length, plain, diagonal;
+    bool some_plain = false, some_diagonal = false;
+    for (int lane = 0; lane < width; ++lane) {
+      Outer& outer = outer_[lane];
+      const bool goes = !done_[lane], accelerates = goes && outer.diagonal && !outer.plain;
+      const double limit = accelerates ? schedule_[lane].limit : momentum_limit();
+      const double b =
+          accelerates || (goes && !lbfgs_ && !outer.plain) ? outer.extrapolation(limit) : 0;
+      Lanes::set_lane(beta, lane, T(b));
+      Lanes::set_lane(length, lane, T(goes ? (1 + b) * outer.length() : 0));
+      Lanes::set_lane(plain, lane, T(goes && outer.plain ? 1 : 0));
+      Lanes::set_lane(diagonal, lane, T(accelerates ? 1 : 0));
+      some_plain = some_plain || (goes && outer.plain);
+      some_diagonal = some_diagonal || accelerates;
+      used_[lane] += goes ? 1 : 0;
+    }
+    const Real theta(T(set_.relaxation)), one(T(1));
+    each_vertex([&](std::int64_t i) {
+      const auto v = vertex(i);
+      const Value u = o_.base[i], before = w_.before[i];
+      Value next = u - way(i, length * o_.direction[i] - beta * (u - before));
+      if (some_plain) next = pick(plain, subtract_product(u, v.inverse, o_.pull[i]), next);
+      if (some_diagonal) {
+        const Value& g = Touching ? o_.gradient[i] : o_.pull[i];
+        next = pick(diagonal, accelerate(u, before, g, theta * v.inverse, one + beta), next);
+      }
+      w_.u[i] = v.hold(v.target, v.project(contacts_, next, u));
+    });
+  }
+
+  // the last trial counts only if it is better than the base
+  void settle() {
+    evaluate(0);
+    judge(0);
+    each_vertex([&](std::int64_t i) { w_.u[i] = choose(w_.u[i], o_.base[i]); });
+    for (int lane = 0; lane < width; ++lane) schedule_[lane].restarts = outer_[lane].restarts;
+  }
+
+ private:
+  static double momentum_limit() {
+    const double b = (1 - sqrt(1 - momentum_rho * momentum_rho)) / momentum_rho;
+    return b * b;
+  }
+
+  // where the lane accepted its trial `a`, else `b`
+  Value choose(const Value& a, const Value& b) const { return pick(accepted_, a, b); }
+
+  static Value pick(const Real& flag, const Value& a, const Value& b) {
+    return pick_if(flag > Real(T(0)), a, b);
+  }
+
+  template <class Condition>
+  static Value pick_if(const Condition& take, const Value& a, const Value& b) {
+    const Vec3<Real> x = Lanes::vec3(a), y = Lanes::vec3(b);
+    return Lanes::value({select(take, x.x, y.x), select(take, x.y, y.y), select(take, x.z, y.z)});
+  }
+
+  template <class Visit>
+  void each_vertex(Visit visit) const {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) visit(i);
+    team_.barrier();
+  }
+
+  // visit(vertex, sums), chunk by chunk: neither threads nor the batch change the order of a sum
+  template <class Visit>
+  void pass(Visit visit) {
+    for (std::int64_t c = team_.begin(o_.chunks); c < team_.end(o_.chunks); ++c) {
+      Value sum[dots];
+      for (Value& s : sum) s = none_;
+      const std::int64_t end = std::min<std::int64_t>(plan_.vertices, (c + 1) * Work::chunk);
+      for (std::int64_t i = c * Work::chunk; i < end; ++i) visit(i, sum);
+      for (int d = 0; d < dots; ++d) o_.sums[c][d] = Sweep<Lanes>::add_components(sum[d]);
+    }
+    team_.barrier();
+  }
+
+  void add_up(int lane, double (&total)[dots]) const {
+    for (int d = 0; d < dots; ++d) {
+      total[d] = 0;
+      for (int c = 0; c < o_.chunks; ++c) total[d] += Lanes::lane(o_.sums[c][d], lane);
+    }
+  }
+
+  auto is_stranger(std::int64_t i) const {
+    return w_.inertia[i] > Real(T(known_inertia) * plan_.levels.reference_inertia[i]) * trusted_;
+  }
+
+  // the part of a field along which contacts let a vertex go
+  Value open(std::int64_t i, const Value& field) const {
+    if constexpr (!Touching) return field;
+    return Lanes::value(o_.free[i] * Lanes::vec3(field));
+  }
+
+  // the part of a field that M is to work on: not across contacts, nor where it knows nothing of a pin
+  Value let_through(std::int64_t i, const Value& field) const {
+    return open(i, strangers_ ? pick_if(is_stranger(i), none_, field) : field);
+  }
+
+  void keep_directions(std::int64_t i) {
+    o_.gradient[i] = choose(o_.fresh_gradient[i], o_.gradient[i]);
+    for (int a = 0; a < 3; ++a) {
+      o_.free[i].row[a] = Lanes::vec3(
+          choose(Lanes::value(o_.fresh_free[i].row[a]), Lanes::value(o_.free[i].row[a])));
+    }
+  }
+
+  // A way that M has a say on, where it has: the rest goes along the pull, by the diagonal.
+  Value way(std::int64_t i, const Value& d) const {
+    const Value plain = vertex(i).inverse * o_.pull[i];
+    if (!(plan_.levels.fine_inverse[i] > T(0))) return plain;
+    Value mixed = d;
+    if constexpr (Touching) mixed = open(i, d) + (plain - open(i, plain));
+    return strangers_ ? pick_if(is_stranger(i), plain, mixed) : mixed;
+  }
+
+  // the second loop of L-BFGS, and the slope g.d
+  void correct() {
+    const Value* z = o_.cycle.result();
+    pass([&](std::int64_t i, Value(&sum)[dots]) {
+      for (int j = 0; j < history; ++j) sum[j] = multiply_add(o_.y[j][i], z[i], sum[j]);
+    });
+    double total[dots], with[history], c[history];
+    Real factor[history];
+    for (int lane = 0; lane < width; ++lane) {
+      add_up(lane, total);
+      for (int j = 0; j < history; ++j) with[j] = total[j];
+      pairs_[lane].second_loop(newest_, with, c);
+      for (int j = 0; j < history; ++j) Lanes::set_lane(factor[j], lane, T(c[j]));
+    }
+    team_.barrier();
+    pass([&](std::int64_t i, Value(&sum)[dots]) {
+      Value d = z[i];
+      for (int j = 0; j < history; ++j) d = multiply_add(factor[j], o_.s[j][i], d);
+      o_.direction[i] = d;
+      sum[0] = multiply_add(o_.pull[i], way(i, d), sum[0]);
+    });
+    for (int lane = 0; lane < width; ++lane) {
+      add_up(lane, total);
+      outer_[lane].slope = total[0];
+      // not downhill: what was learnt does not hold here
+      if (total[0] >= 0 || done_[lane] || outer_[lane].plain || outer_[lane].diagonal) continue;
+      pairs_[lane].clear();
+      outer_[lane].plain = true;
+      ++outer_[lane].restarts;
+    }
+    team_.barrier();
+  }
+
+  // the soft stop of an environment, by a trial that it went on from
+  void stop(int lane, int k, double change, double length) {
+    const bool kept = k > 0 && outer_[lane].accepted && !done_[lane];
+    if (kept && change <= set_.tolerance * set_.tolerance * length && set_.tolerance > 0)
+      done_[lane] = true;
+  }
+
+  // how far the material is from that of M, per lane
+  void compare_with_reference() {
+    const MisfitMeter<T> meter{plan_, call_.material.stiffness, team_, o_.ratios};
+    for (int lane = 0; lane < width; ++lane) {
+      misfit_[lane] = meter.measure(in_.environment(lane), [&](std::int64_t i) {
+        return Lanes::lane(Lanes::widen(w_.inertia[i]), lane);
+      });
+      Lanes::set_lane(trusted_, lane, T(misfit_[lane].trusted));
+      strangers_ = strangers_ || misfit_[lane].strangers;
+    }
+  }
+
+  Work& o_;
+  bool lbfgs_, strangers_ = false;  // strangers: vertices that M knows too little of, in any lane
+  int newest_ = 0;
+  Value none_ = Lanes::value({Real(T(0)), Real(T(0)), Real(T(0))});
+  Real accepted_{T(1)}, finite_{T(1)}, trusted_{T(1)};
+  Misfit misfit_[width];
+  Outer outer_[width];
+  Pairs pairs_[width];
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,218 @@
+// A step by preconditioned L-BFGS, or by momentum: M approximates A^-1 by levels, see plan/multilevel_build.h.
+//
+// E lies below a quadratic with the constant matrix A (solver/step.h). With the material that M was made for, 0 < M A <= 1 up
+// to rounding, so u - theta M grad E with theta < 2 lowers E by at least theta (1 - theta / 2) g^T M g. With another one,
+// A <= s A_0 for the largest ratio s of its inertias and stiffnesses to those M was made for: theta M / s does.
+// What accelerates that step may overshoot, so every trial is judged by its energy before the next one starts from it.
+// Trials that fail go back, and after a few of them a plain Jacobi iteration takes over, which descends by the proof there:
+// once with L-BFGS, which has learnt from the failures; accelerated and for the rest of the step with momentum, which has not,
+// and with friction, whose forces no energy has.
+//
+// Contacts hold vertices in directions that M does not know of. M is applied to what is out of balance in the others, and
+// its result taken in the others, while the held ones go by the diagonal (two-metric projection, Bertsekas 1982), as does a
+// vertex that a spring holds much harder than M knows. Friction enters the judgement as the force that it has at the base.
+#pragma once
+#include "math/scalar.h"
+#include "plan/views.h"
+
+namespace pd::inline PD_TARGET {
+
+// The runner's own functions say where it runs: in a kernel, or on the host.
+#if defined(__CUDACC__)
+#pragma nv_exec_check_disable
+#endif
+template <class Runner>
+PD_HD void multilevel_step(Runner& run, const Settings& settings) {
+  run.predict();
+  if (settings.report) run.measure_course();
+  run.start();
+  run.translate();
+  for (int k = 0; k < settings.iterations; ++k) {
+    run.evaluate(k);  // local step at the trial: its energy, and what is out of balance there
+    run.judge(k);     // go on from the trial, or back
+    run.learn(k);     // what the way to it says about the curvature
+    if (run.finished()) break;
+    run.precondition();  // direction: M, corrected by what was learnt
+    run.advance();       // next trial, on the pins and out of the contacts
+  }
+  if (settings.iterations > 0) run.settle();  // the last trial, if it is better
+  run.translate();
+  if (settings.report) run.measure();
+  run.finish();
+}
+
+// ---- M: a symmetric V-cycle
+
+// Chebyshev's polynomial of degree 2 for eigenvalues of D^-1 A in [1/4, 1], from zero (Saad 2003, algorithm 12.1):
+//   w = first / D r,   z = keep w + second / D (r - A w)
+struct Smoother {
+  static constexpr double middle = 0.625, half = 0.375;
+  static constexpr double ratio = half / middle, next = 1 / (2 / ratio - ratio);
+  static constexpr double first = 1 / middle, keep = 1 + next * ratio, second = 2 * next / half;
+};
+
+// A matrix level with B unknowns a row and axis, and how it is lifted from four functions of each node below.
+template <int B, class T>
+struct Level {
+  int rows, nodes;
+  const int32 *start, *column;
+  const T *value, *inverse;
+  const int32 *lift_start, *lift_node;
+  const T* lift_weight;
+  const int32 *node_start, *node_row, *node_lift;
+};
+
+template <class T>
+PD_HD Level<1, T> fine_level(const Levels<T>& l) {
+  return {l.vertices,         l.fine_nodes,      l.fine_start,      l.fine_column,
+          l.fine_value,       l.fine_inverse,    l.fine_lift_start, l.fine_lift_node,
+          l.fine_lift_weight, l.fine_node_start, l.fine_node_row,   l.fine_node_lift};
+}
+
+template <class T>
+PD_HD Level<4, T> middle_level(const Levels<T>& l) {
+  return {l.fine_nodes,         l.middle_nodes,      l.middle_start,      l.middle_column,
+          l.middle_value,       l.middle_inverse,    l.middle_lift_start, l.middle_lift_node,
+          l.middle_lift_weight, l.middle_node_start, l.middle_node_row,   l.middle_node_lift};
+}
+
+// sum -= A x, one row
+template <class Real, int B, class T, class Value>
+PD_HD void subtract_row(const Level<B, T>& level, const Value* x, int row, Value (&sum)[B]) {
+  for (int32 p = level.start[row]; p < level.start[row + 1]; ++p) {
+    const Value* from = x + std::int64_t(level.column[p]) * B;
+    const T* a = level.value + std::int64_t(p) * B * B;
+    for (int i = 0; i < B; ++i) {
+      for (int j = 0; j < B; ++j) sum[i] = subtract_product(sum[i], Real(a[i * B + j]), from[j]);
+    }
+  }
+}
+
+// sum += P x, one row
+template <class Real, int B, class T, class Value>
+PD_HD void add_lift(const Level<B, T>& level, const Value* x, int row, Value (&sum)[B]) {
+  for (int32 p = level.lift_start[row]; p < level.lift_start[row + 1]; ++p) {
+    const Value* from = x + std::int64_t(level.lift_node[p]) * 4;
+    const T* weight = level.lift_weight + std::int64_t(p) * B * 4;
+    for (int i = 0; i < B; ++i) {
+      for (int j = 0; j < 4; ++j) sum[i] = multiply_add(Real(weight[i * 4 + j]), from[j], sum[i]);
+    }
+  }
+}
+
+// sum += P^T x, the four functions of one node
+template <class Real, int B, class T, class Value>
+PD_HD void add_restriction(const Level<B, T>& level, const Value* x, int node, Value (&sum)[4]) {
+  for (int32 p = level.node_start[node]; p < level.node_start[node + 1]; ++p) {
+    const Value* from = x + std::int64_t(level.node_row[p]) * B;
+    const T* weight = level.lift_weight + std::int64_t(level.node_lift[p]) * B * 4;
+    for (int i = 0; i < B; ++i) {
+      for (int j = 0; j < 4; ++j) sum[j] = multiply_add(Real(weight[i * 4 + j]), from[i], sum[j]);
+    }
+  }
+}
+
+// ---- the outer iteration of one environment: numbers only
+
+constexpr int history = 8;                 // pairs that L-BFGS remembers
+constexpr int patience = 4;                // trials that may fail before a plain iteration
+constexpr double sufficient = 1e-4;        // of the decrease that the slope promises (Armijo)
+constexpr double least_curvature = 1e-12;  // s.y of a pair, in |s| |y|
+constexpr double known_inertia =
+    4;  // times what M was made of and the elements have become: more is left to the diagonal
+constexpr double momentum_rho = 0.9995;  // that of M A is not known, and this limit serves all
+
+// Rounding of E, relative: a rise that says nothing.
+template <class T>
+PD_HD constexpr double energy_noise() {
+  return sizeof(T) == 4 ? 1e-5 : 1e-12;
+}
+
+// Where an environment stands: which trial is out, and what became of those before.
+struct Outer {
+  double scale = 1;              // M / scale serves the material of the step
+  double energy = 0, slope = 0;  // at the base; g.d of the direction from there
+  double slack = 0;
+  int failures = 0, restarts = 0, momentum = 0;
+  bool plain = false, friction = false, accepted = true, known = false;
+  bool diagonal = false;  // momentum with 1 / D in place of M, to the end of the step
+
+  // how much of the direction the next trial takes
+  PD_HD double length() const { return failures > 1 ? 1.0 / double(1 << (failures - 1)) : 1.0; }
+
+  // Whether to go on from a trial of this energy. False for NaN, unless there is nothing to go back to.
+  PD_HD bool accept(double trial, bool armijo) {
+    const double demanded = armijo && !plain && !diagonal ? sufficient * length() * slope : 0;
+    const bool fell = !known || trial <= energy - demanded + slack * absolute(energy);
+    // friction has no energy: there the plain iteration is a fixed-point map, and goes on regardless
+    accepted = fell || ((plain || diagonal) && friction && trial < HUGE_VAL);
+    restarts += !fell;
+    failures = accepted ? 0 : failures + 1;
+    if (!fell) momentum = 0;
+    if (accepted) {
+      known = true;
+      energy = trial;
+    }
+    plain = failures >= patience;
+    // with the momentum gone M alone descends, if it fits; and pairs learn nothing of sliding
+    diagonal = diagonal || (armijo ? friction && restarts > patience : failures > 1);
+    return accepted;
+  }
+
+  // beta of u + beta (u - before)
+  PD_HD double extrapolation(double limit) {
+    const double ramp = momentum / (momentum + 2.0);
+    ++momentum;
+    return ramp < limit ? ramp : limit;
+  }
+};
+
+// L-BFGS (Nocedal 1980) with all that it needs of s and y as numbers, so that the vectors are read once before M and once
+// after it. Pairs stand in a ring, one place a trial; a pair without positive curvature stays out.
+struct Pairs {
+  double product[history][history] = {};  // s_i . y_j, j not older than i
+  double pulled[history] = {};            // s_i . g
+  double alpha[history] = {};
+  bool valid[history] = {};
+
+  PD_HD void clear() {
+    for (bool& v : valid) v = false;
+  }
+
+  // the pair in place `newest`: s_i . y of it with every s_i, |s|^2 and |y|^2
+  PD_HD void add(int newest, const double (&with)[history], double ss, double yy) {
+    for (int i = 0; i < history; ++i) product[i][newest] = with[i];
+    const double curvature = with[newest];
+    valid[newest] = curvature > least_curvature * sqrt(ss * yy) && curvature < HUGE_VAL;
+  }
+
+  PD_HD static int older(int place, int by) { return (place - by + history) % history; }
+
+  // g - sum alpha_i y_i is what M is applied to
+  PD_HD void first_loop(int newest) {
+    for (int a = 0; a < history; ++a) {
+      const int i = older(newest, a);
+      double rest = pulled[i];
+      for (int b = 0; b < a; ++b) {
+        const int j = older(newest, b);
+        if (valid[j]) rest -= alpha[j] * product[i][j];
+      }
+      alpha[i] = valid[i] ? rest / product[i][i] : 0;
+    }
+  }
+
+  // z + sum c_i s_i is the direction; `with` are y_i . z
+  PD_HD void second_loop(int newest, const double (&with)[history], double (&c)[history]) const {
+    for (int a = history - 1; a >= 0; --a) {
+      const int i = older(newest, a);
+      double rest = with[i];
+      for (int b = history - 1; b > a; --b) {
+        const int j = older(newest, b);
+        if (valid[j]) rest += c[j] * product[j][i];
+      }
+      c[i] = valid[i] ? alpha[i] - rest / product[i][i] : 0;
+    }
+  }
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,180 @@
+"""The preconditioner: what its levels hold, what it does to the matrix, that threads and batches change nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from cases import Case, beam, box, slivers
+from multilevel_cases import Tables, many_bodies, precondition, spectrum_of, swing
+from runs import ULP, noise, simulator
+from scipy.sparse import csr_array
+
+import torchpd as pd
+from torchpd.multilevel import has_levels, inertia_of_levels
+from torchpd.tables import MULTILEVEL_TABLE, PLAN_TABLE
+
+pytestmark = pytest.mark.usefixtures("poisoned")
+ops = torch.ops.torchpd
+
+
+def prepared(case: Case, dtype: torch.dtype = torch.float64) -> pd.Simulator:
+    return simulator(case, dtype, solver=pd.Multilevel())
+
+
+# 13 cells: 12 740 free vertices, the first count of these boxes with a middle level
+@pytest.mark.parametrize(("cells", "youngs"), [(5, 1e4), (5, 1e6), (5, 1e8), (13, 1e6)])
+def test_eigenvalues_on_uniform_boxes(cells: int, youngs: float) -> None:
+    """0 < M A <= 1 in exact arithmetic where the smoother is bounded; the lower bound is what makes it worth having."""
+    case = swing(cells, youngs)
+    sim = prepared(case)
+    assert (int(sim.plan.level_sizes[5]) > 0) == (cells == 13)
+    low, high = spectrum_of(sim, case)
+    assert high <= 1.01
+    assert low >= 0.3
+
+
+@pytest.mark.parametrize("name", ["beam", "slivers", "bodies"])
+def test_op_is_the_cycle_of_its_tables(name: str, dtype: torch.dtype) -> None:
+    case = {"beam": lambda: beam(1e6), "slivers": slivers, "bodies": many_bodies}[name]()
+    sim = prepared(case, dtype)
+    exact = simulator(case, torch.float64, solver=pd.Multilevel())
+    field = noise(sim.rest_positions).double().numpy()
+    expected = Tables(exact.plan)(field)
+    found = precondition(sim, field)
+    # backward stable but for the condition of the coarse factor's square, at most 1e6 here, in norms
+    error = np.linalg.norm(found - expected)
+    assert error <= (1e-9 if dtype == torch.float64 else 1e-2) * np.linalg.norm(expected)
+    held = ~case.problem().free
+    assert not found[held].any()
+
+
+def test_matrix_is_that_of_the_reference() -> None:
+    case = slivers()
+    plan = prepared(case).plan
+    count = plan.vertices
+    entries = (plan.fine_value.numpy(), plan.fine_column.numpy(), plan.fine_start.numpy())
+    stored = csr_array(entries, shape=(count, count))
+    problem, order = case.problem(), plan.vertex_order.numpy()
+    free = np.flatnonzero(problem.free[order])
+    expected = problem.matrix[order][:, order][free][:, free]
+    assert abs(stored[free][:, free] - expected).max() <= 64 * ULP[torch.float64] * abs(expected).max()
+    assert stored.nnz == stored[free][:, free].nnz
+    inverse = np.where(problem.free, 1.0 / problem.weighted_diagonal, 0.0)[order]
+    np.testing.assert_allclose(plan.fine_inverse.numpy(), inverse, rtol=1e-12)
+
+
+def test_it_is_symmetric_and_positive(dtype: torch.dtype) -> None:
+    sim = prepared(slivers(), dtype)
+    x, y = (noise(sim.rest_positions, seed)[None] for seed in (0, 1))
+    plan = list(sim.plan.arrays)
+    mx, my = ops.precondition(x, plan), ops.precondition(y, plan)
+    assert float((x * my).sum()) == pytest.approx(float((y * mx).sum()), rel=1e3 * ULP[dtype] * float(x.norm()))
+    assert float((x * mx).sum()) > 0.0
+    twice = ops.precondition(2.0 * x - y, plan)
+    assert float((twice - (2.0 * mx - my)).norm()) <= 1e3 * ULP[dtype] * float(mx.norm() + my.norm())
+
+
+def test_translation_of_a_free_body_is_exact() -> None:
+    """A constant is in every coarse space; what is added to the coarse diagonal, 1e-12 of it, weakens the solve."""
+    vertices, tets = box((1.0, 0.2, 0.2), (15, 3, 3))
+    body = pd.Solid(pd.TetMesh(vertices, tets), 1e8)
+    case = Case(pd.Scene(body), vertices, 0.0 * vertices, 1.0 / 30.0)
+    problem, field = case.problem(), np.ones_like(vertices)
+    image = precondition(prepared(case), problem.matrix @ field)
+    stiffest = float((problem.weighted_diagonal / problem.weight).max())
+    assert np.linalg.norm(image - field) <= 1e-12 * stiffest * np.linalg.norm(field)
+
+
+@pytest.mark.parametrize("cells", [(1, 1, 1), (2, 1, 1)])
+def test_tiny_meshes_are_solved_exactly_or_almost(cells: tuple[int, int, int]) -> None:
+    vertices, tets = box((0.1, 0.1, 0.1), cells)
+    body = pd.Solid(pd.TetMesh(vertices, tets), 1e5)
+    case = Case(pd.Scene(body, pd.Pin(body, [0])), vertices, 0.0 * vertices, 1.0 / 60.0)
+    low, high = spectrum_of(prepared(case), case)
+    assert low >= 0.3
+    assert high <= 1.0 + 1e-9
+
+
+def test_nothing_free_gives_zero(dtype: torch.dtype) -> None:
+    tet = pd.shapes.single_tet(0.1)
+    body = pd.Solid(tet, 1e5)
+    sim = pd.Simulator(pd.Scene(body, pd.Pin(body, range(4))), solver=pd.Multilevel(), dtype=dtype)
+    assert not ops.precondition(torch.ones(1, 4, 3, dtype=dtype), list(sim.plan.arrays)).any()
+    after = sim(sim.rest_state())
+    assert torch.equal(after.positions, sim.rest_state().positions)
+
+
+def test_many_bodies_have_functions_of_their_own() -> None:
+    """More pieces than the dense level holds: each keeps its node on the middle level."""
+    case = many_bodies(300)
+    sim = prepared(case)
+    assert int(sim.plan.level_sizes[2]) >= 300
+    assert 0 < int(sim.plan.level_sizes[5]) <= 256
+    low, high = spectrum_of(sim, case)
+    assert low >= 0.3
+    assert high <= 1.01
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_tables_and_products_have_the_same_bits_on_any_number_of_threads(dtype: torch.dtype) -> None:
+    case = swing(6, 1e6)
+    two = prepared(case, dtype)
+    field = noise(two.rest_positions)[None].repeat(3, 1, 1) * torch.tensor([1.0, 2.0, -1.0]).to(dtype)[:, None, None]
+    product = ops.precondition(field, list(two.plan.arrays))
+    torch.set_num_threads(1)
+    one = prepared(case, dtype)
+    assert all(torch.equal(a, b) for a, b in zip(one.plan.arrays, two.plan.arrays, strict=True))
+    assert torch.equal(ops.precondition(field, list(one.plan.arrays)), product)
+    assert torch.equal(product[1], 2.0 * product[0])
+    assert torch.equal(ops.precondition(field[2:], list(one.plan.arrays))[0], product[2])
+
+
+def test_a_plan_without_it_is_as_before(dtype: torch.dtype) -> None:
+    """Another solver costs no bytes, also after a multilevel one."""
+    case = beam(1e5)
+    sim = simulator(case, dtype)
+    arrays = sim.plan.arrays
+    assert len(arrays) == len(PLAN_TABLE)
+    sim.solver = pd.Multilevel()
+    assert has_levels(sim.plan.arrays)
+    assert [row.name for row in sim.plan.table] == [row.name for row in PLAN_TABLE + MULTILEVEL_TABLE]
+    sim.solver = pd.Chebyshev()
+    assert all(one is other for one, other in zip(sim.plan.arrays, arrays, strict=True))
+
+
+def test_arrays_are_those_of_the_table(dtype: torch.dtype) -> None:
+    kinds = {"real": dtype, "int32": torch.int32}
+    for case in (swing(3, 1e6), many_bodies()):
+        plan = prepared(case, dtype).plan
+        for row, array in zip(MULTILEVEL_TABLE, plan.arrays[len(PLAN_TABLE) :], strict=True):
+            assert getattr(plan, row.name) is array
+            assert array.dtype == kinds[row.type], row.name
+            assert array.is_contiguous(), row.name
+            assert array.shape[1:] == ((row.width,) if row.width > 1 else ()), row.name
+        sizes = plan.level_sizes.tolist()
+        assert sizes[0] == len(plan.fine_column) == int(plan.fine_start[-1])
+        assert sizes[1] == len(plan.fine_lift_node) == int(plan.fine_node_start[-1])
+        assert sizes[2] == len(plan.fine_node_start) - 1
+        middle = bool(sizes[5])
+        assert sizes[3] == len(plan.middle_column)
+        assert sizes[4] == len(plan.middle_lift_node)
+        assert sizes[5] == (len(plan.middle_node_start) - 1 if middle else 0)
+        moved = plan.to("meta")
+        on_cpu = [row.name for row, array in zip(moved.table, moved.arrays, strict=True) if array.device.type == "cpu"]
+        assert on_cpu == ["sizes", "level_sizes"]
+
+
+def test_reference_is_what_it_was_made_of(dtype: torch.dtype) -> None:
+    """The stiffest environment and the largest inertia; held only where all hold."""
+    vertices, tets = box((0.3, 0.1, 0.1), (3, 1, 1))
+    body = pd.Solid(pd.TetMesh(vertices, tets), 1e5)
+    sim = pd.Simulator(pd.Scene(body, pd.Pin(body, [0, 1], stiffness=[10.0, 20.0])), dtype=dtype)
+    springs = torch.tensor([[torch.inf, torch.inf], [5.0, torch.inf]], dtype=dtype)
+    sim.set_material(stiffness=torch.stack([sim.stiffness, 3.0 * sim.stiffness]), pin_stiffness=springs)
+    sim.solver = pd.Multilevel()
+    assert torch.equal(sim.plan.reference_stiffness, 3.0 * torch.full_like(sim.plan.reference_stiffness, 1e5))
+    inertia = inertia_of_levels(sim.plan.arrays)
+    expected = sim.masses.detach() / sim.time_step**2
+    assert float(inertia[0]) == pytest.approx(float(expected[0]) + 5.0, rel=8 * ULP[dtype])
+    assert inertia.isinf().tolist() == [number == 1 for number in range(sim.vertices)]

@@ -1,0 +1,340 @@
+"""The multilevel solver in any scene: contacts, pins and stiffness that it was not prepared for, gradients, files."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cases import Case, beam, box, contact_block, on_sphere, slivers
+from runs import arguments_of, displacement, moving, same_bits, simulate, simulator, state_of
+from test_determinism import assert_same_bits, different_environments
+from test_determinism import run as outputs
+from test_determinism import scene as everything
+
+import torchpd as pd
+from torchpd.reference_solvers import relative_error, solve_with_contact
+
+pytestmark = pytest.mark.usefixtures("poisoned")
+
+SOLVERS = [pd.Multilevel(), pd.Multilevel("momentum")]
+IDS = ["lbfgs", "momentum"]
+
+
+def errors(case: Case, solver: Any, counts: list[int], solution: Any) -> list[float]:
+    sim, found = simulator(case, torch.float64, solver=solver), []
+    for sim.iterations in counts:
+        u = displacement(sim, sim(state_of(case, sim), **arguments_of(case, sim)))
+        found.append(relative_error(u, solution, case.problem().first_iterate(case.start)))
+    return found
+
+
+# ---- contacts
+
+
+@pytest.mark.parametrize("name", ["ground", "sphere", "sticking to a sphere", "sliding on the ground"])
+def test_contacts_end_where_the_reference_does(name: str) -> None:
+    """In a fraction of the iterations of Chebyshev, but for sliding: that falls back to something like it."""
+    case = {
+        "ground": contact_block(pd.Ground(), velocity=(0.0, -1.0, 0.0), youngs=1e6, cells=4),
+        "sphere": on_sphere(0.0),
+        "sticking to a sphere": on_sphere(0.3),
+        "sliding on the ground": contact_block(pd.Ground(friction=0.5), velocity=(1.0, -1.0, 0.0), youngs=1e6, cells=4),
+    }[name]
+    solution = solve_with_contact(case.problem())
+    early, late = errors(case, pd.Multilevel(), [30, 300], solution)
+    assert late <= 1e-5
+    if name != "sliding on the ground":
+        assert early <= 1e-5
+        assert errors(case, pd.Chebyshev(), [30], solution)[0] > 10 * early
+
+
+@pytest.mark.parametrize("name", ["ground", "sphere", "sliding"])
+def test_momentum_finds_contacts_too(name: str) -> None:
+    case = {
+        "ground": contact_block(pd.Ground(), velocity=(0.0, -1.0, 0.0), youngs=1e5),
+        "sphere": on_sphere(0.3),
+        "sliding": contact_block(pd.Ground(friction=0.5), velocity=(1.0, -1.0, 0.0), youngs=1e5),
+    }[name]
+    assert errors(case, pd.Multilevel("momentum"), [300], solve_with_contact(case.problem()))[0] <= 1e-5
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=IDS)
+def test_nothing_sinks_in_and_energy_does_not_rise(solver: pd.Multilevel, dtype: torch.dtype) -> None:
+    case = contact_block(pd.Ground(), pd.Sphere((0.15, -0.1, 0.15), 0.12), velocity=(0.0, -1.0, 0.0), youngs=1e6)
+    sim = simulator(case, dtype, solver=solver)
+    energies = []
+    for sim.iterations in range(25):
+        after, info = sim(state_of(case, sim), return_info=True)
+        assert float(after.positions[..., 1].min()) >= -8 * torch.finfo(dtype).eps
+        energies.append(float(info.energy))
+    slack = 1e-5 if dtype == torch.float32 else 1e-12
+    assert all(one * (1 + slack) >= other for one, other in pairwise(energies))
+
+
+# ---- what it was not prepared for
+
+
+def pinned_beam(stiffness: float | None) -> Case:
+    case = beam(1e6)
+    body = case.scene.solids[0]
+    scene = pd.Scene(body, pd.Pin(body, np.arange(36), stiffness=stiffness), pd.Gravity((0.0, -9.8, 0.0)))
+    return Case(scene, case.positions, case.velocities, case.time_step, start="inertial")
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=IDS)
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_stiffness_scaled_since(solver: pd.Multilevel, factor: float) -> None:
+    case = beam(1e5)
+    fresh = beam(1e5 * factor)
+    ready = simulator(fresh, torch.float64, solver=pd.Multilevel(), iterations=400)
+    solution = displacement(ready, ready(state_of(fresh, ready), start="inertial"))
+    sim = simulator(case, torch.float64, solver=solver, iterations=80)
+    sim.set_material(stiffness=factor * sim.stiffness)
+    after, info = sim(state_of(case, sim), start="inertial", return_info=True)
+    assert relative_error(displacement(sim, after), solution, case.problem().first_iterate("inertial")) <= 1e-2
+    # inertia stays as it was, so 1 - q / s is 0.9 either way
+    assert float(info.rho) == pytest.approx(0.9, rel=1e-9)
+    sim.prepare_solver()
+    after, info = sim(state_of(case, sim), start="inertial", return_info=True)
+    assert float(info.rho) == 0.0
+    assert relative_error(displacement(sim, after), solution, case.problem().first_iterate("inertial")) <= 1e-3
+
+
+def test_material_scaled_as_a_whole_loses_nothing() -> None:
+    """s A_0 everywhere: M / s, and the iterates of a scaled energy."""
+    case = beam(1e6)
+    sim = simulator(case, torch.float64, solver=pd.Multilevel(), iterations=20)
+    plain = sim(state_of(case, sim), start="inertial")
+    sim.set_material(stiffness=4.0 * sim.stiffness, masses=4.0 * sim.masses)
+    after, info = sim(state_of(case, sim), start="inertial", return_info=True)
+    assert float(info.rho) == 0.0
+    # factors of two round nothing
+    assert torch.equal(after.positions, plain.positions)
+
+
+@pytest.mark.parametrize("stiffness", [float("inf"), 1e6], ids=["hard", "stiff"])
+@pytest.mark.parametrize("solver", SOLVERS, ids=IDS)
+def test_pins_that_came_since_do_not_stall_it(solver: pd.Multilevel, stiffness: float) -> None:
+    """The preconditioner knows of springs of 1 N/m; info says that it does not fit, and a new one does."""
+    case = pinned_beam(1.0)
+    sim = simulator(case, torch.float64, solver=solver)
+    with torch.no_grad():
+        sim.pin_stiffness.fill_(stiffness)  # behind its back, as an optimiser would
+    held = pinned_beam(None if stiffness == float("inf") else stiffness)
+    ready = simulator(held, torch.float64, solver=pd.Multilevel(), iterations=400)
+    solution, first = displacement(ready, ready(state_of(held, ready))), held.problem().first_iterate()
+
+    def look(iterations: int) -> tuple[float, float]:
+        sim.iterations = iterations
+        after, info = sim(state_of(case, sim), return_info=True)
+        return relative_error(displacement(sim, after), solution, first), float(info.rho)
+
+    late, rho = look(300)
+    assert rho > 0.99
+    assert late <= 1e-2
+    sim.prepare_solver()
+    assert look(60)[0] <= 1e-3
+    assert look(60)[1] == 0.0
+
+
+def test_hard_pins_by_set_material_prepare_it_anew() -> None:
+    case = pinned_beam(1.0)
+    sim = simulator(case, torch.float64, solver=pd.Multilevel(), iterations=4)
+    before = sim.plan
+    sim.set_material(stiffness=2.0 * sim.stiffness)
+    assert sim.plan is before
+    sim.set_material(pin_stiffness=torch.full_like(sim.pin_stiffness, float("inf")))
+    assert sim.plan is not before
+    _, info = sim(state_of(case, sim), return_info=True)
+    assert float(info.rho) == 0.0
+
+
+def test_some_environments_held_and_others_not() -> None:
+    case = pinned_beam(1e3)
+    sim = simulator(case, torch.float64, solver=pd.Multilevel(), iterations=300)
+    springs = sim.pin_stiffness.detach().repeat(2, 1)
+    springs[1] = float("inf")
+    sim.set_material(pin_stiffness=springs)
+    after = sim(state_of(case, sim, 2))
+    for item, stiffness in enumerate((1e3, None)):
+        alone = pinned_beam(stiffness)
+        ready = simulator(alone, torch.float64, solver=pd.Multilevel(), iterations=300)
+        solution = displacement(ready, ready(state_of(alone, ready)))
+        error = relative_error(displacement(sim, after, item), solution, alone.problem().first_iterate())
+        assert error <= 1e-3, item
+
+
+# ---- the same bits
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("tolerance", [0.0, 0.03], ids=["all iterations", "soft stop"])
+@pytest.mark.parametrize("solver", SOLVERS, ids=IDS)
+def test_batch_and_threads_do_not_matter(solver: pd.Multilevel, tolerance: float, dtype: torch.dtype) -> None:
+    sim = simulator(everything(), dtype, solver=solver, iterations=14, tolerance=tolerance)
+    state, forces = different_environments(sim, 19)
+    together = outputs(sim, state, forces)
+    for items in (slice(0, 1), slice(3, 5), slice(9, 18)):
+        assert_same_bits([t[items] for t in together], outputs(sim, state, forces, items))
+    torch.set_num_threads(1)
+    for items in (slice(0, 19), slice(3, 4)):
+        assert_same_bits([t[items] for t in together], outputs(sim, state, forces, items))
+
+
+def test_material_of_an_environment_is_that_of_its_own_simulator(dtype: torch.dtype) -> None:
+    case = everything()
+    sim = simulator(case, dtype, solver=pd.Multilevel(), iterations=14)
+    single = simulator(case, dtype, solver=pd.Multilevel(), iterations=14)
+    state, forces = different_environments(sim, 9)
+    factor = torch.linspace(0.5, 2.0, 9, dtype=dtype)[:, None]
+    varied = {
+        "stiffness": sim.stiffness * factor, "masses": sim.masses * factor.flip(0),
+        # beyond what M is believed for, in some
+        "pin_stiffness": sim.pin_stiffness * factor**8,
+    }  # fmt: skip
+    sim.set_material(**varied)
+    together = outputs(sim, state, forces)
+    for item in (0, 4, 8):
+        single.set_material(**{name: value[item] for name, value in varied.items()})
+        items = slice(item, item + 1)
+        assert_same_bits([t[items] for t in together], outputs(single, state, forces, items))
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=IDS)
+def test_rollout_is_its_steps(solver: pd.Multilevel, dtype: torch.dtype) -> None:
+    sim = simulate(dtype, solver=solver)
+    state = moving(sim)
+    track = sim.rollout(state, 4)
+    for step in range(4):
+        state = sim(state)
+        assert same_bits(state, track.state(step))
+    inplace = moving(sim)
+    for _ in range(4):
+        sim.step_(inplace)
+    assert same_bits(inplace, state)
+
+
+# ---- gradients
+
+
+def test_gradients_are_those_of_any_solver() -> None:
+    """At the converged step the way there does not matter; the adjoint system is solved to 1e-10."""
+    found = []
+    for solver, iterations in ((pd.Chebyshev(), 3000), (pd.Multilevel(), 200)):
+        sim = simulator(slivers(), torch.float64, solver=solver, iterations=iterations)
+        sim.stiffness.requires_grad_()
+        state = state_of(slivers(), sim)
+        state.velocities.requires_grad_()
+        sim(state).positions.square().sum().backward()
+        assert sim.stiffness.grad is not None
+        found.append((sim.stiffness.grad, state.velocities.grad))
+    for one, other in zip(*found, strict=True):
+        assert float((one - other).norm()) <= 1e-7 * float(other.norm())
+
+
+def test_gradients_with_contact() -> None:
+    case = contact_block(pd.Ground(), velocity=(0.3, -1.0, 0.0))
+    found = []
+    for solver, iterations in ((pd.Chebyshev(), 3000), (pd.Multilevel(), 300)):
+        sim = simulator(case, torch.float64, solver=solver, iterations=iterations)
+        state = state_of(case, sim)
+        state.velocities.requires_grad_()
+        sim(state).positions.square().sum().backward()
+        found.append(state.velocities.grad)
+    assert float((found[0] - found[1]).norm()) <= 1e-7 * float(found[0].norm())
+
+
+# ---- the rest of the library
+
+
+def test_saved_and_loaded_it_takes_the_same_steps(tmp_path: Path, dtype: torch.dtype) -> None:
+    sim = simulate(dtype, solver=pd.Multilevel("momentum", relaxation=1.7))
+    # not what the preconditioner was made of: the file has to remember that
+    sim.set_material(stiffness=3.0 * sim.stiffness)
+    sim.save(tmp_path / "sim.safetensors")
+    loaded = pd.Simulator.load(tmp_path / "sim.safetensors")
+    assert loaded.solver == sim.solver
+    assert same_bits(loaded.rollout(moving(sim), 3), sim.rollout(moving(sim), 3))
+
+
+def test_precision_can_be_changed() -> None:
+    wide, narrow = simulate(torch.float64, solver=pd.Multilevel()), simulate(torch.float32, solver=pd.Multilevel())
+    narrow.double()
+    assert narrow.plan.fine_value.dtype == torch.float64
+    assert narrow.plan.level_sizes.dtype == torch.int32
+    after, expected = narrow(moving(wide)), wide(moving(wide))
+    # masses had been rounded to float32
+    assert float((after.positions - expected.positions).abs().max()) <= 1e-4
+
+
+def test_other_devices_are_refused(device: torch.device) -> None:
+    sim = simulate(torch.float32, solver=pd.Multilevel())
+    if device.type == "cuda":
+        with pytest.raises(RuntimeError, match=r"Multilevel runs on the CPU, not on cuda.*; on a GPU take Chebyshev"):
+            sim.to(device)
+    there = simulate(torch.float32).to("meta")
+    with pytest.raises(RuntimeError, match="Multilevel runs on the CPU"):
+        there.solver = pd.Multilevel()
+
+
+def test_print_says_what_it_prepared() -> None:
+    text = str(simulate(torch.float32, solver=pd.Multilevel()))
+    for fact in (
+        "Multilevel lbfgs: 12 iterations, relaxation 1.8",
+        "preconditioner: 45 vertices > ",
+        "solved directly",
+    ):
+        assert fact in text, fact
+    assert "preconditioner" not in str(simulate(torch.float32))
+
+
+def test_settings_are_checked() -> None:
+    for keywords, message in (
+        ({"outer": "newton"}, r"Multilevel\.outer must be one of 'lbfgs', 'momentum', got 'newton'"),
+        ({"relaxation": 2.0}, r"Multilevel\.relaxation must lie in \(0, 2\)"),
+        ({"relaxation": 0.0}, r"Multilevel\.relaxation must lie in \(0, 2\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            pd.Multilevel(**keywords)  # type: ignore[arg-type]
+
+
+def test_ops_want_the_arrays_of_the_preconditioner() -> None:
+    sim = simulate(torch.float32)
+    state, ops = sim.rest_state(), torch.ops.torchpd
+    numbers = {**pd.Multilevel().numbers(), "iterations": 2, "time_step": 0.01, "tolerance": 0.0}
+    plan = list(sim.plan.arrays)
+    with pytest.raises(ValueError, match=r"plan has no multilevel preconditioner; a Simulator with solver=Multilevel"):
+        ops.step(*state, None, None, sim.material(), plan, **numbers, inertial=False, report=False)
+    with pytest.raises(ValueError, match=r"plan has no multilevel preconditioner"):
+        ops.precondition(state.positions, plan)
+    sim.solver = pd.Multilevel()
+    plan = list(sim.plan.arrays)
+    with pytest.raises(ValueError, match=r"field must have the 45 vertices of the plan, got Float \[1, 3, 3\]"):
+        ops.precondition(torch.zeros(1, 3, 3), plan)
+    with pytest.raises(TypeError, match=r"field must be float32 or float64"):
+        ops.precondition(state.positions.long(), plan)
+    with pytest.raises(ValueError, match=r"plan must be the 16 arrays of Plan\.arrays, or 40 with those of"):
+        ops.precondition(state.positions, plan[:-1])
+    with pytest.raises(ValueError, match=r"plan\.coarse_factor must be \[\d+\] .*compile the scene again"):
+        ops.precondition(state.positions, [*plan[:-1], plan[-1][:-1].contiguous()])
+
+
+def test_vertices_far_from_others_in_size() -> None:
+    """Two bodies of very different stiffness and size in one scene."""
+    small, large = box((0.1, 0.1, 0.1), (3, 3, 3)), box((2.0, 2.0, 2.0), (4, 4, 4))
+    bodies = [
+        pd.Solid(pd.TetMesh(small[0] + [5.0, 0.0, 0.0], small[1]), 1e8),
+        pd.Solid(pd.TetMesh(*large), 1e4),
+    ]
+    sim = pd.Simulator(
+        pd.Scene(*bodies, pd.Pin(bodies[1], [0, 1]), pd.Gravity()), 1 / 60, 40, pd.Multilevel(), torch.float64
+    )
+    state = sim.rest_state()
+    generator = torch.Generator().manual_seed(0)
+    speed = torch.randn(state.velocities.shape, generator=generator, dtype=torch.float64)
+    _, info = sim(pd.State(state.positions, speed), return_info=True)
+    assert float(info.residual) <= 1e-4
