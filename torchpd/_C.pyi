@@ -13,6 +13,8 @@ def build_device_plan(
     positions: NDArray[float64],
     tets: NDArray[int64],
     patches: int,
+    kernel: int,
+    fixed: bool,
     piece: NDArray[int32],
     progress: Callable[[float], None],
 ) -> dict[str, NDArray[Any]]: ...

@@ -101,7 +101,7 @@ def _advance(bar: tqdm[Any], done: float) -> None:
 def _patch_size(tets: int) -> int:
     """Tetrahedra a patch: what fits the cache, in a number of patches that two or four threads can share evenly.
 
-    Larger patches share fewer vertices (1.8 slots a vertex at 1024, 1.6 at 2048).
+    Larger patches share fewer vertices (1.6 slots a vertex at 1024, 1.4 at 2048).
     """
     patches = max(1, -(-tets // 2048))
     patches = -(-patches // 4) * 4 if tets >= 1024 else min(2, max(1, tets // 256))
