@@ -113,7 +113,10 @@ def test_one_class_for_both_plans(kernel: str, dtype: torch.dtype) -> None:
     assert (plan.kernel, cpu.kernel) == (kernel, None)
     assert plan.vertices == cpu.vertices == len(values.rest_positions)
     assert plan.dtype == dtype
-    assert plan.to(dtype=torch.float64).dtype == torch.float64
+    assert plan.to(dtype=dtype).dtype == dtype
+    other = torch.float64 if dtype == torch.float32 else torch.float32
+    with pytest.raises(ValueError, match=r"Plan.to: the plan of a GPU has other arrays in another precision"):
+        plan.to(dtype=other)
     assert plan.bytes == sum(array.numel() * array.element_size() for array in plan.arrays)
     assert len(DEVICE_SIZES) == len(plan.sizes)
     assert (plan.size("tets"), plan.size("patches")) == (len(values.tets), plan.patches)

@@ -77,11 +77,16 @@ class Plan:
         return sum(array.numel() * array.element_size() for array in self.arrays)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Plan:
-        """A copy on another device or in another precision. Widening brings no digits back: compile again.
+        """A copy on another device or, of a plan for the CPU, in another precision. Widening brings no digits back.
 
         The kernels of a GPU and of the CPU need different plans: `Simulator.to` compiles the right one. `sizes` stay on
         the CPU: the host reads them, and must not wait for a device.
         """
+        if self.kernel is not None and dtype not in (None, self.dtype):
+            raise ValueError(
+                f"Plan.to: the plan of a GPU has other arrays in another precision: compile it for {dtype}, "
+                f"as sim.to({dtype}) does; got a plan in {self.dtype}"
+            )
         sizes, *others = self.arrays
         moved = (array.to(device=device, dtype=dtype if array.is_floating_point() else None) for array in others)
         return replace(self, arrays=(sizes, *moved))

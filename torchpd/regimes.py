@@ -40,7 +40,7 @@ def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
     real = torch.finfo(plan.dtype).bits // 8
     slots, entries = plan.size("most_slots"), plan.size("most_entries")
     if plan.kernel == "stream":
-        return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS)
+        return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.pass_static_bytes
     return _C.fused_shared_bytes(real, slots, entries, planes, balls)
 
 

@@ -3,6 +3,7 @@
 #include "cuda/half.h"
 #include "cuda/momentum.h"
 #include "cuda/vertices.h"
+#include "plan/shared_memory.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -133,6 +134,7 @@ template <Visit What>
 PD_DEVICE void write_sums(const ThreadSums& sums, double* row) {
   using Op = std::conditional_t<What == Visit::weigh, Least, Add>;
   __shared__ double warp_sum[sums_count][warp_size];
+  static_assert(sizeof(warp_sum) == pass_static_bytes);
   const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
   for (int n = 0; n < sums_count; ++n) {
     const double sum = across_warp(sums.value[n], Op{});

@@ -77,8 +77,11 @@ class TeamSums {
     leave(value, wanted, op);
     __syncthreads();
     if (leads()) {
+      // what other warps wrote before the barrier goes before the sums, and what is read after them goes after
+      if constexpr (Many) __threadfence();
       send(op);
       receive(op);
+      if constexpr (Many) __threadfence();
     }
     __syncthreads();
   }
@@ -90,7 +93,6 @@ class TeamSums {
     } else {
       __threadfence();
       all_reduce({0, 0, 0}, 1, Add{});
-      __threadfence();
     }
   }
 

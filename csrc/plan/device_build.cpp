@@ -231,7 +231,7 @@ void fill_rest_positions(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& pa
   }
   int exponent = 0;
   std::frexp(extent, &exponent);  // extent < 2^exponent
-  // below 2^29, so that differences stay below 2^30 and fit
+  // up to 2^29, so that differences are up to 2^30 and fit
   const double unit = std::ldexp(1.0, exponent - 29);
   plan.patch_unit[number] = unit;
   for (std::size_t s = 0; s < count; ++s) {
