@@ -209,7 +209,7 @@ def run_on_gpu(options: argparse.Namespace) -> Row:
                 "cuda": torch.version.cuda,
             },
             "call_microseconds": measure_calls(options),
-            "paper": [] if options.quick or options.only else measure_paper(options),
+            "paper": measure_paper(options) if "paper" in (options.only or ["paper"]) and not options.quick else [],
         }
         jobs = [(scene, getattr(torch, name)) for name in options.dtype for scene in options.scenes]
         bar = tqdm(jobs, desc="measuring", unit="scene", leave=False)

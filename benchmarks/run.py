@@ -199,9 +199,10 @@ def parse(words: list[str]) -> argparse.Namespace:
         scenes = QUICK_GPU_SCENES if options.quick else GPU_SCENES
     if options.on_gpu and not torch.cuda.is_available():
         parser.error("--device: torch finds no CUDA device")
-    unknown = set(options.only or ()) - {scene.name for scene in scenes}
+    names = [scene.name for scene in scenes] + ["paper"] * options.on_gpu
+    unknown = set(options.only or ()) - set(names)
     if unknown:
-        parser.error(f"--only: no scene {', '.join(sorted(unknown))}; there are {', '.join(s.name for s in scenes)}")
+        parser.error(f"--only: no scene {', '.join(sorted(unknown))}; there are {', '.join(names)}")
     wanted = options.only or [s.name for s in scenes if options.heavy or not getattr(s, "heavy", False)]
     options.scenes = [scene for scene in scenes if scene.name in wanted]
     return options

@@ -190,7 +190,8 @@ constexpr int part_slot_array = int(DevicePlanArray::part_slot);
 // Lengths of the arrays, by the names in device.def.
 struct DevicePlanRows {
   std::int64_t size, vertex, pin, pinned_vertex, block, patch_end, patch, slot, shared_end,
-      shared_slot, piece_slot, part_patch_end, part_end, part_slot, piece_end, part;
+      shared_slot, piece_slot, part_patch_end, part_end, part_slot, piece_end, part, stored_block,
+      rest_slot, fixed_slot, computed_block, computed_patch, sender;
 };
 
 template <class T>
@@ -210,6 +211,7 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   plan.slots = size[size_slots];
   plan.shared = size[size_shared];
   plan.parts = size[size_parts];
+  plan.senders = size[size_senders];
   plan.most_slots = size[size_most_slots];
   plan.most_pairs = size[size_most_pairs];
   plan.most_entries = size[size_most_entries];
@@ -240,6 +242,16 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.part_slot = pieces ? arrays[part_slot_array].size(0) : 0;
   count.piece_end = pieces ? plan.pieces + 1 : 0;
   count.part = plan.parts;
+  count.stored_block = plan.kernel == 0 ? plan.blocks : 0;
+  const bool computed = plan.kernel != 0, fixed = computed && sizeof(T) == 4;
+  count.rest_slot = computed && !fixed ? plan.slots : 0;
+  count.fixed_slot = fixed ? plan.slots : 0;
+  count.computed_block = computed ? plan.blocks : 0;
+  count.computed_patch = computed ? plan.patches : 0;
+  count.sender = plan.senders;
+  TORCH_CHECK_VALUE(plan.kernel != 1 || plan.senders >= count.shared_slot,
+                    "plan.sizes must count a row of senders for each of the ", count.shared_slot,
+                    " shared slots of kernel 1, got ", plan.senders, "; compile the scene again");
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = 0;
   using real = T;

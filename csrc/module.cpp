@@ -77,13 +77,16 @@ py::dict build_plan(const Doubles& positions, const Indices& tets, int patch_siz
   return arrays;
 }
 
-py::dict build_device_plan(const Doubles& positions, const Indices& tets, int patches,
-                           const Numbers& piece, const std::function<void(double)>& progress) {
+py::dict build_device_plan(const Doubles& positions, const Indices& tets, int patches, int kernel,
+                           bool fixed, const Numbers& piece,
+                           const std::function<void(double)>& progress) {
   check_mesh(positions, tets);
   if (patches < 1 || patches > tets.shape(0)) {
     throw py::value_error("patches must lie in 1.." + std::to_string(tets.shape(0)) +
                           ", the number of tetrahedra, got " + std::to_string(patches));
   }
+  if (kernel < 0 || kernel > 2)
+    throw py::value_error("kernel must be 0, 1 or 2, got " + std::to_string(kernel));
   const std::int64_t vertices = positions.shape(0);
   if (piece.ndim() != 1 || piece.shape(0) != vertices)
     throw py::value_error("piece must be int32 [vertices], a number for each row of positions");
@@ -92,7 +95,7 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets, int pa
       throw py::value_error("piece must hold numbers of pieces, counted from 0, or -1");
   }
   auto plan = pd::build_device_plan(positions.data(), vertices, tets.data(), tets.shape(0), patches,
-                                    piece.data(), progress);
+                                    kernel, fixed, piece.data(), progress);
   py::dict arrays;
 #define X(name, type, width, rows, meaning) arrays[#name] = as_array(plan.name, width);
 #include "plan/device.def"
@@ -197,7 +200,8 @@ PYBIND11_MODULE(_C, m) {
   m.def("build_plan", &build_plan, py::arg("positions"), py::arg("tets"), py::arg("patch_size"),
         py::arg("progress"));
   m.def("build_device_plan", &build_device_plan, py::arg("positions"), py::arg("tets"),
-        py::arg("patches"), py::arg("piece"), py::arg("progress"));
+        py::arg("patches"), py::arg("kernel"), py::arg("fixed"), py::arg("piece"),
+        py::arg("progress"));
   m.def("build_multilevel", &build_multilevel, py::arg("positions"), py::arg("tets"),
         py::arg("vertex_order"), py::arg("stiffness"), py::arg("inertia"), py::arg("threads"),
         py::arg("progress"));
@@ -212,6 +216,7 @@ PYBIND11_MODULE(_C, m) {
   m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("slots"),
         py::arg("entries"), py::arg("planes"), py::arg("balls"),
         "Shared memory of a block of the kernels block and grid.");
+  m.attr("pass_static_bytes") = pd::pass_static_bytes;
   m.def("pass_shared_bytes", &pd::pass_shared_bytes, py::arg("real"), py::arg("slots"),
         py::arg("entries"), py::arg("fields"),
         "Shared memory of a block of the kernel stream and of energies and their derivatives.");

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay
+from scipy.spatial import ConvexHull, Delaunay
 
 from torchpd.effects import Gravity, Ground, Pin, Solid, Sphere
 from torchpd.mesh import TetMesh
@@ -112,6 +112,17 @@ def sliver_mesh(cells: tuple[int, int, int] = (8, 3, 3), *, seed: int = 0) -> Te
     volumes = np.linalg.det(points[tets][:, 1:] - points[tets][:, :1]) / 6.0
     # a regular share of a cell is 1e-3 / 6 m^3: keep slivers down to some 1e-3 of that
     return TetMesh(points, tets[volumes > 2e-7])
+
+
+def cone_mesh(points: int, *, radius: float = 0.2) -> TetMesh:
+    """A ball of 2 points - 4 tetrahedra, all of which have its centre, vertex 0, as a corner."""
+    number = np.arange(points)
+    angle, height = np.pi * (1.0 + 5.0**0.5) * number, 1.0 - (2.0 * number + 1.0) / points
+    around = np.sqrt(1.0 - height**2)
+    sphere = np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=1)
+    faces = 1 + ConvexHull(sphere).simplices.astype(np.int64)
+    vertices = radius * np.concatenate([np.zeros((1, 3)), sphere])
+    return TetMesh(vertices, oriented(vertices, np.column_stack([0 * faces[:, 0], faces])))
 
 
 def slivers(*, seed: int = 0) -> Case:

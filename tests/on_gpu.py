@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -76,11 +75,10 @@ def relative(found: torch.Tensor, expected: torch.Tensor) -> float:
     return float(difference) / max(float(want.abs().max()), 1e-300)
 
 
-@contextmanager
-def nobody_waits() -> Iterator[None]:
-    """Every synchronisation that torch knows of is an error, and one that it does not know of shows in the time.
+def host_waits(call: Callable[[], object]) -> bool:
+    """Whether the host waits for the device in a call: an error where torch knows that it would.
 
-    The device is kept busy meanwhile; who waited for it would come back after it is done.
+    What torch does not know of shows in the time: the device is busy meanwhile, and done when such a call returns.
     """
     torch.cuda.synchronize()
     done = torch.cuda.Event()
@@ -88,12 +86,19 @@ def nobody_waits() -> Iterator[None]:
     done.record()
     torch.cuda.set_sync_debug_mode("error")
     try:
-        yield
-        waited = done.query()
+        call()
+        return bool(done.query())
     finally:
         torch.cuda.set_sync_debug_mode("default")
         torch.cuda.synchronize()
-    assert not waited, "the host has waited for the device"
+
+
+def poll() -> None:
+    """Waits for the device as torch does not know of."""
+    reached = torch.cuda.Event()
+    reached.record()
+    while not reached.query():
+        pass
 
 
 def device_work(call: Callable[[], object]) -> list[str]:

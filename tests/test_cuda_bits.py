@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 from devices import require_gpu
-from on_gpu import DTYPES, GPU, KERNELS, bar, full_on_gpu, moved, nobody_waits, on_gpu, small_on_gpu
+from on_gpu import DTYPES, GPU, KERNELS, bar, full_on_gpu, host_waits, moved, on_gpu, poll, small_on_gpu
 from runs import moving, noise, same_bits, state_of
 from test_determinism import assert_same_bits, different_environments, run
 from test_determinism import scene as scene_of_all_effects
@@ -102,6 +102,8 @@ def test_a_broken_environment_ends_and_breaks_alone(kernel: str, precision: str)
         sick = pd.State(clean.positions.clone(), clean.velocities.clone())
         sick.positions[1, 20, 1] = value
         expected, found = (sim.rollout(state, 3, return_info=True) for state in (clean, sick))
+        if value != 1e30:
+            assert not bool(found.positions[:, 1].isfinite().all(dim=(-2, -1)).any())
         others = [item for item in range(9) if item != 1]
         for one, other in zip([*found[:2], *found.info], [*expected[:2], *expected.info], strict=True):
             assert torch.equal(one[:, others], other[:, others])
@@ -122,9 +124,12 @@ def test_nobody_waits_for_the_device(kernel: str, precision: str) -> None:
     )
     for call in calls:
         call()  # modules are loaded and memory is allocated by the first one
-    for call in calls:
-        with nobody_waits():
-            call()
+    for number, call in enumerate(calls):
+        assert not host_waits(call), number
+    # controls: a wait that torch knows of, and one that it does not
+    with pytest.raises(RuntimeError, match="synchronizing"):
+        host_waits(lambda: state.positions.sum().item())
+    assert host_waits(poll)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -134,7 +139,7 @@ def test_a_step_in_place_allocates_nothing_new(kernel: str, precision: str) -> N
 
     def allocated() -> tuple[int, int]:
         stats = torch.cuda.memory_stats(GPU)
-        return stats.get("num_device_alloc", 0), stats["segment.all.allocated"]
+        return stats["num_device_alloc"], stats["segment.all.allocated"]
 
     sim.step_(state)
     sim.step_(state, info=rows)

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from cases import Array, Case, box, slivers
+from cases import Array, Case, box, cone_mesh, slivers
 from devices import require_gpu
 from on_gpu import DTYPES, GPU, KERNELS, bar, crowd, full_on_gpu, moved, on_gpu, relative
 from runs import arguments_of, displacement, moving, reference_run, rounded_problem, simulate, simulator, state_of
@@ -29,7 +29,9 @@ pytestmark = pytest.mark.usefixtures("poisoned")
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 2e-5}
 # The nearest rotation of an inverted element turns by |dF| / (s_2 - |s_3|), here 1 / 0.3 at the start and again in
 # every iteration until the element is upright: a digit more.
-LOOSE = {"inverted": 10.0, "flat": 10.0}
+# A vertex of 3200 tetrahedra instead of 24 adds up 130 times as many forces: their rounding, of random sign, is 12
+# times as large.
+LOOSE = {"inverted": 10.0, "flat": 10.0, "cones": 12.0}
 COUNTS = (1, 2, 5, 9, 20)
 
 
@@ -57,6 +59,17 @@ def one_tetrahedron() -> Case:
     return stirred(Case(pd.Scene(body, pd.Gravity()), vertices, 0.0 * vertices, 1.0 / 60.0), size=0.03)
 
 
+def cones() -> Case:
+    """A ball whose 3200 tetrahedra all share its centre, and so do all patches."""
+    mesh = cone_mesh(1602)
+    body = pd.Solid(mesh, 1e5)
+    scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] < -0.15), pd.Gravity())
+    velocities = np.outer(mesh.vertices[:, 0], [0.0, -3.0, 0.0])
+    return stirred(Case(scene, mesh.vertices, velocities, 1.0 / 60.0), size=0.001)
+
+
+# more, in float64, than the shared memory of a block
+LARGE = ("several patches, ground and pieces", "cones")
 CASES: dict[str, Callable[[], Case]] = {
     **SAME_CASES,
     "exact beam, shortened": lambda: bar((12, 3, 3), pd.Gravity(), youngs=1e6),
@@ -66,8 +79,9 @@ CASES: dict[str, Callable[[], Case]] = {
     "flat": lambda: deformed((1.0, 0.0, 0.9), (0.004, 0.0, 0.004)),
     "one tetrahedron": one_tetrahedron,
     "crowd": crowd,
+    "cones": cones,
     "several patches, ground and pieces": lambda: stirred(
-        bar((20, 4, 4), pd.Ground(-0.01, friction=0.5), pd.Gravity(), pinned=False), size=0.002
+        bar((24, 5, 5), pd.Ground(-0.01, friction=0.5), pd.Gravity(), pinned=False), size=0.002
     ),
 }
 
@@ -110,10 +124,14 @@ def check(sim: pd.Simulator, name: str, solver: str) -> None:
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", CASES)
 def test_iterates_are_those_of_the_reference(name: str, kernel: str, precision: str) -> None:
-    if name.startswith("several patches") and kernel == "block":
-        pytest.skip("more than a block's shared memory")
+    if name in LARGE and kernel == "block":
+        pytest.skip("for kernels with several patches: more than the shared memory of a block")
     case, _, _ = problem_of(name, DTYPES[precision])
-    check(on_gpu(case, DTYPES[precision], kernel), name, "guarded")
+    sim = on_gpu(case, DTYPES[precision], kernel)
+    assert sim.plan.patches > 1 or not name.startswith("several patches")
+    if name == "cones" and kernel == "grid":
+        assert int(sim.plan.slot_sender[:, 7].max()) > 0  # more patches have a vertex than a row of senders holds
+    check(sim, name, "guarded")
 
 
 @pytest.mark.parametrize("precision", DTYPES)
@@ -166,22 +184,23 @@ def test_material_of_each_environment(kernel: str, precision: str) -> None:
         "planes": own["planes"] + factor[:, None, None] * torch.tensor([0, 0, 0, 0.01, 0.1]).to(dtype),
         "spheres": own["spheres"] + factor[:, None, None] * torch.tensor([0.01, 0, 0, 0.02, 0.1, 0.5, 0, 0]).to(dtype),
     }
-    for name, value in varied.items():  # one at a time, then all together
-        sim.set_material(**own)
-        plain.set_material(**own)
-        sim.set_material(**{name: value})
-        plain.set_material(**{name: value})
-        compare_all_effects(sim, plain, batch)
-    sim.set_material(**varied)
-    plain.set_material(**varied)
-    compare_all_effects(sim, plain, batch)
-
-
-def compare_all_effects(sim: pd.Simulator, plain: pd.Simulator, batch: int) -> None:
     state, forces = different_environments(sim, batch)
-    after = sim(state, forces)
-    expected = plain(moved(state, "cpu", torch.float64), forces.cpu().double())
-    assert relative(after.velocities, expected.velocities) <= 2 * TOLERANCE[sim.dtype]
+    exact = moved(state, "cpu", torch.float64), forces.cpu().double()
+    alike = plain(*exact).velocities
+    for chosen in (*([name] for name in varied), list(varied)):  # one at a time, then all together
+        for one in (sim, plain):
+            one.set_material(**own)
+            one.set_material(**{name: varied[name] for name in chosen})
+        expected = plain(*exact).velocities
+        assert relative(sim(state, forces).velocities, expected) <= 2 * TOLERANCE[dtype], chosen
+        # control: every environment but that of shift 0 feels it, by more than float32 may be wrong
+        assert felt(expected, alike).sum() >= batch - 1, chosen
+
+
+def felt(velocities: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
+    """Which environments move in another way [B]."""
+    difference = (velocities - others).abs().amax(dim=(-2, -1))
+    return difference > 4 * TOLERANCE[torch.float32] * others.abs().max()
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

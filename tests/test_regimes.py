@@ -11,7 +11,7 @@ import torch
 from cases import box
 
 import torchpd as pd
-from torchpd import _C, placing
+from torchpd import _C, placing, regimes
 from torchpd.gpu import Properties, refuse_full_memory, why_not
 from torchpd.plan import KERNELS, Plan, compile_plan
 from torchpd.regimes import choose_plan, shared_bytes
@@ -48,14 +48,17 @@ def test_auto_takes_the_first_that_fits() -> None:
 
 
 def test_number_of_patches() -> None:
-    values = values_of((6, 6, 6))
-    tets = len(values.tets)
-    assert tets == 1296
-    for dtype, stream in ((torch.float32, 2), (torch.float64, 3)):
-        assert choose_plan(values, dtype, H100, "block").patches == 1
-        assert choose_plan(values, dtype, H100, "grid").patches == 12
-        assert choose_plan(values, dtype, Properties(5, 232_448), "grid").patches == 5
-        assert choose_plan(values, dtype, H100, "stream").patches == stream
+    """As many for a grid as leave each its least number of tetrahedra, as few for a stream as leave none too many."""
+    small, large = values_of((6, 6, 6)), values_of((10, 10, 10))
+    for dtype in REAL:
+        assert choose_plan(small, dtype, H100, "block").patches == 1
+        grid, tets = choose_plan(small, dtype, H100, "grid").patches, len(small.tets)
+        assert 2 < grid < 132
+        assert tets / grid >= regimes._GRID_TETS > tets / (grid + 1)
+        assert choose_plan(small, dtype, Properties(5, 232_448), "grid").patches == 5
+        stream, tets = choose_plan(large, dtype, H100, "stream").patches, len(large.tets)
+        assert stream > 1
+        assert tets / stream <= regimes._STREAM_TETS[dtype] < tets / (stream - 1)
     one = pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e5)).values()
     assert [choose_plan(one, torch.float32, H100, name).patches for name in KERNELS] == [1, 1, 1]
 
@@ -110,7 +113,10 @@ def test_one_class_for_both_plans(kernel: str, dtype: torch.dtype) -> None:
     assert (plan.kernel, cpu.kernel) == (kernel, None)
     assert plan.vertices == cpu.vertices == len(values.rest_positions)
     assert plan.dtype == dtype
-    assert plan.to(dtype=torch.float64).dtype == torch.float64
+    assert plan.to(dtype=dtype).dtype == dtype
+    other = torch.float64 if dtype == torch.float32 else torch.float32
+    with pytest.raises(ValueError, match=r"Plan.to: the plan of a GPU has other arrays in another precision"):
+        plan.to(dtype=other)
     assert plan.bytes == sum(array.numel() * array.element_size() for array in plan.arrays)
     assert len(DEVICE_SIZES) == len(plan.sizes)
     assert (plan.size("tets"), plan.size("patches")) == (len(values.tets), plan.patches)

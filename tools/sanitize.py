@@ -2,20 +2,38 @@
 
 compute-sanitizer --tool memcheck python tools/sanitize.py          and racecheck, initcheck, synccheck
 PYTORCH_NO_CUDA_MEMORY_CACHING=1 makes every tensor an allocation of its own, so that memcheck sees its end.
+
+That a tool reports nothing says something if it would report an error. `--plant TOOL` makes one that TOOL must report,
+for each kernel in a process of its own, since memcheck ends the one in which it finds something:
+
+PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --tool memcheck --error-exitcode 86 \\
+    python tools/sanitize.py --plant memcheck --kernel grid             has to exit with 86, whatever else it prints
+
+memcheck    an array of the plan lacks its last number: a kernel reads behind it
+initcheck   nobody has written the velocities that a step starts with
+racecheck   all pairs of a patch leave their forces in the same place of shared memory
+For synccheck there is none: the threads of a block part for no argument.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 import torchpd as pd
+from torchpd.device_plan import compile_device_plan
+from torchpd.plan import Plan
+from torchpd.tables import DEVICE_PLAN_TABLE
 
 KERNELS = ("block", "grid", "stream")
 SOLVERS = (pd.Chebyshev(), pd.Jacobi(), pd.Chebyshev("classic", rho=0.9, delay=1))
@@ -80,6 +98,15 @@ def rotations(dtype: torch.dtype) -> None:
     ops.rotation_differential(matrices, matrices.flip(0).contiguous())
 
 
+def in_many_patches(sim: pd.Simulator) -> Plan:
+    """For the grid, with vertices of more patches than a row of senders holds."""
+    arrays = compile_device_plan(sim.scene.values(), 36, KERNELS.index("grid"), sim.dtype, progress=False)
+    plan = Plan(arrays, DEVICE_PLAN_TABLE).to("cuda")
+    if not bool((plan.slot_sender[:, 7] > 0).any()):
+        raise RuntimeError("no vertex has more than seven patches")
+    return plan
+
+
 def run(kernels: Sequence[str]) -> int:
     """How many simulators have run."""
     count = 0
@@ -97,17 +124,68 @@ def run(kernels: Sequence[str]) -> int:
         free = pd.Simulator(scene(contacts=True, pieces=True, pins=False), 1 / 60, 5, **options)  # type: ignore[arg-type]
         step_all_ways(free.to("cuda"), 2)
         count += 1
+        if kernel == "grid":
+            sim.plan = in_many_patches(sim)
+            step_all_ways(sim, 2)
+            count += 1
         rotations(dtype)
     torch.cuda.synchronize()
     return count
 
 
+# ---- controls
+
+
+def change_plan(sim: pd.Simulator, name: str, change: Callable[[Tensor], Tensor]) -> None:
+    """Puts another array into the plan."""
+    rows = zip(sim.plan.table, sim.plan.arrays, strict=True)
+    sim.plan = replace(sim.plan, arrays=tuple(change(array) if row.name == name else array for row, array in rows))
+
+
+def without_last(array: Tensor) -> Tensor:
+    """The size of part_slot is the only one that no other number of the plan tells: the ops take it as it comes."""
+    short = array[:-1].clone()
+    if short.numel() * short.element_size() % 256 == 0:  # allocations begin at multiples of it
+        raise RuntimeError("what lies behind may be another tensor; take a scene of another size")
+    return short
+
+
+def into_one_place(corners: Tensor) -> Tensor:
+    """Every corner that has an entry gets the first one: in the upper 16 bits, 65535 where there is none."""
+    return torch.where(corners >> 16 == -1, corners, corners & 65535)
+
+
+def plant(tool: str, kernel: str) -> None:
+    """A step in which `tool` must find an error."""
+    built = scene(contacts=False, pieces=True, pins=False)
+    options: dict[str, Any] = {"kernel": kernel, "progress": False}
+    sim = pd.Simulator(built, 1 / 60, 5, **options).to("cuda")
+    state = sim.rest_state(2)
+    if tool == "memcheck":
+        change_plan(sim, "part_slot", without_last)
+    elif tool == "initcheck":
+        state = pd.State(state.positions, torch.empty_like(state.velocities))
+    else:
+        change_plan(sim, "pair_corner", into_one_place)
+    sim.step_(state)
+    torch.cuda.synchronize()
+
+
 def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kernel", nargs="+", choices=KERNELS, default=KERNELS)
+    parser.add_argument("--plant", choices=("memcheck", "initcheck", "racecheck"), help="make an error; see above")
     options = parser.parse_args(words)
     if not torch.cuda.is_available():
         parser.error("torch finds no CUDA device")
+    if options.plant:
+        if len(options.kernel) != 1:
+            parser.error("--plant wants one kernel: --kernel grid")
+        if options.plant != "racecheck" and os.environ.get("PYTORCH_NO_CUDA_MEMORY_CACHING") != "1":
+            parser.error("the tool sees single tensors with PYTORCH_NO_CUDA_MEMORY_CACHING=1 alone")
+        plant(options.plant, *options.kernel)
+        print(f"a step has run with an error in it; where {options.plant} has reported none, it sees none")
+        return
     begin = time.perf_counter()
     count = run(options.kernel)
     print(f"{count} simulators have run in {time.perf_counter() - begin:.1f} s")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -49,7 +50,8 @@ class CapturedStep:
         rows = (len(state[0]), INFO_WIDTH)
         self._rows = torch.empty(rows, dtype=torch.float64, device=sim.device) if report else None
         # the graph knows addresses only: what lies there has to live as long as it does
-        self._alive = (sim.plan, sim.material(), forces, targets, start)
+        own = dict(targets) if isinstance(targets, Mapping) else targets
+        self._alive = (sim.plan, [array.detach() for array in sim.material()], forces, own, start)
 
         def run(moved: State) -> None:
             sim.step_(moved, forces, targets, start, info=self._rows)

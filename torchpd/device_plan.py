@@ -16,7 +16,7 @@ from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 
 __all__ = ["compile_device_plan"]
 
-_SIZE_KERNEL, _SIZE_PINS = DEVICE_SIZES.index("kernel"), DEVICE_SIZES.index("pins")
+_SIZE_PINS = DEVICE_SIZES.index("pins")
 
 
 def compile_device_plan(
@@ -42,10 +42,10 @@ def compile_device_plan(
     piece, _ = free_pieces(values)
     with compiling(len(values.tets), progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_device_plan(
-            values.rest_positions, values.tets, patches, piece, advance
+            values.rest_positions, values.tets, patches, kernel, dtype == torch.float32, piece, advance
         )
     pins = len(values.pin_vertices)
-    arrays["sizes"][[_SIZE_KERNEL, _SIZE_PINS]] = kernel, pins
+    arrays["sizes"][_SIZE_PINS] = pins
     if pins:
         arrays["pin_vertex"] = internal_numbers(arrays["vertex_order"])[values.pin_vertices]
         arrays["vertex_pin"] = np.full(len(values.rest_positions), -1, dtype=np.int32)

@@ -78,11 +78,16 @@ class Plan:
         return sum(array.numel() * array.element_size() for array in self.arrays)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Plan:
-        """A copy on another device or in another precision. Widening brings no digits back: compile again.
+        """A copy on another device or, of a plan for the CPU, in another precision. Widening brings no digits back.
 
         The kernels of a GPU and of the CPU need different plans: `Simulator.to` compiles the right one. `sizes` stay on
         the CPU: the host reads them, and must not wait for a device.
         """
+        if self.kernel is not None and dtype not in (None, self.dtype):
+            raise ValueError(
+                f"Plan.to: the plan of a GPU has other arrays in another precision: compile it for {dtype}, "
+                f"as sim.to({dtype}) does; got a plan in {self.dtype}"
+            )
 
         def moved(row: PlanRow, array: Tensor) -> Tensor:
             if row.rows.endswith("size"):
@@ -106,7 +111,7 @@ def _advance(bar: tqdm[Any], done: float) -> None:
 def _patch_size(tets: int) -> int:
     """Tetrahedra a patch: what fits the cache, in a number of patches that two or four threads can share evenly.
 
-    Larger patches share fewer vertices (1.8 slots a vertex at 1024, 1.6 at 2048).
+    Larger patches share fewer vertices (1.6 slots a vertex at 1024, 1.4 at 2048).
     """
     patches = max(1, -(-tets // 2048))
     patches = -(-patches // 4) * 4 if tets >= 1024 else min(2, max(1, tets // 256))

@@ -23,8 +23,8 @@ from .tables import DEVICE_PLAN_TABLE
 
 __all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
-_GRID_TETS = 100  # a patch at least: smaller ones cost more in exchange than they save
-_STREAM_TETS = {torch.float32: 990, torch.float64: 480}  # a patch, so that both want as much shared memory
+_GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
+_STREAM_TETS = {torch.float32: 2000, torch.float64: 960}  # a patch, so that two share a multiprocessor of an H100
 _MOST_FIELDS = 2  # of a pass: the products with a second derivative
 
 
@@ -40,7 +40,7 @@ def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
     real = torch.finfo(plan.dtype).bits // 8
     slots, entries = plan.size("most_slots"), plan.size("most_entries")
     if plan.kernel == "stream":
-        return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS)
+        return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.pass_static_bytes
     return _C.fused_shared_bytes(real, slots, entries, planes, balls)
 
 

@@ -48,5 +48,5 @@ MATERIAL_TABLE = tuple(MaterialRow(*row) for row in _C.material_table())
 # numbers of a GPU plan's `sizes`: DeviceSize of csrc/plan/views.h
 DEVICE_SIZES = (
     "kernel", "vertices", "tets", "pins", "pieces", "blocks", "patches", "slots", "shared", "parts",
-    "most_slots", "most_pairs", "most_entries", "most_shared", "most_parts",
+    "senders", "most_slots", "most_pairs", "most_entries", "most_shared", "most_parts",
 )  # fmt: skip

@@ -21,7 +21,8 @@ struct Least {
 
 // The same bits in all lanes, since both partners of an exchange combine the same two numbers.
 template <class Op>
-__device__ double across_warp(double value, Op op) {
+PD_DEVICE double across_warp(double value, Op op) {
+#pragma unroll 1
   for (int distance = warp_size / 2; distance > 0; distance /= 2) {
     value = op(value, __shfl_xor_sync(whole_warp, value, distance));
   }
@@ -33,14 +34,14 @@ struct alignas(16) Word {
   std::uint64_t value, tag;
 };
 
-__device__ inline void post(Word* to, Word word) {
+PD_DEVICE void post(Word* to, Word word) {
   asm volatile(
       "{.reg .b128 t; mov.b128 t, {%1, %2}; st.relaxed.gpu.global.b128 [%0], t;}" ::"l"(to),
       "l"(word.value), "l"(word.tag)
       : "memory");
 }
 
-__device__ inline Word look(const Word* from) {
+PD_DEVICE Word look(const Word* from) {
   Word word;
   asm volatile("{.reg .b128 t; ld.relaxed.gpu.global.b128 t, [%2]; mov.b128 {%0, %1}, t;}"
                : "=l"(word.value), "=l"(word.tag)
@@ -58,13 +59,13 @@ struct Letter<float> {
   static constexpr int words = 1;
   Word word;
 
-  __device__ static void post(Word* to, const Vec3<float>& a, unsigned tag) {
+  PD_DEVICE static void post(Word* to, const Vec3<float>& a, unsigned tag) {
     const auto bits = [](float f) { return std::uint64_t(__float_as_uint(f)); };
     pd::post(to, {bits(a.x) | bits(a.y) << 32, bits(a.z) | std::uint64_t(tag) << 32});
   }
-  __device__ void look(const Word* from) { word = pd::look(from); }
-  __device__ bool arrived(unsigned tag) const { return unsigned(word.tag >> 32) == tag; }
-  __device__ Vec3<float> vector() const {
+  PD_DEVICE void look(const Word* from) { word = pd::look(from); }
+  PD_DEVICE bool arrived(unsigned tag) const { return unsigned(word.tag >> 32) == tag; }
+  PD_DEVICE Vec3<float> vector() const {
     return {__uint_as_float(unsigned(word.value)), __uint_as_float(unsigned(word.value >> 32)),
             __uint_as_float(unsigned(word.tag))};
   }
@@ -75,18 +76,18 @@ struct Letter<double> {
   static constexpr int words = 3;
   Word word[3];
 
-  __device__ static void post(Word* to, const Vec3<double>& a, unsigned tag) {
+  PD_DEVICE static void post(Word* to, const Vec3<double>& a, unsigned tag) {
     const double numbers[3] = {a.x, a.y, a.z};
     for (int c = 0; c < 3; ++c)
       pd::post(to + c, {std::uint64_t(__double_as_longlong(numbers[c])), tag});
   }
-  __device__ void look(const Word* from) {
+  PD_DEVICE void look(const Word* from) {
     for (int c = 0; c < 3; ++c) word[c] = pd::look(from + c);
   }
-  __device__ bool arrived(unsigned tag) const {
+  PD_DEVICE bool arrived(unsigned tag) const {
     return word[0].tag == tag && word[1].tag == tag && word[2].tag == tag;
   }
-  __device__ Vec3<double> vector() const {
+  PD_DEVICE Vec3<double> vector() const {
     const auto number = [](const Word& w) { return __longlong_as_double((long long)w.value); };
     return {number(word[0]), number(word[1]), number(word[2])};
   }

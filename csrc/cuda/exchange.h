@@ -5,61 +5,86 @@
 
 namespace pd::inline PD_TARGET {
 
-// A slot of the patch, and for shared ones where the patches' parts lie. A thread's first seat stays in its registers.
-struct Seat {
-  static constexpr int remembered = 8;
-  int slot, row, begin, end;
-  int sender[remembered];
+// One row of slot_sender.
+struct alignas(16) Senders {
+  static constexpr int together = 7;
+  int32 slot[together], more;
 };
 
+// Warps wait as one: lanes that went on as soon as their own words came would do everything after it one by one.
+//
 // Both inline: nvcc 13.0 loses sums when two functions that hold 128-bit words are out of line (seen on an H100; with either
 // one inline the bits are right).
 //
-// The parts of a shared vertex that its patches sent, in their order.
+// The parts of a shared vertex that its patches sent, in their order; zero for lanes that are not `here`.
 template <class T>
-__device__ __forceinline__ Vec3<T> read_letters(const Word* box, const int32* shared_slot, Seat at,
-                                                unsigned round) {
-  constexpr int together = Seat::remembered;
+PD_DEVICE Vec3<T> read_letters(const Word* box, const Senders* rows, int row, bool here,
+                               unsigned round) {
   Vec3<T> sum = {T(0), T(0), T(0)};
-  for (int first = at.begin; first < at.end; first += together) {
-    const Word* from[together];
-    Letter<T> letter[together];
+  bool goes_on = here;
+  do {
+    Senders senders = {{-1, -1, -1, -1, -1, -1, -1}, 0};
+    if (goes_on) senders = rows[row];
+    int count = 0;
 #pragma unroll
-    for (int j = 0; j < together; ++j) {
-      if (first + j >= at.end) continue;
-      const int slot = first == at.begin ? at.sender[j] : shared_slot[first + j];
-      from[j] = box + std::int64_t(slot) * Letter<T>::words;
-      letter[j].look(from[j]);
+    for (int j = 0; j < Senders::together; ++j) count += senders.slot[j] >= 0;
+    count = __reduce_max_sync(whole_warp, count);
+    Letter<T> letter[Senders::together];
+    bool waits = true;
+    for (bool again = false; waits; again = true) {
+      waits = false;
+#pragma unroll
+      for (int j = 0; j < Senders::together; ++j) {
+        if (j >= count) break;
+        if (senders.slot[j] < 0 || (again && letter[j].arrived(round))) continue;
+        letter[j].look(box + std::int64_t(senders.slot[j]) * Letter<T>::words);
+      }
+#pragma unroll
+      for (int j = 0; j < Senders::together; ++j) {
+        if (j >= count) break;
+        waits = waits || (senders.slot[j] >= 0 && !letter[j].arrived(round));
+      }
+      waits = __any_sync(whole_warp, waits);
     }
 #pragma unroll
-    for (int j = 0; j < together; ++j) {
-      if (first + j >= at.end) continue;
-      while (!letter[j].arrived(round)) letter[j].look(from[j]);
-      sum = sum + letter[j].vector();
+    for (int j = 0; j < Senders::together; ++j) {
+      if (j >= count) break;
+      if (senders.slot[j] >= 0) sum = sum + letter[j].vector();
     }
-  }
+    row = senders.more;
+    goes_on = row > 0;
+  } while (__any_sync(whole_warp, goes_on));
   return sum;
 }
 
 // This lane's share of what the patches sent; several requests are under way at once.
 template <class Op>
-__device__ __forceinline__ double over_patches(const Word* box, int patches, unsigned round) {
+PD_DEVICE double over_patches(const Word* box, int patches, unsigned round) {
   constexpr int together = 5;
   const Op op;
   double sum = Op::none;
-  for (int first = threadIdx.x % warp_size; first < patches; first += together * warp_size) {
+  for (int first = 0; first < patches; first += together * warp_size) {
     Word word[together];
+    bool waits = true;
+    for (bool again = false; waits; again = true) {
+      waits = false;
 #pragma unroll
-    for (int j = 0; j < together; ++j) {
-      const int patch = first + j * warp_size;
-      if (patch < patches) word[j] = look(box + patch * sums_count);
+      for (int j = 0; j < together; ++j) {
+        const int patch = first + j * warp_size + int(threadIdx.x) % warp_size;
+        if (patch >= patches || (again && word[j].tag == round)) continue;
+        word[j] = look(box + patch * sums_count);
+      }
+#pragma unroll
+      for (int j = 0; j < together; ++j) {
+        const int patch = first + j * warp_size + int(threadIdx.x) % warp_size;
+        waits = waits || (patch < patches && word[j].tag != round);
+      }
+      waits = __any_sync(whole_warp, waits);
     }
 #pragma unroll
     for (int j = 0; j < together; ++j) {
-      const int patch = first + j * warp_size;
-      if (patch >= patches) continue;
-      while (word[j].tag != round) word[j] = look(box + patch * sums_count);
-      sum = op(sum, __longlong_as_double((long long)word[j].value));
+      const int patch = first + j * warp_size + int(threadIdx.x) % warp_size;
+      if (patch < patches) sum = op(sum, __longlong_as_double((long long)word[j].value));
     }
   }
   return sum;

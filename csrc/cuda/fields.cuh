@@ -39,13 +39,13 @@ __device__ void write_vertex(const DeviceField<T>& field, std::int64_t environme
   }
 }
 
-template <class T>
+template <bool Computed, class T>
 __global__ void __launch_bounds__(field_threads)
     field_weights(const __grid_constant__ FieldWork<T> work) {
   const DevicePlan<T>& plan = work.field.plan;
   const std::int64_t set = blockIdx.x / plan.patches;
   const Patch<T> patch(plan, int(blockIdx.x % plan.patches));
-  weigh_pairs(patch, work.field.stiffness.of(set), work.field.weighted,
+  weigh_pairs(patch, rest_of<Computed>(patch), work.field.stiffness.of(set), work.field.weighted,
               work.weights + set * plan.blocks * 2 * pair_lanes);
 }
 
@@ -66,7 +66,7 @@ __device__ void read_fields(const DeviceField<T>& field, const Patch<T>& patch,
 }
 
 // Fields: how many vectors of a vertex an element reads; Numbers: how many a vertex gets.
-template <class Element, int Fields, int Numbers, class T>
+template <bool Computed, class Element, int Fields, int Numbers, class T>
 __global__ void __launch_bounds__(field_threads)
     field_vertices(const __grid_constant__ FieldWork<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
@@ -81,8 +81,9 @@ __global__ void __launch_bounds__(field_threads)
   const Quad<T>* fields[Fields];
   fields[0] = position;
   if constexpr (Fields == 2) fields[1] = direction;
-  each_pair(patch, const_cast<const Quad<T>* const(&)[Fields]>(fields),
-            work.weights_of(environment), entries, Element{});
+  each_pair<false>(patch, const_cast<const Quad<T>* const(&)[Fields]>(fields),
+                   rest_of<Computed>(patch), work.weights_of(environment), entries, Element{},
+                   read_first_pair(patch, work.weights_of(environment)));
   __syncthreads();
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const int slot = patch.first_slot + s;
@@ -110,7 +111,7 @@ __global__ void __launch_bounds__(field_threads)
 }
 
 // Product: the derivative of the energy along the direction, else the energy.
-template <bool Product, class T>
+template <bool Computed, bool Product, class T>
 __global__ void __launch_bounds__(field_threads)
     field_elements(const __grid_constant__ FieldWork<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
@@ -124,19 +125,20 @@ __global__ void __launch_bounds__(field_threads)
   const T* weights = work.weights_of(environment);
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const PairPlace place = place_of(patch, number);
-    Mat3<T> rest[2];
-    T volume[2];
-    load_rest(plan, place, rest, volume);
+    const PairNumbers<T> pair = read_pair(patch, weights, number);
+    const auto numbers = rest_of<Computed>(patch).read(place, pair);
+    const Mat3<T> rest[2] = {numbers.template shape<OneOf<T, 0>>().inverse,
+                             numbers.template shape<OneOf<T, 1>>().inverse};
     for (int e = 0; e < 2; ++e) {
       const int tet = plan.pair_tet[place.in(2, e)];
       if (tet < 0) continue;
       Vec3<T> x[4], dx[4];
       for (int c = 0; c < 4; ++c) {
-        const unsigned slot = unsigned(plan.pair_corner[place.in(5, c < 3 ? c : 3 + e)]) & 0xffff;
-        x[c] = vec3(position[slot]);
-        if constexpr (Product) dx[c] = vec3(direction[slot]);
+        const int at = pair.slot(c < 3 ? c : 3 + e);
+        x[c] = vec3(position[at]);
+        if constexpr (Product) dx[c] = vec3(direction[at]);
       }
-      const T weight = weights[place.in(2, e)];
+      const T weight = pair.weight[e];
       T& out = work.field.out[environment * plan.tets + tet];
       if constexpr (Product) {
         out = element_energy_product(x, dx, rest[e], weight);
@@ -179,9 +181,9 @@ void launch_field(void (*kernel)(FieldWork<T>), const FieldWork<T>& work, int fi
   check(cudaGetLastError());
 }
 
-template <class Element, int Fields, int Numbers, class T>
+template <bool Computed, class Element, int Fields, int Numbers, class T>
 void run_vertices(const FieldWork<T>& work, cudaStream_t stream) {
-  launch_field(field_vertices<Element, Fields, Numbers, T>, work, Fields, stream);
+  launch_field(field_vertices<Computed, Element, Fields, Numbers, T>, work, Fields, stream);
   if (work.field.plan.shared == 0) return;
   const std::int64_t blocks = (work.field.plan.shared + field_threads - 1) / field_threads;
   field_shared<Numbers, T>
@@ -189,25 +191,36 @@ void run_vertices(const FieldWork<T>& work, cudaStream_t stream) {
   check(cudaGetLastError());
 }
 
+template <bool Computed, class T>
+void run_field_with(const FieldWork<T>& work, cudaStream_t stream) {
+  const DeviceField<T>& field = work.field;
+  const std::int64_t sets = field.stiffness.stride ? field.batch : 1;
+  field_weights<Computed, T>
+      <<<blocks_of(sets * field.plan.patches), field_threads, 0, stream>>>(work);
+  check(cudaGetLastError());
+  switch (field.field) {
+    case Field::gradient:
+      return run_vertices<Computed, SolidGradient<false>, 1, 3>(work, stream);
+    case Field::diagonal:
+      return run_vertices<Computed, SolidDiagonal, 1, 1>(work, stream);
+    case Field::hessian_product:
+      return run_vertices<Computed, SolidHessian, 2, 3>(work, stream);
+    case Field::element_energy:
+      return launch_field(field_elements<Computed, false, T>, work, 1, stream);
+    case Field::element_energy_product:
+      return launch_field(field_elements<Computed, true, T>, work, 2, stream);
+  }
+}
+
 template <class T>
 void run_field(const DeviceField<T>& field, void* memory, Stream to) {
   const auto stream = static_cast<cudaStream_t>(to);
   Arena arena(memory);
   const FieldWork<T> work = arrange(arena, field);
-  const std::int64_t sets = field.stiffness.stride ? field.batch : 1;
-  field_weights<T><<<blocks_of(sets * field.plan.patches), field_threads, 0, stream>>>(work);
-  check(cudaGetLastError());
-  switch (field.field) {
-    case Field::gradient:
-      return run_vertices<SolidGradient<false>, 1, 3>(work, stream);
-    case Field::diagonal:
-      return run_vertices<SolidDiagonal, 1, 1>(work, stream);
-    case Field::hessian_product:
-      return run_vertices<SolidHessian, 2, 3>(work, stream);
-    case Field::element_energy:
-      return launch_field(field_elements<false, T>, work, 1, stream);
-    case Field::element_energy_product:
-      return launch_field(field_elements<true, T>, work, 2, stream);
+  if (field.plan.kernel == int(DeviceKernel::block)) {
+    run_field_with<false>(work, stream);
+  } else {
+    run_field_with<true>(work, stream);
   }
 }
 

@@ -25,6 +25,10 @@ __global__ void __launch_bounds__(Threads, Blocks)
   for (std::int64_t e = team; e < call.step.batch; e += call.teams) runner.roll(e);
 }
 
+// of a block that has a multiprocessor to itself
+template <class T>
+constexpr int most_grid_threads = sizeof(T) == 4 ? 512 : 256;
+
 template <class T>
 using FusedKernel = void (*)(FusedCall<T>);
 
@@ -33,10 +37,10 @@ template <class T, bool Touching, bool Many>
 FusedKernel<T> fused_kernel_for(int threads) {
   if constexpr (Many) {
     if (threads <= 256) return fused_step<T, Touching, true, 256, 1>;
-    return fused_step<T, Touching, true, 384, 1>;
+    return fused_step<T, Touching, true, most_grid_threads<T>, 1>;
   } else if constexpr (sizeof(T) == 8) {
     if (threads <= 128) return fused_step<T, Touching, false, 128, 2>;
-    return fused_step<T, Touching, false, most_threads, 1>;
+    return fused_step<T, Touching, false, 256, 1>;
   } else {
     if (threads <= 128) return fused_step<T, Touching, false, 128, 5>;
     if (threads <= 192) return fused_step<T, Touching, false, 192, 3>;
@@ -77,11 +81,11 @@ inline int block_threads(std::size_t real, std::size_t shared) {
   return real == 4 ? threads : std::min(threads, 256);
 }
 
-// One patch a multiprocessor: a thread for every pair and slot, as far as there are.
-inline int grid_threads(int pairs, int slots) {
-  const int wanted = std::max(pairs, slots);
-  if (wanted > 256) return 384;
-  return std::clamp((wanted + warp_size - 1) / warp_size * warp_size, 64, 256);
+// One patch a multiprocessor: a thread for every tetrahedron and slot, as far as there are, and a warp without any to lead.
+template <class T>
+int grid_threads(int pairs, int slots) {
+  const int wanted = std::max(2 * pairs + warp_size, slots);
+  return std::clamp((wanted + warp_size - 1) / warp_size * warp_size, 64, most_grid_threads<T>);
 }
 
 template <class T>
@@ -91,7 +95,7 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step) {
   shared = fused_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries,
                               step.material.planes_count, step.material.spheres_count);
   threads =
-      many ? grid_threads(plan.most_pairs, plan.most_slots) : block_threads(sizeof(T), shared);
+      many ? grid_threads<T>(plan.most_pairs, plan.most_slots) : block_threads(sizeof(T), shared);
   kernel = fused_kernel(step, threads);
   patches = many ? plan.patches : 1;
   const int resident = resident_blocks(reinterpret_cast<const void*>(kernel), threads, shared);
@@ -114,6 +118,7 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaun
   arena.place(s.sums, many ? teams * 2 * plan.patches * sums_count : 0);
   for (Quad<T>** array : {&s.x, &s.velocity, &s.target, &s.origin, &s.before})
     arena.place(*array, teams * plan.slots);
+  arena.place(s.u, many ? teams * plan.slots : 0);
   arena.place(s.weights, teams * plan.blocks * 2 * pair_lanes);
   arena.place(s.shift, teams * launch.patches * plan.pieces);
   arena.place(s.part_sum, teams * plan.parts * 4);

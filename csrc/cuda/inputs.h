@@ -21,40 +21,38 @@ struct Inputs {
   const DeviceStep<T>* call;
   std::int64_t environment;
 
-  __device__ std::int64_t row(int vertex) const {
+  PD_DEVICE std::int64_t row(int vertex) const {
     const DevicePlan<T>& plan = call->plan;
     return (environment * plan.vertices + plan.vertex_order[vertex]) * 3;
   }
 
-  __device__ Vec3<T> at_vertex(const T* from, int vertex) const {
-    return read3(from + row(vertex));
-  }
+  PD_DEVICE Vec3<T> at_vertex(const T* from, int vertex) const { return read3(from + row(vertex)); }
 
-  __device__ Vec3<T> first_iterate(int vertex) const { return at_vertex(call->start, vertex); }
+  PD_DEVICE Vec3<T> first_iterate(int vertex) const { return at_vertex(call->start, vertex); }
 
-  __device__ T mass(int vertex) const {
+  PD_DEVICE T mass(int vertex) const {
     return call->material.masses.of(environment)[call->plan.vertex_order[vertex]];
   }
 
-  __device__ int pin(int vertex) const {
+  PD_DEVICE int pin(int vertex) const {
     return call->plan.pins ? call->plan.vertex_pin[vertex] : -1;
   }
 
-  __device__ T spring(int pin) const {
+  PD_DEVICE T spring(int pin) const {
     return pin < 0 ? T(0) : call->material.pin_stiffness.of(environment)[pin];
   }
 
-  __device__ T damping() const { return *call->material.damping.of(environment); }
+  PD_DEVICE T damping() const { return *call->material.damping.of(environment); }
 
   // a, zero where a pin holds the vertex exactly
-  __device__ T inertia(int vertex, T h) const {
+  PD_DEVICE T inertia(int vertex, T h) const {
     const T stiffness = spring(pin(vertex));
     if (!(stiffness < T(HUGE_VAL))) return T(0);
     return inertia_weight(mass(vertex), damping(), stiffness, h);
   }
 
   // s, the displacement that everything but elasticity wants
-  __device__ Vec3<T> target(int vertex, const Vec3<T>& x, const Vec3<T>& velocity, T h) const {
+  PD_DEVICE Vec3<T> target(int vertex, const Vec3<T>& x, const Vec3<T>& velocity, T h) const {
     const int held = pin(vertex);
     const T stiffness = spring(held);
     Vec3<T> offset = {T(0), T(0), T(0)}, force = offset;
@@ -67,7 +65,7 @@ struct Inputs {
     return inertia_target(weight, mass(vertex), velocity, gravity, force, stiffness, offset, h);
   }
 
-  __device__ void read_contacts(Plane<T>* planes, Ball<T>* balls) const {
+  PD_DEVICE void read_contacts(Plane<T>* planes, Ball<T>* balls) const {
     const Material<T>& material = call->material;
     for (int c = 0; c < material.planes_count; ++c) {
       const T* p = material.planes.of(environment) + 5 * c;
@@ -79,13 +77,13 @@ struct Inputs {
     }
   }
 
-  __device__ void write(int record, int vertex, const Vec3<T>& x, const Vec3<T>& velocity) const {
+  PD_DEVICE void write(int record, int vertex, const Vec3<T>& x, const Vec3<T>& velocity) const {
     const std::int64_t at = record * call->batch * call->plan.vertices * 3 + row(vertex);
     write3(call->out_positions + at, x);
     write3(call->out_velocities + at, velocity);
   }
 
-  __device__ void write_info(int record, const Progress& progress) const {
+  PD_DEVICE void write_info(int record, const Progress& progress) const {
     if (!call->info) return;
     double* to = call->info + (record * call->batch + environment) * info_count;
     const bool report = call->settings.report;

@@ -2,6 +2,9 @@
 #pragma once
 #include "math/vec.h"
 
+// Everything in a kernel: what is called out of line wants its objects in memory, not in registers.
+#define PD_DEVICE __device__ __forceinline__
+
 namespace pd::inline PD_TARGET {
 
 // Three numbers and a fourth that belongs to them: one vertex, 16-byte loads and stores.

@@ -8,8 +8,8 @@ namespace pd::inline PD_TARGET {
 
 // Weight and moment of vertices index(begin) ... index(end - 1), in all lanes.
 template <class T, bool Touching, class Index>
-__device__ void sum_part(const Vertices<T, Touching>& v, int begin, int end, const Index& index,
-                         double (&sum)[4]) {
+PD_DEVICE void sum_part(const Vertices<T, Touching>& v, int begin, int end, const Index& index,
+                        double (&sum)[4]) {
   for (int c = 0; c < 4; ++c) sum[c] = 0;
   for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size) {
     const int i = index(at);
@@ -24,14 +24,14 @@ __device__ void sum_part(const Vertices<T, Touching>& v, int begin, int end, con
 }
 
 template <class T>
-__device__ Quad<T> shift_of(const double (&sum)[4]) {
+PD_DEVICE Quad<T> shift_of(const double (&sum)[4]) {
   return {T(sum[1] / sum[0]), T(sum[2] / sum[0]), T(sum[3] / sum[0]), T(0)};
 }
 
 // Least distance of the vertices from all contacts after a shift, in all lanes.
 template <class T, bool Touching, class Index>
-__device__ double least_gap(const Vertices<T, Touching>& v, const Contacts<T>& contacts, int begin,
-                            int end, const Index& index, const Vec3<T>& shift) {
+PD_DEVICE double least_gap(const Vertices<T, Touching>& v, const Contacts<T>& contacts, int begin,
+                           int end, const Index& index, const Vec3<T>& shift) {
   double least = HUGE_VAL;
   for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size) {
     const int i = index(at);
@@ -43,8 +43,8 @@ __device__ double least_gap(const Vertices<T, Touching>& v, const Contacts<T>& c
 
 // Combines what `read(part, c)` gives for the parts of a piece, in all lanes.
 template <int Count, class T, class Op, class Read>
-__device__ void over_parts(const DevicePlan<T>& plan, int piece, Op op, const Read& read,
-                           double (&sum)[Count]) {
+PD_DEVICE void over_parts(const DevicePlan<T>& plan, int piece, Op op, const Read& read,
+                          double (&sum)[Count]) {
   for (int c = 0; c < Count; ++c) sum[c] = Op::none;
   for (int at = plan.piece_start[piece] + int(threadIdx.x) % warp_size;
        at < plan.piece_start[piece + 1]; at += warp_size) {

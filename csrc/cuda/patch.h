@@ -7,19 +7,22 @@
 #include "effects/solid.h"
 #include "plan/views.h"
 
+#include <type_traits>
+
 namespace pd::inline PD_TARGET {
 
-constexpr int pair_lanes = 32;        // pairs of a block of the plan
-constexpr unsigned no_entry = 65535;  // a corner that repeats another one leaves no force
-constexpr int entry_stride = 8;       // entries of a slot lie 8 apart
+constexpr int pair_lanes = 32;   // pairs of a block of the plan
+constexpr int no_entry = 65535;  // a corner that repeats another one leaves no force
+constexpr int entry_stride = 8;  // entries of a slot lie 8 apart
 
 template <class T>
 struct Patch {
   const DevicePlan<T>& plan;
-  int first_block, pairs, first_vertex, interior, first_slot, slots;
+  int index, first_block, pairs, first_vertex, interior, first_slot, slots;
 
-  __device__ Patch(const DevicePlan<T>& p, int index)
+  PD_DEVICE Patch(const DevicePlan<T>& p, int number)
       : plan(p),
+        index(number),
         first_block(p.patch_block[index]),
         pairs(p.patch_pairs[index]),
         first_vertex(p.patch_vertex[index]),
@@ -27,18 +30,13 @@ struct Patch {
         first_slot(p.patch_slot[index]),
         slots(p.patch_slot[index + 1] - first_slot) {}
 
-  __device__ int shared() const { return slots - interior; }
-  __device__ int vertex(int slot) const { return plan.slot_vertex[first_slot + slot]; }
-
-  // number of a slot's vertex among those that patches share
-  __device__ int among_shared(int slot) const {
-    return vertex(slot) - plan.patch_vertex[plan.patches];
+  PD_DEVICE int shared() const { return slots - interior; }
+  PD_DEVICE int vertex(int slot) const {
+    return slot < interior ? first_vertex + slot : plan.slot_vertex[first_slot + slot];
   }
 
-  __device__ bool owns(int slot) const {
-    return slot < interior ||
-           plan.shared_slot[plan.shared_start[among_shared(slot)]] == first_slot + slot;
-  }
+  PD_DEVICE int row(int slot) const { return plan.slot_row[first_slot + slot]; }
+  PD_DEVICE bool owns(int slot) const { return row(slot) >= 0; }
 };
 
 // Two tetrahedra that share the face of corners 0, 1 and 2.
@@ -46,25 +44,21 @@ template <class T, int Fields>
 struct Pair {
   Vec3<T> corner[Fields][5];
   Vec3<T> force[5];
-  Mat3<T> rest[2];
-  T weight[2];
-  T energy;
 };
 
-// One of the two, as effects see elements.
-template <class T, int Fields, int Which>
-struct PairElement {
+// One tetrahedron of a pair.
+template <class T, int Which>
+struct OneOf {
   using R = T;
-  Pair<T, Fields>& pair;
+  static constexpr int which = Which;
 
-  PD_HD void corners(int, int field, Vec3<T> (&x)[4]) const {
-    for (int c = 0; c < 3; ++c) x[c] = pair.corner[field][c];
-    x[3] = pair.corner[field][3 + Which];
+  PD_HD static T pick(T first, T second) { return Which ? second : first; }
+  PD_HD static Vec3<T> pick(const Vec3<T>& first, const Vec3<T>& second) {
+    return Which ? second : first;
   }
-  PD_HD const Mat3<T>& rest(int) const { return pair.rest[Which]; }
-  PD_HD const T& weight(int) const { return pair.weight[Which]; }
-  PD_HD T& sum(int) const { return pair.energy; }
-  PD_HD void add(int, const Vec3<T> (&g)[4]) const {
+  // the second adds to what the first has left
+  template <int Fields>
+  PD_HD static void add(Pair<T, Fields>& pair, const Vec3<T> (&g)[4]) {
     for (int c = 0; c < 3; ++c) pair.force[c] = Which ? pair.force[c] + g[c] : g[c];
     pair.force[3 + Which] = g[3];
   }
@@ -81,54 +75,194 @@ struct PairPlace {
 };
 
 template <class T>
-__device__ PairPlace place_of(const Patch<T>& patch, int pair) {
+PD_DEVICE PairPlace place_of(const Patch<T>& patch, int pair) {
   return {patch.first_block + pair / pair_lanes, pair % pair_lanes};
 }
 
+// What the plan and an environment say of a pair, but for its rest shape.
 template <class T>
-__device__ void load_rest(const DevicePlan<T>& plan, PairPlace place, Mat3<T> (&rest)[2],
-                          T (&volume)[2]) {
-  const Quad<T>* quads = reinterpret_cast<const Quad<T>*>(plan.pair_rest);
-  const Quad<T> a = quads[place.in(5, 0)], b = quads[place.in(5, 1)], c = quads[place.in(5, 2)],
-                d = quads[place.in(5, 3)], e = quads[place.in(5, 4)];
-  rest[0] = {{{a.x, a.y, a.z}, {a.w, b.x, b.y}, {b.z, b.w, c.x}}};
-  rest[1] = {{{c.y, c.z, c.w}, {d.x, d.y, d.z}, {d.w, e.x, e.y}}};
-  volume[0] = e.z;
-  volume[1] = e.w;
+struct PairNumbers {
+  unsigned corner[5];
+  T weight[2];
+
+  PD_HD int slot(int c) const { return int(corner[c] & 0xffff); }
+  PD_HD int entry(int c) const { return int(corner[c] >> 16); }
+};
+
+// `weights`: null before there are any.
+template <class T>
+PD_DEVICE PairNumbers<T> read_pair(const Patch<T>& patch, const T* weights, int pair) {
+  PairNumbers<T> numbers;
+  const PairPlace place = place_of(patch, pair);
+  for (int c = 0; c < 5; ++c) numbers.corner[c] = unsigned(patch.plan.pair_corner[place.in(5, c)]);
+  for (int e = 0; e < 2; ++e) numbers.weight[e] = weights ? weights[place.in(2, e)] : T(0);
+  return numbers;
 }
 
-// Runs an effect on every pair of a patch; returns the sum of energies that this thread has met.
-template <class T, int Fields, class Element>
-__device__ T each_pair(const Patch<T>& patch, const Quad<T>* const (&field)[Fields],
-                       const T* weights, Quad<T>* entries, const Element& element) {
-  Pair<T, Fields> pair;
-  pair.energy = T(0);
-  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
-    const PairPlace place = place_of(patch, number);
-    unsigned corner[5];
-    for (int c = 0; c < 5; ++c) corner[c] = unsigned(patch.plan.pair_corner[place.in(5, c)]);
-    T volume[2];
-    load_rest(patch.plan, place, pair.rest, volume);
-    for (int e = 0; e < 2; ++e) pair.weight[e] = weights[place.in(2, e)];
-    for (int f = 0; f < Fields; ++f) {
-      for (int c = 0; c < 5; ++c) pair.corner[f][c] = vec3(field[f][corner[c] & 0xffff]);
+template <class R>
+struct RestShape {
+  Mat3<R> inverse;  // Dm^-1 [1/m]
+  R volume;         // [m^3]
+};
+
+// Rest shapes as the plan of a small mesh has them.
+template <class T>
+struct StoredRest {
+  const Quad<T>* quads;
+
+  struct Numbers {
+    Quad<T> a, b, c, d, e;
+
+    template <class Take>
+    PD_HD RestShape<typename Take::R> shape() const {
+      const auto pick = [](T first, T second) { return Take::pick(first, second); };
+      return {{{{pick(a.x, c.y), pick(a.y, c.z), pick(a.z, c.w)},
+                {pick(a.w, d.x), pick(b.x, d.y), pick(b.y, d.z)},
+                {pick(b.z, d.w), pick(b.w, e.x), pick(c.x, e.y)}}},
+              pick(e.z, e.w)};
     }
-    element.template run<1>(PairElement<T, Fields, 0>{pair});
-    element.template run<1>(PairElement<T, Fields, 1>{pair});
-    for (int c = 0; c < 4; ++c) entries[corner[c] >> 16] = quad(pair.force[c]);
-    if (corner[4] >> 16 != no_entry) entries[corner[4] >> 16] = quad(pair.force[4]);
+  };
+
+  PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>&) const {
+    return {quads[place.in(5, 0)], quads[place.in(5, 1)], quads[place.in(5, 2)],
+            quads[place.in(5, 3)], quads[place.in(5, 4)]};
   }
-  return pair.energy;
+};
+
+// A rest position: units of the patch in float32, whose differences are exact; metres in float64.
+template <class T>
+struct RestPoint;
+
+template <>
+struct alignas(16) RestPoint<float> {
+  int32 x, y, z, none;
+
+  PD_HD friend Vec3<float> operator-(const RestPoint& a, const RestPoint& b) {
+    return {float(a.x - b.x), float(a.y - b.y), float(a.z - b.z)};
+  }
+};
+
+template <>
+struct alignas(16) RestPoint<double> {
+  double x, y, z, none;
+
+  PD_HD friend Vec3<double> operator-(const RestPoint& a, const RestPoint& b) {
+    return {a.x - b.x, a.y - b.y, a.z - b.z};
+  }
+};
+
+// Rest shapes worked out from rest positions: a quarter of the bytes.
+template <class T>
+struct ComputedRest {
+  const RestPoint<T>* position;  // of every slot
+  const T* factor;               // pair_factor
+  T unit;                        // of positions [m]
+
+  struct Numbers {
+    RestPoint<T> corner[5];
+    T factor[2], unit;
+
+    template <class Take>
+    PD_HD RestShape<T> shape() const {
+      constexpr int which = Take::which;
+      return {between({corner[0], corner[1], corner[2], corner[3 + which]}, factor[which]),
+              unit * unit / (T(6) * absolute(factor[which]))};
+    }
+  };
+
+  PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>& pair) const {
+    Numbers numbers;
+    for (int c = 0; c < 5; ++c) numbers.corner[c] = position[pair.slot(c)];
+    for (int e = 0; e < 2; ++e) numbers.factor[e] = factor[place.in(2, e)];
+    numbers.unit = unit;
+    return numbers;
+  }
+
+  PD_HD static Mat3<T> between(const RestPoint<T> (&corner)[4], T factor) {
+    const Vec3<T> edge[3] = {corner[1] - corner[0], corner[2] - corner[0], corner[3] - corner[0]};
+    return rest_inverse(edge, factor);
+  }
+};
+
+// What the plan knows of a patch's rest shapes: `Computed` where it holds positions.
+template <bool Computed, class T>
+PD_DEVICE auto rest_of(const Patch<T>& patch) {
+  if constexpr (!Computed) {
+    return StoredRest<T>{reinterpret_cast<const Quad<T>*>(patch.plan.pair_rest)};
+  } else {
+    const void* positions = patch.plan.slot_rest;
+    if constexpr (sizeof(T) == 4) positions = patch.plan.slot_fixed;
+    return ComputedRest<T>{static_cast<const RestPoint<T>*>(positions) + patch.first_slot,
+                           patch.plan.pair_factor, patch.plan.patch_unit[patch.index]};
+  }
+}
+
+// A pair as effects see elements.
+template <class T, int Fields, class Take>
+struct PairElement {
+  using R = typename Take::R;
+  Pair<T, Fields>& pair;
+  Mat3<R> inverse;
+  R weighs;
+  R& energy;
+
+  PD_HD void corners(int, int field, Vec3<R> (&x)[4]) const {
+    for (int c = 0; c < 3; ++c) x[c] = Take::pick(pair.corner[field][c], pair.corner[field][c]);
+    x[3] = Take::pick(pair.corner[field][3], pair.corner[field][4]);
+  }
+  PD_HD const Mat3<R>& rest(int) const { return inverse; }
+  PD_HD const R& weight(int) const { return weighs; }
+  PD_HD R& sum(int) const { return energy; }
+  PD_HD void add(int, const Vec3<R> (&g)[4]) const { Take::add(pair, g); }
+};
+
+// This thread's first pair of a patch, if there is one.
+template <class T>
+PD_DEVICE PairNumbers<T> read_first_pair(const Patch<T>& patch, const T* weights) {
+  if (int(threadIdx.x) < patch.pairs) return read_pair(patch, weights, int(threadIdx.x));
+  return {};
+}
+
+// Runs an effect on every pair of a patch, a thread a pair; returns the sum of energies that this thread has met. `now`: what
+// `read_first_pair` gave. `Ahead`: the next pair is read before this one is worked on.
+template <bool Ahead, class T, int Fields, class Rest, class Element>
+PD_DEVICE T each_pair(const Patch<T>& patch, const Quad<T>* const (&field)[Fields],
+                      const Rest& rest, const T* weights, Quad<T>* entries, const Element& element,
+                      PairNumbers<T> now) {
+  using First = OneOf<T, 0>;
+  using Second = OneOf<T, 1>;
+  Pair<T, Fields> pair;
+  T energy = T(0);
+  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
+    PairNumbers<T> next = now;
+    if (Ahead && number + int(blockDim.x) < patch.pairs)
+      next = read_pair(patch, weights, number + int(blockDim.x));
+    const typename Rest::Numbers shape = rest.read(place_of(patch, number), now);
+    for (int f = 0; f < Fields; ++f) {
+      for (int c = 0; c < 5; ++c) pair.corner[f][c] = vec3(field[f][now.slot(c)]);
+    }
+    element.template run<1>(PairElement<T, Fields, First>{
+        pair, shape.template shape<First>().inverse, now.weight[0], energy});
+    element.template run<1>(PairElement<T, Fields, Second>{
+        pair, shape.template shape<Second>().inverse, now.weight[1], energy});
+    for (int c = 0; c < 4; ++c) entries[now.entry(c)] = quad(pair.force[c]);
+    if (now.entry(4) != no_entry) entries[now.entry(4)] = quad(pair.force[4]);
+    if (!Ahead && number + int(blockDim.x) < patch.pairs)
+      next = read_pair(patch, weights, number + int(blockDim.x));
+    now = next;
+  }
+  return energy;
 }
 
 // w V of every pair of a patch, times l_e when `bounded`.
-template <class T>
-__device__ void weigh_pairs(const Patch<T>& patch, const T* stiffness, bool bounded, T* weights) {
+template <class T, class Rest>
+PD_DEVICE void weigh_pairs(const Patch<T>& patch, const Rest& rest, const T* stiffness,
+                           bool bounded, T* weights) {
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const PairPlace place = place_of(patch, number);
-    Mat3<T> rest[2];
-    T volume[2];
-    load_rest(patch.plan, place, rest, volume);
+    const typename Rest::Numbers numbers = rest.read(place, read_pair<T>(patch, nullptr, number));
+    const T volume[2] = {numbers.template shape<OneOf<T, 0>>().volume,
+                         numbers.template shape<OneOf<T, 1>>().volume};
     for (int e = 0; e < 2; ++e) {
       const int tet = patch.plan.pair_tet[place.in(2, e)];
       const T bound = bounded ? patch.plan.pair_bound[place.in(2, e)] : T(1);
@@ -138,9 +272,9 @@ __device__ void weigh_pairs(const Patch<T>& patch, const T* stiffness, bool boun
 }
 
 template <class T>
-__device__ Vec3<T> sum_entries(const Quad<T>* entries, int row) {
+PD_DEVICE Vec3<T> sum_entries(const Quad<T>* entries, int row) {
   const Quad<T>* entry = entries + (unsigned(row) & 0xffff);
-  const int count = int(unsigned(row) >> 16);
+  const int count = row >> 16 & 0x7fff;
   Vec3<T> sum = {T(0), T(0), T(0)};
 #pragma unroll 4
   for (int j = 0; j < count; ++j) sum = sum + vec3(entry[entry_stride * j]);

@@ -57,7 +57,7 @@ class StreamRunner {
   StreamRunner(const StreamCall<T>& call, cudaStream_t stream)
       : call_(call), set_(call.step.settings), plan_(call.step.plan), launcher_(stream) {
     patches_ = call.step.batch * plan_.patches;
-    pass_shared_ = pass_shared_bytes(sizeof(T), plan_.most_slots, plan_.most_entries, 1);
+    pass_shared_ = pass_shared_bytes(sizeof(T), plan_.most_slots, plan_.most_entries, 2);
   }
 
   void roll() {
@@ -135,7 +135,7 @@ class StreamRunner {
 
   template <Visit What>
   void pass(int k) {
-    launcher_.run(stream_patches<What, T, Touching>, patches_, vertex_threads, pass_shared_, call_,
+    launcher_.run(stream_patches<What, T, Touching>, patches_, pass_threads, pass_shared_, call_,
                   k);
     launcher_.run(stream_shared<What, T, Touching>, call_.step.batch * call_.shared_blocks(),
                   vertex_threads, 0, call_, k);
@@ -195,7 +195,7 @@ void allow_shared_memory(std::size_t bytes) {
        {stream_patches<Visit::weigh, T, Touching>, stream_patches<Visit::update, T, Touching>,
         stream_patches<Visit::update_guarded, T, Touching>,
         stream_patches<Visit::measure, T, Touching>}) {
-    if (resident_blocks(reinterpret_cast<const void*>(kernel), vertex_threads, bytes) == 0)
+    if (resident_blocks(reinterpret_cast<const void*>(kernel), pass_threads, bytes) == 0)
       throw std::runtime_error("torchpd: a patch of the plan wants " + std::to_string(bytes) +
                                " bytes of shared memory, more than this device has");
   }
@@ -204,7 +204,7 @@ void allow_shared_memory(std::size_t bytes) {
 template <class T, bool Touching>
 void run_stream_with(const StreamCall<T>& call, cudaStream_t stream) {
   allow_shared_memory<T, Touching>(
-      pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 1));
+      pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 2));
   StreamRunner<T, Touching>(call, stream).roll();
 }
 

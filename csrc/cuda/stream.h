@@ -1,12 +1,15 @@
 // Kernels of one pass each, for meshes of any size: what a step does, patch by patch and vertex by vertex, in global memory.
 #pragma once
+#include "cuda/half.h"
 #include "cuda/momentum.h"
-#include "cuda/patch.h"
 #include "cuda/vertices.h"
+#include "plan/shared_memory.h"
 
 namespace pd::inline PD_TARGET {
 
 constexpr int vertex_threads = 256;  // of a block of the kernels over vertices
+constexpr int pass_threads =
+    384;  // of a block of the kernels over patches, two on a multiprocessor
 
 template <class T>
 struct StreamMemory {
@@ -47,7 +50,7 @@ struct StreamWork {
   Inputs<T> in;
   T h;
 
-  __device__ StreamWork(const StreamCall<T>& c, std::int64_t e)
+  PD_DEVICE StreamWork(const StreamCall<T>& c, std::int64_t e)
       : call(c),
         plan(c.step.plan),
         environment(e),
@@ -65,17 +68,17 @@ struct StreamWork {
         in{&c.step, e},
         h(T(c.step.settings.time_step)) {}
 
-  __device__ const Settings& settings() const { return call.step.settings; }
-  __device__ T omega(int k) const {
+  PD_DEVICE const Settings& settings() const { return call.step.settings; }
+  PD_DEVICE T omega(int k) const {
     return T(call.memory.omega[environment * guard_period + k % guard_period]);
   }
-  __device__ double* sum_row(int row) const {
+  PD_DEVICE double* sum_row(int row) const {
     return call.memory.sums + (environment * call.sum_rows() + row) * sums_count;
   }
-  __device__ Quad<T>& shift(int piece) const {
+  PD_DEVICE Quad<T>& shift(int piece) const {
     return call.memory.shift[environment * plan.pieces + piece];
   }
-  __device__ double* part_sum(int part) const {
+  PD_DEVICE double* part_sum(int part) const {
     return call.memory.part_sum + (environment * plan.parts + part) * 4;
   }
 };
@@ -97,39 +100,41 @@ struct ThreadSums {
 };
 
 template <Visit What, class T, bool Touching>
-__device__ void visit(const StreamWork<T, Touching>& w, int i, const Vec3<T>& force, int k,
-                      ThreadSums& sums) {
+PD_DEVICE void visit(const StreamWork<T, Touching>& w, int i, const Vec3<T>& force, int k,
+                     ThreadSums& sums) {
   double (&sum)[sums_count] = sums.value;
   if constexpr (What == Visit::weigh) {
     sum[0] = Least{}(sum[0], w.v.weigh(i, force.x));
   } else if constexpr (What == Visit::measure) {
-    sum[0] += w.v.energy(i);
-    sum[1] += w.v.residual(i, w.contacts, force);
+    const auto seen = w.v.see(i);
+    sum[0] += seen.energy();
+    sum[1] += seen.residual(w.contacts, force);
   } else {
-    if constexpr (What == Visit::update_guarded) sum[0] += w.v.energy(i);
-    const Vec3<T> u = vec3(w.v.u[i]);
-    const Vec3<T> next = w.v.next(i, w.contacts, force, T(w.settings().relaxation), w.omega(k));
+    const auto seen = w.v.see(i);
+    if constexpr (What == Visit::update_guarded) sum[0] += seen.energy();
+    const Vec3<T> next = seen.next(w.contacts, force, T(w.settings().relaxation), w.omega(k));
     if (w.settings().tolerance > 0) {
-      const Vec3<T> change = next - u;
+      const Vec3<T> change = next - seen.u;
       sum[1] += double(dot(change, change));
       sum[2] += double(dot(next, next));
     }
-    w.v.set_before(i, u);
+    w.v.set_before(i, seen.u);
     w.v.set(i, next);
   }
 }
 
 template <Visit What>
-__device__ ThreadSums no_sums() {
+PD_DEVICE ThreadSums no_sums() {
   if constexpr (What == Visit::weigh) return {{HUGE_VAL, HUGE_VAL, HUGE_VAL}};
   return {{0, 0, 0}};
 }
 
 // The sums of a block, to its row.
 template <Visit What>
-__device__ void write_sums(const ThreadSums& sums, double* row) {
+PD_DEVICE void write_sums(const ThreadSums& sums, double* row) {
   using Op = std::conditional_t<What == Visit::weigh, Least, Add>;
   __shared__ double warp_sum[sums_count][warp_size];
+  static_assert(sizeof(warp_sum) == pass_static_bytes);
   const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
   for (int n = 0; n < sums_count; ++n) {
     const double sum = across_warp(sums.value[n], Op{});
@@ -145,34 +150,39 @@ __device__ void write_sums(const ThreadSums& sums, double* row) {
 }
 
 template <Visit What, class T, bool Touching>
-__device__ bool wants_sums(const StreamWork<T, Touching>& w) {
+PD_DEVICE bool wants_sums(const StreamWork<T, Touching>& w) {
   return What != Visit::update || w.settings().tolerance > 0;
 }
 
 template <Visit What, class T, bool Touching>
-__device__ bool skips(const StreamWork<T, Touching>& w) {
+PD_DEVICE bool skips(const StreamWork<T, Touching>& w) {
   constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
   return updates && w.settings().tolerance > 0 && w.progress.done;
 }
 
 // Elements of every patch, and the vertices inside it.
 template <Visit What, class T, bool Touching>
-__global__ void __launch_bounds__(vertex_threads)
+__global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
     stream_patches(const __grid_constant__ StreamCall<T> call, int k) {
   extern __shared__ __align__(16) std::byte shared[];
   const int number = int(blockIdx.x % call.step.plan.patches);
   const StreamWork<T, Touching> w(call, blockIdx.x / call.step.plan.patches);
   if (skips<What>(w)) return;
   const Patch<T> patch(w.plan, number);
-  Quad<T>*position = reinterpret_cast<Quad<T>*>(shared), *entries = position + w.plan.most_slots;
-  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x)
+  const HalfNumbers<T> first = read_half(patch, w.weights, int(threadIdx.x));
+  Quad<T>* position = reinterpret_cast<Quad<T>*>(shared);
+  const RestPoint<T>* rest = rest_of<true>(patch).position;
+  auto* rest_position = reinterpret_cast<RestPoint<T>*>(position + w.plan.most_slots);
+  Quad<T>* entries = position + 2 * w.plan.most_slots;
+  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     position[s] = quad(vec3(w.origin[patch.first_slot + s]) + vec3(w.v.u[patch.vertex(s)]));
+    rest_position[s] = rest[s];
+  }
   __syncthreads();
 
   ThreadSums sums = no_sums<What>();
-  const Quad<T>* const fields[1] = {position};
-  const double energy =
-      double(each_pair(patch, fields, w.weights, entries, typename ElementOf<What>::type{}));
+  const double energy = double(each_half(patch, position, rest_position, w.weights, entries,
+                                         typename ElementOf<What>::type{}, first));
   if constexpr (What != Visit::weigh) sums.value[0] += energy;
   __syncthreads();
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
@@ -252,7 +262,8 @@ __global__ void __launch_bounds__(vertex_threads)
     stream_weights(const __grid_constant__ StreamCall<T> call, bool bounded) {
   const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
   const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
-  weigh_pairs(patch, call.step.material.stiffness.of(w.environment), bounded, w.weights);
+  weigh_pairs(patch, rest_of<true>(patch), call.step.material.stiffness.of(w.environment), bounded,
+              w.weights);
 }
 
 // ---- vertex by vertex

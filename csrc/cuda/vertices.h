@@ -9,11 +9,35 @@ struct Vertices {
   Quad<T>*x, *velocity, *target;  // at the start of the step [m], [m/s], s [m]
   Quad<T>*u, *before;             // iterate and the one before [m]; w: 1 / D, a
 
-  __device__ Vertex<Thread<T>, Touching> at(int i) const {
+  // What a pass knows of a vertex before the force on it.
+  struct Seen {
+    Vertex<Thread<T>, Touching> vertex;
+    Vec3<T> u, before;
+
+    PD_DEVICE double energy() const {
+      const Vec3<T> none = {T(0), T(0), T(0)}, twice = vertex.add_energy(u, none);
+      return 0.5 * double((twice.x + twice.y) + twice.z);
+    }
+
+    // square of what is left of the gradient
+    PD_DEVICE double residual(const Contacts<T>& contacts, const Vec3<T>& force) const {
+      const Vec3<T> r = vertex.unbalanced(contacts, u, force);
+      return double(dot(r, r));
+    }
+
+    PD_DEVICE Vec3<T> next(const Contacts<T>& contacts, const Vec3<T>& force, T theta,
+                           T omega) const {
+      return vertex.next(contacts, u, before, force, theta, omega);
+    }
+  };
+
+  PD_DEVICE Seen see(int i) const { return {at(i), vec3(u[i]), vec3(before[i])}; }
+
+  PD_DEVICE Vertex<Thread<T>, Touching> at(int i) const {
     return {vec3(x[i]), vec3(target[i]), before[i].w, u[i].w};
   }
 
-  __device__ void load(int i, const Inputs<T>& in, int vertex, T h) const {
+  PD_DEVICE void load(int i, const Inputs<T>& in, int vertex, T h) const {
     x[i] = quad(in.at_vertex(in.call->positions, vertex));
     velocity[i] = quad(in.at_vertex(in.call->velocities, vertex));
     before[i] = {T(0), T(0), T(0), in.inertia(vertex, h)};
@@ -21,21 +45,21 @@ struct Vertices {
   }
 
   // 1 / D; returns a / D, infinite where a pin holds the vertex
-  __device__ double weigh(int i, T elastic) const {
+  PD_DEVICE double weigh(int i, T elastic) const {
     const T a = before[i].w;
     if (!(a > T(0))) return HUGE_VAL;
     u[i].w = T(1) / (a + elastic);
     return double(a * u[i].w);
   }
 
-  __device__ void predict(int i, const Inputs<T>& in, int vertex, T h) const {
+  PD_DEVICE void predict(int i, const Inputs<T>& in, int vertex, T h) const {
     target[i] = quad(in.target(vertex, vec3(x[i]), vec3(velocity[i]), h));
   }
 
-  __device__ Vec3<T> straight(int i, T h) const { return h * vec3(velocity[i]); }
+  PD_DEVICE Vec3<T> straight(int i, T h) const { return h * vec3(velocity[i]); }
 
-  __device__ Vec3<T> first(int i, const Inputs<T>& in, int vertex,
-                           const Contacts<T>& contacts) const {
+  PD_DEVICE Vec3<T> first(int i, const Inputs<T>& in, int vertex,
+                          const Contacts<T>& contacts) const {
     const Settings& settings = in.call->settings;
     Vec3<T> guess = straight(i, T(settings.time_step));
     if (settings.start == StartKind::inertial) guess = vec3(target[i]);
@@ -43,28 +67,12 @@ struct Vertices {
     return at(i).first(contacts, guess);
   }
 
-  __device__ double energy(int i) const {
-    const Vec3<T> none = {T(0), T(0), T(0)}, twice = at(i).add_energy(vec3(u[i]), none);
-    return 0.5 * double((twice.x + twice.y) + twice.z);
-  }
-
-  // square of what is left of the gradient
-  __device__ double residual(int i, const Contacts<T>& contacts, const Vec3<T>& force) const {
-    const Vec3<T> r = at(i).unbalanced(contacts, vec3(u[i]), force);
-    return double(dot(r, r));
-  }
-
-  __device__ Vec3<T> next(int i, const Contacts<T>& contacts, const Vec3<T>& force, T theta,
-                          T omega) const {
-    return at(i).next(contacts, vec3(u[i]), vec3(before[i]), force, theta, omega);
-  }
-
-  __device__ void set(int i, const Vec3<T>& value) const { u[i] = quad(value, u[i].w); }
-  __device__ void set_before(int i, const Vec3<T>& value) const {
+  PD_DEVICE void set(int i, const Vec3<T>& value) const { u[i] = quad(value, u[i].w); }
+  PD_DEVICE void set_before(int i, const Vec3<T>& value) const {
     before[i] = quad(value, before[i].w);
   }
 
-  __device__ void finish(int i, T h) const {
+  PD_DEVICE void finish(int i, T h) const {
     const Vec3<T> moved = vec3(u[i]);
     x[i] = quad(vec3(x[i]) + moved);
     velocity[i] = quad((T(1) / h) * moved);

@@ -59,4 +59,17 @@ PD_HD Vec3<R> cross(const Vec3<R>& a, const Vec3<R>& b) {
           multiply_subtract(a.x, b.y, a.y * b.x)};
 }
 
+// a b - c d to about one rounding, however much of it cancels (Kahan; Jeannerod, Louvet and Muller 2013)
+template <class R>
+PD_HD R difference_of_products(const R& a, const R& b, const R& c, const R& d) {
+  const R product = c * d;
+  return multiply_subtract(a, b, product) + subtract_product(product, c, d);
+}
+
+template <class R>
+PD_HD Vec3<R> exact_cross(const Vec3<R>& a, const Vec3<R>& b) {
+  return {difference_of_products(a.y, b.z, a.z, b.y), difference_of_products(a.z, b.x, a.x, b.z),
+          difference_of_products(a.x, b.y, a.y, b.x)};
+}
+
 }  // namespace pd::inline PD_TARGET

@@ -130,7 +130,8 @@ std::vector<Patch> make_patches(const Mesh& mesh, std::int64_t vertices) {
 }
 
 // The numbers that say where the arrays of each patch begin.
-void number_patches(DeviceMeshPlan& plan, const std::vector<Patch>& patches) {
+void number_patches(DeviceMeshPlan& plan, const std::vector<Patch>& patches, bool stored,
+                    bool fixed) {
   plan.patch_block = plan.patch_slot = {0};
   for (const Patch& patch : patches) {
     plan.patch_pairs.push_back(std::int32_t(patch.pairs.size()));
@@ -139,33 +140,41 @@ void number_patches(DeviceMeshPlan& plan, const std::vector<Patch>& patches) {
   }
   const std::size_t blocks = plan.patch_block.back(), slots = plan.patch_slot.back();
   plan.pair_tet.resize(blocks * 2 * lanes);
-  plan.pair_rest.resize(blocks * 20 * lanes);
   plan.pair_bound.resize(blocks * 2 * lanes);
+  if (stored) plan.pair_rest.resize(blocks * 20 * lanes);
+  if (!stored && !fixed) plan.slot_rest.resize(slots * 4);
   plan.pair_corner.resize(blocks * 5 * lanes);
   plan.slot_vertex.resize(slots);
   plan.slot_row.resize(slots);
+  if (stored) return;
+  plan.pair_factor.resize(blocks * 2 * lanes);
+  plan.patch_unit.assign(patches.size(), 1.0);
+  if (fixed) plan.slot_fixed.resize(slots * 4);
 }
 
 std::int32_t packed(std::int64_t low, std::int64_t high) {
   return std::int32_t(std::uint32_t(low) | std::uint32_t(high) << 16);
 }
 
-// Inverse rest matrices, volumes and bounds of a pair in lane `lane` of `block`.
+// Rest shapes and bounds of a pair in lane `lane` of `block`.
 void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, const Pair& pair,
-               std::int64_t block, std::int64_t lane) {
+               double unit, std::int64_t block, std::int64_t lane) {
   const auto quad = [&](int i) -> double& {
     return plan.pair_rest[((5 * block + i / 4) * lanes + lane) * 4 + i % 4];
   };
   const auto vertex = [&](int c) { return std::int64_t(patch.vertex[pair.corner[c]]); };
   for (int which = 0; which < 2; ++which) {
     const Rest rest = rest_of(mesh.positions, {vertex(0), vertex(1), vertex(2), vertex(3 + which)});
+    plan.pair_bound[(2 * block + which) * lanes + lane] = rest.bound;
+    if (!plan.pair_factor.empty())
+      plan.pair_factor[(2 * block + which) * lanes + lane] = unit * unit / (6 * rest.volume);
+    if (plan.pair_rest.empty()) continue;
     for (int i = 0; i < 9; ++i) quad(9 * which + i) = rest.inverse[i];
     quad(18 + which) = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
-    plan.pair_bound[(2 * block + which) * lanes + lane] = rest.bound;
   }
 }
 
-void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch,
+void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, double unit,
                  std::int64_t first_block) {
   std::vector<std::int32_t> entry = patch.first;
   const std::int64_t count = std::ssize(patch.pairs);
@@ -177,7 +186,7 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch,
       pair.tet = {-1, -1};
       forces = 0;
     }
-    fill_rest(plan, mesh, patch, pair, block, lane);
+    fill_rest(plan, mesh, patch, pair, unit, block, lane);
     for (int which = 0; which < 2; ++which)
       plan.pair_tet[(2 * block + which) * lanes + lane] = pair.tet[which];
     for (int c = 0; c < 5; ++c) {
@@ -190,7 +199,8 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch,
 }
 
 // Slots of one patch. Its interior vertices are numbered anew, in the order of their slots.
-void fill_slots(DeviceMeshPlan& plan, const Numbering& numbering, const Patch& patch, int number) {
+void fill_slots(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number) {
+  const Numbering& numbering = mesh.numbering;
   const std::int32_t inside = numbering.patch_vertex[number];
   const std::int32_t interior = numbering.patch_vertex[number + 1] - inside;
   for (std::int32_t s = 0; s < std::int32_t(patch.vertex.size()); ++s) {
@@ -202,9 +212,65 @@ void fill_slots(DeviceMeshPlan& plan, const Numbering& numbering, const Patch& p
   }
 }
 
+// Rest positions of one patch from its first vertex, in metres or in units of which its extent has up to 2^29.
+void fill_rest_positions(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number) {
+  const auto offset = [&](std::size_t s, int c) {
+    return mesh.positions[3 * std::int64_t(patch.vertex[s]) + c] -
+           mesh.positions[3 * std::int64_t(patch.vertex[0]) + c];
+  };
+  const std::size_t count = patch.vertex.size(), first = 4 * std::size_t(plan.patch_slot[number]);
+  if (!plan.slot_rest.empty()) {
+    for (std::size_t s = 0; s < count; ++s) {
+      for (int c = 0; c < 3; ++c) plan.slot_rest[first + 4 * s + c] = offset(s, c);
+    }
+  }
+  if (plan.slot_fixed.empty()) return;
+  double extent = 0;
+  for (std::size_t s = 0; s < count; ++s) {
+    for (int c = 0; c < 3; ++c) extent = std::max(extent, std::abs(offset(s, c)));
+  }
+  int exponent = 0;
+  std::frexp(extent, &exponent);  // extent < 2^exponent
+  // up to 2^29, so that differences are up to 2^30 and fit
+  const double unit = std::ldexp(1.0, exponent - 29);
+  plan.patch_unit[number] = unit;
+  for (std::size_t s = 0; s < count; ++s) {
+    for (int c = 0; c < 3; ++c)
+      plan.slot_fixed[first + 4 * s + c] = std::int32_t(std::llround(offset(s, c) / unit));
+  }
+}
+
+// The first patch that has a shared vertex owns it.
+void mark_owners(DeviceMeshPlan& plan) {
+  for (std::size_t i = 0; i + 1 < plan.shared_start.size(); ++i) {
+    for (std::int32_t at = plan.shared_start[i] + 1; at < plan.shared_start[i + 1]; ++at)
+      plan.slot_row[plan.shared_slot[at]] |= std::int32_t(0x80000000);
+  }
+}
+
+// For every shared slot the slots of its vertex, in rows of seven.
+void link_slots(DeviceMeshPlan& plan) {
+  constexpr std::int32_t width = 8, together = width - 1;
+  const std::int32_t first_shared = plan.patch_vertex.back();
+  const std::size_t shared_slots = plan.shared_slot.size();
+  plan.slot_sender.assign(shared_slots * width, -1);
+  std::size_t number = 0;
+  for (const std::int32_t v : plan.slot_vertex) {
+    if (v < first_shared) continue;
+    const std::int32_t* sender = plan.shared_slot.data() + plan.shared_start[v - first_shared];
+    const std::int32_t* end = plan.shared_slot.data() + plan.shared_start[v - first_shared + 1];
+    for (std::size_t row = number++ * width;; row = plan.slot_sender.size() - width) {
+      for (int j = 0; j < together && sender < end; ++j) plan.slot_sender[row + j] = *sender++;
+      plan.slot_sender[row + together] =
+          sender < end ? std::int32_t(plan.slot_sender.size() / width) : 0;
+      if (sender == end) break;
+      plan.slot_sender.resize(plan.slot_sender.size() + width, -1);
+    }
+  }
+}
+
 // The vertices of each piece without pins, patch by patch: every vertex in the first patch that has it.
 void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pieces) {
-  const std::int32_t first_shared = plan.patch_vertex.back();
   plan.patch_part = plan.part_start = {0};
   plan.piece_start.assign(pieces + 1, 0);
   std::vector<std::int32_t> part_piece;
@@ -214,9 +280,7 @@ void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pie
     for (std::int32_t slot = plan.patch_slot[p]; slot < plan.patch_slot[p + 1]; ++slot) {
       const std::int32_t v = plan.slot_vertex[slot], number = piece[plan.vertex_order[v]];
       plan.slot_piece.push_back(number);
-      const bool owned =
-          v < first_shared || plan.shared_slot[plan.shared_start[v - first_shared]] == slot;
-      if (number >= 0 && owned) mine.emplace_back(number, slot);
+      if (number >= 0 && plan.slot_row[slot] >= 0) mine.emplace_back(number, slot);
     }
     std::sort(mine.begin(), mine.end());
     for (std::size_t i = 0; i < mine.size(); ++i) {
@@ -236,9 +300,9 @@ void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pie
 }
 
 std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan, const std::vector<Patch>& patches,
-                                      std::int64_t tets, std::int32_t pieces) {
+                                      std::int64_t tets, std::int32_t pieces, int kernel) {
   std::vector<std::int32_t> sizes(size_count, 0);
-  sizes[size_kernel] = -1;
+  sizes[size_kernel] = kernel;
   sizes[size_vertices] = std::int32_t(plan.vertex_order.size());
   sizes[size_tets] = std::int32_t(tets);
   sizes[size_pieces] = pieces;
@@ -247,6 +311,7 @@ std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan, const std::vec
   sizes[size_slots] = plan.patch_slot.back();
   sizes[size_shared] = std::int32_t(plan.shared_start.size() - 1);
   sizes[size_parts] = std::int32_t(plan.piece_part.size());
+  sizes[size_senders] = std::int32_t(plan.slot_sender.size() / 8);
   for (std::size_t p = 0; p < patches.size(); ++p) {
     const auto raise = [&](DeviceSize which, std::int64_t size) {
       sizes[which] = std::max(sizes[which], std::int32_t(size));
@@ -265,7 +330,7 @@ std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan, const std::vec
 
 DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
                                  const std::int64_t* tets, std::int64_t count, int patches,
-                                 const std::int32_t* piece,
+                                 int kernel, bool fixed, const std::int32_t* piece,
                                  const std::function<void(double)>& progress) {
   Mesh mesh{positions, tets, partition_mesh(positions, tets, count, patches, 1), {}};
   progress(0.4);
@@ -274,12 +339,13 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
   progress(0.7);
 
   DeviceMeshPlan plan;
-  number_patches(plan, made);
+  number_patches(plan, made, kernel == 0, fixed);
   plan.vertex_order = mesh.numbering.vertex_order;
   run_team(most_threads(), [&](const Team& team) {
     for (std::int64_t p = team.begin(patches); p < team.end(patches); ++p) {
-      fill_blocks(plan, mesh, made[p], plan.patch_block[p]);
-      fill_slots(plan, mesh.numbering, made[p], int(p));
+      fill_slots(plan, mesh, made[p], int(p));
+      if (kernel != 0) fill_rest_positions(plan, mesh, made[p], int(p));
+      fill_blocks(plan, mesh, made[p], kernel != 0 ? plan.patch_unit[p] : 1.0, plan.patch_block[p]);
     }
   });
   plan.patch_vertex = std::move(mesh.numbering.patch_vertex);
@@ -287,9 +353,11 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
       link_shared(plan.slot_vertex, plan.patch_vertex.back(), std::ssize(plan.vertex_order));
   plan.shared_start = std::move(shared.start);
   plan.shared_slot = std::move(shared.slot);
+  mark_owners(plan);
+  if (kernel == 1) link_slots(plan);
   const std::int32_t pieces = *std::max_element(piece, piece + vertices) + 1;
   if (pieces > 0) add_parts(plan, piece, pieces);
-  plan.sizes = count_sizes(plan, made, count, pieces);
+  plan.sizes = count_sizes(plan, made, count, pieces, kernel);
   progress(1.0);
   return plan;
 }

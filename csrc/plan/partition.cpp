@@ -10,39 +10,43 @@ namespace {
 
 using Point = std::array<double, 3>;
 
-std::vector<Point> tet_centres(const double* x, const std::int64_t* tets, std::int64_t count) {
-  std::vector<Point> centres(count);
+// The least coordinates of every tetrahedron's corners. Ordered by them, a cut shares the vertices on one side of it alone;
+// ordered by centres it shares some on either side.
+std::vector<Point> low_corners(const double* x, const std::int64_t* tets, std::int64_t count) {
+  std::vector<Point> low(count);
   for (std::int64_t t = 0; t < count; ++t) {
     for (int c = 0; c < 3; ++c) {
-      centres[t][c] = 0;
-      for (int k = 0; k < 4; ++k) centres[t][c] += 0.25 * x[3 * tets[4 * t + k] + c];
+      low[t][c] = x[3 * tets[4 * t] + c];
+      for (int k = 1; k < 4; ++k) low[t][c] = std::min(low[t][c], x[3 * tets[4 * t + k] + c]);
     }
   }
-  return centres;
+  return low;
 }
 
-// Splits [begin, end) of `items` at `middle` across the longest side of the box of their centres.
-void bisect(std::vector<std::int32_t>& items, const std::vector<Point>& centres, std::int64_t begin,
+// Splits [begin, end) of `items` at `middle` across the longest side of the box of their low corners.
+void bisect(std::vector<std::int32_t>& items, const std::vector<Point>& corners, std::int64_t begin,
             std::int64_t middle, std::int64_t end) {
-  Point low = centres[items[begin]], high = low;
+  Point low = corners[items[begin]], high = low;
   for (std::int64_t i = begin; i < end; ++i) {
     for (int c = 0; c < 3; ++c) {
-      low[c] = std::min(low[c], centres[items[i]][c]);
-      high[c] = std::max(high[c], centres[items[i]][c]);
+      low[c] = std::min(low[c], corners[items[i]][c]);
+      high[c] = std::max(high[c], corners[items[i]][c]);
     }
   }
-  int axis = 0;
-  for (int c = 1; c < 3; ++c) {
-    if (high[c] - low[c] > high[axis] - low[axis]) axis = c;
-  }
-  // ties fall to the number, so that every platform makes the same plan
-  std::nth_element(
-      items.begin() + begin, items.begin() + middle, items.begin() + end, [&](auto a, auto b) {
-        return centres[a][axis] != centres[b][axis] ? centres[a][axis] < centres[b][axis] : a < b;
-      });
+  std::array<int, 3> axis = {0, 1, 2};
+  std::stable_sort(axis.begin(), axis.end(),
+                   [&](int a, int b) { return high[a] - low[a] > high[b] - low[b]; });
+  // a layer that is cut itself is cut across, and the last ties fall to the number, so that every platform makes the same plan
+  std::nth_element(items.begin() + begin, items.begin() + middle, items.begin() + end,
+                   [&](auto a, auto b) {
+                     for (const int c : axis) {
+                       if (corners[a][c] != corners[b][c]) return corners[a][c] < corners[b][c];
+                     }
+                     return a < b;
+                   });
 }
 
-void divide(Partition& mesh, const std::vector<Point>& centres, std::int64_t begin,
+void divide(Partition& mesh, const std::vector<Point>& corners, std::int64_t begin,
             std::int64_t end, std::int64_t patches, std::int64_t grain) {
   if (patches <= 1) {
     std::sort(mesh.tets.begin() + begin, mesh.tets.begin() + end);
@@ -51,9 +55,9 @@ void divide(Partition& mesh, const std::vector<Point>& centres, std::int64_t beg
   }
   const std::int64_t grains = (end - begin + grain - 1) / grain, left = patches / 2;
   const std::int64_t middle = std::min(end, begin + grains * left / patches * grain);
-  if (middle > begin && middle < end) bisect(mesh.tets, centres, begin, middle, end);
-  divide(mesh, centres, begin, middle, left, grain);
-  divide(mesh, centres, middle, end, patches - left, grain);
+  if (middle > begin && middle < end) bisect(mesh.tets, corners, begin, middle, end);
+  divide(mesh, corners, begin, middle, left, grain);
+  divide(mesh, corners, middle, end, patches - left, grain);
 }
 
 }  // namespace
@@ -62,7 +66,7 @@ Partition partition_mesh(const double* positions, const std::int64_t* tets, std:
                          std::int64_t patches, std::int64_t grain) {
   Partition mesh{std::vector<std::int32_t>(count), {0}};
   std::iota(mesh.tets.begin(), mesh.tets.end(), 0);
-  divide(mesh, tet_centres(positions, tets, count), 0, count, patches, grain);
+  divide(mesh, low_corners(positions, tets, count), 0, count, patches, grain);
   return mesh;
 }
 

@@ -12,6 +12,9 @@ constexpr std::size_t fused_shared_bytes(std::size_t real, std::size_t slots, st
   return fused_control_bytes + real * (8 * slots + 4 * entries + 5 * planes + 8 * balls);
 }
 
+// what a pass keeps beside: three sums of up to 32 warps
+constexpr std::size_t pass_static_bytes = 3 * 32 * sizeof(double);
+
 // `fields` vectors of every slot
 constexpr std::size_t pass_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
                                         std::size_t fields) {

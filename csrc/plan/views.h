@@ -72,6 +72,7 @@ enum DeviceSize : int {
   size_slots,
   size_shared,
   size_parts,
+  size_senders,
   size_most_slots,
   size_most_pairs,
   size_most_entries,
@@ -88,7 +89,7 @@ struct DevicePlan {
 #include "plan/device.def"
 #undef X
   int kernel = 0, vertices = 0, tets = 0, pins = 0, pieces = 0, blocks = 0, patches = 0, slots = 0;
-  int shared = 0, parts = 0;
+  int shared = 0, parts = 0, senders = 0;
   int most_slots = 0, most_pairs = 0, most_entries = 0, most_shared = 0, most_parts = 0;
 };
 

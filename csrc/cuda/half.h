@@ -1,0 +1,95 @@
+// A patch as each_pair works on it, but with a lane for each of a pair's tetrahedra: half the work in a row, where patches are
+// so small that its length counts. Both lanes add up the forces on the corners that they share, to the same bits.
+#pragma once
+#include "cuda/collect.h"
+#include "cuda/patch.h"
+
+namespace pd::inline PD_TARGET {
+
+// What the plan and an environment say of a lane's tetrahedron: the even lane has the first of the pair.
+template <class T>
+struct HalfNumbers {
+  unsigned corner[4];  // slot, plus 65536 times the entry
+  T weight, factor;    // w V, pair_factor
+};
+
+template <class T>
+PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int number) {
+  HalfNumbers<T> numbers;
+  // lanes past the end repeat the last pair
+  const int pair = number / 2 < patch.pairs ? number / 2 : patch.pairs - 1, which = number & 1;
+  const PairPlace place = place_of(patch, pair);
+  for (int c = 0; c < 3; ++c) numbers.corner[c] = unsigned(patch.plan.pair_corner[place.in(5, c)]);
+  numbers.corner[3] = unsigned(patch.plan.pair_corner[place.in(5, 3 + which)]);
+  numbers.weight = weights[place.in(2, which)];
+  numbers.factor = patch.plan.pair_factor[place.in(2, which)];
+  return numbers;
+}
+
+template <class T>
+struct HalfElement {
+  using R = T;
+  const Vec3<T> (&position)[4];
+  Mat3<T> inverse;
+  T weighs;
+  Vec3<T> (&force)[4];
+  T& energy;
+
+  PD_HD void corners(int, int, Vec3<T> (&x)[4]) const {
+    for (int c = 0; c < 4; ++c) x[c] = position[c];
+  }
+  PD_HD const Mat3<T>& rest(int) const { return inverse; }
+  PD_HD const T& weight(int) const { return weighs; }
+  PD_HD T& sum(int) const { return energy; }
+  PD_HD void add(int, const Vec3<T> (&g)[4]) const {
+    for (int c = 0; c < 4; ++c) force[c] = g[c];
+  }
+};
+
+template <class T>
+PD_DEVICE Vec3<T> add_partner(const Vec3<T>& a) {
+  return {a.x + __shfl_xor_sync(whole_warp, a.x, 1), a.y + __shfl_xor_sync(whole_warp, a.y, 1),
+          a.z + __shfl_xor_sync(whole_warp, a.z, 1)};
+}
+
+// Runs an effect on every pair; returns the sum of energies that this thread has met. `now`: what `read_half` gave for this
+// thread's first tetrahedron. `rest`: where elements read rest positions.
+template <class T, class Element>
+PD_DEVICE T each_half(const Patch<T>& patch, const Quad<T>* position, const RestPoint<T>* rest,
+                      const T* weights, Quad<T>* entries, const Element& element,
+                      HalfNumbers<T> now) {
+  T energy = T(0);
+  const int lane = int(threadIdx.x) % warp_size;
+  for (int first = int(threadIdx.x) - lane; first < 2 * patch.pairs; first += blockDim.x) {
+    HalfNumbers<T> next = now;
+    if (first + int(blockDim.x) < 2 * patch.pairs)
+      next = read_half(patch, weights, first + int(blockDim.x) + lane);
+    Vec3<T> x[4], force[4];
+    RestPoint<T> point[4];
+    for (int c = 0; c < 4; ++c) {
+      x[c] = vec3(position[now.corner[c] & 0xffff]);
+      point[c] = rest[now.corner[c] & 0xffff];
+    }
+    T met = T(0);
+    element.template run<1>(
+        HalfElement<T>{x, ComputedRest<T>::between(point, now.factor), now.weight, force, met});
+    for (int c = 0; c < 3; ++c) force[c] = add_partner(force[c]);
+    const bool here = first + lane < 2 * patch.pairs, second = lane & 1;
+    // the first writes corners 0 and 1, the second corner 2, each its own apex
+    const Vec3<T> own = {select(second, force[2].x, force[0].x),
+                         select(second, force[2].y, force[0].y),
+                         select(second, force[2].z, force[0].z)};
+    const int entry = int((second ? now.corner[2] : now.corner[0]) >> 16);
+    const int apex = int(now.corner[3] >> 16);
+    if (here) {
+      energy += met;
+      entries[entry] = quad(own);
+      if (!second) entries[now.corner[1] >> 16] = quad(force[1]);
+      if (apex != no_entry) entries[apex] = quad(force[3]);
+    }
+    now = next;
+  }
+  return energy;
+}
+
+}  // namespace pd::inline PD_TARGET

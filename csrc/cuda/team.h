@@ -1,0 +1,111 @@
+// Sums over all threads that work on an environment: every thread leaves its part, the leading warp adds up after a barrier and
+// exchanges with the leading warps of the other blocks.
+#pragma once
+#include "cuda/exchange.h"
+
+namespace pd::inline PD_TARGET {
+
+// In shared memory.
+struct TeamTotals {
+  double warp_sum[sums_count][warp_size];
+  double total[sums_count];
+};
+
+// The last warp leads: it is the one that a last round of pairs leaves idle.
+PD_DEVICE bool leads() { return threadIdx.x + warp_size >= blockDim.x; }
+PD_DEVICE bool is_leader() { return threadIdx.x + warp_size == blockDim.x; }
+PD_DEVICE int lane() { return int(threadIdx.x) % warp_size; }
+
+// `Many`: several blocks an environment, patch by patch.
+template <bool Many>
+class TeamSums {
+ public:
+  // `box` [2, patches, sums_count] starts with tags of zero
+  PD_DEVICE TeamSums(TeamTotals& totals, Word* box, int patch, int patches)
+      : totals_(totals), box_(box), patch_(patch), patches_(patches) {}
+
+  PD_DEVICE double total(int n) const { return totals_.total[n]; }
+
+  // Every thread, before a barrier: its first `wanted` values.
+  template <class Op>
+  PD_DEVICE void leave(const double (&value)[sums_count], int wanted, Op op) {
+    wanted_ = wanted;
+#pragma unroll
+    for (int n = 0; n < sums_count; ++n) {
+      if (n >= wanted) break;
+      const double sum = across_warp(value[n], op);
+      if (lane() == 0) totals_.warp_sum[n][threadIdx.x / warp_size] = sum;
+    }
+  }
+
+  // Leading warp: the sums of the block, to the other blocks.
+  template <class Op>
+  PD_DEVICE void send(Op op) {
+    const int warps = blockDim.x / warp_size;
+    ++round_;
+#pragma unroll 1
+    for (int n = 0; n < wanted_; ++n) {
+      const double sum = across_warp(lane() < warps ? totals_.warp_sum[n][lane()] : Op::none, op);
+      if (lane() != 0) continue;
+      if constexpr (Many) {
+        post(box(patch_, n), {std::uint64_t(__double_as_longlong(sum)), round_});
+      } else {
+        totals_.total[n] = sum;
+      }
+    }
+    __syncwarp();
+  }
+
+  // Leading warp: the sums of all blocks, the same in each.
+  template <class Op>
+  PD_DEVICE void receive(Op op) {
+    if constexpr (Many) {
+#pragma unroll 1
+      for (int n = 0; n < wanted_; ++n) {
+        const double mine = over_patches<Op>(box(0, n), patches_, round_);
+        __syncwarp();
+        const double sum = across_warp(mine, op);
+        if (lane() == 0) totals_.total[n] = sum;
+      }
+    }
+    __syncwarp();
+  }
+
+  // All threads; the totals are there when it returns.
+  template <class Op>
+  PD_DEVICE void all_reduce(const double (&value)[sums_count], int wanted, Op op) {
+    leave(value, wanted, op);
+    __syncthreads();
+    if (leads()) {
+      // what other warps wrote before the barrier goes before the sums, and what is read after them goes after
+      if constexpr (Many) __threadfence();
+      send(op);
+      receive(op);
+      if constexpr (Many) __threadfence();
+    }
+    __syncthreads();
+  }
+
+  // Waits for all blocks of the environment; what they wrote before can be read after.
+  PD_DEVICE void meet() {
+    if constexpr (!Many) {
+      __syncthreads();
+    } else {
+      __threadfence();
+      all_reduce({0, 0, 0}, 1, Add{});
+    }
+  }
+
+ private:
+  PD_DEVICE Word* box(int patch, int n) const {
+    return box_ + ((round_ & 1) * patches_ + patch) * sums_count + n;
+  }
+
+  TeamTotals& totals_;
+  Word* box_;
+  int patch_, patches_;
+  int wanted_ = 0;      // sums that were left
+  unsigned round_ = 0;  // exchanges so far
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,170 @@
+"""The patches of a GPU's plan: where they are cut, vertices that they share, parts of pieces. In NumPy, on no GPU."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cases import box
+from device_plans import CASES, GRID, SENDERS, SIZES, Arrays, Lanes, arrays_of, values_of
+from numpy.typing import NDArray
+
+import torchpd as pd
+from torchpd.scene import SceneValues
+
+
+@pytest.fixture(scope="module", params=CASES, ids=lambda case: f"{case[0]}, {case[1]}")
+def case(request: pytest.FixtureRequest) -> tuple[str, int]:
+    chosen: tuple[str, int] = request.param
+    return chosen
+
+
+@pytest.fixture(scope="module")
+def values(case: tuple[str, int]) -> SceneValues:
+    return values_of(case[0])
+
+
+@pytest.fixture(scope="module")
+def plan(case: tuple[str, int]) -> Arrays:
+    return arrays_of(case, GRID)
+
+
+@pytest.fixture(scope="module")
+def lanes(plan: Arrays) -> Lanes:
+    return Lanes.of(plan)
+
+
+def test_patches_hold_their_interior_and_then_shared_vertices(lanes: Lanes, plan: Arrays, values: SceneValues) -> None:
+    np.testing.assert_array_equal(np.sort(plan.vertex_order), np.arange(len(values.rest_positions)))
+    touched = np.unique(np.stack([lanes.vertex.reshape(-1), np.repeat(lanes.patch, 5)]), axis=1)
+    patches = np.bincount(touched[0])
+    first_shared = plan.patch_vertex[-1]
+    np.testing.assert_array_equal(patches[plan.vertex_order[:first_shared]], 1)
+    assert (patches[plan.vertex_order[first_shared:]] > 1).all()
+    for p, (a, b) in enumerate(zip(plan.patch_slot[:-1], plan.patch_slot[1:], strict=True)):
+        mine, interior = plan.slot_vertex[a:b], np.arange(plan.patch_vertex[p], plan.patch_vertex[p + 1])
+        np.testing.assert_array_equal(mine[: len(interior)], interior)
+        assert (mine[len(interior) :] >= first_shared).all()
+        np.testing.assert_array_equal(np.sort(plan.vertex_order[mine]), touched[0][touched[1] == p])
+    assert len(plan.shared_start) == len(plan.vertex_order) - first_shared + 1
+    for v, (a, b) in enumerate(zip(plan.shared_start[:-1], plan.shared_start[1:], strict=True)):
+        np.testing.assert_array_equal(plan.shared_slot[a:b], np.flatnonzero(plan.slot_vertex == first_shared + v))
+
+
+def test_the_first_patch_owns_a_vertex(plan: Arrays) -> None:
+    first = np.unique(plan.slot_vertex, return_index=True)[1]
+    np.testing.assert_array_equal(np.flatnonzero(plan.slot_row >= 0), np.sort(first))
+
+
+def sender_rows(plan: Arrays, number: int) -> list[int]:
+    """The rows of slot_sender that one shared slot reads."""
+    rows = [number]
+    while (more := int(plan.slot_sender[rows[-1], SENDERS])) != 0:
+        assert more > rows[-1]
+        rows.append(more)
+    return rows
+
+
+def shared_slots(plan: Arrays) -> NDArray[np.int64]:
+    """Slots of vertices that patches share, patch by patch."""
+    return np.flatnonzero(plan.slot_vertex >= plan.patch_vertex[-1])
+
+
+def test_senders_are_the_slots_of_a_vertex_in_patch_order(plan: Arrays) -> None:
+    slots, seen = shared_slots(plan), []
+    assert plan.slot_sender.shape[1:] == (SENDERS + 1,)
+    for number, slot in enumerate(slots):
+        rows = sender_rows(plan, number)
+        seen += rows
+        assert min(rows[1:], default=len(slots)) >= len(slots)  # those that go on stand after the others
+        expected = np.flatnonzero(plan.slot_vertex == plan.slot_vertex[slot])
+        padding = np.full(SENDERS * len(rows) - len(expected), -1)
+        assert len(padding) < SENDERS
+        np.testing.assert_array_equal(plan.slot_sender[rows, :SENDERS].reshape(-1), [*expected, *padding])
+    assert sorted(seen) == list(range(len(plan.slot_sender)))
+
+
+@pytest.mark.parametrize("patches", [2, 7, 8, 14, 15, 20])
+def test_a_vertex_of_many_patches_has_several_rows_of_senders(patches: int) -> None:
+    values = values_of("cones")
+    plan = Arrays.of(values, patches)
+    hub = np.flatnonzero(plan.vertex_order[plan.slot_vertex[shared_slots(plan)]] == 0)
+    assert len(hub) == patches
+    for number in hub:
+        assert len(sender_rows(plan, int(number))) == -(-patches // SENDERS)
+
+
+@pytest.mark.parametrize(
+    ("cells", "patches", "cuts"),
+    [
+        ((9, 9, 9), 2, [(9, 9)]),
+        ((20, 5, 5), 7, [(5, 5)] * 6),
+        ((33, 4, 4), 12, [(4, 4)] * 11),
+        ((21, 6, 5), 5, [(6, 5)] * 4),
+        ((11, 11, 2), 4, [(11, 2), (6, 2), (6, 2)]),
+    ],
+)
+def test_a_cut_shares_one_layer_of_vertices(
+    cells: tuple[int, int, int], patches: int, cuts: list[tuple[int, int]]
+) -> None:
+    """On a line across the cut both sides touch one vertex, or two where the cut goes from one layer to the next.
+
+    It does so along a row of cells across the shorter side: one vertex more than cells, and two more at a cell that is
+    cut itself.
+    """
+    vertices, tets = box((float(cells[0]), float(cells[1]), float(cells[2])), cells)
+    most = sum((a + 1) * (b + 1) + min(a, b) + 3 for a, b in cuts)
+    for order in (np.arange(len(tets)), np.random.default_rng(0).permutation(len(tets))):  # numbers must not matter
+        plan = Arrays.of(pd.Scene(pd.Solid(pd.TetMesh(vertices, tets[order]), 1e5)).values(), patches)
+        assert len(plan.patch_pairs) == patches
+        assert plan.sizes[SIZES.index("shared")] <= most
+    # control: ordered by their centres, tetrahedra of a layer that is cut share vertices on either side of it
+    touched = np.zeros((len(vertices), patches), dtype=bool)
+    for number, part in enumerate(cut_by_centres(vertices[tets].mean(axis=1), np.arange(len(tets)), patches)):
+        touched[tets[part], number] = True
+    assert (touched.sum(axis=1) > 1).sum() > most
+
+
+def cut_by_centres(centres: NDArray[np.float64], tets: NDArray[np.int64], patches: int) -> list[NDArray[np.int64]]:
+    """Recursive bisection by one coordinate of the centres."""
+    if patches == 1:
+        return [tets]
+    axis = int(np.ptp(centres[tets], axis=0).argmax())
+    tets = tets[np.lexsort((tets, centres[tets, axis]))]
+    left = patches // 2
+    middle = len(tets) * left // patches
+    return [*cut_by_centres(centres, tets[:middle], left), *cut_by_centres(centres, tets[middle:], patches - left)]
+
+
+def test_parts_hold_each_free_vertex_once(plan: Arrays, values: SceneValues) -> None:
+    held = np.isin(values.component, values.component[values.pin_vertices])
+    names = ("slot_piece", "patch_part", "part_start", "part_slot", "piece_start", "piece_part")
+    if held.all():
+        assert [len(getattr(plan, name)) for name in names] == [0] * len(names)
+        return
+    user = plan.vertex_order[plan.slot_vertex]
+    np.testing.assert_array_equal(plan.slot_piece < 0, held[user])
+    np.testing.assert_array_equal(np.sort(user[plan.part_slot]), np.flatnonzero(~held))
+    # a shared vertex belongs to the first patch that has it
+    np.testing.assert_array_equal(
+        plan.part_slot, np.unique(plan.slot_vertex, return_index=True)[1][plan.slot_vertex[plan.part_slot]]
+    )
+    assert len(plan.patch_part) == len(plan.patch_pairs) + 1
+    assert len(plan.part_start) == len(plan.piece_part) + 1
+    assert (np.diff(plan.part_start) > 0).all()
+    part_patch = np.repeat(np.arange(len(plan.patch_pairs)), np.diff(plan.patch_part))
+    seen = []
+    for piece, (a, b) in enumerate(zip(plan.piece_start[:-1], plan.piece_start[1:], strict=True)):
+        parts = plan.piece_part[a:b]
+        seen += list(parts)
+        assert (np.diff(part_patch[parts]) > 0).all()
+        for part in parts:
+            slots = plan.part_slot[plan.part_start[part] : plan.part_start[part + 1]]
+            assert (np.diff(slots) > 0).all()
+            assert (slots >= plan.patch_slot[part_patch[part]]).all()
+            assert (slots < plan.patch_slot[part_patch[part] + 1]).all()
+            assert (plan.slot_piece[slots] == piece).all()
+    assert sorted(seen) == list(range(len(plan.piece_part)))
+    moving = plan.slot_piece >= 0
+    pairs = np.unique(np.stack([plan.slot_piece[moving], values.component[user[moving]]]), axis=1)
+    np.testing.assert_array_equal(pairs[0], np.arange(len(plan.piece_start) - 1))  # one component each
+    assert len(np.unique(pairs[1])) == len(pairs[1])
