@@ -58,8 +58,9 @@ def test_module_is_documented_and_lists_its_names(path: Path) -> None:
 def test_types_of_the_extension_name_what_it_has() -> None:
     stub = ast.parse((ROOT / "torchpd" / "_C.pyi").read_text(encoding="utf-8"))
     extension = importlib.import_module("torchpd._C")
-    declared = {node.name for node in stub.body if isinstance(node, ast.FunctionDef)}
-    assert declared == {name for name in vars(extension) if not name.startswith("_")}
+    functions = {node.name for node in stub.body if isinstance(node, ast.FunctionDef)}
+    numbers = {ast.unparse(node.target) for node in stub.body if isinstance(node, ast.AnnAssign)}
+    assert functions | numbers == {name for name in vars(extension) if not name.startswith("_")}
 
 
 def test_every_declared_dependency_is_pinned() -> None:
