@@ -1,11 +1,15 @@
 """Compiles every CUDA source for the architectures that matter. Needs nvcc, but no GPU and no CUDA build of torch.
 
-What ptxas says about registers, spills and shared memory is kept in build/cuda-check/, one report per source.
+What ptxas says about registers, spills and shared memory is kept in build/cuda-check/, one report per source, and with
+--table FILE as one table (CSV) of all kernels; benchmarks/results/cuda-registers.csv is the one of this repository.
 """
 
 from __future__ import annotations
 
+import argparse
+import csv
 import os
+import re
 import runpy
 import shlex
 import shutil
@@ -54,7 +58,50 @@ def compile_source(command: list[str], source: Path) -> bool:
     return passed
 
 
+_ENTRY = re.compile(r"Compiling entry function '(?P<kernel>\w+)' for 'sm_(?P<architecture>\d+)'")
+_FRAME = re.compile(r"(?P<stack>\d+) bytes stack frame, (?P<spill_stores>\d+) bytes spill stores, (?P<spill_loads>\d+)")
+_USED = re.compile(r"Used (?P<registers>\d+) registers(?:.*?(?P<shared>\d+) bytes smem)?")
+COLUMNS = ("source", "architecture", "kernel", "registers", "stack", "spill_stores", "spill_loads", "shared")
+
+
+def kernels_of(report: str) -> list[dict[str, str]]:
+    """What ptxas says of every kernel: bytes, but for registers."""
+    rows: list[dict[str, str]] = []
+    for line in report.splitlines():
+        if entry := _ENTRY.search(line):
+            rows.append(entry.groupdict() | {"shared": "0"})
+        elif not rows or "registers" in rows[-1]:
+            continue  # functions that kernels call, after the kernel's own lines
+        elif frame := _FRAME.search(line):
+            rows[-1] |= frame.groupdict()
+        elif used := _USED.search(line):
+            rows[-1] |= {name: value for name, value in used.groupdict().items() if value}
+    return rows
+
+
+def write_table(path: Path) -> None:
+    """All kernels of all reports, by name."""
+    rows = [
+        {"source": report.stem} | row
+        for report in sorted(REPORTS.glob("*.txt"))
+        for row in kernels_of(report.read_text(encoding="utf-8"))
+    ]
+    names = "\n".join(row["kernel"] for row in rows)
+    if shutil.which("c++filt"):
+        names = subprocess.run(["c++filt"], input=names, capture_output=True, text=True, check=True).stdout
+    for row, name in zip(rows, names.splitlines(), strict=True):
+        row["kernel"] = name.split("(pd::")[0].removeprefix("void ")
+    rows.sort(key=lambda row: (row["source"], row["architecture"], row["kernel"]))
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def main() -> int:
+    parser = argparse.ArgumentParser(description="Compile every CUDA source; no GPU needed.")
+    parser.add_argument("--table", type=Path, help="file for a table of the kernels' registers and spills (CSV)")
+    options = parser.parse_args()
     nvcc = find_nvcc()
     if nvcc is None:
         print("cuda-check: skipped, there is no nvcc (set CUDA_HOME to the folder of a CUDA toolkit)")
@@ -66,6 +113,8 @@ def main() -> int:
         passed = list(pool.map(lambda source: compile_source(command_for(nvcc, source, folders), source), sources))
     targets = ", ".join(f"sm_{target}" for target in TARGETS)
     print(f"cuda-check: {sum(passed)} of {len(sources)} CUDA sources compile for {targets} with {nvcc}")
+    if options.table and all(passed):
+        write_table(options.table)
     return 0 if all(passed) else 1
 
 
