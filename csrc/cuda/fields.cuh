@@ -81,9 +81,8 @@ __global__ void __launch_bounds__(field_threads)
   const Quad<T>* fields[Fields];
   fields[0] = position;
   if constexpr (Fields == 2) fields[1] = direction;
-  each_pair<false>(patch, const_cast<const Quad<T>* const(&)[Fields]>(fields),
-                   rest_of<Computed>(patch), work.weights_of(environment), entries, Element{},
-                   read_first_pair(patch, work.weights_of(environment)));
+  each_pair(patch, const_cast<const Quad<T>* const(&)[Fields]>(fields), rest_of<Computed>(patch),
+            work.weights_of(environment), entries, Element{});
   __syncthreads();
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const int slot = patch.first_slot + s;

@@ -228,8 +228,7 @@ class FusedRunner {
       return each_half(patch_, position_, rest_, weights(), entries_, element, half_);
     } else {
       const Quad<T>* const fields[1] = {position_};
-      return each_pair<false>(patch_, fields, rest_of<Many>(patch_), weights(), entries_, element,
-                              read_first_pair(patch_, weights()));
+      return each_pair(patch_, fields, rest_of<Many>(patch_), weights(), entries_, element);
     }
   }
 

@@ -216,27 +216,18 @@ struct PairElement {
   PD_HD void add(int, const Vec3<R> (&g)[4]) const { Take::add(pair, g); }
 };
 
-// This thread's first pair of a patch, if there is one.
-template <class T>
-PD_DEVICE PairNumbers<T> read_first_pair(const Patch<T>& patch, const T* weights) {
-  if (int(threadIdx.x) < patch.pairs) return read_pair(patch, weights, int(threadIdx.x));
-  return {};
-}
-
-// Runs an effect on every pair of a patch, a thread a pair; returns the sum of energies that this thread has met. `now`: what
-// `read_first_pair` gave. `Ahead`: the next pair is read before this one is worked on.
-template <bool Ahead, class T, int Fields, class Rest, class Element>
+// Runs an effect on every pair of a patch, a thread a pair; returns the sum of energies that this thread has met.
+template <class T, int Fields, class Rest, class Element>
 PD_DEVICE T each_pair(const Patch<T>& patch, const Quad<T>* const (&field)[Fields],
-                      const Rest& rest, const T* weights, Quad<T>* entries, const Element& element,
-                      PairNumbers<T> now) {
+                      const Rest& rest, const T* weights, Quad<T>* entries,
+                      const Element& element) {
   using First = OneOf<T, 0>;
   using Second = OneOf<T, 1>;
   Pair<T, Fields> pair;
   T energy = T(0);
+  PairNumbers<T> now{};
+  if (int(threadIdx.x) < patch.pairs) now = read_pair(patch, weights, int(threadIdx.x));
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
-    PairNumbers<T> next = now;
-    if (Ahead && number + int(blockDim.x) < patch.pairs)
-      next = read_pair(patch, weights, number + int(blockDim.x));
     const typename Rest::Numbers shape = rest.read(place_of(patch, number), now);
     for (int f = 0; f < Fields; ++f) {
       for (int c = 0; c < 5; ++c) pair.corner[f][c] = vec3(field[f][now.slot(c)]);
@@ -247,9 +238,9 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Quad<T>* const (&field)[Field
         pair, shape.template shape<Second>().inverse, now.weight[1], energy});
     for (int c = 0; c < 4; ++c) entries[now.entry(c)] = quad(pair.force[c]);
     if (now.entry(4) != no_entry) entries[now.entry(4)] = quad(pair.force[4]);
-    if (!Ahead && number + int(blockDim.x) < patch.pairs)
-      next = read_pair(patch, weights, number + int(blockDim.x));
-    now = next;
+    // here rather than at the top: fewer registers are spilled
+    const int next = number + int(blockDim.x);
+    if (next < patch.pairs) now = read_pair(patch, weights, next);
   }
   return energy;
 }
