@@ -126,7 +126,7 @@ def run(kernels: Sequence[str]) -> int:
         count += 1
         if kernel == "grid":
             sim.plan = in_many_patches(sim)
-            step_all_ways(sim, 2)
+            step_all_ways(sim, 3)
             count += 1
         rotations(dtype)
     torch.cuda.synchronize()
