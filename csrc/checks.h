@@ -160,16 +160,18 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   return plan;
 }
 
-// A multilevel schedule needs the arrays of its preconditioner, which only plans of the CPU have.
+// A multilevel schedule needs the arrays of its preconditioner, and on a GPU the plan of the kernels that know it.
 template <class P>
 void check_levels(const P& plan, bool wanted) {
   if (!wanted) return;
-  if constexpr (requires { plan.levels; }) {
-    TORCH_CHECK_VALUE(plan.levels.there(),
-                      "plan has no multilevel preconditioner; a Simulator with solver=Multilevel() "
-                      "makes one");
-  } else {
-    TORCH_CHECK_NOT_IMPLEMENTED(false, "the multilevel solver runs on the CPU only");
+  TORCH_CHECK_VALUE(plan.levels.there(),
+                    "plan has no multilevel preconditioner; a Simulator with solver=Multilevel() "
+                    "makes one");
+  if constexpr (requires { plan.kernel; }) {
+    TORCH_CHECK_VALUE(plan.kernel == 2,
+                      "plan must be one for kernel 2 (stream), which the multilevel solver runs "
+                      "with, got kernel ",
+                      plan.kernel);
   }
 }
 
@@ -196,8 +198,11 @@ struct DevicePlanRows {
 
 template <class T>
 DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
-  TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays, "plan must be the ", device_plan_arrays,
-                    " arrays of a plan for ", place.device.str(), ", got ", arrays.size(),
+  constexpr int with_levels = device_plan_arrays + level_arrays;
+  TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays || arrays.size() == with_levels,
+                    "plan must be the ", device_plan_arrays, " arrays of a plan for ",
+                    place.device.str(), ", or ", with_levels,
+                    " with those of a multilevel preconditioner, got ", arrays.size(),
                     "; sim.to(...) compiles the plan of a device");
   const int32* size = sizes_view(arrays[0], size_count);
   DevicePlan<T> plan;
@@ -261,6 +266,8 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   plan.name = arrays[at++].const_data_ptr<type>();
 #include "plan/device.def"
 #undef X
+  if (arrays.size() == with_levels)
+    plan.levels = levels_view<T>(arrays, device_plan_arrays, plan.vertices, plan.tets, place);
   return plan;
 }
 

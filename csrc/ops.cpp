@@ -31,6 +31,12 @@ struct Cpu {
   static void field(const FieldCall<double>& call, const Tensor&) {
     kernels().field64(call, threads());
   }
+  static void precondition(const PreconditionCall<float>& call, const Tensor&) {
+    kernels().precondition32(call, threads());
+  }
+  static void precondition(const PreconditionCall<double>& call, const Tensor&) {
+    kernels().precondition64(call, threads());
+  }
   static void rotation(const RotationCall<float>& call, const Tensor&) {
     kernels().rotation32(call, threads());
   }
@@ -40,37 +46,6 @@ struct Cpu {
 
   static int threads() { return at::get_num_threads(); }
 };
-
-template <class T>
-void run_precondition(const Tensor& field, at::TensorList arrays, const Tensor& out) {
-  const Plan<T> plan = plan_view<T>(arrays, {field.device(), "field"});
-  check_levels(plan, true);
-  TORCH_CHECK_VALUE(field.size(1) == plan.vertices, "field must have the ", plan.vertices,
-                    " vertices of the plan, got ", describe(field));
-  const Tensor from = field.contiguous();
-  PreconditionCall<T> call{plan.levels, plan.vertex_order, field.size(0), from.const_data_ptr<T>(),
-                           out.mutable_data_ptr<T>()};
-  if (call.batch == 0) return;
-  if constexpr (sizeof(T) == 4) {
-    kernels().precondition32(call, Cpu::threads());
-  } else {
-    kernels().precondition64(call, Cpu::threads());
-  }
-}
-
-// No other device has a preconditioner yet.
-Tensor precondition(const Tensor& field, at::TensorList plan) {
-  check_real(field, "field", "[batch, vertices, 3] (N)");
-  TORCH_CHECK_VALUE(field.dim() == 3 && field.size(2) == 3,
-                    "field must be [batch, vertices, 3] (N), got ", describe(field));
-  const Tensor out = at::empty(field.sizes(), field.options());
-  if (field.scalar_type() == at::kFloat) {
-    run_precondition<float>(field, plan, out);
-  } else {
-    run_precondition<double>(field, plan, out);
-  }
-  return out;
-}
 
 const std::string step_numbers =
     "int schedule, int iterations, float time_step, float relaxation, float rho, int delay, bool "
@@ -108,9 +83,6 @@ TORCH_LIBRARY(torchpd, m) {
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }
 
-TORCH_LIBRARY_IMPL(torchpd, CPU, m) {
-  register_ops<Cpu>(m);
-  m.impl("precondition", &precondition);
-}
+TORCH_LIBRARY_IMPL(torchpd, CPU, m) { register_ops<Cpu>(m); }
 
 }  // namespace pd

@@ -1,6 +1,7 @@
 // What every op does on either device: checks, views, one call of the backend.
 //
-// A Backend has `Plan<T>`, the plan that its kernels see; `plan_view<T>(arrays, place)`; and `step`, `field` and `rotation`, which
+// A Backend has `Plan<T>`, the plan that its kernels see; `plan_view<T>(arrays, place)`; and `step`, `field`, `precondition` and
+// `rotation`, which
 // run a call on the device of the tensor they are given.
 #pragma once
 #include "checks.h"
@@ -211,6 +212,34 @@ Tensor elastic_diagonal(const Tensor& stiffness, at::TensorList plan, bool weigh
 }
 
 template <class Backend, class T>
+void precondition_typed(const Tensor& field, at::TensorList arrays, const Tensor& out) {
+  const auto plan = Backend::template plan_view<T>(arrays, {field.device(), "field"});
+  TORCH_CHECK_VALUE(plan.levels.there(),
+                    "plan has no multilevel preconditioner; a Simulator with solver=Multilevel() "
+                    "makes one");
+  TORCH_CHECK_VALUE(field.size(1) == plan.vertices, "field must have the ", plan.vertices,
+                    " vertices of the plan, got ", describe(field));
+  const Tensor from = field.contiguous();
+  const PreconditionCall<T> call{plan.levels, plan.vertex_order, field.size(0),
+                                 from.const_data_ptr<T>(), out.mutable_data_ptr<T>()};
+  if (call.batch > 0) Backend::precondition(call, out);
+}
+
+template <class Backend>
+Tensor precondition(const Tensor& field, at::TensorList plan) {
+  check_real(field, "field", "[batch, vertices, 3] (N)");
+  TORCH_CHECK_VALUE(field.dim() == 3 && field.size(2) == 3,
+                    "field must be [batch, vertices, 3] (N), got ", describe(field));
+  const Tensor out = at::empty(field.sizes(), field.options());
+  if (field.scalar_type() == at::kFloat) {
+    precondition_typed<Backend, float>(field, plan, out);
+  } else {
+    precondition_typed<Backend, double>(field, plan, out);
+  }
+  return out;
+}
+
+template <class Backend, class T>
 void rotation_typed(const Tensor& matrices, const Tensor& direction, const Tensor& out) {
   const Tensor f = matrices.contiguous(),
                d = direction.defined() ? direction.contiguous() : Tensor();
@@ -253,6 +282,7 @@ void register_ops(torch::Library& m) {
   m.impl("element_energy", &element_energy<Backend>);
   m.impl("element_energy_product", &element_energy_product<Backend>);
   m.impl("elastic_diagonal", &elastic_diagonal<Backend>);
+  m.impl("precondition", &precondition<Backend>);
   m.impl("nearest_rotation", &nearest_rotation<Backend>);
   m.impl("rotation_differential", &rotation_differential<Backend>);
 }

@@ -8,13 +8,6 @@
 
 namespace pd::inline PD_TARGET {
 
-struct Misfit {
-  double scale = 1;        // s of A <= s A_0, strangers aside
-  double spread = 0;       // 1 - q / s, q A_0 <= A <= s A_0 with them
-  double trusted = 1;      // ratio of inertias up to known_inertia times which M is believed
-  bool strangers = false;  // whether there are vertices beyond
-};
-
 // All of a team measures together; the ranges do not depend on how it shares the work.
 template <class T>
 struct MisfitMeter {
@@ -22,15 +15,6 @@ struct MisfitMeter {
   const Values<T>& stiffness;
   const Team& team;
   double (*ratios)[2];  // one a thread
-
-  struct Range {
-    double least = HUGE_VAL, largest = 0;
-
-    void count(double ratio) {
-      least = std::min(least, ratio);
-      largest = std::max(largest, ratio);
-    }
-  };
 
   // `inertia(i)` is a of an internal vertex, 0 where the step holds it
   template <class Inertia>
@@ -42,17 +26,13 @@ struct MisfitMeter {
     each_inertia(inertia, [&](double ratio) { inertias.count(ratio); });
     meet(elements);
     meet(inertias);
-    Misfit m;
-    m.trusted = std::max(elements.largest, std::min(inertias.least, inertias.largest));
+    Misfit m(elements, inertias);
     const double most = known_inertia * m.trusted;
     each_inertia(inertia, [&](double ratio) {
       if (!(ratio > most)) common.count(ratio);
     });
     meet(common);
-    m.scale = std::max(elements.largest, common.largest);
-    const double least = std::min(elements.least, common.least);
-    m.spread = other_pins(inertia) ? 1 : 1 - least / std::max(elements.largest, inertias.largest);
-    m.strangers = inertias.largest > most;
+    m.conclude(elements, inertias, common, other_pins(inertia));
     return m;
   }
 

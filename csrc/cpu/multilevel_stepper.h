@@ -53,6 +53,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
   }
 
+  void descend() { multilevel_iterations(*this, set_); }
+
   // E and what is out of balance at the trial u
   void evaluate(int k) {
     sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
@@ -161,7 +163,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     for (int lane = 0; lane < width; ++lane) {
       Outer& outer = outer_[lane];
       const bool goes = !done_[lane], accelerates = goes && outer.diagonal && !outer.plain;
-      const double limit = accelerates ? schedule_[lane].limit : momentum_limit();
+      const double limit = accelerates ? schedule_[lane].limit : Outer::momentum_limit();
       const double b =
           accelerates || (goes && !lbfgs_ && !outer.plain) ? outer.extrapolation(limit) : 0;
       Lanes::set_lane(beta, lane, T(b));
@@ -195,11 +197,6 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   }
 
  private:
-  static double momentum_limit() {
-    const double b = (1 - sqrt(1 - momentum_rho * momentum_rho)) / momentum_rho;
-    return b * b;
-  }
-
   // where the lane accepted its trial `a`, else `b`
   Value choose(const Value& a, const Value& b) const { return pick(accepted_, a, b); }
 

@@ -36,6 +36,11 @@ template <class T>
 void run_field(const DeviceField<T>& call, void* memory, Stream stream);
 
 template <class T>
+std::int64_t precondition_bytes(const PreconditionCall<T>& call);
+template <class T>
+void run_precondition(const PreconditionCall<T>& call, void* memory, Stream stream);
+
+template <class T>
 void run_rotation(const RotationCall<T>& call, Stream stream);
 
 }  // namespace pd

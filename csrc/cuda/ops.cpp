@@ -31,6 +31,11 @@ struct Cuda {
   }
 
   template <class T>
+  static void precondition(const PreconditionCall<T>& call, const Tensor& like) {
+    run(like, call, precondition_bytes<T>, run_precondition<T>);
+  }
+
+  template <class T>
   static void rotation(const RotationCall<T>& call, const Tensor& like) {
     const c10::cuda::CUDAGuard guard(like.device());
     run_rotation(call, c10::cuda::getCurrentCUDAStream().stream());

@@ -2,9 +2,11 @@
 #pragma once
 #include "cuda/arena.h"
 #include "cuda/launch.h"
+#include "cuda/outer.h"
 #include "cuda/runtime.h"
 #include "cuda/stream.h"
 #include "plan/shared_memory.h"
+#include "solver/multilevel.h"
 #include "solver/step.h"
 
 #include <stdexcept>
@@ -54,8 +56,14 @@ class Launcher {
 template <class T, bool Touching>
 class StreamRunner {
  public:
-  StreamRunner(const StreamCall<T>& call, cudaStream_t stream)
-      : call_(call), set_(call.step.settings), plan_(call.step.plan), launcher_(stream) {
+  // `outer`: memory of outer_bytes, for the multilevel solver alone
+  StreamRunner(const StreamCall<T>& call, void* outer, cudaStream_t stream)
+      : call_(call),
+        set_(call.step.settings),
+        plan_(call.step.plan),
+        outer_(outer),
+        stream_(stream),
+        launcher_(stream) {
     patches_ = call.step.batch * plan_.patches;
     pass_shared_ = pass_shared_bytes(sizeof(T), plan_.most_slots, plan_.most_entries, 2);
   }
@@ -63,8 +71,13 @@ class StreamRunner {
   void roll() {
     vertices<VertexTask::load>(0);
     weigh();
+    if (set_.multilevel()) run_comparison(call_, outer_, stream_);
     for (int t = 0; t < set_.steps; ++t) {
-      step(*this, set_);
+      if (set_.multilevel()) {
+        multilevel_step(*this, set_);
+      } else {
+        step(*this, set_);
+      }
       if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
       if (Touching && t + 1 < set_.steps) environments<EnvironmentTask::move_balls>(0);
     }
@@ -99,6 +112,8 @@ class StreamRunner {
     }
     if (checks || set_.tolerance > 0) decide<Decision::iterate>(k);
   }
+
+  void descend() { run_outer(call_, outer_, stream_); }
 
   // environments that are done skip what is still launched: asking would mean waiting
   bool finished() const { return false; }
@@ -175,6 +190,8 @@ class StreamRunner {
   const StreamCall<T>& call_;
   const Settings& set_;
   const DevicePlan<T>& plan_;
+  void* outer_;
+  cudaStream_t stream_;
   Launcher launcher_;
   std::int64_t patches_;  // of all environments
   std::size_t pass_shared_;
@@ -185,7 +202,7 @@ template <class T>
 std::int64_t stream_bytes(const DeviceStep<T>& step) {
   Arena arena(nullptr);
   arrange(arena, StreamCall<T>{step, {}});
-  return arena.size();
+  return arena.size() + (step.settings.multilevel() ? outer_bytes(step) : 0);
 }
 
 // lets the kernels of a pass have more shared memory than the usual 48 KB
@@ -202,10 +219,10 @@ void allow_shared_memory(std::size_t bytes) {
 }
 
 template <class T, bool Touching>
-void run_stream_with(const StreamCall<T>& call, cudaStream_t stream) {
+void run_stream_with(const StreamCall<T>& call, void* outer, cudaStream_t stream) {
   allow_shared_memory<T, Touching>(
       pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 2));
-  StreamRunner<T, Touching>(call, stream).roll();
+  StreamRunner<T, Touching>(call, outer, stream).roll();
 }
 
 template <class T>
@@ -214,10 +231,11 @@ void run_stream(const DeviceStep<T>& step, void* memory, Stream to) {
   StreamCall<T> call{step, {}};
   Arena arena(memory);
   call.memory = arrange(arena, call);
+  void* outer = static_cast<std::byte*>(memory) + arena.size();
   if (step.material.planes_count + step.material.spheres_count > 0) {
-    run_stream_with<T, true>(call, stream);
+    run_stream_with<T, true>(call, outer, stream);
   } else {
-    run_stream_with<T, false>(call, stream);
+    run_stream_with<T, false>(call, outer, stream);
   }
 }
 

@@ -160,14 +160,11 @@ PD_DEVICE bool skips(const StreamWork<T, Touching>& w) {
   return updates && w.settings().tolerance > 0 && w.progress.done;
 }
 
-// Elements of every patch, and the vertices inside it.
-template <Visit What, class T, bool Touching>
-__global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
-    stream_patches(const __grid_constant__ StreamCall<T> call, int k) {
-  extern __shared__ __align__(16) std::byte shared[];
-  const int number = int(blockIdx.x % call.step.plan.patches);
-  const StreamWork<T, Touching> w(call, blockIdx.x / call.step.plan.patches);
-  if (skips<What>(w)) return;
+// Elements of a patch: here(vertex, force) for every vertex inside it; the forces on those that it shares stay behind.
+// Returns what this thread has met of their energy. `shared`: pass_shared_bytes.
+template <class T, bool Touching, class Element, class Here>
+PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, std::byte* shared,
+                                 const Element& element, const Here& here) {
   const Patch<T> patch(w.plan, number);
   const HalfNumbers<T> first = read_half(patch, w.weights, int(threadIdx.x));
   Quad<T>* position = reinterpret_cast<Quad<T>*>(shared);
@@ -179,25 +176,47 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
     rest_position[s] = rest[s];
   }
   __syncthreads();
-
-  ThreadSums sums = no_sums<What>();
-  const double energy = double(each_half(patch, position, rest_position, w.weights, entries,
-                                         typename ElementOf<What>::type{}, first));
-  if constexpr (What != Visit::weigh) sums.value[0] += energy;
+  const double energy =
+      double(each_half(patch, position, rest_position, w.weights, entries, element, first));
   __syncthreads();
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const int slot = patch.first_slot + s;
     const Vec3<T> force = sum_entries(entries, w.plan.slot_row[slot]);
     if (s < patch.interior) {
-      visit<What>(w, patch.first_vertex + s, force, k, sums);
+      here(patch.first_vertex + s, force);
     } else {
       w.shared_force[slot] = quad(force);
     }
   }
+  return energy;
+}
+
+// Elements of every patch, and the vertices inside it.
+template <Visit What, class T, bool Touching>
+__global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
+    stream_patches(const __grid_constant__ StreamCall<T> call, int k) {
+  extern __shared__ __align__(16) std::byte shared[];
+  const int number = int(blockIdx.x % call.step.plan.patches);
+  const StreamWork<T, Touching> w(call, blockIdx.x / call.step.plan.patches);
+  if (skips<What>(w)) return;
+  ThreadSums sums = no_sums<What>();
+  const double energy =
+      pass_over_patch(w, number, shared, typename ElementOf<What>::type{},
+                      [&](int i, const Vec3<T>& force) { visit<What>(w, i, force, k, sums); });
+  if constexpr (What != Visit::weigh) sums.value[0] += energy;
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));
 }
 
-// Vertices that patches share: what the patches left, in their order.
+// The force on a vertex that patches share: what they left, in their order.
+template <class T, bool Touching>
+PD_DEVICE Vec3<T> shared_force(const StreamWork<T, Touching>& w, int shared) {
+  Vec3<T> force = {T(0), T(0), T(0)};
+  for (int at = w.plan.shared_start[shared]; at < w.plan.shared_start[shared + 1]; ++at)
+    force = force + vec3(w.shared_force[w.plan.shared_slot[at]]);
+  return force;
+}
+
+// Vertices that patches share.
 template <Visit What, class T, bool Touching>
 __global__ void __launch_bounds__(vertex_threads)
     stream_shared(const __grid_constant__ StreamCall<T> call, int k) {
@@ -206,12 +225,8 @@ __global__ void __launch_bounds__(vertex_threads)
   if (skips<What>(w)) return;
   ThreadSums sums = no_sums<What>();
   const int i = number * vertex_threads + int(threadIdx.x);
-  if (i < w.plan.shared) {
-    Vec3<T> force = {T(0), T(0), T(0)};
-    for (int at = w.plan.shared_start[i]; at < w.plan.shared_start[i + 1]; ++at)
-      force = force + vec3(w.shared_force[w.plan.shared_slot[at]]);
-    visit<What>(w, w.plan.patch_vertex[w.plan.patches] + i, force, k, sums);
-  }
+  if (i < w.plan.shared)
+    visit<What>(w, w.plan.patch_vertex[w.plan.patches] + i, shared_force(w, i), k, sums);
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(w.plan.patches + number));
 }
 

@@ -15,6 +15,9 @@ constexpr std::size_t fused_shared_bytes(std::size_t real, std::size_t slots, st
 // what a pass keeps beside: three sums of up to 32 warps
 constexpr std::size_t pass_static_bytes = 3 * 32 * sizeof(double);
 
+// the same with all that the iterations of the multilevel solver keep
+constexpr std::size_t outer_static_bytes = 5120;
+
 // `fields` vectors of every slot
 constexpr std::size_t pass_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
                                         std::size_t fields) {

@@ -91,6 +91,7 @@ struct DevicePlan {
   int kernel = 0, vertices = 0, tets = 0, pins = 0, pieces = 0, blocks = 0, patches = 0, slots = 0;
   int shared = 0, parts = 0, senders = 0;
   int most_slots = 0, most_pairs = 0, most_entries = 0, most_shared = 0, most_parts = 0;
+  Levels<T> levels;
 };
 
 // One array of the material: the same for all environments when stride is 0.

@@ -27,6 +27,17 @@ PD_HD void multilevel_step(Runner& run, const Settings& settings) {
   if (settings.report) run.measure_course();
   run.start();
   run.translate();
+  if (settings.iterations > 0) run.descend();  // multilevel_iterations
+  run.translate();
+  if (settings.report) run.measure();
+  run.finish();
+}
+
+#if defined(__CUDACC__)
+#pragma nv_exec_check_disable
+#endif
+template <class Runner>
+PD_HD void multilevel_iterations(Runner& run, const Settings& settings) {
   for (int k = 0; k < settings.iterations; ++k) {
     run.evaluate(k);  // local step at the trial: its energy, and what is out of balance there
     run.judge(k);     // go on from the trial, or back
@@ -35,10 +46,7 @@ PD_HD void multilevel_step(Runner& run, const Settings& settings) {
     run.precondition();  // direction: M, corrected by what was learnt
     run.advance();       // next trial, on the pins and out of the contacts
   }
-  if (settings.iterations > 0) run.settle();  // the last trial, if it is better
-  run.translate();
-  if (settings.report) run.measure();
-  run.finish();
+  run.settle();  // the last trial, if it is better
 }
 
 // ---- M: a symmetric V-cycle
@@ -88,6 +96,18 @@ PD_HD void subtract_row(const Level<B, T>& level, const Value* x, int row, Value
   }
 }
 
+// One of the row's unknowns; `read` gives x by unknown.
+template <int B, class T, class Value, class Read>
+PD_HD Value subtract_unknown(const Level<B, T>& level, const Read& read, int row, int i,
+                             Value sum) {
+  for (int32 p = level.start[row]; p < level.start[row + 1]; ++p) {
+    const std::int64_t from = std::int64_t(level.column[p]) * B;
+    const T* a = level.value + std::int64_t(p) * B * B + i * B;
+    for (int j = 0; j < B; ++j) sum = subtract_product(sum, a[j], read(from + j));
+  }
+  return sum;
+}
+
 // sum += P x, one row
 template <class Real, int B, class T, class Value>
 PD_HD void add_lift(const Level<B, T>& level, const Value* x, int row, Value (&sum)[B]) {
@@ -98,6 +118,17 @@ PD_HD void add_lift(const Level<B, T>& level, const Value* x, int row, Value (&s
       for (int j = 0; j < 4; ++j) sum[i] = multiply_add(Real(weight[i * 4 + j]), from[j], sum[i]);
     }
   }
+}
+
+// One of the row's unknowns; `read` gives x by unknown.
+template <int B, class T, class Value, class Read>
+PD_HD Value lift_unknown(const Level<B, T>& level, const Read& read, int row, int i, Value sum) {
+  for (int32 p = level.lift_start[row]; p < level.lift_start[row + 1]; ++p) {
+    const std::int64_t from = std::int64_t(level.lift_node[p]) * 4;
+    const T* weight = level.lift_weight + (std::int64_t(p) * B + i) * 4;
+    for (int j = 0; j < 4; ++j) sum = multiply_add(weight[j], read(from + j), sum);
+  }
+  return sum;
 }
 
 // sum += P^T x, the four functions of one node
@@ -112,15 +143,54 @@ PD_HD void add_restriction(const Level<B, T>& level, const Value* x, int node, V
   }
 }
 
+// ---- how far the material of a step is from that which M was made of
+
+// Ratios of one to the other.
+struct Range {
+  double least = HUGE_VAL, largest = 0;
+
+  PD_HD void count(double ratio) { add({ratio, ratio}); }
+
+  PD_HD void add(const Range& other) {
+    least = other.least < least ? other.least : least;
+    largest = other.largest > largest ? other.largest : largest;
+  }
+};
+
+constexpr double known_inertia =
+    4;  // times what M was made of and the elements have become: more is left to the diagonal
+
+struct Misfit {
+  double scale = 1;        // s of A <= s A_0, strangers aside
+  double spread = 0;       // 1 - q / s, q A_0 <= A <= s A_0 with them
+  double trusted = 1;      // ratio of inertias up to known_inertia times which M is believed
+  bool strangers = false;  // whether there are vertices beyond
+
+  Misfit() = default;
+
+  PD_HD Misfit(const Range& elements, const Range& inertias)
+      : trusted(larger(elements.largest, smaller(inertias.least, inertias.largest))),
+        strangers(inertias.largest > known_inertia * trusted) {}
+
+  // `common`: the inertias that are no strangers'; `other_pins`: the step holds other vertices than M does
+  PD_HD void conclude(const Range& elements, const Range& inertias, const Range& common,
+                      bool other_pins) {
+    scale = larger(elements.largest, common.largest);
+    const double least = smaller(elements.least, common.least);
+    spread = other_pins ? 1 : 1 - least / larger(elements.largest, inertias.largest);
+  }
+
+  PD_HD static double larger(double a, double b) { return a < b ? b : a; }
+  PD_HD static double smaller(double a, double b) { return b < a ? b : a; }
+};
+
 // ---- the outer iteration of one environment: numbers only
 
 constexpr int history = 8;                 // pairs that L-BFGS remembers
 constexpr int patience = 4;                // trials that may fail before a plain iteration
 constexpr double sufficient = 1e-4;        // of the decrease that the slope promises (Armijo)
 constexpr double least_curvature = 1e-12;  // s.y of a pair, in |s| |y|
-constexpr double known_inertia =
-    4;  // times what M was made of and the elements have become: more is left to the diagonal
-constexpr double momentum_rho = 0.9995;  // that of M A is not known, and this limit serves all
+constexpr double momentum_rho = 0.9995;    // that of M A is not known, and this limit serves all
 
 // Rounding of E, relative: a rise that says nothing.
 template <class T>
@@ -157,6 +227,12 @@ struct Outer {
     // with the momentum gone M alone descends, if it fits; and pairs learn nothing of sliding
     diagonal = diagonal || (armijo ? friction && restarts > patience : failures > 1);
     return accepted;
+  }
+
+  // the most that momentum with M takes
+  PD_HD static double momentum_limit() {
+    const double b = (1 - sqrt(1 - momentum_rho * momentum_rho)) / momentum_rho;
+    return b * b;
   }
 
   // beta of u + beta (u - before)

@@ -1,0 +1,48 @@
+// Blocks that work on one environment together, phase by phase, in memory that all of them see.
+#pragma once
+#include "cuda/collect.h"
+
+namespace pd::inline PD_TARGET {
+
+// How work is shared out never decides in which order something is added up, so the bits do not depend on `blocks`.
+class BlockTeam {
+ public:
+  // `counter` starts as zero and belongs to the team; all blocks of the launch have to be resident
+  PD_DEVICE BlockTeam(int rank, int blocks, unsigned* counter)
+      : rank_(rank), blocks_(blocks), counter_(counter) {}
+
+  PD_DEVICE int rank() const { return rank_; }
+  PD_DEVICE int blocks() const { return blocks_; }
+  PD_DEVICE int thread() const { return rank_ * int(blockDim.x) + int(threadIdx.x); }
+  PD_DEVICE int threads() const { return blocks_ * int(blockDim.x); }
+  // neighbouring warps in different blocks: few pieces of work are spread over all multiprocessors
+  PD_DEVICE int warp() const { return int(threadIdx.x) / warp_size * blocks_ + rank_; }
+  PD_DEVICE int warps() const { return threads() / warp_size; }
+
+  // What any thread of the team wrote before can be read after.
+  PD_DEVICE void barrier() {
+    __syncthreads();
+    if (blocks_ == 1) return;
+    goal_ += unsigned(blocks_);
+    if (threadIdx.x == 0) {
+      __threadfence();
+      asm volatile("red.release.gpu.global.add.u32 [%0], 1;" ::"l"(counter_) : "memory");
+      unsigned arrived;
+      do {
+        asm volatile("ld.acquire.gpu.global.u32 %0, [%1];"
+                     : "=r"(arrived)
+                     : "l"(counter_)
+                     : "memory");
+      } while (int(arrived - goal_) < 0);
+      __threadfence();
+    }
+    __syncthreads();
+  }
+
+ private:
+  int rank_, blocks_;
+  unsigned* counter_;
+  unsigned goal_ = 0;  // arrivals that the next barrier waits for
+};
+
+}  // namespace pd::inline PD_TARGET

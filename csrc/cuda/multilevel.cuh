@@ -1,0 +1,221 @@
+// The kernels of the multilevel solver and their launches, for one precision.
+#pragma once
+#include "cuda/arena.h"
+#include "cuda/launch.h"
+#include "cuda/misfit.h"
+#include "cuda/outer.h"
+#include "cuda/runtime.h"
+#include "plan/shared_memory.h"
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+namespace pd {
+
+static_assert(pass_threads <= strip_warps * warp_size);
+static_assert(sizeof(OuterControl<double>) + pass_static_bytes <= outer_static_bytes);
+
+template <class T, bool Touching>
+__global__ void __launch_bounds__(pass_threads)
+    outer_iterations(const __grid_constant__ OuterCall<T> call) {
+  extern __shared__ __align__(16) std::byte shared[];
+  __shared__ __align__(16) std::byte control[sizeof(OuterControl<T>)];
+  const int number = int(blockIdx.x) / call.blocks;
+  BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
+  const OuterMemory<T> memory = of_team(call, number);
+  for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
+    MultilevelRunner<T, Touching> runner(call, memory, e, team,
+                                         *reinterpret_cast<OuterControl<T>*>(control), shared);
+    multilevel_iterations(runner, call.stream.step.settings);
+  }
+}
+
+template <class T>
+__global__ void __launch_bounds__(pass_threads)
+    compare_material(const __grid_constant__ OuterCall<T> call) {
+  const int number = int(blockIdx.x) / call.blocks;
+  BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
+  Ranges ranges(of_team(call, number).ranges, team);
+  for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
+    const Misfit misfit = measure_misfit(StreamWork<T, false>(call.stream, e), ranges, team);
+    if (team.thread() == 0) call.memory.misfit[e] = misfit;
+  }
+}
+
+template <class T>
+struct CycleCall {
+  PreconditionCall<T> op;
+  CycleMemory<T> memory;
+  unsigned* counter;
+  int teams, blocks;
+};
+
+template <class T>
+__global__ void __launch_bounds__(pass_threads)
+    precondition_fields(const __grid_constant__ CycleCall<T> call) {
+  __shared__ __align__(16) std::byte strip[sizeof(StripSums<T>)];
+  const int number = int(blockIdx.x) / call.blocks;
+  BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.counter + number);
+  const Levels<T>& levels = call.op.levels;
+  const CycleMemory<T> memory = cycle_of_team(levels, call.memory, number);
+  DeviceCycle<T> cycle(levels, memory, team, *reinterpret_cast<StripSums<T>*>(strip));
+  for (std::int64_t e = number; e < call.op.batch; e += call.teams) {
+    const auto row = [&](int i) { return (e * levels.vertices + call.op.vertex_order[i]) * 3; };
+    for (int i = team.thread(); i < levels.vertices; i += team.threads())
+      cycle.set(i, read3(call.op.field + row(i)));
+    team.barrier();
+    cycle.run();
+    for (int i = team.thread(); i < levels.vertices; i += team.threads())
+      write3(call.op.out + row(i), cycle.result(i));
+    team.barrier();
+  }
+}
+
+// How many blocks an environment gets, and how many environments run at once. No bits depend on it.
+struct Teams {
+  int count, blocks;
+
+  Teams(std::int64_t batch, int resident, int useful)
+      : count(int(std::clamp<std::int64_t>(batch, 1, resident))),
+        blocks(std::clamp(resident / count, 1, useful)) {}
+};
+
+template <class T>
+int useful_blocks(const Levels<T>& levels) {
+  constexpr int alone =
+      4 * pass_threads;  // vertices with which one block is done before several have met
+  return levels.vertices <= alone ? 1 : (levels.vertices + pass_threads - 1) / pass_threads;
+}
+
+template <class T>
+void arrange(Arena& arena, const Levels<T>& levels, int teams, CycleMemory<T>& m) {
+  const std::int64_t middle = levels.has_middle() ? 4 * std::int64_t(levels.fine_nodes) : 0;
+  const auto place = [&](LevelFields<T>& f, std::int64_t size) {
+    for (Quad<T>** array : {&f.in, &f.z, &f.rest, &f.part}) arena.place(*array, teams * size);
+  };
+  place(m.fine, levels.vertices);
+  place(m.middle, middle);
+  for (Quad<T>** array : {&m.coarse_in, &m.coarse_half, &m.coarse_out})
+    arena.place(*array, teams * 4 * std::int64_t(levels.coarse_nodes()));
+}
+
+template <class T>
+using OuterKernel = void (*)(OuterCall<T>);
+
+template <class T>
+struct OuterLaunch {
+  OuterKernel<T> kernel;
+  std::size_t shared;
+  int resident;
+
+  explicit OuterLaunch(const DeviceStep<T>& step)
+      : kernel(touching(step) ? outer_iterations<T, true> : outer_iterations<T, false>),
+        shared(pass_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries, 2)),
+        resident(resident_blocks(reinterpret_cast<const void*>(kernel), pass_threads, shared)) {
+    if (resident == 0)
+      throw std::runtime_error("torchpd: a patch of the plan wants " + std::to_string(shared) +
+                               " bytes of shared memory beside those of the multilevel solver, "
+                               "more than this device has");
+  }
+
+  static bool touching(const DeviceStep<T>& step) {
+    return step.material.planes_count + step.material.spheres_count > 0;
+  }
+
+  OuterCall<T> call(const StreamCall<T>& stream) const {
+    const DevicePlan<T>& plan = stream.step.plan;
+    const Teams teams(stream.step.batch, resident, plan.patches);
+    return {stream, {}, teams.count, teams.blocks};
+  }
+};
+
+template <class T>
+OuterMemory<T> arrange(Arena& arena, const OuterCall<T>& call) {
+  const DeviceStep<T>& step = call.stream.step;
+  const std::int64_t teams = call.teams, n = step.plan.vertices;
+  const std::int64_t pairs = step.settings.schedule == ScheduleKind::lbfgs ? history * n : 0;
+  const std::int64_t held = OuterLaunch<T>::touching(step) ? n : 0;
+  OuterMemory<T> m;
+  // what must start as zero comes first
+  arena.place(m.counter, teams);
+  for (Quad<T>** array : {&m.base, &m.pull, &m.fresh, &m.direction}) arena.place(*array, teams * n);
+  for (Quad<T>** array : {&m.s, &m.y}) arena.place(*array, teams * pairs);
+  for (Mat3<T>** array : {&m.free, &m.fresh_free}) arena.place(*array, teams * held);
+  for (Quad<T>** array : {&m.gradient, &m.fresh_gradient}) arena.place(*array, teams * held);
+  arrange(arena, step.plan.levels, int(teams), m.cycle);
+  arena.place(m.chunk_dots, teams * 2 * call.chunks() * outer_dots);
+  arena.place(m.row_sums, teams * call.rows() * sums_count);
+  arena.place(m.ranges, teams * 2 * call.blocks * ranges_count);
+  arena.place(m.misfit, step.batch);
+  return m;
+}
+
+template <class T>
+std::int64_t outer_bytes(const DeviceStep<T>& step) {
+  Arena arena(nullptr);
+  arrange(arena, OuterLaunch<T>(step).call({step, {}}));
+  return arena.size();
+}
+
+// All blocks at once, since they wait for each other.
+template <class Call>
+void launch_teams(const void* kernel, Call& call, unsigned* counter, std::size_t shared,
+                  cudaStream_t stream) {
+  void* arguments[] = {&call};
+  check(cudaMemsetAsync(counter, 0, call.teams * sizeof(unsigned), stream));
+  check(cudaLaunchCooperativeKernel(kernel, dim3(call.teams * call.blocks), dim3(pass_threads),
+                                    arguments, shared, stream));
+}
+
+template <class T>
+OuterCall<T> outer_call(const StreamCall<T>& stream, const OuterLaunch<T>& launch, void* memory) {
+  Arena arena(memory);
+  OuterCall<T> call = launch.call(stream);
+  call.memory = arrange(arena, call);
+  return call;
+}
+
+template <class T>
+void run_comparison(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
+  OuterCall<T> call = outer_call(stream, OuterLaunch<T>(stream.step), memory);
+  launch_teams(reinterpret_cast<const void*>(compare_material<T>), call, call.memory.counter, 0,
+               to);
+}
+
+template <class T>
+void run_outer(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
+  const OuterLaunch<T> launch(stream.step);
+  OuterCall<T> call = outer_call(stream, launch, memory);
+  launch_teams(reinterpret_cast<const void*>(launch.kernel), call, call.memory.counter,
+               launch.shared, to);
+}
+
+template <class T>
+CycleCall<T> cycle_call(const PreconditionCall<T>& op, void* memory, std::int64_t* bytes) {
+  const void* kernel = reinterpret_cast<const void*>(precondition_fields<T>);
+  const Teams teams(op.batch, resident_blocks(kernel, pass_threads, 0), useful_blocks(op.levels));
+  CycleCall<T> call{op, {}, nullptr, teams.count, teams.blocks};
+  Arena arena(memory);
+  arena.place(call.counter, call.teams);
+  arrange(arena, op.levels, call.teams, call.memory);
+  *bytes = arena.size();
+  return call;
+}
+
+template <class T>
+std::int64_t precondition_bytes(const PreconditionCall<T>& op) {
+  std::int64_t bytes = 0;
+  cycle_call(op, nullptr, &bytes);
+  return bytes;
+}
+
+template <class T>
+void run_precondition(const PreconditionCall<T>& op, void* memory, Stream stream) {
+  std::int64_t bytes = 0;
+  CycleCall<T> call = cycle_call(op, memory, &bytes);
+  launch_teams(reinterpret_cast<const void*>(precondition_fields<T>), call, call.counter, 0,
+               static_cast<cudaStream_t>(stream));
+}
+
+}  // namespace pd
