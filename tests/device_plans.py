@@ -1,4 +1,4 @@
-"""Plans of a GPU as NumPy arrays, read as its kernels read them; the meshes to compile."""
+"""Plans of a GPU as NumPy arrays, read as its kernels read them; the meshes to compile; both as fixtures."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
 from cases import box, cone_mesh, oriented, sliver_mesh
 from numpy.typing import NDArray
@@ -167,3 +168,27 @@ def entries_of(plan: Arrays) -> NDArray[np.int64]:
     _, _, forces = rows_of(plan)
     slots = [forces[a:b] for a, b in zip(plan.patch_slot[:-1], plan.patch_slot[1:], strict=True)]
     return np.array([sum(SLICE * s[i : i + SLICE].max() for i in range(0, len(s), SLICE)) for s in slots])
+
+
+# for every test that imports them: one of CASES, its scene, its plan for GRID, the pairs of that
+
+
+@pytest.fixture(name="case", scope="module", params=CASES, ids=lambda case: f"{case[0]}, {case[1]}")
+def fixture_case(request: pytest.FixtureRequest) -> tuple[str, int]:
+    chosen: tuple[str, int] = request.param
+    return chosen
+
+
+@pytest.fixture(name="values", scope="module")
+def fixture_values(case: tuple[str, int]) -> SceneValues:
+    return values_of(case[0])
+
+
+@pytest.fixture(name="plan", scope="module")
+def fixture_plan(case: tuple[str, int]) -> Arrays:
+    return arrays_of(case, GRID)
+
+
+@pytest.fixture(name="lanes", scope="module")
+def fixture_lanes(plan: Arrays) -> Lanes:
+    return Lanes.of(plan)

@@ -5,32 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cases import box
-from device_plans import CASES, GRID, SENDERS, SIZES, Arrays, Lanes, arrays_of, values_of
+from device_plans import (  # noqa: F401  (fixtures)
+    SENDERS,
+    SIZES,
+    Arrays,
+    Lanes,
+    fixture_case,
+    fixture_lanes,
+    fixture_plan,
+    fixture_values,
+    values_of,
+)
 from numpy.typing import NDArray
 
 import torchpd as pd
 from torchpd.scene import SceneValues
-
-
-@pytest.fixture(scope="module", params=CASES, ids=lambda case: f"{case[0]}, {case[1]}")
-def case(request: pytest.FixtureRequest) -> tuple[str, int]:
-    chosen: tuple[str, int] = request.param
-    return chosen
-
-
-@pytest.fixture(scope="module")
-def values(case: tuple[str, int]) -> SceneValues:
-    return values_of(case[0])
-
-
-@pytest.fixture(scope="module")
-def plan(case: tuple[str, int]) -> Arrays:
-    return arrays_of(case, GRID)
-
-
-@pytest.fixture(scope="module")
-def lanes(plan: Arrays) -> Lanes:
-    return Lanes.of(plan)
 
 
 def test_patches_hold_their_interior_and_then_shared_vertices(lanes: Lanes, plan: Arrays, values: SceneValues) -> None:

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 from cases import box
-from device_plans import (
+from device_plans import (  # noqa: F401  (fixtures)
     BLOCK,
-    CASES,
     GRID,
     KERNELS,
     LANES,
@@ -23,6 +22,10 @@ from device_plans import (
     Rest,
     arrays_of,
     entries_of,
+    fixture_case,
+    fixture_lanes,
+    fixture_plan,
+    fixture_values,
     rows_of,
     values_of,
 )
@@ -35,27 +38,6 @@ from torchpd.device_plan import compile_device_plan
 from torchpd.reference import elements
 from torchpd.scene import SceneValues
 from torchpd.tables import DEVICE_PLAN_TABLE
-
-
-@pytest.fixture(scope="module", params=CASES, ids=lambda case: f"{case[0]}, {case[1]}")
-def case(request: pytest.FixtureRequest) -> tuple[str, int]:
-    chosen: tuple[str, int] = request.param
-    return chosen
-
-
-@pytest.fixture(scope="module")
-def values(case: tuple[str, int]) -> SceneValues:
-    return values_of(case[0])
-
-
-@pytest.fixture(scope="module")
-def plan(case: tuple[str, int]) -> Arrays:
-    return arrays_of(case, GRID)
-
-
-@pytest.fixture(scope="module")
-def lanes(plan: Arrays) -> Lanes:
-    return Lanes.of(plan)
 
 
 def test_every_tetrahedron_is_in_one_lane(lanes: Lanes, values: SceneValues) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-__all__ = ["as_array", "check_finite", "check_positive", "check_scalar", "check_shape", "check_vector"]
+__all__ = ["as_array", "check_finite", "check_positive", "check_scalar", "check_shape", "check_vector", "check_whole"]
 
 
 def as_array(name: str, value: Any, dtype: Any = None) -> NDArray[Any]:
@@ -69,3 +69,10 @@ def check_vector(name: str, value: Any) -> NDArray[np.float64]:
     check_finite(name, array)
     array.setflags(write=False)
     return array
+
+
+def check_whole(name: str, value: int, *, minimum: int) -> int:
+    """One whole number, as an int."""
+    if isinstance(value, bool) or int(value) != value or value < minimum:
+        raise ValueError(f"{name} must be a whole number >= {minimum}, got {value!r}")
+    return int(value)

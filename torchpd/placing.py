@@ -16,7 +16,7 @@ from .plan import Plan, compile_plan
 from .regimes import choose_plan
 
 if TYPE_CHECKING:
-    from .simulator import Simulator
+    from .model import Model
 
 __all__ = ["check_wanted_device", "plan_on"]
 
@@ -51,7 +51,7 @@ def _same_plan(source: torch.device, target: torch.device) -> bool:
     return source == target or properties_of(source) == properties_of(target)
 
 
-def plan_on(sim: Simulator, dtype: torch.dtype, device: torch.device) -> Plan:
+def plan_on(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
     """The plan of a simulator for a precision and a device: its own moved there where that will do."""
     if dtype == sim.dtype and _same_plan(sim.device, device):
         plan = sim.plan

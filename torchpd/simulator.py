@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from .adjoint import AdjointCall, step_gradient
 from .capture import CapturedStep
-from .material import MATERIAL_ROWS, check_material, material_of
-from .multilevel import has_levels, precondition_plan, reference_of, without_levels
+from .checks import check_whole
+from .material import MATERIAL_ROWS
+from .model import Model
 from .ops import INFO_WIDTH, refuse_tangents
-from .placing import check_wanted_device, plan_on
-from .plan import Plan, compile_plan
-from .regimes import check_kernel
 from .rollout import PerStep, Rollout, roll
-from .scene import Scene
-from .solvers import Chebyshev, Multilevel, Solver, check_solver
+from .solvers import Solver
 from .state import Info, State, Track
 from .summary import describe
-from .targets import Anchors, Targets
+from .targets import Targets
 
 if TYPE_CHECKING:
     from .tuning import Promise
@@ -32,7 +29,7 @@ __all__ = ["Simulator", "Targets"]
 _ops = torch.ops.torchpd
 
 
-class Simulator(nn.Module):
+class Simulator(Model):
     """Steps a scene through time by implicit Euler, solved approximately by projective dynamics.
 
     The values that training may change are parameters (without gradient until asked), for all environments or, with a
@@ -52,168 +49,6 @@ class Simulator(nn.Module):
         progress: show a bar while a large scene compiles.
     """
 
-    rest_positions: Tensor
-    stiffness: Tensor
-    masses: Tensor
-    gravity: Tensor
-    damping: Tensor
-    pin_stiffness: Tensor
-    pin_targets: Tensor
-    planes: Tensor
-    spheres: Tensor
-
-    def __init__(
-        self,
-        scene: Scene,
-        time_step: float = 1 / 60,
-        iterations: int = 64,
-        solver: Solver | None = None,
-        dtype: torch.dtype = torch.float32,
-        *,
-        tolerance: float = 0.0,
-        kernel: str = "auto",
-        progress: bool = True,
-    ) -> None:
-        super().__init__()
-        if not isinstance(scene, Scene):
-            raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
-        self.scene = scene
-        self.time_step = _positive("time_step", time_step, "s")
-        self.iterations = _whole("iterations", iterations, 0)
-        solver = check_solver(Chebyshev() if solver is None else solver, torch.device("cpu"))
-        self.tolerance = float(tolerance)
-        if not 0.0 <= self.tolerance < 1.0:
-            raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
-        self.promise: Promise | None = None  # of `tune`
-        self.kernel = check_kernel(kernel)
-        values = scene.values()
-        self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
-        self.anchors = Anchors(scene, self.time_step)
-        self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
-        for name, value in material_of(values, dtype).items():
-            self.register_parameter(name, nn.Parameter(value, requires_grad=False))
-        self.solver = solver
-
-    # ---- what a simulation is made of
-
-    @property
-    def vertices(self) -> int:
-        """Vertices of all bodies."""
-        return self.plan.vertices
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of states."""
-        return self.plan.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Where states have to be."""
-        return self.plan.device
-
-    @property
-    def solver(self) -> Solver:
-        """How a step is solved. A multilevel one is prepared when it is set."""
-        return self._solver
-
-    @solver.setter
-    def solver(self, solver: Solver) -> None:
-        self._solver = check_solver(solver, self.device)
-        if isinstance(solver, Multilevel) != has_levels(self.plan.arrays):
-            self.prepare_solver()
-
-    def prepare_solver(self) -> None:
-        """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`.
-
-        Worth it after the material has changed unevenly, which `Info.rho` and `Info.residual` tell, or time_step has.
-        `set_material` does it by itself when it pins other vertices hard, or frees some. Takes 0.3 s for 8 thousand
-        vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
-        """
-        self.plan = without_levels(self.plan)
-        if isinstance(self.solver, Multilevel):
-            reference = reference_of(self.plan, self.material(), self.time_step)
-            self.plan = precondition_plan(self.plan, self.scene.values(), *reference)
-
-    def material(self) -> list[Tensor]:
-        """The differentiable arrays in the order of the ops."""
-        return [getattr(self, name) for name in MATERIAL_ROWS]
-
-    def set_material(self, **arrays: Tensor | float) -> None:
-        """Replace differentiable arrays, for all environments or with a leading batch for each; all of them, or none.
-
-        An array of the same shape is overwritten, so that optimisers keep it; another batch makes a new parameter.
-
-        Args:
-            arrays: by name, see the class. Shapes and values are checked here, once.
-        """
-        checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
-        held = self._held_everywhere()
-        with torch.no_grad():
-            for name, tensor in checked.items():
-                own = getattr(self, name)
-                if own.shape == tensor.shape:
-                    own.copy_(tensor)
-                else:
-                    setattr(self, name, nn.Parameter(tensor.clone(), requires_grad=own.requires_grad))
-        # what is held belongs to the structure of a preconditioner
-        if has_levels(self.plan.arrays) and not torch.equal(held, self._held_everywhere()):
-            self.prepare_solver()
-
-    def _held_everywhere(self) -> Tensor:
-        """Whether each pin holds exactly in all environments [P]."""
-        hard = self.pin_stiffness.isinf()
-        return hard.all(0) if hard.dim() == 2 else hard
-
-    def _checked_material(self, name: str, value: Tensor | float) -> Tensor:
-        if name not in MATERIAL_ROWS:
-            raise TypeError(f"set_material: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}")
-        own = getattr(self, name)
-        tensor = torch.as_tensor(value).detach()
-        if tensor.is_complex() or tensor.dtype == torch.bool:
-            raise TypeError(f"set_material: {name} must hold real numbers, got {tensor.dtype}")
-        tensor = tensor.to(dtype=self.dtype, device=self.device)
-        shape = tuple(own.shape[own.dim() - MATERIAL_ROWS[name].dims :])
-        tensor = tensor.expand(shape) if tensor.dim() == 0 else tensor
-        if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
-            raise ValueError(
-                f"set_material: {name} must be {list(shape)}, or with a batch in front, got {list(tensor.shape)}"
-            )
-        check_material(name, tensor)
-        return tensor.contiguous()
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        """Checks values, and takes arrays of every environment where this simulator had shared ones."""
-        for name in MATERIAL_ROWS:
-            if prefix + name in state_dict:
-                self.set_material(**{name: state_dict[prefix + name]})
-        super()._load_from_state_dict(state_dict, prefix, *rest)
-
-    def check_state(self, state: State) -> None:
-        """Refuse a state of another precision or on another device."""
-        if state[0].dtype != self.dtype or state[0].device != self.device:
-            raise TypeError(
-                f"state must be {self.dtype} on {self.device} like the simulator, got {state[0].dtype} on "
-                f"{state[0].device}; sim.to(...) changes the simulator"
-            )
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
-        wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
-        if wanted.dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
-        if wanted.device.type == "cuda":
-            check_solver(self.solver, wanted.device)
-        changes_precision = wanted.dtype != self.dtype
-        # first, because it may refuse
-        plan = plan_on(self, wanted.dtype, wanted.device)
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        self.plan = plan
-        if changes_precision:
-            # digits that float32 has lost do not come back by widening. The material may have been trained, and keeps
-            # the digits it has.
-            positions = self.scene.values().rest_positions
-            self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
-        return self
-
     def extra_repr(self) -> str:
         return describe(self)
 
@@ -224,7 +59,7 @@ class Simulator(nn.Module):
 
     def rest_state(self, batch: int = 1) -> State:
         """Everything at rest, [batch, V, 3]."""
-        shape = (_whole("batch", batch, 0), -1, -1)
+        shape = (check_whole("batch", batch, minimum=0), -1, -1)
         positions = self.rest_positions.expand(shape).clone()
         return State(positions, torch.zeros_like(positions))
 
@@ -335,7 +170,7 @@ class Simulator(nn.Module):
         Returns:
             Track of the recorded states.
         """
-        steps, every = _whole("steps", steps, 0), _whole("every", every, 1)
+        steps, every = check_whole("steps", steps, minimum=0), check_whole("every", every, minimum=1)
         if start not in ("velocity", "inertial"):
             raise ValueError(f'rollout: start must be "velocity" or "inertial", got {start!r}')
         return roll(self, Rollout(state, steps, every, forces, targets, start, return_info), progress=progress)
@@ -467,27 +302,6 @@ class Simulator(nn.Module):
 
         return load_simulation(path)
 
-    # ---- arguments of the ops
-
-    def numbers(self, *, inertial: bool, report: bool) -> dict[str, Any]:
-        """The settings as keyword arguments of the ops."""
-        return {
-            **self.solver.numbers(),
-            "iterations": self.iterations,
-            "time_step": self.time_step,
-            "tolerance": self.tolerance,
-            "inertial": inertial,
-            "report": report,
-        }
-
-    def material_at(self, targets: Targets | None, batch: int) -> list[Tensor]:
-        """The material with pins and spheres where `targets` puts them."""
-        if targets is None:
-            return self.material()
-        pins, spheres = self.anchors.place(targets, self.pin_targets, self.spheres, batch)
-        replaced = {"pin_targets": pins, "spheres": spheres}
-        return [replaced.get(name, getattr(self, name)).contiguous() for name in MATERIAL_ROWS]
-
 
 def _first_iterate(start: str | Tensor) -> tuple[Tensor | None, bool]:
     if isinstance(start, Tensor):
@@ -495,16 +309,3 @@ def _first_iterate(start: str | Tensor) -> tuple[Tensor | None, bool]:
     if start not in ("velocity", "inertial"):
         raise ValueError(f'start must be "velocity", "inertial" or positions [B, V, 3], got {start!r}')
     return None, start == "inertial"
-
-
-def _positive(name: str, value: float, unit: str) -> float:
-    number = float(value)
-    if not 0.0 < number < float("inf"):
-        raise ValueError(f"{name} must be positive and finite [{unit}], got {value}")
-    return number
-
-
-def _whole(name: str, value: int, least: int) -> int:
-    if isinstance(value, bool) or int(value) != value or value < least:
-        raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
-    return int(value)
