@@ -216,6 +216,7 @@ PYBIND11_MODULE(_C, m) {
   m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("slots"),
         py::arg("entries"), py::arg("planes"), py::arg("balls"),
         "Shared memory of a block of the kernels block and grid.");
+  m.attr("outer_static_bytes") = pd::outer_static_bytes;
   m.attr("pass_static_bytes") = pd::pass_static_bytes;
   m.def("pass_shared_bytes", &pd::pass_shared_bytes, py::arg("real"), py::arg("slots"),
         py::arg("entries"), py::arg("fields"),

@@ -36,13 +36,14 @@ from torchpd.plan import Plan
 from torchpd.tables import DEVICE_PLAN_TABLE
 
 KERNELS = ("block", "grid", "stream")
+RUNS = (*KERNELS, "levels")  # and what the multilevel solver runs with
 SOLVERS = (pd.Chebyshev(), pd.Jacobi(), pd.Chebyshev("classic", rho=0.9, delay=1))
 ops = torch.ops.torchpd
 
 
-def scene(*, contacts: bool, pieces: bool, pins: bool) -> pd.Scene:
+def scene(*, contacts: bool, pieces: bool, pins: bool, cells: tuple[int, int, int] = (6, 2, 2)) -> pd.Scene:
     """Two bars, the second of which is free where pieces are wanted."""
-    mesh = pd.shapes.box((0.6, 0.2, 0.2), (6, 2, 2))
+    mesh = pd.shapes.box((0.6, 0.2, 0.2), cells)
     bars = [pd.Solid(pd.TetMesh(mesh.vertices + [0.0, y, 0.0], mesh.tets), 1e5) for y in (0.0, 0.5)]
     held = bars[:1] if pieces else bars
     parts: list[pd.scene.Part] = [*bars, pd.Gravity(), pd.Damping(0.5)]
@@ -107,11 +108,32 @@ def in_many_patches(sim: pd.Simulator) -> Plan:
     return plan
 
 
+def levels(dtype: torch.dtype) -> int:
+    """The multilevel solver: one block an environment, several, and several environments one after another."""
+    count = 0
+    for outer, contacts in itertools.product(("lbfgs", "momentum"), (False, True)):
+        for cells, batch in (((6, 2, 2), 3), ((14, 4, 4), 3)):
+            built = scene(contacts=contacts, pieces=contacts, pins=True, cells=cells)
+            solver = pd.Multilevel(outer)  # type: ignore[arg-type]
+            options: dict[str, Any] = {"solver": solver, "tolerance": 1e-2 * contacts, "dtype": dtype}
+            sim = pd.Simulator(built, 1 / 60, 5, progress=False, **options).to("cuda")
+            step_all_ways(sim, batch)
+            ops.precondition(sim.rest_state(batch).positions, list(sim.plan.arrays))
+            count += 1
+    many = pd.Simulator(scene(contacts=False, pieces=False, pins=True), 1 / 60, 2, solver=pd.Multilevel(), dtype=dtype)
+    many.to("cuda")(many.rest_state(300))
+    torch.cuda.synchronize()
+    return count + 1
+
+
 def run(kernels: Sequence[str]) -> int:
     """How many simulators have run."""
     count = 0
     flags = list(itertools.product((False, True), repeat=2))
     for kernel, dtype in itertools.product(kernels, (torch.float32, torch.float64)):
+        if kernel == "levels":
+            count += levels(dtype)
+            continue
         for number, (contacts, pieces) in enumerate(flags):
             solver, tolerance = SOLVERS[number % len(SOLVERS)], 1e-2 if number % 2 else 0.0
             options = {"solver": solver, "tolerance": tolerance, "dtype": dtype, "kernel": kernel, "progress": False}
@@ -173,7 +195,7 @@ def plant(tool: str, kernel: str) -> None:
 
 def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kernel", nargs="+", choices=KERNELS, default=KERNELS)
+    parser.add_argument("--kernel", nargs="+", choices=RUNS, default=RUNS)
     parser.add_argument("--plant", choices=("memcheck", "initcheck", "racecheck"), help="make an error; see above")
     options = parser.parse_args(words)
     if not torch.cuda.is_available():

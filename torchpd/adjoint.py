@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from .diagonal import named_material, pinned_vertices, step_diagonal
-from .multilevel import has_levels, inertia_of_levels
+from .multilevel import has_levels, reference_of_levels
 from .tables import MATERIAL_TABLE
 
 __all__ = ["AdjointCall", "step_adjoint", "step_gradient"]
@@ -192,7 +192,8 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
         if not has_levels(call.plan):
             return plain
         # M has no say on vertices that were held when it was made
-        known = torch.isfinite(inertia_of_levels(call.plan)).unsqueeze(-1)
+        _, inertia_of_levels = reference_of_levels(call.plan)
+        known = torch.isfinite(inertia_of_levels).unsqueeze(-1)
         return allowed(torch.where(known, torch.ops.torchpd.precondition(field, call.plan), plain))
 
     tolerance = _TOLERANCE[right.dtype]

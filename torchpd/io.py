@@ -24,7 +24,7 @@ from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .embedding import Embedding
 from .mesh import TetMesh, TriMesh
 from .mesh_checks import store
-from .multilevel import precondition_plan
+from .multilevel import precondition_plan, reference_of_levels
 from .scene import Part, Scene
 from .simulator import Simulator
 from .solvers import Chebyshev, Jacobi, Multilevel, Solver
@@ -63,7 +63,8 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
     material = dict(zip((name for name, *_ in MATERIAL_TABLE), sim.material(), strict=True))
     tensors.update({f"material.{name}": value.detach().cpu().contiguous() for name, value in material.items()})
     if isinstance(sim.solver, Multilevel):
-        tensors.update({f"solver.{name}": getattr(sim.plan, name).cpu().contiguous() for name in _REFERENCE})
+        reference = zip(_REFERENCE, reference_of_levels(sim.plan.arrays), strict=True)
+        tensors.update({f"solver.{name}": value.cpu().contiguous() for name, value in reference})
     record: Record = {
         "format": FORMAT_VERSION,
         "written_by": f"torchpd {__version__}",
@@ -209,9 +210,9 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
     for name in record["trained"]:
         getattr(sim, name).requires_grad_()
     if isinstance(sim.solver, Multilevel):
-        reference = [tensors[f"solver.{name}"] for name in _REFERENCE]
-        if not all(torch.equal(getattr(sim.plan, name), own) for name, own in zip(_REFERENCE, reference, strict=True)):
-            sim.plan = precondition_plan(sim.plan, sim.scene.values(), *reference)
+        stiffness, inertia = (tensors[f"solver.{name}"] for name in _REFERENCE)
+        if not all(map(torch.equal, (stiffness, inertia), reference_of_levels(sim.plan.arrays))):
+            sim.plan = precondition_plan(sim.plan, sim.scene.values(), stiffness, inertia)
     return sim
 
 

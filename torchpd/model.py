@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from .checks import check_whole
 from .material import MATERIAL_ROWS, check_material, material_of
-from .multilevel import has_levels, precondition_plan, reference_of, without_levels
-from .placing import check_wanted_device, plan_on
+from .multilevel import has_levels
+from .placing import check_wanted_device, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
@@ -58,7 +58,8 @@ class Model(nn.Module):
         self.scene = scene
         self.time_step = _positive("time_step", time_step, "s")
         self.iterations = check_whole("iterations", iterations, minimum=0)
-        solver = check_solver(Chebyshev() if solver is None else solver, torch.device("cpu"))
+        self._solver: Solver = Chebyshev()
+        solver = check_solver(self._solver if solver is None else solver, torch.device("cpu"))
         self.tolerance = float(tolerance)
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
@@ -94,9 +95,14 @@ class Model(nn.Module):
 
     @solver.setter
     def solver(self, solver: Solver) -> None:
-        self._solver = check_solver(solver, self.device)
-        if isinstance(solver, Multilevel) != has_levels(self.plan.arrays):
+        before, self._solver = self._solver, check_solver(solver, self.device)
+        if isinstance(solver, Multilevel) == has_levels(self.plan.arrays):
+            return
+        try:
             self.prepare_solver()
+        except BaseException:
+            self._solver = before
+            raise
 
     def prepare_solver(self) -> None:
         """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`.
@@ -105,10 +111,7 @@ class Model(nn.Module):
         `set_material` does it by itself when it pins other vertices hard, or frees some. Takes 0.3 s for 8 thousand
         vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
         """
-        self.plan = without_levels(self.plan)
-        if isinstance(self.solver, Multilevel):
-            reference = reference_of(self.plan, self.material(), self.time_step)
-            self.plan = precondition_plan(self.plan, self.scene.values(), *reference)
+        self.plan = plan_for_solver(self)
 
     def material(self) -> list[Tensor]:
         """The differentiable arrays in the order of the ops."""
@@ -195,8 +198,6 @@ class Model(nn.Module):
         wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
-        if wanted.device.type == "cuda":
-            check_solver(self.solver, wanted.device)
         changes_precision = wanted.dtype != self.dtype
         # first, because it may refuse
         plan = plan_on(self, wanted.dtype, wanted.device)

@@ -11,14 +11,15 @@ from torch import Tensor
 from . import _C
 from .gpu import free_memory, properties_of, refuse_full_memory, why_not
 from .material import material_of
-from .multilevel import has_levels, precondition_plan, reference_of
+from .multilevel import precondition_plan, reference_of, without_levels
 from .plan import Plan, compile_plan
 from .regimes import choose_plan
+from .solvers import Multilevel
 
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_wanted_device", "plan_on"]
+__all__ = ["check_wanted_device", "plan_for_solver", "plan_on"]
 
 
 def _reason(device: torch.device | None = None) -> str:
@@ -51,20 +52,39 @@ def _same_plan(source: torch.device, target: torch.device) -> bool:
     return source == target or properties_of(source) == properties_of(target)
 
 
+def _compile(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
+    """The scene's plan for a device and the solver, on the CPU, without what the solver prepares."""
+    values = sim.scene.values()
+    if device.type != "cuda":
+        return compile_plan(values, dtype=dtype, progress=False)
+    levels = isinstance(sim.solver, Multilevel)
+    return choose_plan(values, dtype, properties_of(device), sim.kernel, levels=levels, progress=False)
+
+
+def plan_for_solver(sim: Model) -> Plan:
+    """The plan of a simulator for its solver, where it is, with what the solver prepares of the material now."""
+    wants = isinstance(sim.solver, Multilevel)
+    plan = without_levels(sim.plan)
+    # kernels of a GPU want other patches for a multilevel solver than for the others
+    if plan.kernel is not None and wants != plan.for_levels:
+        plan = _compile(sim, sim.dtype, sim.device).to(sim.device)
+    if wants:
+        plan = precondition_plan(plan, sim.scene.values(), *reference_of(plan, sim.material(), sim.time_step))
+    return plan
+
+
 def plan_on(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
     """The plan of a simulator for a precision and a device: its own moved there where that will do."""
     if dtype == sim.dtype and _same_plan(sim.device, device):
         plan = sim.plan
-    elif device.type == "cuda":
-        plan = choose_plan(sim.scene.values(), dtype, properties_of(device), sim.kernel, progress=False)
     else:
-        plan = compile_plan(sim.scene.values(), dtype=dtype, progress=False)
-        if has_levels(sim.plan.arrays):
+        plan = _compile(sim, dtype, device)
+        if isinstance(sim.solver, Multilevel):
             # coming from "meta" the values of the material are lost
             lost = sim.device.type == "meta"
-            arrays = list(material_of(sim.scene.values(), dtype).values()) if lost else sim.material()
-            reference = reference_of(plan, [array.to(dtype=dtype) for array in arrays], sim.time_step)
-            plan = precondition_plan(plan, sim.scene.values(), *reference)
+            arrays = list(material_of(sim.scene.values(), sim.dtype).values()) if lost else sim.material()
+            source = compile_plan(sim.scene.values(), dtype=sim.dtype, progress=False) if lost else sim.plan
+            plan = precondition_plan(plan, sim.scene.values(), *reference_of(source, arrays, sim.time_step))
     if device.type == "cuda" and device != sim.device:
         material = sum(array.numel() for array in (*sim.material(), sim.rest_positions))
         refuse_full_memory(plan.bytes + material * (torch.finfo(dtype).bits // 8), free_memory(device))

@@ -28,13 +28,14 @@ KERNELS = ("block", "grid", "stream")
 class Plan:
     """Constant arrays of a scene in the order of a table that C++ declares, also by name: `plan.vertex_order`.
 
-    The CPU and GPUs have a table each; that of a multilevel preconditioner may follow the CPU's. `why` says in words
-    why a GPU's plan is for the kernel that it is for.
+    The CPU and GPUs have a table each, which that of a multilevel preconditioner may follow. `why` says in words why a
+    GPU's plan is for the kernel that it is for; `for_levels`: its patches are those of a multilevel solver.
     """
 
     arrays: tuple[Tensor, ...]
     table: tuple[PlanRow, ...] = PLAN_TABLE
     why: str = ""
+    for_levels: bool = False
 
     def __getattr__(self, name: str) -> Tensor:
         for number, row in enumerate(self.table):
@@ -46,7 +47,7 @@ class Plan:
     @property
     def kernel(self) -> str | None:
         """Which kernel of a GPU the plan is for: "block", "grid" or "stream"; None for the CPU."""
-        return KERNELS[self.size("kernel")] if self.table == DEVICE_PLAN_TABLE else None
+        return KERNELS[self.size("kernel")] if self.table[: len(DEVICE_PLAN_TABLE)] == DEVICE_PLAN_TABLE else None
 
     def size(self, name: str) -> int:
         """A number of a GPU's plan by its name in DEVICE_SIZES."""

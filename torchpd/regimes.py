@@ -24,6 +24,8 @@ from .tables import DEVICE_PLAN_TABLE
 __all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
 _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
+# with a multilevel solver, whose blocks also share out vertices: a thread each, or up to three in one block alone
+_LEVEL_TETS, _LEVEL_ALONE = 384, 1152
 _STREAM_TETS = {torch.float32: 2000, torch.float64: 960}  # a patch, so that two share a multiprocessor of an H100
 _MOST_FIELDS = 2  # of a pass: the products with a second derivative
 
@@ -39,6 +41,8 @@ def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
     """Shared memory of a block of the kernel that a plan is for."""
     real = torch.finfo(plan.dtype).bits // 8
     slots, entries = plan.size("most_slots"), plan.size("most_entries")
+    if plan.for_levels:
+        return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.outer_static_bytes
     if plan.kernel == "stream":
         return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.pass_static_bytes
     return _C.fused_shared_bytes(real, slots, entries, planes, balls)
@@ -66,6 +70,8 @@ class _Scene(NamedTuple):
             return 1
         if kernel == "grid":
             return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
+        if kernel == "levels":
+            return 1 if self.tets <= _LEVEL_ALONE else -(-self.tets // _LEVEL_TETS)
         return -(-self.tets // _STREAM_TETS[self.dtype])
 
     def least_shared_bytes(self, patches: int) -> int:
@@ -90,18 +96,24 @@ def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | Non
     return (plan if needed <= gpu.shared else None), f"{needed:,} B"
 
 
-def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
+def _stream_plan(scene: _Scene, gpu: Properties, *, levels: bool) -> Plan:
     """More patches where many tetrahedra share a vertex, whose forces one patch sums."""
-    patches = scene.patches("stream", gpu)
-    plan = scene.plan("stream", patches)
-    while scene.shared_bytes(plan) > gpu.shared and patches < scene.tets:
+    patches = scene.patches("levels" if levels else "stream", gpu)
+    while True:
+        plan = replace(scene.plan("stream", patches), for_levels=levels)
+        if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
+            return plan
         patches = min(2 * patches, scene.tets)
-        plan = scene.plan("stream", patches)
-    return plan
 
 
 def choose_plan(
-    values: SceneValues, dtype: torch.dtype, gpu: Properties, kernel: str = "auto", *, progress: bool = True
+    values: SceneValues,
+    dtype: torch.dtype,
+    gpu: Properties,
+    kernel: str = "auto",
+    *,
+    levels: bool = False,
+    progress: bool = True,
 ) -> Plan:
     """The plan of a scene for a GPU, on the CPU; move it with `Plan.to`.
 
@@ -110,10 +122,17 @@ def choose_plan(
         dtype: torch.float32 or torch.float64.
         gpu: what the device has.
         kernel: "auto" takes the first of "block", "grid" and "stream" that fits.
+        levels: for a multilevel solver, which runs as "stream" does but for its iterations.
         progress: show a bar when the mesh is large.
     """
     check_kernel(kernel)
     scene = _Scene(values, dtype, progress)
+    if levels:
+        if kernel not in ("auto", "stream"):
+            raise ValueError(
+                f'Simulator: Multilevel runs with kernel="stream" on a GPU, got kernel={kernel!r}; leave it at "auto"'
+            )
+        return replace(_stream_plan(scene, gpu, levels=True), why="what Multilevel runs with")
     needs = []
     for name in ("block", "grid"):
         if kernel not in ("auto", name):
@@ -128,7 +147,7 @@ def choose_plan(
                 f"Simulator: kernel={kernel!r} does not fit this GPU: it needs {needed} of shared memory a thread "
                 f'block, and {gpu.shared:,} B are there; take {others}, or "auto", which takes the first that fits'
             )
-    return replace(_stream_plan(scene, gpu), why=_reason(kernel, needs, gpu))
+    return replace(_stream_plan(scene, gpu, levels=False), why=_reason(kernel, needs, gpu))
 
 
 def _reason(kernel: str, needs: list[str], gpu: Properties) -> str:

@@ -125,7 +125,7 @@ class Multilevel:
     """Iterations with a multilevel approximation M of A^-1, A the constant matrix of projective dynamics.
 
     For stiff and for accurate steps: a few dozen iterations do, however stiff or fine the mesh, each at two to four
-    times the cost of a Jacobi iteration. The scene takes longer to compile. CPU only.
+    times the cost of a Jacobi iteration. The scene takes longer to compile.
 
     Every iterate is judged by its energy before the next one starts from it. Contacts project every iterate; while they
     hold vertices M fits less well. With friction, which has no energy, the judgement allows a rise of 1 %.
@@ -164,9 +164,6 @@ def check_solver(solver: Solver, device: torch.device) -> Solver:
     """The solver, if a simulator on this device can have it."""
     if not isinstance(solver, Jacobi | Chebyshev | Multilevel):
         raise TypeError(f"Simulator: solver must be Jacobi, Chebyshev or Multilevel, got {type(solver).__name__}")
-    if isinstance(solver, Multilevel) and device.type != "cpu":
-        raise RuntimeError(
-            f"Simulator: Multilevel runs on the CPU, not on {device}; on a GPU take Chebyshev, by "
-            "sim.solver = torchpd.Chebyshev()"
-        )
+    if isinstance(solver, Multilevel) and device.type not in ("cpu", "cuda"):
+        raise RuntimeError(f"Simulator: Multilevel is prepared on the CPU or on a GPU, not on {device}")
     return solver

@@ -9,7 +9,7 @@ import torch
 from . import _C
 from .regimes import shared_bytes
 from .solvers import Chebyshev, Multilevel, Solver
-from .tables import PLAN_TABLE
+from .tables import MULTILEVEL_TABLE
 
 if TYPE_CHECKING:
     from .plan import Plan
@@ -49,7 +49,7 @@ def _preconditioner_lines(sim: Simulator) -> list[str]:
         return []
     nodes, below = int(plan.level_sizes[2]), int(plan.level_sizes[5])
     steps = [f"{plan.vertices} vertices", f"{nodes} nodes", *([f"{below} nodes"] if below else [])]
-    own = sum(array.numel() * array.element_size() for array in plan.arrays[len(PLAN_TABLE) :])
+    own = sum(array.numel() * array.element_size() for array in plan.arrays[-len(MULTILEVEL_TABLE) :])
     return [f"preconditioner: {' > '.join(steps)}, the last solved directly; {own:,} B of the plan"]
 
 
@@ -89,6 +89,7 @@ _LAUNCHES = {
     "grid": "a thread block for each patch, all iterations in one launch",
     "stream": "a thread block for each patch, launches for every iteration",
 }
+_LEVEL_LAUNCHES = "some thread blocks an environment, all iterations in one launch"
 
 
 def _kernel_lines(sim: Simulator) -> list[str]:
@@ -99,11 +100,12 @@ def _kernel_lines(sim: Simulator) -> list[str]:
     mesh = (
         f"{plan.patches} patch{'es' * (plan.patches > 1)}, {pairs} pairs of tetrahedra, {plan.size('shared')} vertices"
     )
+    launches = _LEVEL_LAUNCHES if plan.for_levels else _LAUNCHES[kernel]
     others = " or ".join(f'"{name}"' for name in _LAUNCHES if name != kernel)
     return [
-        f"kernel {kernel}: {_LAUNCHES[kernel]}",
+        f"kernel {kernel}: {launches}",
         f"mesh: {mesh} that patches share, {block:,} B of shared memory a thread block",
-        f"why {kernel}: {plan.why}; Simulator(..., kernel=...) may ask for {others}",
+        f"why {kernel}: {plan.why}" + ("" if plan.for_levels else f"; Simulator(..., kernel=...) may ask for {others}"),
     ]
 
 

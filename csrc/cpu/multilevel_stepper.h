@@ -137,7 +137,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
   void precondition() {
-    Real alpha[history], scale;
+    Real alpha[history] = {}, scale;
     for (int lane = 0; lane < width; ++lane) {
       for (int j = 0; j < history; ++j) Lanes::set_lane(alpha[j], lane, T(pairs_[lane].alpha[j]));
       Lanes::set_lane(scale, lane, T(set_.relaxation / outer_[lane].scale));
