@@ -206,22 +206,9 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
                     "; sim.to(...) compiles the plan of a device");
   const int32* size = sizes_view(arrays[0], size_count);
   DevicePlan<T> plan;
-  plan.kernel = size[size_kernel];
-  plan.vertices = size[size_vertices];
-  plan.tets = size[size_tets];
-  plan.pins = size[size_pins];
-  plan.pieces = size[size_pieces];
-  plan.blocks = size[size_blocks];
-  plan.patches = size[size_patches];
-  plan.slots = size[size_slots];
-  plan.shared = size[size_shared];
-  plan.parts = size[size_parts];
-  plan.senders = size[size_senders];
-  plan.most_slots = size[size_most_slots];
-  plan.most_pairs = size[size_most_pairs];
-  plan.most_entries = size[size_most_entries];
-  plan.most_shared = size[size_most_shared];
-  plan.most_parts = size[size_most_parts];
+#define X(name, meaning) plan.name = size[size_##name];
+#include "plan/device_sizes.def"
+#undef X
   TORCH_CHECK_VALUE(plan.kernel >= 0 && plan.kernel <= 2 && plan.patches >= 1 &&
                         (plan.kernel != 0 || plan.patches == 1) && plan.most_slots >= 1 &&
                         plan.most_slots <= plan.slots && plan.most_entries >= 0,

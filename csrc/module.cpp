@@ -11,6 +11,7 @@
 #include <pybind11/stl.h>
 
 #include <map>
+#include <span>
 
 namespace py = pybind11;
 
@@ -125,31 +126,30 @@ py::dict build_multilevel(const Doubles& positions, const Indices& tets, const N
   return arrays;
 }
 
-py::list plan_table() {
-  py::list rows;
-#define X(name, type, width, rows_, meaning) \
-  rows.append(py::make_tuple(#name, #type, width, #rows_, meaning));
+// Tables of constant arrays, in the order in which ops take them.
+struct TableRow {
+  const char *name, *type;
+  int width;
+  const char *rows, *meaning;
+};
+
+#define X(name, type, width, rows, meaning) TableRow{#name, #type, width, #rows, meaning},
+constexpr TableRow plan_rows[] = {
 #include "plan/plan.def"
-#undef X
-  return rows;
-}
-
-py::list multilevel_table() {
-  py::list rows;
-#define X(name, type, width, rows_, meaning) \
-  rows.append(py::make_tuple(#name, #type, width, #rows_, meaning));
+};
+constexpr TableRow multilevel_rows[] = {
 #include "plan/multilevel.def"
-#undef X
-  return rows;
-}
-
-py::list device_plan_table() {
-  py::list rows;
-#define X(name, type, width, rows_, meaning) \
-  rows.append(py::make_tuple(#name, #type, width, #rows_, meaning));
+};
+constexpr TableRow device_plan_rows[] = {
 #include "plan/device.def"
+};
 #undef X
-  return rows;
+
+py::list table(std::span<const TableRow> rows) {
+  py::list all;
+  for (const TableRow& row : rows)
+    all.append(py::make_tuple(row.name, row.type, row.width, row.rows, row.meaning));
+  return all;
 }
 
 py::list material_table() {
@@ -158,6 +158,14 @@ py::list material_table() {
 #include "plan/material.def"
 #undef X
   return rows;
+}
+
+py::list device_sizes() {
+  py::list names;
+#define X(name, meaning) names.append(#name);
+#include "plan/device_sizes.def"
+#undef X
+  return names;
 }
 
 py::dict build_info() {
@@ -205,12 +213,16 @@ PYBIND11_MODULE(_C, m) {
   m.def("build_multilevel", &build_multilevel, py::arg("positions"), py::arg("tets"),
         py::arg("vertex_order"), py::arg("stiffness"), py::arg("inertia"), py::arg("threads"),
         py::arg("progress"));
-  m.def("plan_table", &plan_table,
-        "Rows (name, type, width, rows, meaning) of the constant arrays, in op order.");
-  m.def("multilevel_table", &multilevel_table,
-        "Rows (name, type, width, rows, meaning) of a preconditioner's arrays, in op order.");
-  m.def("device_plan_table", &device_plan_table,
-        "Rows (name, type, width, rows, meaning) of the constant arrays on a GPU, in op order.");
+  m.def(
+      "plan_table", [] { return table(plan_rows); },
+      "Rows (name, type, width, rows, meaning) of the constant arrays, in op order.");
+  m.def(
+      "multilevel_table", [] { return table(multilevel_rows); },
+      "Rows (name, type, width, rows, meaning) of a preconditioner's arrays, in op order.");
+  m.def(
+      "device_plan_table", [] { return table(device_plan_rows); },
+      "Rows (name, type, width, rows, meaning) of the constant arrays on a GPU, in op order.");
+  m.def("device_sizes", &device_sizes, "Names of the numbers in a GPU plan's sizes.");
   m.def("material_table", &material_table,
         "Rows (name, width, rows, meaning) of the differentiable arrays, in op order.");
   m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("slots"),

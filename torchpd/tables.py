@@ -45,8 +45,5 @@ PLAN_TABLE = tuple(PlanRow(*row) for row in _C.plan_table())
 MULTILEVEL_TABLE = tuple(PlanRow(*row) for row in _C.multilevel_table())
 DEVICE_PLAN_TABLE = tuple(PlanRow(*row) for row in _C.device_plan_table())
 MATERIAL_TABLE = tuple(MaterialRow(*row) for row in _C.material_table())
-# numbers of a GPU plan's `sizes`: DeviceSize of csrc/plan/views.h
-DEVICE_SIZES = (
-    "kernel", "vertices", "tets", "pins", "pieces", "blocks", "patches", "slots", "shared", "parts",
-    "senders", "most_slots", "most_pairs", "most_entries", "most_shared", "most_parts",
-)  # fmt: skip
+# numbers of a GPU plan's `sizes`: csrc/plan/device_sizes.def
+DEVICE_SIZES = tuple(_C.device_sizes())

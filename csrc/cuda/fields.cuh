@@ -49,21 +49,34 @@ __global__ void __launch_bounds__(field_threads)
               work.weights + set * plan.blocks * 2 * pair_lanes);
 }
 
-// Positions relative to the first vertex of the patch, and directions, in shared memory.
-template <class T>
-__device__ void read_fields(const DeviceField<T>& field, const Patch<T>& patch,
-                            std::int64_t environment, Quad<T>* position, Quad<T>* direction) {
-  const DevicePlan<T>& plan = field.plan;
-  const auto at = [&](const T* from, int slot) {
-    const std::int64_t row = environment * plan.vertices + plan.vertex_order[patch.vertex(slot)];
-    return read3(from + 3 * row);
-  };
-  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
-    position[s] = {};
-    if (field.positions) position[s] = quad(at(field.positions, s) - at(field.positions, 0));
-    if (direction) direction[s] = quad(at(field.direction, s));
+// What a block works on, a patch of one environment: its positions, relative to its first vertex, and with two Fields also
+// its directions, read into shared memory.
+template <int Fields, class T>
+struct PatchFields {
+  std::int64_t environment;
+  Patch<T> patch;
+  Quad<T>*position, *direction;  // by slot
+  Quad<T>* entries;              // behind them
+
+  __device__ PatchFields(const DeviceField<T>& field, std::byte* shared)
+      : environment(blockIdx.x / field.plan.patches),
+        patch(field.plan, int(blockIdx.x % field.plan.patches)),
+        position(reinterpret_cast<Quad<T>*>(shared)),
+        direction(Fields == 2 ? position + field.plan.most_slots : nullptr),
+        entries(position + Fields * field.plan.most_slots) {
+    const auto at = [&](const T* from, int slot) {
+      const DevicePlan<T>& plan = field.plan;
+      const std::int64_t row = environment * plan.vertices + plan.vertex_order[patch.vertex(slot)];
+      return read3(from + 3 * row);
+    };
+    for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
+      position[s] = {};
+      if (field.positions) position[s] = quad(at(field.positions, s) - at(field.positions, 0));
+      if (direction) direction[s] = quad(at(field.direction, s));
+    }
+    __syncthreads();
   }
-}
+};
 
 // Fields: how many vectors of a vertex an element reads; Numbers: how many a vertex gets.
 template <bool Computed, class Element, int Fields, int Numbers, class T>
@@ -71,13 +84,8 @@ __global__ void __launch_bounds__(field_threads)
     field_vertices(const __grid_constant__ FieldWork<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
   const DevicePlan<T>& plan = work.field.plan;
-  const std::int64_t environment = blockIdx.x / plan.patches;
-  const Patch<T> patch(plan, int(blockIdx.x % plan.patches));
-  Quad<T>* position = reinterpret_cast<Quad<T>*>(shared);
-  Quad<T>* direction = Fields == 2 ? position + plan.most_slots : nullptr;
-  Quad<T>* entries = position + Fields * plan.most_slots;
-  read_fields(work.field, patch, environment, position, direction);
-  __syncthreads();
+  const auto [environment, patch, position, direction, entries] =
+      PatchFields<Fields, T>(work.field, shared);
   const Quad<T>* fields[Fields];
   fields[0] = position;
   if constexpr (Fields == 2) fields[1] = direction;
@@ -115,12 +123,8 @@ __global__ void __launch_bounds__(field_threads)
     field_elements(const __grid_constant__ FieldWork<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
   const DevicePlan<T>& plan = work.field.plan;
-  const std::int64_t environment = blockIdx.x / plan.patches;
-  const Patch<T> patch(plan, int(blockIdx.x % plan.patches));
-  Quad<T>* position = reinterpret_cast<Quad<T>*>(shared);
-  Quad<T>* direction = Product ? position + plan.most_slots : nullptr;
-  read_fields(work.field, patch, environment, position, direction);
-  __syncthreads();
+  const auto [environment, patch, position, direction, entries] =
+      PatchFields<Product ? 2 : 1, T>(work.field, shared);
   const T* weights = work.weights_of(environment);
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const PairPlace place = place_of(patch, number);

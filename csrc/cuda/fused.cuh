@@ -1,7 +1,7 @@
 // The fused kernel and its launch, for one precision.
 #pragma once
 #include "cuda/arena.h"
-#include "cuda/fused.h"
+#include "cuda/fused_momentum.h"
 #include "cuda/launch.h"
 #include "cuda/runtime.h"
 #include "plan/shared_memory.h"

@@ -322,6 +322,11 @@ __global__ void __launch_bounds__(vertex_threads)
     w.origin[patch.first_slot + s] = quad(vec3(w.v.x[patch.vertex(s)]) - anchor);
 }
 
+// Of this thread in the grid.
+PD_DEVICE std::int64_t thread_number() {
+  return std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+}
+
 // ---- momentum: a warp for each part, then for each piece
 
 enum class ShiftTask { moments, gaps };
@@ -330,7 +335,7 @@ template <ShiftTask What, class T>
 __global__ void __launch_bounds__(vertex_threads)
     stream_parts(const __grid_constant__ StreamCall<T> call) {
   const int parts = call.step.plan.parts;
-  const std::int64_t warp = (std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x) / warp_size;
+  const std::int64_t warp = thread_number() / warp_size;
   if (warp >= call.step.batch * parts) return;
   const StreamWork<T, true> w(call, warp / parts);
   const int part = int(warp % parts);
@@ -351,7 +356,7 @@ template <ShiftTask What, class T>
 __global__ void __launch_bounds__(vertex_threads)
     stream_pieces(const __grid_constant__ StreamCall<T> call) {
   const int pieces = call.step.plan.pieces;
-  const std::int64_t warp = (std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x) / warp_size;
+  const std::int64_t warp = thread_number() / warp_size;
   if (warp >= call.step.batch * pieces) return;
   const StreamWork<T, true> w(call, warp / pieces);
   const int piece = int(warp % pieces);
@@ -390,7 +395,7 @@ enum class EnvironmentTask { move_balls, store };
 template <EnvironmentTask What, class T>
 __global__ void __launch_bounds__(vertex_threads)
     stream_environments(const __grid_constant__ StreamCall<T> call, int record) {
-  const std::int64_t e = std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  const std::int64_t e = thread_number();
   if (e >= call.step.batch) return;
   const StreamWork<T, true> w(call, e);
   if constexpr (What == EnvironmentTask::store) w.in.write_info(record, w.progress);

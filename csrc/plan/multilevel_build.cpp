@@ -268,28 +268,19 @@ Aggregates group_nodes(const BlockMatrix& matrix,
   return limited(aggregate(graph, Mask(matrix.rows, 0), wanted), most_coarse_nodes);
 }
 
-void store_fine(MultilevelTables& t, BlockMatrix& matrix, Step& step) {
-  t.fine_start = std::move(matrix.start);
-  t.fine_column = std::move(matrix.column);
-  t.fine_value = std::move(matrix.value);
-  t.fine_lift_start = std::move(step.lift.start);
-  t.fine_lift_node = std::move(step.lift.column);
-  t.fine_lift_weight = std::move(step.lift.value);
-  t.fine_node_start = std::move(step.restriction.matrix.start);
-  t.fine_node_row = std::move(step.restriction.matrix.column);
-  t.fine_node_lift = std::move(step.restriction.from);
+using Numbers = std::vector<std::int32_t>;
+
+void store(BlockMatrix& matrix, Numbers& start, Numbers& column, std::vector<double>& value) {
+  start = std::move(matrix.start);
+  column = std::move(matrix.column);
+  value = std::move(matrix.value);
 }
 
-void store_middle(MultilevelTables& t, BlockMatrix& matrix, Step& step) {
-  t.middle_start = std::move(matrix.start);
-  t.middle_column = std::move(matrix.column);
-  t.middle_value = std::move(matrix.value);
-  t.middle_lift_start = std::move(step.lift.start);
-  t.middle_lift_node = std::move(step.lift.column);
-  t.middle_lift_weight = std::move(step.lift.value);
-  t.middle_node_start = std::move(step.restriction.matrix.start);
-  t.middle_node_row = std::move(step.restriction.matrix.column);
-  t.middle_node_lift = std::move(step.restriction.from);
+// Of the transposed matrix, where its values stand in the other is enough.
+void store(Transposed& transposed, Numbers& start, Numbers& column, Numbers& from) {
+  start = std::move(transposed.matrix.start);
+  column = std::move(transposed.matrix.column);
+  from = std::move(transposed.from);
 }
 
 }  // namespace
@@ -317,7 +308,9 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
   t.level_sizes[level_fine_entries] = fine.matrix.start.back();
   t.level_sizes[level_fine_lifts] = step.lift.start.back();
   t.level_sizes[level_fine_nodes] = groups.count;
-  store_fine(t, fine.matrix, step);
+  store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
+  store(step.lift, t.fine_lift_start, t.fine_lift_node, t.fine_lift_weight);
+  store(step.restriction, t.fine_node_start, t.fine_node_row, t.fine_node_lift);
   progress(0.7);
 
   BlockMatrix coarse = std::move(step.coarse);
@@ -329,7 +322,9 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
     t.level_sizes[level_middle_entries] = coarse.start.back();
     t.level_sizes[level_middle_lifts] = step.lift.start.back();
     t.level_sizes[level_middle_nodes] = last.count;
-    store_middle(t, coarse, step);
+    store(coarse, t.middle_start, t.middle_column, t.middle_value);
+    store(step.lift, t.middle_lift_start, t.middle_lift_node, t.middle_lift_weight);
+    store(step.restriction, t.middle_node_start, t.middle_node_row, t.middle_node_lift);
     coarse = std::move(step.coarse);
   }
   progress(0.8);

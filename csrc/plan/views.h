@@ -60,24 +60,11 @@ struct Plan {
   Levels<T> levels;
 };
 
-// Numbers of DevicePlan::sizes; most_*: the largest of any patch.
+// Numbers of DevicePlan::sizes, as DevicePlan itself has them too.
 enum DeviceSize : int {
-  size_kernel,
-  size_vertices,
-  size_tets,
-  size_pins,
-  size_pieces,
-  size_blocks,
-  size_patches,
-  size_slots,
-  size_shared,
-  size_parts,
-  size_senders,
-  size_most_slots,
-  size_most_pairs,
-  size_most_entries,
-  size_most_shared,
-  size_most_parts,
+#define X(name, meaning) size_##name,
+#include "plan/device_sizes.def"
+#undef X
   size_count
 };
 
@@ -88,9 +75,9 @@ struct DevicePlan {
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "plan/device.def"
 #undef X
-  int kernel = 0, vertices = 0, tets = 0, pins = 0, pieces = 0, blocks = 0, patches = 0, slots = 0;
-  int shared = 0, parts = 0, senders = 0;
-  int most_slots = 0, most_pairs = 0, most_entries = 0, most_shared = 0, most_parts = 0;
+#define X(name, meaning) int name = 0;
+#include "plan/device_sizes.def"
+#undef X
   Levels<T> levels;
 };
 
