@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from devices import require_gpu
 from multilevel_cases import irregular, many_bodies, precondition, swing
 from on_gpu import GPU, device_work, host_waits, moved, relative
 from runs import arguments_of, noise, same_bits, simulator, small, state_of
+from scipy.sparse import csr_array
 
 import torchpd as pd
 from torchpd.tables import MULTILEVEL_TABLE
@@ -35,9 +37,49 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 
 
+def reordered(levels: dict[str, np.ndarray], place: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays of a preconditioner whose vertex i is to stand at place[i]."""
+    out = dict(levels)
+    for name in ("reference_inertia", "fine_inverse"):
+        out[name] = np.empty_like(levels[name])
+        out[name][place] = levels[name]
+
+    def moved_rows(start: np.ndarray, column: np.ndarray, count: int, columns: np.ndarray) -> csr_array:
+        """Where each entry stood, by its new row and column."""
+        rows = np.repeat(place, np.diff(start))
+        return csr_array((np.arange(len(column)), (rows, columns[column])), shape=(len(place), count))
+
+    matrix = moved_rows(levels["fine_start"], levels["fine_column"], len(place), place)
+    out["fine_start"], out["fine_column"] = matrix.indptr, matrix.indices
+    out["fine_value"] = levels["fine_value"][matrix.data]
+    nodes = int(levels["level_sizes"][2])
+    lift = moved_rows(levels["fine_lift_start"], levels["fine_lift_node"], nodes, np.arange(nodes))
+    lift.sort_indices()
+    out["fine_lift_start"], out["fine_lift_node"] = lift.indptr, lift.indices
+    out["fine_lift_weight"] = levels["fine_lift_weight"][lift.data]
+    by_node = csr_array((np.arange(lift.nnz), lift.indices, lift.indptr), shape=lift.shape).tocsc()
+    out["fine_node_row"], out["fine_node_lift"] = by_node.indices, by_node.data
+    out["coarse_columns"] = levels["coarse_columns"][:0]
+    return out
+
+
 def pair(case: Case, dtype: torch.dtype, solver: pd.Multilevel, **options: object) -> tuple[pd.Simulator, pd.Simulator]:
-    sims = [simulator(case, dtype, device, solver=solver, **options) for device in ("cpu", GPU)]
-    return sims[0], sims[1]
+    """On the CPU and on a GPU, with the same M: where vertices stand decides which of several equals are taken."""
+    cpu, gpu = (simulator(case, dtype, device, solver=solver, **options) for device in ("cpu", GPU))
+    if isinstance(solver, pd.Multilevel):
+        share(gpu, cpu)
+    return cpu, gpu
+
+
+def share(gpu: pd.Simulator, cpu: pd.Simulator) -> None:
+    """Gives a simulator on the CPU the preconditioner of one on a GPU."""
+    levels = {row.name: getattr(gpu.plan, row.name).cpu().numpy() for row in MULTILEVEL_TABLE}
+    internal = np.argsort(cpu.plan.vertex_order.numpy())
+    arrays = reordered(levels, internal[gpu.plan.vertex_order.cpu().numpy()])
+    kept = cpu.plan.arrays[: -len(MULTILEVEL_TABLE)]
+    own = cpu.plan.arrays[-len(MULTILEVEL_TABLE) :]
+    new = (torch.tensor(arrays[row.name]).to(t.dtype) for row, t in zip(MULTILEVEL_TABLE, own, strict=True))
+    cpu.plan = replace(cpu.plan, arrays=(*kept, *new))
 
 
 @pytest.mark.parametrize("name", ["slivers", "beam", "box", "bodies"])
@@ -68,13 +110,16 @@ def test_iterates_are_those_of_the_cpu(name: str, outer: str) -> None:
 
 @pytest.mark.parametrize("outer", SOLVERS)
 @pytest.mark.parametrize("name", ["beam", "octopus", "ground"])
-def test_float32_ends_where_float64_does(name: str, outer: str) -> None:
+def test_float32_comes_as_near_as_on_the_cpu(name: str, outer: str) -> None:
+    """Its floor is that of the scene: 4e-4 on the octopus, whose stiffness is random over two decades."""
     case = CASES[name]()
-    ends = []
-    for dtype, device in ((torch.float64, "cpu"), (torch.float32, GPU)):
-        sim = simulator(case, dtype, device, solver=SOLVERS[outer], iterations=120)
-        ends.append(sim(state_of(case, sim), **arguments_of(case, sim)).velocities)
-    assert relative(ends[1], ends[0]) <= 2e-4
+    iterations = 120 if outer == "lbfgs" else 600
+    exact = simulator(case, torch.float64, solver=SOLVERS[outer], iterations=iterations)
+    end, errors = exact(state_of(case, exact), **arguments_of(case, exact)).velocities, []
+    for sim in pair(case, torch.float32, SOLVERS[outer], iterations=iterations):
+        errors.append(relative(sim(state_of(case, sim), **arguments_of(case, sim)).velocities, end))
+    assert errors[1] <= 2 * errors[0] + 8 * torch.finfo(torch.float32).eps
+    assert errors[0] <= 1e-3
 
 
 @pytest.mark.parametrize("outer", SOLVERS)

@@ -314,10 +314,10 @@ def test_ops_want_the_arrays_of_the_preconditioner() -> None:
         ops.precondition(torch.zeros(1, 3, 3), plan)
     with pytest.raises(TypeError, match=r"field must be float32 or float64"):
         ops.precondition(state.positions.long(), plan)
-    with pytest.raises(ValueError, match=r"plan must be the 16 arrays of Plan\.arrays, or 40 with those of"):
+    with pytest.raises(ValueError, match=r"plan must be the 16 arrays of Plan\.arrays, or 41 with those of"):
         ops.precondition(state.positions, plan[:-1])
-    with pytest.raises(ValueError, match=r"plan\.coarse_factor must be \[\d+\] .*compile the scene again"):
-        ops.precondition(state.positions, [*plan[:-1], plan[-1][:-1].contiguous()])
+    with pytest.raises(ValueError, match=r"plan\.reference_stiffness must be \[\d+\] .*compile the scene again"):
+        ops.precondition(state.positions, [*plan[:17], plan[17][:-1].contiguous(), *plan[18:]])
 
 
 def test_vertices_far_from_others_in_size() -> None:

@@ -103,7 +103,7 @@ def test_iterates_are_those_of_the_reference(dtype: torch.dtype, device: torch.d
     sim = simulator(case, dtype, device, solver=pd.Multilevel())
     problem = case.problem()
     first = problem.first_iterate(case.start)
-    tables = Tables(simulator(case, torch.float64, solver=pd.Multilevel()).plan)
+    tables = Tables(simulator(case, torch.float64, device, solver=pd.Multilevel()).plan.to("cpu"))
     expected = preconditioned_lbfgs(problem, first, tables, iterations=12)
     u, info = run(sim, case, 12)
     assert int(info.restarts) == 0

@@ -83,6 +83,8 @@ def precondition_plan(
             values.rest_positions, values.tets, order, rounded(stiffness), rounded(inertia),
             torch.get_num_threads(), advance,
         )  # fmt: skip
+    if plan.kernel is not None:
+        arrays["coarse_columns"] = _by_columns(arrays["coarse_factor"])
     levels = (
         torch.from_numpy(arrays[row.name]).to(
             # the host reads sizes, and must not wait for a device
@@ -92,3 +94,10 @@ def precondition_plan(
         for row in MULTILEVEL_TABLE
     )
     return replace(plan, arrays=(*plan.arrays, *levels), table=plan.table + MULTILEVEL_TABLE)
+
+
+def _by_columns(packed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A lower triangle that stands row by row, column by column."""
+    size = int(np.sqrt(2 * len(packed)))
+    column, row = np.triu_indices(size)
+    return np.asarray(packed[row * (row + 1) // 2 + column])

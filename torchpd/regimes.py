@@ -24,7 +24,7 @@ from .tables import DEVICE_PLAN_TABLE
 __all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
 _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
-# with a multilevel solver, whose blocks also share out vertices: a thread each, or up to three in one block alone
+# with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block
 _LEVEL_TETS, _LEVEL_ALONE = 384, 1152
 _STREAM_TETS = {torch.float32: 2000, torch.float64: 960}  # a patch, so that two share a multiprocessor of an H100
 _MOST_FIELDS = 2  # of a pass: the products with a second derivative
@@ -71,7 +71,9 @@ class _Scene(NamedTuple):
         if kernel == "grid":
             return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
         if kernel == "levels":
-            return 1 if self.tets <= _LEVEL_ALONE else -(-self.tets // _LEVEL_TETS)
+            if self.tets <= _LEVEL_ALONE:
+                return 1
+            return min(-(-self.tets // _LEVEL_TETS), gpu.multiprocessors)
         return -(-self.tets // _STREAM_TETS[self.dtype])
 
     def least_shared_bytes(self, patches: int) -> int:
@@ -103,7 +105,8 @@ def _stream_plan(scene: _Scene, gpu: Properties, *, levels: bool) -> Plan:
         plan = replace(scene.plan("stream", patches), for_levels=levels)
         if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
             return plan
-        patches = min(2 * patches, scene.tets)
+        # of which all multiprocessors have the same number
+        patches = min(patches + gpu.multiprocessors if levels else 2 * patches, scene.tets)
 
 
 def choose_plan(

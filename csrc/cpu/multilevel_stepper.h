@@ -190,8 +190,6 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   // the last trial counts only if it is better than the base
   void settle() {
-    evaluate(0);
-    judge(0);
     each_vertex([&](std::int64_t i) { w_.u[i] = choose(w_.u[i], o_.base[i]); });
     for (int lane = 0; lane < width; ++lane) schedule_[lane].restarts = outer_[lane].restarts;
   }
@@ -246,9 +244,15 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     return Lanes::value(o_.free[i] * Lanes::vec3(field));
   }
 
-  // the part of a field that M is to work on: not across contacts, nor where it knows nothing of a pin
+  // the part of a field that M is to work on: not across contacts, nor where it knows nothing of a vertex
   Value let_through(std::int64_t i, const Value& field) const {
-    return open(i, strangers_ ? pick_if(is_stranger(i), none_, field) : field);
+    return open(i, strangers_ ? for_strangers(i, none_, field) : field);
+  }
+
+  // `theirs` in lanes where M knows nothing of the vertex
+  Value for_strangers(std::int64_t i, const Value& theirs, const Value& known) const {
+    if (!(plan_.levels.fine_inverse[i] > T(0))) return theirs;
+    return pick_if(is_stranger(i), theirs, known);
   }
 
   void keep_directions(std::int64_t i) {
@@ -261,11 +265,10 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   // A way that M has a say on, where it has: the rest goes along the pull, by the diagonal.
   Value way(std::int64_t i, const Value& d) const {
-    const Value plain = vertex(i).inverse * o_.pull[i];
-    if (!(plan_.levels.fine_inverse[i] > T(0))) return plain;
     Value mixed = d;
+    const Value plain = vertex(i).inverse * o_.pull[i];
     if constexpr (Touching) mixed = open(i, d) + (plain - open(i, plain));
-    return strangers_ ? pick_if(is_stranger(i), plain, mixed) : mixed;
+    return strangers_ ? for_strangers(i, plain, mixed) : mixed;
   }
 
   // the second loop of L-BFGS, and the slope g.d
@@ -273,32 +276,28 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     const Value* z = o_.cycle.result();
     pass([&](std::int64_t i, Value(&sum)[dots]) {
       for (int j = 0; j < history; ++j) sum[j] = multiply_add(o_.y[j][i], z[i], sum[j]);
+      sum[history] = multiply_add(o_.pull[i], way(i, z[i]), sum[history]);
     });
     double total[dots], with[history], c[history];
     Real factor[history];
     for (int lane = 0; lane < width; ++lane) {
       add_up(lane, total);
       for (int j = 0; j < history; ++j) with[j] = total[j];
+      Outer& outer = outer_[lane];
       pairs_[lane].second_loop(newest_, with, c);
+      outer.slope = pairs_[lane].slope(total[history], c);
       for (int j = 0; j < history; ++j) Lanes::set_lane(factor[j], lane, T(c[j]));
+      // not downhill: what was learnt does not hold here
+      if (outer.slope >= 0 || done_[lane] || outer.plain || outer.diagonal) continue;
+      pairs_[lane].clear();
+      outer.plain = true;
+      ++outer.restarts;
     }
-    team_.barrier();
-    pass([&](std::int64_t i, Value(&sum)[dots]) {
+    each_vertex([&](std::int64_t i) {
       Value d = z[i];
       for (int j = 0; j < history; ++j) d = multiply_add(factor[j], o_.s[j][i], d);
       o_.direction[i] = d;
-      sum[0] = multiply_add(o_.pull[i], way(i, d), sum[0]);
     });
-    for (int lane = 0; lane < width; ++lane) {
-      add_up(lane, total);
-      outer_[lane].slope = total[0];
-      // not downhill: what was learnt does not hold here
-      if (total[0] >= 0 || done_[lane] || outer_[lane].plain || outer_[lane].diagonal) continue;
-      pairs_[lane].clear();
-      outer_[lane].plain = true;
-      ++outer_[lane].restarts;
-    }
-    team_.barrier();
   }
 
   // the soft stop of an environment, by a trial that it went on from

@@ -1,5 +1,7 @@
 // Arrays one after another in a block of memory.
 #pragma once
+#include "math/device.h"
+
 #include <cstddef>
 #include <cstdint>
 
@@ -8,15 +10,15 @@ namespace pd {
 // Without a base it only adds up their size.
 class Arena {
  public:
-  explicit Arena(void* base) : base_(static_cast<std::byte*>(base)) {}
+  PD_HD explicit Arena(void* base) : base_(static_cast<std::byte*>(base)) {}
 
   template <class Item>
-  void place(Item*& array, std::int64_t count) {
+  PD_HD void place(Item*& array, std::int64_t count) {
     array = reinterpret_cast<Item*>(base_ + size_);
     size_ += (count * std::int64_t(sizeof(Item)) + 255) / 256 * 256;
   }
 
-  std::int64_t size() const { return size_; }
+  PD_HD std::int64_t size() const { return size_; }
 
  private:
   std::byte* base_;

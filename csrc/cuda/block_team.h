@@ -13,7 +13,7 @@ class BlockTeam {
 
   PD_DEVICE int rank() const { return rank_; }
   PD_DEVICE int blocks() const { return blocks_; }
-  PD_DEVICE int thread() const { return rank_ * int(blockDim.x) + int(threadIdx.x); }
+  PD_DEVICE int thread() const { return warp() * warp_size + int(threadIdx.x) % warp_size; }
   PD_DEVICE int threads() const { return blocks_ * int(blockDim.x); }
   // neighbouring warps in different blocks: few pieces of work are spread over all multiprocessors
   PD_DEVICE int warp() const { return int(threadIdx.x) / warp_size * blocks_ + rank_; }
@@ -25,7 +25,6 @@ class BlockTeam {
     if (blocks_ == 1) return;
     goal_ += unsigned(blocks_);
     if (threadIdx.x == 0) {
-      __threadfence();
       asm volatile("red.release.gpu.global.add.u32 [%0], 1;" ::"l"(counter_) : "memory");
       unsigned arrived;
       do {
@@ -34,7 +33,6 @@ class BlockTeam {
                      : "l"(counter_)
                      : "memory");
       } while (int(arrived - goal_) < 0);
-      __threadfence();
     }
     __syncthreads();
   }

@@ -29,6 +29,16 @@ PD_DEVICE double across_warp(double value, Op op) {
   return value;
 }
 
+// Several sums at once, whose chains overlap.
+template <int Count>
+PD_DEVICE void add_across_warp(double (&value)[Count]) {
+#pragma unroll
+  for (int distance = warp_size / 2; distance > 0; distance /= 2) {
+#pragma unroll
+    for (int n = 0; n < Count; ++n) value[n] += __shfl_xor_sync(whole_warp, value[n], distance);
+  }
+}
+
 // Sixteen bytes that are written and read at once, so that a tag in them vouches for the rest.
 struct alignas(16) Word {
   std::uint64_t value, tag;

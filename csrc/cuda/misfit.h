@@ -53,6 +53,7 @@ PD_DEVICE Misfit measure_misfit(const StreamWork<T, false>& w, Ranges& ranges, B
   // visit(a / a_0) of the vertices that neither the step nor M holds; says whether one of them alone holds any
   const auto each_inertia = [&](const auto& visit) {
     bool differ = false;
+#pragma unroll 1
     for (int i = team.thread(); i < w.plan.vertices; i += team.threads()) {
       const double a = double(w.v.before[i].w);
       const bool free = levels.fine_inverse[i] > T(0);
@@ -63,6 +64,7 @@ PD_DEVICE Misfit measure_misfit(const StreamWork<T, false>& w, Ranges& ranges, B
   };
   Range first[ranges_count], second[ranges_count];
   Range &elements = first[0], &inertias = first[1], &common = second[0], &others = second[1];
+#pragma unroll 1
   for (int t = team.thread(); t < w.plan.tets; t += team.threads())
     elements.count(double(stiffness[t]) / double(levels.reference_stiffness[t]));
   if (each_inertia([&](double ratio) { inertias.count(ratio); })) others.count(1);

@@ -13,26 +13,41 @@
 
 namespace pd {
 
-static_assert(pass_threads <= strip_warps * warp_size);
-static_assert(sizeof(OuterControl<double>) + pass_static_bytes <= outer_static_bytes);
+static_assert(sizeof(OuterControl) + pass_static_bytes <= outer_static_bytes);
+
+template <class T>
+PD_HD void arrange(Arena& arena, const Levels<T>& levels, int teams, CycleMemory<T>& m) {
+  const std::int64_t middle = levels.has_middle() ? 4 * std::int64_t(levels.fine_nodes) : 0;
+  const auto place = [&](LevelFields<T>& f, std::int64_t size) {
+    for (Quad<T>** array : {&f.in, &f.z, &f.rest, &f.part}) arena.place(*array, teams * size);
+  };
+  place(m.fine, levels.vertices);
+  place(m.middle, middle);
+  for (Quad<T>** array : {&m.coarse_in, &m.coarse_half, &m.coarse_out})
+    arena.place(*array, teams * 4 * std::int64_t(levels.coarse_nodes()));
+}
 
 template <class T, bool Touching>
-__global__ void __launch_bounds__(pass_threads)
+__global__ void __launch_bounds__(outer_threads)
     outer_iterations(const __grid_constant__ OuterCall<T> call) {
   extern __shared__ __align__(16) std::byte shared[];
-  __shared__ __align__(16) std::byte control[sizeof(OuterControl<T>)];
+  __shared__ __align__(16) std::byte control[sizeof(OuterControl)];
   const int number = int(blockIdx.x) / call.blocks;
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
-  const OuterMemory<T> memory = of_team(call, number);
+  OuterMemory<T> memory = of_team(call, number);
+  if (call.shared_cycle) {
+    Arena arena(shared + call.shared_cycle);
+    arrange(arena, call.plan().levels, 1, memory.cycle);
+  }
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
     MultilevelRunner<T, Touching> runner(call, memory, e, team,
-                                         *reinterpret_cast<OuterControl<T>*>(control), shared);
+                                         *reinterpret_cast<OuterControl*>(control), shared);
     multilevel_iterations(runner, call.stream.step.settings);
   }
 }
 
 template <class T>
-__global__ void __launch_bounds__(pass_threads)
+__global__ void __launch_bounds__(outer_threads)
     compare_material(const __grid_constant__ OuterCall<T> call) {
   const int number = int(blockIdx.x) / call.blocks;
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
@@ -52,14 +67,13 @@ struct CycleCall {
 };
 
 template <class T>
-__global__ void __launch_bounds__(pass_threads)
+__global__ void __launch_bounds__(outer_threads)
     precondition_fields(const __grid_constant__ CycleCall<T> call) {
-  __shared__ __align__(16) std::byte strip[sizeof(StripSums<T>)];
   const int number = int(blockIdx.x) / call.blocks;
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.counter + number);
   const Levels<T>& levels = call.op.levels;
   const CycleMemory<T> memory = cycle_of_team(levels, call.memory, number);
-  DeviceCycle<T> cycle(levels, memory, team, *reinterpret_cast<StripSums<T>*>(strip));
+  DeviceCycle<T> cycle(levels, memory, team);
   for (std::int64_t e = number; e < call.op.batch; e += call.teams) {
     const auto row = [&](int i) { return (e * levels.vertices + call.op.vertex_order[i]) * 3; };
     for (int i = team.thread(); i < levels.vertices; i += team.threads())
@@ -84,20 +98,8 @@ struct Teams {
 template <class T>
 int useful_blocks(const Levels<T>& levels) {
   constexpr int alone =
-      4 * pass_threads;  // vertices with which one block is done before several have met
-  return levels.vertices <= alone ? 1 : (levels.vertices + pass_threads - 1) / pass_threads;
-}
-
-template <class T>
-void arrange(Arena& arena, const Levels<T>& levels, int teams, CycleMemory<T>& m) {
-  const std::int64_t middle = levels.has_middle() ? 4 * std::int64_t(levels.fine_nodes) : 0;
-  const auto place = [&](LevelFields<T>& f, std::int64_t size) {
-    for (Quad<T>** array : {&f.in, &f.z, &f.rest, &f.part}) arena.place(*array, teams * size);
-  };
-  place(m.fine, levels.vertices);
-  place(m.middle, middle);
-  for (Quad<T>** array : {&m.coarse_in, &m.coarse_half, &m.coarse_out})
-    arena.place(*array, teams * 4 * std::int64_t(levels.coarse_nodes()));
+      4 * outer_threads;  // vertices with which one block is done before several have met
+  return levels.vertices <= alone ? 1 : (levels.vertices + outer_threads - 1) / outer_threads;
 }
 
 template <class T>
@@ -106,17 +108,37 @@ using OuterKernel = void (*)(OuterCall<T>);
 template <class T>
 struct OuterLaunch {
   OuterKernel<T> kernel;
-  std::size_t shared;
+  std::size_t shared, shared_cycle = 0;
   int resident;
 
   explicit OuterLaunch(const DeviceStep<T>& step)
       : kernel(touching(step) ? outer_iterations<T, true> : outer_iterations<T, false>),
         shared(pass_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries, 2)),
-        resident(resident_blocks(reinterpret_cast<const void*>(kernel), pass_threads, shared)) {
+        resident(blocks_with(shared)) {
+    keep_cycle(step);
     if (resident == 0)
       throw std::runtime_error("torchpd: a patch of the plan wants " + std::to_string(shared) +
                                " bytes of shared memory beside those of the multilevel solver, "
                                "more than this device has");
+  }
+
+  int blocks_with(std::size_t bytes) const {
+    return resident_blocks(reinterpret_cast<const void*>(kernel), outer_threads, bytes);
+  }
+
+  // The fields of the cycle in shared memory, where one block has an environment to itself and there is room.
+  void keep_cycle(const DeviceStep<T>& step) {
+    const bool one = step.plan.patches == 1;
+    if (!one && step.batch < resident) return;
+    Arena arena(nullptr);
+    CycleMemory<T> fields;
+    arrange(arena, step.plan.levels, 1, fields);
+    const std::size_t begin = (shared + 255) / 256 * 256, all = begin + std::size_t(arena.size());
+    const int blocks = blocks_with(all);
+    if (blocks < (one ? 1 : resident)) return;
+    shared_cycle = begin;
+    shared = all;
+    resident = blocks;
   }
 
   static bool touching(const DeviceStep<T>& step) {
@@ -126,7 +148,7 @@ struct OuterLaunch {
   OuterCall<T> call(const StreamCall<T>& stream) const {
     const DevicePlan<T>& plan = stream.step.plan;
     const Teams teams(stream.step.batch, resident, plan.patches);
-    return {stream, {}, teams.count, teams.blocks};
+    return {stream, {}, teams.count, teams.blocks, shared_cycle};
   }
 };
 
@@ -139,13 +161,13 @@ OuterMemory<T> arrange(Arena& arena, const OuterCall<T>& call) {
   OuterMemory<T> m;
   // what must start as zero comes first
   arena.place(m.counter, teams);
-  for (Quad<T>** array : {&m.base, &m.pull, &m.fresh, &m.direction}) arena.place(*array, teams * n);
+  for (Quad<T>** array : {&m.base, &m.pull, &m.fresh}) arena.place(*array, teams * n);
   for (Quad<T>** array : {&m.s, &m.y}) arena.place(*array, teams * pairs);
   for (Mat3<T>** array : {&m.free, &m.fresh_free}) arena.place(*array, teams * held);
   for (Quad<T>** array : {&m.gradient, &m.fresh_gradient}) arena.place(*array, teams * held);
   arrange(arena, step.plan.levels, int(teams), m.cycle);
   arena.place(m.chunk_dots, teams * 2 * call.chunks() * outer_dots);
-  arena.place(m.row_sums, teams * call.rows() * sums_count);
+  arena.place(m.patch_sums, teams * step.plan.patches * sums_count);
   arena.place(m.ranges, teams * 2 * call.blocks * ranges_count);
   arena.place(m.misfit, step.batch);
   return m;
@@ -164,7 +186,7 @@ void launch_teams(const void* kernel, Call& call, unsigned* counter, std::size_t
                   cudaStream_t stream) {
   void* arguments[] = {&call};
   check(cudaMemsetAsync(counter, 0, call.teams * sizeof(unsigned), stream));
-  check(cudaLaunchCooperativeKernel(kernel, dim3(call.teams * call.blocks), dim3(pass_threads),
+  check(cudaLaunchCooperativeKernel(kernel, dim3(call.teams * call.blocks), dim3(outer_threads),
                                     arguments, shared, stream));
 }
 
@@ -194,7 +216,7 @@ void run_outer(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
 template <class T>
 CycleCall<T> cycle_call(const PreconditionCall<T>& op, void* memory, std::int64_t* bytes) {
   const void* kernel = reinterpret_cast<const void*>(precondition_fields<T>);
-  const Teams teams(op.batch, resident_blocks(kernel, pass_threads, 0), useful_blocks(op.levels));
+  const Teams teams(op.batch, resident_blocks(kernel, outer_threads, 0), useful_blocks(op.levels));
   CycleCall<T> call{op, {}, nullptr, teams.count, teams.blocks};
   Arena arena(memory);
   arena.place(call.counter, call.teams);

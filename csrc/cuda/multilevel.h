@@ -2,54 +2,62 @@
 // cpu/multilevel_stepper.h. What goes before and after them is a launch each, as in stream.h.
 #pragma once
 #include "cuda/cycle.h"
+#include "cuda/pairs.h"
 #include "cuda/stream.h"
 
 namespace pd::inline PD_TARGET {
 
 constexpr int outer_dots = 2 * history + 3;  // sums that one pass over the vertices may make
 constexpr int ranges_count = 2;              // that a round of Ranges compares
-constexpr int most_chunks = 640;             // of vertices, each added up by one warp
+constexpr int most_chunks = 640;             // of vertices, whose sums every block adds up
+constexpr int outer_threads = 768;           // of a block, a multiprocessor each
+constexpr int outer_warps = outer_threads / warp_size;
 
 // Device memory of the teams.
 template <class T>
 struct OuterMemory {
-  Quad<T>*base, *pull, *fresh, *direction;  // [teams, vertices]
-  Quad<T>*s, *y;                            // [teams, history, vertices], with pairs
-  Mat3<T>*free, *fresh_free;                // [teams, vertices], with contacts
-  Quad<T>*gradient, *fresh_gradient;        // [teams, vertices], with contacts
-  CycleMemory<T> cycle;                     // [teams, ...]
-  double* chunk_dots;                       // [teams, 2, chunks, outer_dots], passes alternate
-  double* row_sums;                         // [teams, rows, sums_count]
-  Range* ranges;                            // [teams, 2, blocks, ranges_count], rounds alternate
-  Misfit* misfit;                           // [batch]
-  unsigned* counter;                        // [teams], zero at the launch
+  Quad<T>*base, *pull, *fresh;        // [teams, vertices]
+  Quad<T>*s, *y;                      // [teams, history, vertices], with pairs
+  Mat3<T>*free, *fresh_free;          // [teams, vertices], with contacts
+  Quad<T>*gradient, *fresh_gradient;  // [teams, vertices], with contacts
+  CycleMemory<T> cycle;               // [teams, ...]
+  double* chunk_dots;                 // [teams, 2, outer_dots, chunks], passes alternate
+  double* patch_sums;                 // [teams, patches, sums_count]
+  Range* ranges;                      // [teams, 2, blocks, ranges_count], rounds alternate
+  Misfit* misfit;                     // [batch]
+  unsigned* counter;                  // [teams], zero at the launch
 };
 
 template <class T>
 struct OuterCall {
   StreamCall<T> stream;
   OuterMemory<T> memory;
-  int teams, blocks;  // blocks of a team
+  int teams, blocks;         // blocks of a team
+  std::size_t shared_cycle;  // where the cycle's fields stand in shared memory; 0: in device memory
 
   PD_HD const DevicePlan<T>& plan() const { return stream.step.plan; }
-  // vertices of a chunk: whole warps, few enough chunks that every block can add them up
-  PD_HD int chunk() const {
-    return (plan().vertices + most_chunks * warp_size - 1) / (most_chunks * warp_size) * warp_size;
+  // Warps whose vertices are added up together, a divisor of those of a block. The plan alone decides, so that an
+  // environment gives the same bits whatever the number of blocks.
+  PD_HD int warps_of_chunk() const {
+    for (int warps : {1, 2, 3, 4, 6, 8, 12}) {
+      if (chunks_of(plan().vertices, warps) <= most_chunks) return warps;
+    }
+    return outer_warps;
   }
-  PD_HD int chunks() const { return (plan().vertices + chunk() - 1) / chunk(); }
-  PD_HD int shared_rows() const { return (plan().shared + pass_threads - 1) / pass_threads; }
-  PD_HD int rows() const { return plan().patches + shared_rows(); }
+  PD_HD static int chunks_of(int count, int warps) {
+    return (count + warps * warp_size - 1) / (warps * warp_size);
+  }
+  PD_HD int chunks() const { return chunks_of(plan().vertices, warps_of_chunk()); }
 };
 
 // In shared memory: what all threads of a block go by; its first thread decides.
-template <class T>
 struct OuterControl {
   Outer outer;
   Pairs pairs;
   double total[outer_dots];
-  double factor[history];
+  double factor[history];  // of the pairs' ways in the direction
+  double warp_dot[outer_warps][outer_dots];
   bool accepted, finite, done;
-  StripSums<T> strip;
 };
 
 // The arrays of one team.
@@ -57,15 +65,14 @@ template <class T>
 PD_DEVICE OuterMemory<T> of_team(const OuterCall<T>& call, int team) {
   OuterMemory<T> m = call.memory;
   const std::int64_t n = call.plan().vertices, at = team * n;
-  for (Quad<T>** array : {&m.base, &m.pull, &m.fresh, &m.direction, &m.gradient, &m.fresh_gradient})
-    *array += at;
+  for (Quad<T>** array : {&m.base, &m.pull, &m.fresh, &m.gradient, &m.fresh_gradient}) *array += at;
   m.s += history * at;
   m.y += history * at;
   m.free += at;
   m.fresh_free += at;
   m.cycle = cycle_of_team(call.plan().levels, m.cycle, team);
   m.chunk_dots += std::int64_t(team) * 2 * call.chunks() * outer_dots;
-  m.row_sums += std::int64_t(team) * call.rows() * sums_count;
+  m.patch_sums += std::int64_t(team) * call.plan().patches * sums_count;
   m.ranges += std::int64_t(team) * 2 * call.blocks * ranges_count;
   return m;
 }
@@ -74,14 +81,14 @@ template <class T, bool Touching>
 class MultilevelRunner {
  public:
   PD_DEVICE MultilevelRunner(const OuterCall<T>& call, const OuterMemory<T>& memory,
-                             std::int64_t environment, BlockTeam& team, OuterControl<T>& control,
+                             std::int64_t environment, BlockTeam& team, OuterControl& control,
                              std::byte* shared)
       : call_(call),
         w_(call.stream, environment),
         m_(memory),
         team_(team),
         c_(control),
-        cycle_(call.plan().levels, memory.cycle, team, control.strip),
+        cycle_(call.plan().levels, memory.cycle, team),
         shared_(shared),
         lbfgs_(call.stream.step.settings.schedule == ScheduleKind::lbfgs) {
     const Misfit& misfit = m_.misfit[environment];
@@ -106,34 +113,45 @@ class MultilevelRunner {
 
   // E and what is out of balance at the trial u
   PD_DEVICE void evaluate(int) {
+#pragma unroll 1
     for (int patch = team_.rank(); patch < w_.plan.patches; patch += team_.blocks()) {
       ThreadSums sums = {{0, 0, 0}};
       sums.value[0] +=
           pass_over_patch(w_, patch, shared_, SolidGradient<true>{},
                           [&](int i, const Vec3<T>& force) { look_at(i, force, sums); });
-      write_sums<Visit::measure>(sums, row(patch));
+      write_sums<Visit::measure>(sums, m_.patch_sums + patch * sums_count);
     }
     team_.barrier();
-    for (int chunk = team_.rank(); chunk < call_.shared_rows(); chunk += team_.blocks()) {
+    const int first = w_.plan.patch_vertex[w_.plan.patches];
+    add_up<2>(w_.plan.shared, [&](int i, double (&sum)[2]) {
       ThreadSums sums = {{0, 0, 0}};
-      const int i = chunk * pass_threads + int(threadIdx.x);
-      if (i < w_.plan.shared)
-        look_at(w_.plan.patch_vertex[w_.plan.patches] + i, shared_force(w_, i), sums);
-      __syncthreads();  // the block's sums of before have been read
-      write_sums<Visit::measure>(sums, row(w_.plan.patches + chunk));
-    }
-    team_.barrier();
+      look_at(first + i, shared_force(w_, i), sums);
+      sum[0] = sums.value[0];
+      sum[1] = sums.value[1];
+    });
   }
 
   // every block decides from the same sums, so all decide alike
   PD_DEVICE void judge(int) {
-    ThreadSums sums = {{0, 0, 0}};
-    for (int r = threadIdx.x; r < call_.rows(); r += blockDim.x) {
-      for (int n = 0; n < 2; ++n) sums.value[n] += row(r)[n];
+    // the shared vertices' part is there
+    double sum[2] = {0, 0};
+#pragma unroll 1
+    for (int patch = threadIdx.x; patch < w_.plan.patches; patch += blockDim.x) {
+      for (int n = 0; n < 2; ++n) sum[n] += m_.patch_sums[patch * sums_count + n];
     }
-    write_sums<Visit::measure>(sums, c_.total);
+    add_across_warp(sum);
+    const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
+    if (lane == 0) {
+      for (int n = 0; n < 2; ++n) c_.warp_dot[warp][n] = sum[n];
+    }
+    __syncthreads();
+    if (warp == 0) {
+      for (int n = 0; n < 2; ++n) sum[n] = lane < outer_warps ? c_.warp_dot[lane][n] : 0;
+      add_across_warp(sum);
+    }
     if (threadIdx.x == 0) {
-      const double work = c_.outer.known ? c_.total[1] : 0, energy = c_.total[0] + work;
+      const double work = c_.outer.known ? c_.total[1] + sum[1] : 0;
+      const double energy = (c_.total[0] + sum[0]) + work;
       c_.accepted = c_.outer.accept(energy, lbfgs_);
       // the friction of another base does other work
       if (c_.accepted) c_.outer.energy -= work;
@@ -174,9 +192,13 @@ class MultilevelRunner {
       }
       sum[2 * history + 2] += double(dot(y, y));
     });
-    if (threadIdx.x == 0) {
-      stop(k, c_.total[2 * history], c_.total[2 * history + 1]);
-      if (lbfgs_) remember(k);
+    if (threadIdx.x < warp_size) {
+      if (threadIdx.x == 0) {
+        stop(k, c_.total[2 * history], c_.total[2 * history + 1]);
+        if (lbfgs_) remember(k);
+      }
+      __syncwarp();
+      if (lbfgs_) PairLanes(c_.pairs, newest_).first_loop();
     }
     __syncthreads();
   }
@@ -197,8 +219,7 @@ class MultilevelRunner {
       cycle_.set(i, scale * q);
     });
     cycle_.run();
-    if (lbfgs_) return correct();
-    each_vertex([&](int i) { m_.direction[i] = quad(cycle_.result(i)); });
+    if (lbfgs_) correct();
   }
 
   // next trial: P(u + beta (u - before) - (1 + beta) t d), or a plain or accelerated Jacobi iteration
@@ -215,7 +236,7 @@ class MultilevelRunner {
     each_vertex([&](int i) {
       const auto v = w_.v.at(i);
       const Vec3<T> u = vec3(m_.base[i]), before = vec3(w_.v.before[i]);
-      Vec3<T> next = u - way(i, length * vec3(m_.direction[i]) - beta * (u - before));
+      Vec3<T> next = u - way(i, length * direction(i) - beta * (u - before));
       if (plain) next = subtract_product(u, v.inverse, vec3(m_.pull[i]));
       if (accelerates) {
         const Vec3<T> g = vec3(Touching ? m_.gradient[i] : m_.pull[i]);
@@ -227,12 +248,7 @@ class MultilevelRunner {
 
   // the last trial counts only if it is better than the base
   PD_DEVICE void settle() {
-    if (!c_.done) {
-      evaluate(0);
-      judge(0);
-    }
-    const bool keeps = !c_.done && c_.accepted;
-    if (!keeps) each_vertex([&](int i) { w_.v.set(i, vec3(m_.base[i])); });
+    if (!c_.accepted) each_vertex([&](int i) { w_.v.set(i, vec3(m_.base[i])); });
     if (is_first()) {
       w_.progress.schedule.restarts = c_.outer.restarts;
       w_.progress.done = c_.done;
@@ -243,7 +259,6 @@ class MultilevelRunner {
  private:
   PD_DEVICE bool is_first() const { return team_.thread() == 0; }
   PD_DEVICE std::int64_t vertices() const { return w_.plan.vertices; }
-  PD_DEVICE double* row(int number) const { return m_.row_sums + number * sums_count; }
   PD_DEVICE static Vec3<T> none() { return {T(0), T(0), T(0)}; }
 
   PD_DEVICE void look_at(int i, const Vec3<T>& force, ThreadSums& sums) const {
@@ -263,34 +278,58 @@ class MultilevelRunner {
 
   template <class Visit>
   PD_DEVICE void each_vertex(const Visit& visit) {
+#pragma unroll 1
     for (int i = team_.thread(); i < w_.plan.vertices; i += team_.threads()) visit(i);
     team_.barrier();
   }
 
-  // visit(vertex, sums), chunk by chunk, a warp each; then the totals are in c_.total
+  // visit(vertex, sums); then the totals are in c_.total
   template <int Count, class Visit>
   PD_DEVICE void pass(const Visit& visit) {
-    const int chunk = call_.chunk(), chunks = call_.chunks(), lane = threadIdx.x % warp_size;
+    add_up<Count>(w_.plan.vertices, visit);
+  }
+
+  // visit(number, sums) for numbers 0 ... count - 1, a lane each, chunk by chunk of them
+  template <int Count, class Visit>
+  PD_DEVICE void add_up(int count, const Visit& visit) {
+    const int together = call_.warps_of_chunk(), chunks = call_.chunks_of(count, together);
+    const int groups = outer_warps / together;  // chunks that a block works on at a time
+    const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
     // nobody overwrites what others may still read
     parity_ = !parity_;
-    double* dots = m_.chunk_dots + (parity_ ? std::int64_t(chunks) * outer_dots : 0);
-    for (int number = team_.warp(); number < chunks; number += team_.warps()) {
+    double* dots = m_.chunk_dots + (parity_ ? std::int64_t(call_.chunks()) * outer_dots : 0);
+    // neighbouring chunks in different blocks: few are spread over all multiprocessors
+    const auto chunk_of = [&](int round, int group) {
+      return (round * groups + group) * team_.blocks() + team_.rank();
+    };
+#pragma unroll 1
+    for (int round = 0; chunk_of(round, 0) < chunks; ++round) {
       double sum[Count] = {};
-      const int end = min((number + 1) * chunk, w_.plan.vertices);
-      for (int i = number * chunk + lane; i < end; i += warp_size) visit(i, sum);
+      const int from = (chunk_of(round, warp / together) * together + warp % together) * warp_size;
+      if (from < count) {
+        if (from + lane < count) visit(from + lane, sum);
+        add_across_warp(sum);
+      }
 #pragma unroll
       for (int d = 0; d < Count; ++d) {
-        const double total = across_warp(sum[d], Add{});
-        if (lane == 0) dots[number * outer_dots + d] = total;
+        if (lane == 0) c_.warp_dot[warp][d] = sum[d];
       }
+      __syncthreads();
+      const int group = threadIdx.x / Count, d = threadIdx.x % Count;
+      if (group < groups && chunk_of(round, group) < chunks) {
+        double total = 0;
+        for (int w = 0; w < together; ++w) total += c_.warp_dot[group * together + w][d];
+        dots[d * chunks + chunk_of(round, group)] = total;
+      }
+      __syncthreads();
     }
     team_.barrier();
-    for (int d = threadIdx.x / warp_size; d < Count; d += blockDim.x / warp_size) {
-      double sum = 0;
-      for (int number = lane; number < chunks; number += warp_size)
-        sum += dots[number * outer_dots + d];
-      sum = across_warp(sum, Add{});
-      if (lane == 0) c_.total[d] = sum;
+#pragma unroll 1
+    for (int d = warp; d < Count; d += outer_warps) {
+      double sum[1] = {0};
+      for (int chunk = lane; chunk < chunks; chunk += warp_size) sum[0] += dots[d * chunks + chunk];
+      add_across_warp(sum);
+      if (lane == 0) c_.total[d] = sum[0];
     }
     __syncthreads();
   }
@@ -311,36 +350,22 @@ class MultilevelRunner {
     c_.pairs.valid[newest_] = false;
     if (k > 0) c_.pairs.add(newest_, with, c_.total[2 * history], c_.total[2 * history + 2]);
     if (c_.outer.plain || c_.outer.diagonal) c_.pairs.clear();
-    c_.pairs.first_loop(newest_);
   }
 
   // the second loop of L-BFGS, and the slope g.d
   PD_DEVICE void correct() {
-    pass<history>([&](int i, double (&sum)[history]) {
+    pass<history + 1>([&](int i, double (&sum)[history + 1]) {
       const Vec3<T> z = cycle_.result(i);
 #pragma unroll
       for (int j = 0; j < history; ++j) {
         if (c_.pairs.valid[j]) sum[j] += double(dot(vec3(m_.y[j * vertices() + i]), z));
       }
+      sum[history] += double(dot(vec3(m_.pull[i]), way(i, z)));
     });
-    if (threadIdx.x == 0) {
-      double with[history];
-      for (int j = 0; j < history; ++j) with[j] = c_.total[j];
-      c_.pairs.second_loop(newest_, with, c_.factor);
-    }
-    __syncthreads();
-    pass<1>([&](int i, double (&sum)[1]) {
-      Vec3<T> d = cycle_.result(i);
-#pragma unroll
-      for (int j = 0; j < history; ++j) {
-        if (c_.pairs.valid[j]) d = multiply_add(T(c_.factor[j]), vec3(m_.s[j * vertices() + i]), d);
-      }
-      m_.direction[i] = quad(d);
-      sum[0] += double(dot(vec3(m_.pull[i]), way(i, d)));
-    });
+    if (threadIdx.x < warp_size) PairLanes(c_.pairs, newest_).second_loop(c_.total, c_.factor);
     if (threadIdx.x == 0) {
       Outer& outer = c_.outer;
-      outer.slope = c_.total[0];
+      outer.slope = c_.pairs.slope(c_.total[history], c_.factor);
       // not downhill: what was learnt does not hold here
       if (!(outer.slope >= 0 || outer.plain || outer.diagonal)) {
         c_.pairs.clear();
@@ -351,7 +376,19 @@ class MultilevelRunner {
     __syncthreads();
   }
 
+  PD_DEVICE Vec3<T> direction(int i) const {
+    Vec3<T> d = cycle_.result(i);
+    if (!lbfgs_) return d;
+#pragma unroll
+    for (int j = 0; j < history; ++j) {
+      if (c_.pairs.valid[j]) d = multiply_add(T(c_.factor[j]), vec3(m_.s[j * vertices() + i]), d);
+    }
+    return d;
+  }
+
+  // whether M knows nothing of a vertex
   PD_DEVICE bool is_stranger(int i) const {
+    if (!(w_.plan.levels.fine_inverse[i] > T(0))) return true;
     return w_.v.before[i].w > T(known_inertia) * w_.plan.levels.reference_inertia[i] * trusted_;
   }
 
@@ -361,7 +398,7 @@ class MultilevelRunner {
     return m_.free[i] * field;
   }
 
-  // the part of a field that M is to work on: not across contacts, nor where it knows nothing of a pin
+  // the part of a field that M is to work on: not across contacts, nor where it knows nothing of a vertex
   PD_DEVICE Vec3<T> let_through(int i, const Vec3<T>& field) const {
     return open(i, strangers_ && is_stranger(i) ? none() : field);
   }
@@ -380,7 +417,6 @@ class MultilevelRunner {
   // A way that M has a say on, where it has: the rest goes along the pull, by the diagonal.
   PD_DEVICE Vec3<T> way(int i, const Vec3<T>& d) const {
     const Vec3<T> plain = w_.v.u[i].w * vec3(m_.pull[i]);
-    if (!(w_.plan.levels.fine_inverse[i] > T(0))) return plain;
     if (strangers_ && is_stranger(i)) return plain;
     if constexpr (!Touching) return d;
     return open(i, d) + (plain - open(i, plain));
@@ -390,7 +426,7 @@ class MultilevelRunner {
   const StreamWork<T, Touching> w_;
   const OuterMemory<T>& m_;
   BlockTeam& team_;
-  OuterControl<T>& c_;
+  OuterControl& c_;
   DeviceCycle<T> cycle_;
   std::byte* shared_;
   bool lbfgs_, strangers_;

@@ -16,7 +16,7 @@ constexpr std::size_t fused_shared_bytes(std::size_t real, std::size_t slots, st
 constexpr std::size_t pass_static_bytes = 3 * 32 * sizeof(double);
 
 // the same with all that the iterations of the multilevel solver keep
-constexpr std::size_t outer_static_bytes = 5120;
+constexpr std::size_t outer_static_bytes = 7168;
 
 // `fields` vectors of every slot
 constexpr std::size_t pass_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,

@@ -38,15 +38,16 @@ PD_HD void multilevel_step(Runner& run, const Settings& settings) {
 #endif
 template <class Runner>
 PD_HD void multilevel_iterations(Runner& run, const Settings& settings) {
-  for (int k = 0; k < settings.iterations; ++k) {
+  for (int k = 0;; ++k) {
     run.evaluate(k);  // local step at the trial: its energy, and what is out of balance there
     run.judge(k);     // go on from the trial, or back
-    run.learn(k);     // what the way to it says about the curvature
+    if (k == settings.iterations) break;
+    run.learn(k);  // what the way to it says about the curvature
     if (run.finished()) break;
     run.precondition();  // direction: M, corrected by what was learnt
     run.advance();       // next trial, on the pins and out of the contacts
   }
-  run.settle();  // the last trial, if it is better
+  run.settle();  // on the last trial that was better
 }
 
 // ---- M: a symmetric V-cycle
@@ -96,18 +97,6 @@ PD_HD void subtract_row(const Level<B, T>& level, const Value* x, int row, Value
   }
 }
 
-// One of the row's unknowns; `read` gives x by unknown.
-template <int B, class T, class Value, class Read>
-PD_HD Value subtract_unknown(const Level<B, T>& level, const Read& read, int row, int i,
-                             Value sum) {
-  for (int32 p = level.start[row]; p < level.start[row + 1]; ++p) {
-    const std::int64_t from = std::int64_t(level.column[p]) * B;
-    const T* a = level.value + std::int64_t(p) * B * B + i * B;
-    for (int j = 0; j < B; ++j) sum = subtract_product(sum, a[j], read(from + j));
-  }
-  return sum;
-}
-
 // sum += P x, one row
 template <class Real, int B, class T, class Value>
 PD_HD void add_lift(const Level<B, T>& level, const Value* x, int row, Value (&sum)[B]) {
@@ -118,17 +107,6 @@ PD_HD void add_lift(const Level<B, T>& level, const Value* x, int row, Value (&s
       for (int j = 0; j < 4; ++j) sum[i] = multiply_add(Real(weight[i * 4 + j]), from[j], sum[i]);
     }
   }
-}
-
-// One of the row's unknowns; `read` gives x by unknown.
-template <int B, class T, class Value, class Read>
-PD_HD Value lift_unknown(const Level<B, T>& level, const Read& read, int row, int i, Value sum) {
-  for (int32 p = level.lift_start[row]; p < level.lift_start[row + 1]; ++p) {
-    const std::int64_t from = std::int64_t(level.lift_node[p]) * 4;
-    const T* weight = level.lift_weight + (std::int64_t(p) * B + i) * 4;
-    for (int j = 0; j < 4; ++j) sum = multiply_add(weight[j], read(from + j), sum);
-  }
-  return sum;
 }
 
 // sum += P^T x, the four functions of one node
@@ -164,7 +142,7 @@ struct Misfit {
   double scale = 1;        // s of A <= s A_0, strangers aside
   double spread = 0;       // 1 - q / s, q A_0 <= A <= s A_0 with them
   double trusted = 1;      // ratio of inertias up to known_inertia times which M is believed
-  bool strangers = false;  // whether there are vertices beyond
+  bool strangers = false;  // whether there are vertices beyond, or that M alone holds
 
   Misfit() = default;
 
@@ -178,6 +156,7 @@ struct Misfit {
     scale = larger(elements.largest, common.largest);
     const double least = smaller(elements.least, common.least);
     spread = other_pins ? 1 : 1 - least / larger(elements.largest, inertias.largest);
+    strangers = strangers || other_pins;
   }
 
   PD_HD static double larger(double a, double b) { return a < b ? b : a; }
@@ -247,6 +226,7 @@ struct Outer {
 // after it. Pairs stand in a ring, one place a trial; a pair without positive curvature stays out.
 struct Pairs {
   double product[history][history] = {};  // s_i . y_j, j not older than i
+  double inverse[history] = {};           // 1 / s_i . y_i
   double pulled[history] = {};            // s_i . g
   double alpha[history] = {};
   bool valid[history] = {};
@@ -259,7 +239,9 @@ struct Pairs {
   PD_HD void add(int newest, const double (&with)[history], double ss, double yy) {
     for (int i = 0; i < history; ++i) product[i][newest] = with[i];
     const double curvature = with[newest];
-    valid[newest] = curvature > least_curvature * sqrt(ss * yy) && curvature < HUGE_VAL;
+    inverse[newest] = 1 / curvature;
+    const double least = least_curvature * least_curvature * ss * yy;
+    valid[newest] = curvature > 0 && curvature * curvature > least && curvature < HUGE_VAL;
   }
 
   PD_HD static int older(int place, int by) { return (place - by + history) % history; }
@@ -273,8 +255,14 @@ struct Pairs {
         const int j = older(newest, b);
         if (valid[j]) rest -= alpha[j] * product[i][j];
       }
-      alpha[i] = valid[i] ? rest / product[i][i] : 0;
+      alpha[i] = valid[i] ? rest * inverse[i] : 0;
     }
+  }
+
+  // g.d of the direction, `own` being that of z
+  PD_HD double slope(double own, const double (&c)[history]) const {
+    for (int i = 0; i < history; ++i) own += valid[i] ? c[i] * pulled[i] : 0;
+    return own;
   }
 
   // z + sum c_i s_i is the direction; `with` are y_i . z
@@ -286,7 +274,7 @@ struct Pairs {
         const int j = older(newest, b);
         if (valid[j]) rest += c[j] * product[j][i];
       }
-      c[i] = valid[i] ? alpha[i] - rest / product[i][i] : 0;
+      c[i] = valid[i] ? alpha[i] - rest * inverse[i] : 0;
     }
   }
 };
