@@ -71,7 +71,7 @@ def random_scene(rng: np.random.Generator) -> tuple[Row, pd.Simulator]:
         parts.append(pd.Pin(body, mesh.vertices[:, 0] <= low[0] + 0.05 * (high[0] - low[0])))
     elif held == "ground":
         parts.append(pd.Ground(float(low[1]) - 0.001, friction=0.5))
-    sim = pd.Simulator(pd.Scene(*parts), time_step, progress=False)
+    sim = pd.Simulator(pd.Scene(*parts), time_step, 64, progress=False)
     facts = {"mesh": kind, "vertices": sim.vertices, "tets": len(mesh.tets), "support": held}
     return {**facts, "youngs": youngs, "time_step": time_step}, sim
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import torch
 from torch import Tensor, nn
 
 from .adjoint import AdjointCall, step_gradient
+from .automatic import Choice, choose_solver
 from .capture import CapturedStep
+from .forecast import warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_material, material_of
 from .multilevel import has_levels, precondition_plan, reference_of, without_levels
 from .ops import INFO_WIDTH, refuse_tangents
@@ -19,7 +21,7 @@ from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .rollout import PerStep, Rollout, roll
 from .scene import Scene
-from .solvers import Chebyshev, Multilevel, Solver, check_solver
+from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
 from .state import Info, State, Track
 from .summary import describe
 from .targets import Anchors, Targets
@@ -43,8 +45,12 @@ class Simulator(nn.Module):
     Args:
         scene: what there is.
         time_step: h [s], positive.
-        iterations: local and global steps of one time step, at most.
-        solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later.
+        iterations: local and global steps of one time step, at most. None: 64, or what "auto" chooses. Where 64 are
+            expected to leave a tenth of the error or more an `UnsolvedWarning` says so; `print(sim)` tells for any.
+        solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later. None is Chebyshev.
+            "auto" takes Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner on the device,
+            and as many iterations as that takes unless they are given; `print(sim)` says why. It chooses anew when the
+            simulator moves to another device and in `prepare_solver`.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "grid" or "stream", see `torchpd.regimes`;
@@ -66,8 +72,8 @@ class Simulator(nn.Module):
         self,
         scene: Scene,
         time_step: float = 1 / 60,
-        iterations: int = 64,
-        solver: Solver | None = None,
+        iterations: int | None = None,
+        solver: Solver | Literal["auto"] | None = None,
         dtype: torch.dtype = torch.float32,
         *,
         tolerance: float = 0.0,
@@ -79,8 +85,10 @@ class Simulator(nn.Module):
             raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
         self.scene = scene
         self.time_step = _positive("time_step", time_step, "s")
-        self.iterations = _whole("iterations", iterations, 0)
-        solver = check_solver(Chebyshev() if solver is None else solver, torch.device("cpu"))
+        self.iterations = DEFAULT_ITERATIONS if iterations is None else _whole("iterations", iterations, 0)
+        solver = Chebyshev() if solver is None else solver
+        if solver != "auto":
+            check_solver(solver, torch.device("cpu"))
         self.tolerance = float(tolerance)
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
@@ -92,7 +100,13 @@ class Simulator(nn.Module):
         self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
         for name, value in material_of(values, dtype).items():
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
-        self.solver = solver
+        self.choice: Choice | None = None  # of "auto"
+        if solver == "auto":
+            self._choose_solver(None if iterations is None else self.iterations)
+        else:
+            self.solver = solver
+            if iterations is None:
+                warn_of_few_iterations(self)
 
     # ---- what a simulation is made of
 
@@ -113,22 +127,40 @@ class Simulator(nn.Module):
 
     @property
     def solver(self) -> Solver:
-        """How a step is solved. A multilevel one is prepared when it is set."""
+        """How a step is solved. A multilevel one is prepared when it is set; "auto" sets iterations too."""
         return self._solver
 
     @solver.setter
-    def solver(self, solver: Solver) -> None:
-        self._solver = check_solver(solver, self.device)
+    def solver(self, solver: Solver | Literal["auto"]) -> None:
+        if solver == "auto":
+            return self._choose_solver(None)
+        self._solver, self.choice = check_solver(solver, self.device), None
         if isinstance(solver, Multilevel) != has_levels(self.plan.arrays):
-            self.prepare_solver()
+            self._prepare()
+        return None
+
+    def _choose_solver(self, iterations: int | None) -> None:
+        """What "auto" does, see `choose_solver`."""
+        self.solver, choice = choose_solver(self, iterations)
+        self.iterations, self.choice = choice.iterations, choice
+
+    def _choose_again(self, choice: Choice) -> None:
+        """Iterations that somebody has set since stay."""
+        own = choice.sets_iterations and self.iterations == choice.iterations
+        self._choose_solver(None if own else self.iterations)
 
     def prepare_solver(self) -> None:
-        """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`.
+        """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`, the choice of "auto".
 
         Worth it after the material has changed unevenly, which `Info.rho` and `Info.residual` tell, or time_step has.
         `set_material` does it by itself when it pins other vertices hard, or frees some. Takes 0.3 s for 8 thousand
         vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
         """
+        if self.choice is not None:
+            self._choose_again(self.choice)
+        self._prepare()
+
+    def _prepare(self) -> None:
         self.plan = without_levels(self.plan)
         if isinstance(self.solver, Multilevel):
             reference = reference_of(self.plan, self.material(), self.time_step)
@@ -157,7 +189,7 @@ class Simulator(nn.Module):
                     setattr(self, name, nn.Parameter(tensor.clone(), requires_grad=own.requires_grad))
         # what is held belongs to the structure of a preconditioner
         if has_levels(self.plan.arrays) and not torch.equal(held, self._held_everywhere()):
-            self.prepare_solver()
+            self._prepare()
 
     def _held_everywhere(self) -> Tensor:
         """Whether each pin holds exactly in all environments [P]."""
@@ -198,6 +230,15 @@ class Simulator(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Simulator:
         wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
+        choice = self.choice
+        if choice is not None and wanted.device.type not in (self.device.type, "meta"):
+            # whatever it was, the other device may choose differently
+            iterations, self.solver = self.iterations, Chebyshev()
+            try:
+                return self._apply(fn, recurse)
+            finally:
+                self.iterations = iterations
+                self._choose_again(choice)
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
         if wanted.device.type == "cuda":
