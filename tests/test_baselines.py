@@ -41,6 +41,7 @@ ENOUGH = {
     "PCG global step": 60,
     "direct global step": 60,
     "Newton": 12,
+    "Newton-PCG with M": 12,
     "L-BFGS": 120,
 }
 
