@@ -94,7 +94,7 @@ def random_state(sim: pd.Simulator, rng: np.random.Generator) -> pd.State:
 def judge(sim: pd.Simulator, state: pd.State) -> Row:
     """Errors of steps along the motion of the tuned simulator, and what the promise says of each."""
     smooth = frictionless(sim)
-    errors, raw, trusted, audits = [], [], [], []
+    errors, raw, trusted, audits, residuals = [], [], [], [], []
     for step in range(max(JUDGED_STEPS) + 1):
         after, info = smooth(state, return_info=True)
         if step in JUDGED_STEPS:
@@ -104,9 +104,12 @@ def judge(sim: pd.Simulator, state: pd.State) -> Row:
                 errors.append(exact.error_beyond_rounding(displacement, sim.dtype))
                 raw.append(exact.judge(displacement).position)
                 trusted.append(bool(sim.promise.holds(info)[0]))
+                residuals.append(float(info.residual[0]))
                 audits.append(float(sim.promise.audit(smooth, state, after)[0]))
         state = after
-    return {"errors": errors, "errors_with_rounding": raw, "trusted": trusted, "audits": audits}
+    return {
+        "errors": errors, "errors_with_rounding": raw, "trusted": trusted, "audits": audits, "residuals": residuals,
+    }  # fmt: skip
 
 
 def run_scene(number: int, error: float) -> Row:
@@ -122,6 +125,7 @@ def run_scene(number: int, error: float) -> Row:
     row["tuning_seconds"] = time.perf_counter() - begin
     row.update(solver=str(promise.solver), iterations=promise.iterations, attained=promise.attained)
     row.update(promised=promise.error, studied=promise.studied_error, milliseconds=promise.milliseconds)
+    row.update(studied_errors=promise.trials[-1].errors, studied_residuals=promise.trials[-1].residuals)
     row.update(judge(sim, other))
     row["held"] = not row["errors"] or max(row["errors"]) <= promise.error
     row["budget"] = judge_budget(sim, start, other)

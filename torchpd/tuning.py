@@ -57,6 +57,7 @@ class Trial(NamedTuple):
     iterations: int
     error: float  # worst over the states, beyond rounding
     residuals: tuple[float, ...]  # of the states
+    errors: tuple[float, ...] = ()  # of the states
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,7 @@ class _Study:
         errors = [
             step.error_beyond_rounding(u, self.sim.dtype, _STUDIED_ROUNDINGS) + step.uncertainty for step, u in pairs
         ]
-        return Trial(solver, iterations, max(errors), tuple(info.residual.tolist()))
+        return Trial(solver, iterations, max(errors), tuple(info.residual.tolist()), tuple(errors))
 
 
 def tune(
