@@ -147,20 +147,27 @@ def run_case(size: str, youngs: float, device: torch.device, seconds: float) -> 
         own["forecast"] = None if expected is None else expected.iterations(ERROR)
         timed[name] = (solver, own["iterations"] or most)
         timed[f"{name}, 4 iterations"] = (solver, 4)
-    sim.solver = "auto"
-    assert sim.choice is not None
-    chosen, count = sim.solver, sim.iterations
-    row["auto"] = {"solver": type(chosen).__name__, "iterations": count, "why": sim.choice.why}
-    row["auto"]["error"] = case.error(chosen, count)
-    timed["auto"] = (chosen, count)
     found = milliseconds(case, timed, seconds)
     for name, (_, iterations) in list(timed.items()):
         if name in SOLVERS:
             few = found[f"{name}, 4 iterations"]["min"]
             slope = (found[name]["min"] - few) / max(iterations - 4, 1)
             row["solvers"][name].update(milliseconds=found[name], microseconds_an_iteration=1e3 * slope)
-    row["auto"]["milliseconds"] = found["auto"]
+    row["auto"] = run_auto(case, seconds)
     return {**row, **judged(row)}
+
+
+@torch.no_grad()
+def run_auto(case: Case, seconds: float) -> Row:
+    """What "auto" chose, its error and time."""
+    sim = case.sim
+    sim.solver = "auto"
+    assert sim.choice is not None
+    solver, count, why = sim.solver, sim.iterations, sim.choice.why
+    return {
+        "solver": type(solver).__name__, "iterations": count, "why": why, "error": case.error(solver, count),
+        "milliseconds": milliseconds(case, {"auto": (solver, count)}, seconds)["auto"],
+    }  # fmt: skip
 
 
 def judged(row: Row) -> Row:
@@ -232,6 +239,7 @@ def main(words: list[str]) -> None:
     parser.add_argument("--youngs", nargs="*", type=float, default=list(YOUNGS), help="Young's moduli [Pa]")
     parser.add_argument("--seconds", type=float, default=2.0, help="of timing a case (%(default)g)")
     parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
+    parser.add_argument("--auto", action="store_true", help='measure anew what "auto" takes in cases that are kept')
     parser.add_argument("--out", type=Path, help="file for the result (JSON); by default that of the device")
     options = parser.parse_args(words)
     out = options.out or Path(__file__).parent / "results" / f"time-to-error-{options.device}.json"
@@ -244,7 +252,11 @@ def main(words: list[str]) -> None:
             bar.set_postfix_str(f"{size}, {youngs:g} Pa")
             if (size, youngs) not in rows:
                 rows[size, youngs] = run_case(size, youngs, device, options.seconds)
-                write(out, device, options.threads, rows)
+            elif options.auto:
+                row = rows[size, youngs]
+                row["auto"] = run_auto(Case(SIZES[size], youngs, device), options.seconds)
+                row.update(judged(row))
+            write(out, device, options.threads, rows)
     found = [rows[key] for key in sorted(rows, key=lambda key: (SIZES[key[0]], key[1]))]
     print(table(found))
     print(costs(found))

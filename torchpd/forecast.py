@@ -1,9 +1,10 @@
 """How many iterations a solver will need, foretold from the weights of the step alone: nothing is solved.
 
 The smallest ratio mu of inertia to diagonal bounds the spectrum of D^-1 A from below, and with it the rate of the
-Jacobi and Chebyshev iterations. What `Multilevel` needs grows with log(1 / mu) only; its constants are fitted to 129
-random scenes without contacts. A forecast is the middle of what such scenes took (`benchmarks/forecast.py`): nine of
-ten needed 0.3 to 1.4 times as many, and meshes with slivers the fewest of these. `Simulator.tune` measures instead.
+Jacobi and Chebyshev iterations. What `Multilevel` needs does not depend on the mesh, but on mu n^(2/3), n vertices of a
+body: about rho L^2 / (E h^2), how far a wave travels in a step against the size L of the body. It grows with the
+logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. Forecasts are about
+right: `benchmarks/forecast.py` says how much so. `Simulator.tune` measures instead.
 
 Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
 """
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
 __all__ = ["Forecast", "Spectrum", "UnsolvedWarning", "forecast", "spectrum_of", "warn_of_few_iterations"]
 
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
-# iterations of Multilevel for a tenth of the error: slope * log10(1 / mu) + offset, at least `least`
-_LEVELS_SLOPE, _LEVELS_OFFSET, _LEVELS_LEAST = 2.3, -1.3, 1.3
-_LEVELS_CONTACTS = 2.0  # times as many where vertices may touch something
+# iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
+_LEVELS_LEAST, _LEVELS_SLOPE = 2.0, 3.0
+_LEVELS_CONTACTS = 1.25  # times as many where vertices may touch something
 _MOST = 10_000
 FAR_TOO_FEW = 0.1  # error that is left
 
@@ -112,7 +113,9 @@ def forecast(sim: Simulator, solver: Solver | None = None, spectrum: Spectrum | 
     if spectrum is None or not numbers["weighted"]:
         return None
     if isinstance(solver, Multilevel):
-        decade = max(_LEVELS_SLOPE * math.log10(1.0 / spectrum.slow) + _LEVELS_OFFSET, _LEVELS_LEAST)
+        body = max(len(solid.mesh.vertices) for solid in sim.scene.solids)
+        reach = min(spectrum.slow * body ** (2.0 / 3.0), 1.0)
+        decade = _LEVELS_LEAST + _LEVELS_SLOPE * math.log10(1.0 / reach)
         contacts = sim.planes.shape[-2] + sim.spheres.shape[-2]
         return Forecast(math.log(10.0) / (decade * (_LEVELS_CONTACTS if contacts else 1.0)))
     theta, rho = numbers["relaxation"], numbers["rho"]
