@@ -156,6 +156,13 @@ def judge_budget(sim: pd.Simulator, start: pd.State, other: pd.State) -> Row:
     }  # fmt: skip
 
 
+def suspects(row: Row) -> list[bool]:
+    """Whether `Promise.estimate` exceeds the promise, of every judged step."""
+    studied = zip(row["studied_errors"], row["studied_residuals"], strict=True)
+    ratio = max((error / residual for error, residual in studied if residual > 0.0), default=0.0)
+    return [not ratio * residual <= row["promised"] for residual in row["residuals"]]
+
+
 def summary(rows: list[Row]) -> Row:
     """Counts, the two kinds of promises apart."""
     judged = [row for row in rows if row["errors"]]
@@ -164,9 +171,9 @@ def summary(rows: list[Row]) -> Row:
         "best reachable": [r for r in judged if not r["attained"]],
     }
     steps = [
-        (e > row["promised"], not t, a > row["promised"])
+        (e > row["promised"], not t, suspect, a > row["promised"])
         for row in judged
-        for e, t, a in zip(row["errors"], row["trusted"], row["audits"], strict=True)
+        for e, t, suspect, a in zip(row["errors"], row["trusted"], suspects(row), row["audits"], strict=True)
     ]
     return {
         "scenes": len(judged),
@@ -186,8 +193,9 @@ def summary(rows: list[Row]) -> Row:
         **{
             name: {
                 "steps": sum(broken == wanted for broken, *_ in steps),
-                "doubted by holds(info)": sum(broken == wanted and doubted for broken, doubted, _ in steps),
-                "doubted by audit": sum(broken == wanted and doubted for broken, _, doubted in steps),
+                "doubted by holds(info)": sum(broken == wanted and doubted for broken, doubted, *_ in steps),
+                "doubted by estimate(info)": sum(broken == wanted and doubted for broken, _, doubted, _ in steps),
+                "doubted by audit": sum(broken == wanted and doubted for broken, *_, doubted in steps),
             }
             for name, wanted in (("broken steps", True), ("kept steps", False))
         },

@@ -58,11 +58,19 @@ def test_promises_and_refusals_are_counted_apart() -> None:
     def row(attained: bool, error: float, promised: float, *, trusted: bool = True) -> dict[str, object]:
         return {
             "attained": attained, "promised": promised, "errors": [error], "errors_with_rounding": [error],
+            "studied_errors": [5e-3, 1e-3], "studied_residuals": [1e-2, 1e-3], "residuals": [2.0 * promised],
             "trusted": [trusted], "audits": [error], "held": error <= promised, "tuning_seconds": 1.0,
             "budget": {"kept": True, "steady": True, "share": 0.9},
         }  # fmt: skip
 
-    still = {**row(True, 0.0, 1e-2), "errors": [], "errors_with_rounding": [], "trusted": [], "audits": []}
+    still = {
+        **row(True, 0.0, 1e-2),
+        "errors": [],
+        "errors_with_rounding": [],
+        "trusted": [],
+        "audits": [],
+        "residuals": [],
+    }
     counts = summary(
         [row(True, 5e-3, 1e-2), row(True, 2e-2, 1e-2, trusted=False), row(False, 0.1, 0.2), row(False, 0.3, 0.2), still]
     )
@@ -71,8 +79,18 @@ def test_promises_and_refusals_are_counted_apart() -> None:
     assert counts["attained"] == {"scenes": 2, "held": 1}
     assert counts["best reachable"] == {"scenes": 2, "held": 1}
     assert counts["held"] == 0.5
-    assert counts["broken steps"] == {"steps": 2, "doubted by holds(info)": 1, "doubted by audit": 2}
-    assert counts["kept steps"] == {"steps": 2, "doubted by holds(info)": 0, "doubted by audit": 0}
+    assert counts["broken steps"] == {
+        "steps": 2,
+        "doubted by holds(info)": 1,
+        "doubted by estimate(info)": 2,
+        "doubted by audit": 2,
+    }
+    assert counts["kept steps"] == {
+        "steps": 2,
+        "doubted by holds(info)": 0,
+        "doubted by estimate(info)": 2,
+        "doubted by audit": 0,
+    }
 
 
 @pytest.mark.usefixtures("on_path")
