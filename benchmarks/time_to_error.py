@@ -214,6 +214,33 @@ def table(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def matrix(rows: list[Row]) -> str:
+    """Short, as the README has it: milliseconds of Chebyshev / Multilevel and their ratio, by size and stiffness."""
+    stiffnesses = sorted({row["youngs"] for row in rows})
+    lines = [
+        "| vertices | " + " | ".join(f"{youngs:.0e} Pa" for youngs in stiffnesses) + " |",
+        "|---" * (1 + len(stiffnesses)) + "|",
+    ]
+    for count in sorted({row["vertices"] for row in rows}):
+        cells = {row["youngs"]: _short(row) for row in rows if row["vertices"] == count}
+        lines.append(f"| {count:,} | " + " | ".join(cells.get(youngs, "") for youngs in stiffnesses) + " |")
+    return "\n".join(lines)
+
+
+def _short(row: Row) -> str:
+    plain, levels = (own["milliseconds"]["min"] for own in row["solvers"].values())
+    failed = [own["iterations"] is None for own in row["solvers"].values()]
+    if failed[1]:
+        return f"{_plain(plain)}: `Multilevel` failed"
+    before = "> " * failed[0]
+    return f"{before}{_plain(plain)} / {_plain(levels)}: {before}{_plain(row['times_faster'])} x"
+
+
+def _plain(number: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{number:,.1f}" if number < 10.0 else f"{float(f'{number:.2g}'):,.0f}"
+
+
 def costs(rows: list[Row]) -> str:
     """Microseconds of an iteration by kernel and size: what `torchpd.automatic.COSTS` holds."""
     lines = []
@@ -259,6 +286,7 @@ def main(words: list[str]) -> None:
             write(out, device, options.threads, rows)
     found = [rows[key] for key in sorted(rows, key=lambda key: (SIZES[key[0]], key[1]))]
     print(table(found))
+    print(matrix(found))
     print(costs(found))
 
 

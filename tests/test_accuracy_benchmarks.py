@@ -136,7 +136,7 @@ def _time_to_error_row(plain: int | None, levels: int | None, took: str) -> dict
 
 @pytest.mark.usefixtures("on_path")
 def test_time_to_error_keeps_failures_and_wrong_choices() -> None:
-    from time_to_error import judged, table
+    from time_to_error import judged, matrix, table
 
     cases = [(300, 20, "Multilevel"), (300, 20, "Chebyshev"), (None, 20, "Multilevel"), (300, None, "Chebyshev")]
     rows = [{**(row := _time_to_error_row(*case)), **judged(row)} for case in cases]
@@ -150,6 +150,10 @@ def test_time_to_error_keeps_failures_and_wrong_choices() -> None:
     assert "Chebyshev, the slower by 5:" in wrong
     assert "| not in 8192 it., 30 ms: error 0.2 | 20 it., 6 ms | more than 5 |" in bound
     assert "Multilevel failed" in failed
+    short = [matrix([row]).splitlines()[-1] for row in rows]
+    assert short[0] == "| 1,000 | 30 / 6.0: 5.0 x |"
+    assert short[2] == "| 1,000 | > 30 / 6.0: > 5.0 x |"
+    assert "`Multilevel` failed" in short[3]
 
 
 @pytest.mark.usefixtures("on_path")
