@@ -47,18 +47,18 @@ Row = dict[str, Any]
 class Case:
     """One beam on one device, its converged step, and the error of any answer."""
 
-    def __init__(self, cells: int, youngs: float, device: torch.device) -> None:
+    def __init__(self, cells: int, youngs: float, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
         subject = SUBJECTS["beam"]()
         self.scene = subject.scene(subject.mesh(cells), youngs)
         self.time_step = subject.time_step
-        wide = self._simulator(torch.float64, torch.device("cpu"), pd.Multilevel())
+        wide = self.simulator(torch.float64, torch.device("cpu"), pd.Multilevel())
         start = pd.State(*(part.float() for part in subject.start(wide)))
         self.solution, self.uncertainty = converged(wide, pd.State(*(part.double() for part in start)))
-        self.sim = self._simulator(torch.float32, device, pd.Chebyshev())
-        self.state = pd.State(*(part.to(device) for part in start))
+        self.sim = self.simulator(dtype, device, pd.Chebyshev())
+        self.state = pd.State(*(part.to(device, dtype) for part in start))
         self.first = start.velocities[0].double() * self.time_step
 
-    def _simulator(self, dtype: torch.dtype, device: torch.device, solver: Solver) -> pd.Simulator:
+    def simulator(self, dtype: torch.dtype, device: torch.device, solver: Solver) -> pd.Simulator:
         return pd.Simulator(self.scene, self.time_step, 64, solver, dtype, progress=False).to(device)
 
     def error(self, solver: Solver, iterations: int) -> float:
@@ -109,7 +109,7 @@ def milliseconds(case: Case, solvers: dict[str, tuple[Solver, int]], seconds: fl
     times: dict[str, list[float]] = {name: [] for name in solvers}
     sims = {}
     for name, (solver, iterations) in solvers.items():
-        sims[name] = case._simulator(torch.float32, device, solver)
+        sims[name] = case.simulator(case.sim.dtype, device, solver)
         sims[name].iterations = iterations
         sims[name](case.state)
     while len(min(times.values(), key=len)) < 3 or sum(map(sum, times.values())) < seconds:
@@ -130,9 +130,9 @@ def wait_for(device: torch.device) -> None:
 
 
 @torch.no_grad()
-def run_case(size: str, youngs: float, device: torch.device, seconds: float) -> Row:
+def run_case(size: str, youngs: float, device: torch.device, seconds: float, dtype: torch.dtype = torch.float32) -> Row:
     """Iterations, errors and times of both solvers and of what "auto" chose."""
-    case, most = Case(SIZES[size], youngs, device), MOST[size]
+    case, most = Case(SIZES[size], youngs, device, dtype), MOST[size]
     sim = case.sim
     row: Row = {
         "size": size, "youngs": youngs, "vertices": sim.vertices, "tets": len(case.scene.values().tets), "most": most,
@@ -266,10 +266,15 @@ def main(words: list[str]) -> None:
     parser.add_argument("--youngs", nargs="*", type=float, default=list(YOUNGS), help="Young's moduli [Pa]")
     parser.add_argument("--seconds", type=float, default=2.0, help="of timing a case (%(default)g)")
     parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
+    parser.add_argument(
+        "--dtype", choices=("float32", "float64"), default="float32", help="of the steps that are timed"
+    )
     parser.add_argument("--auto", action="store_true", help='measure anew what "auto" takes in cases that are kept')
     parser.add_argument("--out", type=Path, help="file for the result (JSON); by default that of the device")
     options = parser.parse_args(words)
-    out = options.out or Path(__file__).parent / "results" / f"time-to-error-{options.device}.json"
+    name = "time-to-error-" + "-".join([options.device, *(["float64"] if options.dtype == "float64" else [])])
+    out = options.out or Path(__file__).parent / "results" / f"{name}.json"
+    dtype = getattr(torch, options.dtype)
     torch.set_num_threads(options.threads)
     device = torch.device(options.device)
     rows = {(row["size"], row["youngs"]): row for row in json.loads(out.read_text())["rows"]} if out.exists() else {}
@@ -278,10 +283,10 @@ def main(words: list[str]) -> None:
         for size, youngs in bar:
             bar.set_postfix_str(f"{size}, {youngs:g} Pa")
             if (size, youngs) not in rows:
-                rows[size, youngs] = run_case(size, youngs, device, options.seconds)
+                rows[size, youngs] = run_case(size, youngs, device, options.seconds, dtype)
             elif options.auto:
                 row = rows[size, youngs]
-                row["auto"] = run_auto(Case(SIZES[size], youngs, device), options.seconds)
+                row["auto"] = run_auto(Case(SIZES[size], youngs, device, dtype), options.seconds)
                 row.update(judged(row))
             write(out, device, options.threads, rows)
     found = [rows[key] for key in sorted(rows, key=lambda key: (SIZES[key[0]], key[1]))]
