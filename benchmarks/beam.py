@@ -28,7 +28,7 @@ def beam(youngs: float) -> tuple[pd.Simulator, pd.State]:
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (25, 5, 5))
     solid = pd.Solid(mesh, youngs=youngs, density=1000.0)
     scene = pd.Scene(solid, pd.Pin(solid, mesh.vertices[:, 0] == 0.0), pd.Gravity((0.0, -9.8, 0.0)))
-    sim = pd.Simulator(scene, 1 / 30, dtype=torch.float64)
+    sim = pd.Simulator(scene, 1 / 30, 64, dtype=torch.float64)
     state = sim.rest_state()
     state.velocities[..., 1] = -10.0 * state.positions[..., 0] ** 2
     return sim, state

@@ -71,7 +71,7 @@ def fewest(sim: pd.Simulator, state: pd.State, solution: Tensor, goals: list[flo
 
 
 def measure(name: str, scene: pd.Scene, state: pd.State) -> None:
-    sim = pd.Simulator(scene, 1 / 30, dtype=torch.float64, progress=False)
+    sim = pd.Simulator(scene, 1 / 30, 64, dtype=torch.float64, progress=False)
     start = time.perf_counter()
     sim.solver = pd.Multilevel()
     setup = time.perf_counter() - start

@@ -71,7 +71,7 @@ def random_scene(rng: np.random.Generator) -> tuple[Row, pd.Simulator]:
         parts.append(pd.Pin(body, mesh.vertices[:, 0] <= low[0] + 0.05 * (high[0] - low[0])))
     elif held == "ground":
         parts.append(pd.Ground(float(low[1]) - 0.001, friction=0.5))
-    sim = pd.Simulator(pd.Scene(*parts), time_step, progress=False)
+    sim = pd.Simulator(pd.Scene(*parts), time_step, 64, progress=False)
     facts = {"mesh": kind, "vertices": sim.vertices, "tets": len(mesh.tets), "support": held}
     return {**facts, "youngs": youngs, "time_step": time_step}, sim
 
@@ -94,7 +94,7 @@ def random_state(sim: pd.Simulator, rng: np.random.Generator) -> pd.State:
 def judge(sim: pd.Simulator, state: pd.State) -> Row:
     """Errors of steps along the motion of the tuned simulator, and what the promise says of each."""
     smooth = frictionless(sim)
-    errors, raw, trusted, audits = [], [], [], []
+    errors, raw, trusted, audits, residuals = [], [], [], [], []
     for step in range(max(JUDGED_STEPS) + 1):
         after, info = smooth(state, return_info=True)
         if step in JUDGED_STEPS:
@@ -104,9 +104,12 @@ def judge(sim: pd.Simulator, state: pd.State) -> Row:
                 errors.append(exact.error_beyond_rounding(displacement, sim.dtype))
                 raw.append(exact.judge(displacement).position)
                 trusted.append(bool(sim.promise.holds(info)[0]))
+                residuals.append(float(info.residual[0]))
                 audits.append(float(sim.promise.audit(smooth, state, after)[0]))
         state = after
-    return {"errors": errors, "errors_with_rounding": raw, "trusted": trusted, "audits": audits}
+    return {
+        "errors": errors, "errors_with_rounding": raw, "trusted": trusted, "audits": audits, "residuals": residuals,
+    }  # fmt: skip
 
 
 def run_scene(number: int, error: float) -> Row:
@@ -122,6 +125,7 @@ def run_scene(number: int, error: float) -> Row:
     row["tuning_seconds"] = time.perf_counter() - begin
     row.update(solver=str(promise.solver), iterations=promise.iterations, attained=promise.attained)
     row.update(promised=promise.error, studied=promise.studied_error, milliseconds=promise.milliseconds)
+    row.update(studied_errors=promise.trials[-1].errors, studied_residuals=promise.trials[-1].residuals)
     row.update(judge(sim, other))
     row["held"] = not row["errors"] or max(row["errors"]) <= promise.error
     row["budget"] = judge_budget(sim, start, other)
@@ -152,6 +156,13 @@ def judge_budget(sim: pd.Simulator, start: pd.State, other: pd.State) -> Row:
     }  # fmt: skip
 
 
+def suspects(row: Row) -> list[bool]:
+    """Whether `Promise.estimate` exceeds the promise, of every judged step."""
+    studied = zip(row["studied_errors"], row["studied_residuals"], strict=True)
+    ratio = max((error / residual for error, residual in studied if residual > 0.0), default=0.0)
+    return [not ratio * residual <= row["promised"] for residual in row["residuals"]]
+
+
 def summary(rows: list[Row]) -> Row:
     """Counts, the two kinds of promises apart."""
     judged = [row for row in rows if row["errors"]]
@@ -160,9 +171,9 @@ def summary(rows: list[Row]) -> Row:
         "best reachable": [r for r in judged if not r["attained"]],
     }
     steps = [
-        (e > row["promised"], not t, a > row["promised"])
+        (e > row["promised"], not t, suspect, a > row["promised"])
         for row in judged
-        for e, t, a in zip(row["errors"], row["trusted"], row["audits"], strict=True)
+        for e, t, suspect, a in zip(row["errors"], row["trusted"], suspects(row), row["audits"], strict=True)
     ]
     return {
         "scenes": len(judged),
@@ -182,8 +193,9 @@ def summary(rows: list[Row]) -> Row:
         **{
             name: {
                 "steps": sum(broken == wanted for broken, *_ in steps),
-                "doubted by holds(info)": sum(broken == wanted and doubted for broken, doubted, _ in steps),
-                "doubted by audit": sum(broken == wanted and doubted for broken, _, doubted in steps),
+                "doubted by holds(info)": sum(broken == wanted and doubted for broken, doubted, *_ in steps),
+                "doubted by estimate(info)": sum(broken == wanted and doubted for broken, _, doubted, _ in steps),
+                "doubted by audit": sum(broken == wanted and doubted for broken, *_, doubted in steps),
             }
             for name, wanted in (("broken steps", True), ("kept steps", False))
         },

@@ -18,7 +18,8 @@ ULP = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}  # rounding of one oper
 
 def simulator(case: Case, dtype: torch.dtype, device: torch.device | str = "cpu", **options: Any) -> pd.Simulator:
     """The scene and time step of a case, compiled."""
-    return pd.Simulator(case.scene, case.time_step, dtype=dtype, progress=False, **options).to(device)
+    chosen = {"iterations": 64, **options}
+    return pd.Simulator(case.scene, case.time_step, dtype=dtype, progress=False, **chosen).to(device)
 
 
 def state_of(case: Case, sim: pd.Simulator, batch: int = 1) -> pd.State:

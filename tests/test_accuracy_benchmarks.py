@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,11 +58,19 @@ def test_promises_and_refusals_are_counted_apart() -> None:
     def row(attained: bool, error: float, promised: float, *, trusted: bool = True) -> dict[str, object]:
         return {
             "attained": attained, "promised": promised, "errors": [error], "errors_with_rounding": [error],
+            "studied_errors": [5e-3, 1e-3], "studied_residuals": [1e-2, 1e-3], "residuals": [2.0 * promised],
             "trusted": [trusted], "audits": [error], "held": error <= promised, "tuning_seconds": 1.0,
             "budget": {"kept": True, "steady": True, "share": 0.9},
         }  # fmt: skip
 
-    still = {**row(True, 0.0, 1e-2), "errors": [], "errors_with_rounding": [], "trusted": [], "audits": []}
+    still = {
+        **row(True, 0.0, 1e-2),
+        "errors": [],
+        "errors_with_rounding": [],
+        "trusted": [],
+        "audits": [],
+        "residuals": [],
+    }
     counts = summary(
         [row(True, 5e-3, 1e-2), row(True, 2e-2, 1e-2, trusted=False), row(False, 0.1, 0.2), row(False, 0.3, 0.2), still]
     )
@@ -70,8 +79,18 @@ def test_promises_and_refusals_are_counted_apart() -> None:
     assert counts["attained"] == {"scenes": 2, "held": 1}
     assert counts["best reachable"] == {"scenes": 2, "held": 1}
     assert counts["held"] == 0.5
-    assert counts["broken steps"] == {"steps": 2, "doubted by holds(info)": 1, "doubted by audit": 2}
-    assert counts["kept steps"] == {"steps": 2, "doubted by holds(info)": 0, "doubted by audit": 0}
+    assert counts["broken steps"] == {
+        "steps": 2,
+        "doubted by holds(info)": 1,
+        "doubted by estimate(info)": 2,
+        "doubted by audit": 2,
+    }
+    assert counts["kept steps"] == {
+        "steps": 2,
+        "doubted by holds(info)": 0,
+        "doubted by estimate(info)": 2,
+        "doubted by audit": 0,
+    }
 
 
 @pytest.mark.usefixtures("on_path")
@@ -99,3 +118,94 @@ def test_scenes_that_were_judged_are_kept(tmp_path: Path) -> None:
     out.write_text(json.dumps(first))
     run("tune.py", "--scenes", "1", "--out", str(out))
     assert json.loads(out.read_text())["rows"][0]["tuning_seconds"] == 123.0
+
+
+def _time_to_error_row(plain: int | None, levels: int | None, took: str) -> dict[str, Any]:
+    def own(count: int | None, milliseconds: float) -> dict[str, Any]:
+        times = {"min": milliseconds, "median": milliseconds}
+        error = 9e-4 if count else 0.2
+        return {"iterations": count, "error": error, "milliseconds": times, "microseconds_an_iteration": milliseconds}
+
+    row: dict[str, Any] = {
+        "vertices": 1000, "youngs": 1e6, "most": 8192, "kernel": None,
+        "solvers": {"Chebyshev": own(plain, 30.0), "Multilevel": own(levels, 6.0)},
+        "auto": {"solver": took, "iterations": 40, "error": 1e-4, "milliseconds": {"min": 8.0, "median": 8.0}},
+    }  # fmt: skip
+    return row
+
+
+@pytest.mark.usefixtures("on_path")
+def test_time_to_error_keeps_failures_and_wrong_choices() -> None:
+    from time_to_error import judged, matrix, table
+
+    cases = [(300, 20, "Multilevel"), (300, 20, "Chebyshev"), (None, 20, "Multilevel"), (300, None, "Chebyshev")]
+    rows = [{**(row := _time_to_error_row(*case)), **judged(row)} for case in cases]
+    assert [row["times_faster"] for row in rows] == [5.0, 5.0, 5.0, None]
+    assert [row["at_least"] for row in rows] == [False, False, True, False]
+    assert [row["faster"] for row in rows] == ["Multilevel", "Multilevel", "Multilevel", "Chebyshev"]
+    assert [row["auto_took_the_faster"] for row in rows] == [True, False, True, True]
+    assert [row["auto_loses"] for row in rows] == [1.0, 5.0, 1.0, 1.0]
+    right, wrong, bound, failed = table(rows).splitlines()[2:]
+    assert "| 300 it., 30 ms | 20 it., 6 ms | 5 | Multilevel: 40 it., 8 ms, error 0.0001 |" in right
+    assert "Chebyshev, the slower by 5:" in wrong
+    assert "| not in 8192 it., 30 ms: error 0.2 | 20 it., 6 ms | more than 5 |" in bound
+    assert "Multilevel failed" in failed
+    short = [matrix([row]).splitlines()[-1] for row in rows]
+    assert short[0] == "| 1,000 | 30 / 6.0: 5.0 x |"
+    assert short[2] == "| 1,000 | > 30 / 6.0: > 5.0 x |"
+    assert "`Multilevel` failed" in short[3]
+
+
+@pytest.mark.usefixtures("on_path")
+def test_costs_are_fitted_to_the_times_of_iterations() -> None:
+    from time_to_error import costs
+
+    rows = []
+    for thousands in (1.0, 3.0, 10.0):
+        row = _time_to_error_row(300, 20, "Multilevel")
+        row["vertices"] = int(1000 * thousands)
+        row["solvers"]["Chebyshev"]["microseconds_an_iteration"] = 2.0 + 40.0 * thousands
+        row["solvers"]["Multilevel"]["microseconds_an_iteration"] = 10.0 + 160.0 * thousands
+        rows.append(row)
+    plain, levels = costs(rows).splitlines()
+    assert plain.startswith("cpu: Chebyshev: Cost(2, 40) measured")
+    assert levels.startswith("cpu: Multilevel: Cost(10, 160) measured")
+    assert costs(rows[:1]) == ""
+
+
+@pytest.mark.usefixtures("on_path")
+def test_time_to_error_on_a_small_beam(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The iterations that it finds are the fewest, to a sixteenth; more of them it refuses to try."""
+    import time_to_error
+    import torch
+
+    monkeypatch.setitem(time_to_error.SIZES, "1k", 2)
+    monkeypatch.setitem(time_to_error.MOST, "1k", 64)
+    monkeypatch.setattr(time_to_error, "milliseconds", lambda case, timed, seconds: {n: {"min": 1.0} for n in timed})
+    row = time_to_error.run_case("1k", 1e6, torch.device("cpu"), 0.0)
+    assert row["uncertainty"] < 1e-8
+    assert row["solvers"]["Chebyshev"]["iterations"] is None
+    assert row["solvers"]["Chebyshev"]["error"] > 1e-3
+    count = row["solvers"]["Multilevel"]["iterations"]
+    case = time_to_error.Case(2, 1e6, torch.device("cpu"))
+    solver = time_to_error.SOLVERS["Multilevel"]
+    assert case.error(solver, count) <= 1e-3 < case.error(solver, count - 1 - count // 16)
+    assert row["auto"]["solver"] == "Multilevel"
+    assert row["auto"]["error"] <= 1e-3
+
+
+@pytest.mark.usefixtures("on_path")
+def test_forecasts_are_judged_by_what_was_needed() -> None:
+    from forecast import summary
+
+    def row(needed: int | None, error: float, support: str = "held") -> dict[str, Any]:
+        own = {"forecast": [5, 10, 20], "needed": [4, 9, needed]}
+        return {
+            "support": support, "Chebyshev": own, "Multilevel": own, "auto": {"error": error, "solver": "Multilevel"},
+        }  # fmt: skip
+
+    found = summary([row(20, 1e-4), row(30, 2e-3), row(None, 1e-4, "ground"), {"left_out": "no motion"}])
+    assert (found["scenes"], found["left out"]) == (3, 1)
+    assert found["Chebyshev, no contacts: needed / forecast to 0.001"]["95 %"] == 1.0
+    assert found["Multilevel, contacts: needed / forecast to 0.001"]["50 %"] == np.inf
+    assert found["auto, no contacts"] == {"scenes": 2, "error 0.001 reached": 1, "Multilevel": 2}

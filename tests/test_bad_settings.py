@@ -32,7 +32,7 @@ def test_settings_of_a_simulator_are_checked() -> None:
         ({"tolerance": 1.0}, ValueError, r"tolerance must lie in \[0, 1\), got 1"),
         ({"tolerance": -0.1}, ValueError, r"tolerance must lie in \[0, 1\)"),
         ({"tolerance": math.nan}, ValueError, r"tolerance must lie in \[0, 1\), got nan"),
-        ({"solver": "jacobi"}, TypeError, r"solver must be Jacobi, Chebyshev or Multilevel, got str"),
+        ({"solver": "jacobi"}, TypeError, r"solver must be Jacobi, Chebyshev, Multilevel or \"auto\", got 'jacobi'"),
         ({"dtype": torch.float16}, ValueError, r"dtype must be torch\.float32 or torch\.float64, got torch\.float16"),
     ):
         with pytest.raises(kind, match=message):

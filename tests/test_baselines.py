@@ -7,10 +7,12 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from cases import Case, box, contact_block
 
 import torchpd as pd
 from torchpd.baselines import BASELINES, GaussSeidel, colour_vertices, run_baseline, two_stage_rho
+from torchpd.newton_krylov import NewtonKrylov
 from torchpd.reference import StepProblem
 from torchpd.reference_solvers import newton, relative_error
 
@@ -41,6 +43,7 @@ ENOUGH = {
     "PCG global step": 60,
     "direct global step": 60,
     "Newton": 12,
+    "Newton-PCG with M": 12,
     "L-BFGS": 120,
 }
 
@@ -89,6 +92,24 @@ def test_two_stage_rho_lies_below_the_spectral_radius(problem: StepProblem) -> N
     largest = 1.0 - np.linalg.eigvalsh(scaled)[0]
     rho = two_stage_rho(problem, problem.first_iterate(), lambda g: g / diagonal[:, None], iterations=64)
     assert 2.0 * largest - 1.0 < rho < 0.5 * (1.0 + largest)
+
+
+def test_newton_krylov_has_the_energy_of_the_reference_and_its_derivatives(problem: StepProblem) -> None:
+    """E and grad E of the compiled elements against NumPy's, H p against central differences of grad E."""
+    passes = [0]
+    method = NewtonKrylov(problem, passes)
+    rng = np.random.default_rng(0)
+    u, p = (np.where(problem.free[:, None], rng.normal(size=problem.positions.shape), 0.0) for _ in range(2))
+    u *= 0.01
+    energy, gradient = method.evaluate(torch.from_numpy(u))
+    expected, slopes = problem.evaluate(u)
+    assert energy == pytest.approx(expected, rel=1e-10)
+    assert np.allclose(gradient, slopes, rtol=0, atol=1e-10 * np.abs(slopes).max())
+    product = method.product(torch.from_numpy(u), torch.from_numpy(p)).numpy()
+    step = 1e-6
+    differences = (problem.gradient(u + step * p) - problem.gradient(u - step * p)) / (2.0 * step)
+    assert np.allclose(product, differences, rtol=0, atol=1e-6 * np.abs(product).max())
+    assert passes == [2]
 
 
 def test_memory_is_watched_and_contacts_are_refused(problem: StepProblem) -> None:

@@ -115,9 +115,11 @@ def test_float32_comes_as_near_as_on_the_cpu(name: str, outer: str) -> None:
     case = CASES[name]()
     iterations = 120 if outer == "lbfgs" else 600
     exact = simulator(case, torch.float64, solver=SOLVERS[outer], iterations=iterations)
-    end, errors = exact(state_of(case, exact), **arguments_of(case, exact)).velocities, []
-    for sim in pair(case, torch.float32, SOLVERS[outer], iterations=iterations):
-        errors.append(relative(sim(state_of(case, sim), **arguments_of(case, sim)).velocities, end))
+    end = exact(state_of(case, exact), **arguments_of(case, exact)).velocities
+    errors = [
+        relative(sim(state_of(case, sim), **arguments_of(case, sim)).velocities, end)
+        for sim in pair(case, torch.float32, SOLVERS[outer], iterations=iterations)
+    ]
     assert errors[1] <= 2 * errors[0] + 8 * torch.finfo(torch.float32).eps
     assert errors[0] <= 1e-3
 

@@ -82,7 +82,11 @@ def test_residuals_are_watched(tuned: tuple[pd.Simulator, Promise]) -> None:
     sim, promise = tuned
     _, info = sim(swinging(sim, batch=2), return_info=True)
     assert promise.holds(info).tolist() == [True, True]
-    # the estimate is proportional, and calibrated at the worst studied state
+    # the estimate is proportional, and no studied state has more error than it says
+    chosen = promise.trials[-1]
+    assert max(chosen.errors) == chosen.error
+    ratios = [e - promise.error_per_residual * r for e, r in zip(chosen.errors, chosen.residuals, strict=True)]
+    assert max(ratios) == pytest.approx(0.0, abs=1e-12)
     assert promise.estimate(info)[0] == pytest.approx(promise.error_per_residual * float(info.residual[0]))
     doubted = info._replace(residual=torch.tensor([2.0 * promise.residual_limit, math.nan]))
     assert promise.holds(doubted).tolist() == [False, False]

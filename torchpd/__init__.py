@@ -17,6 +17,7 @@ from .version import __version__
 
 if load_extension()[0] is not None:
     from .capture import CapturedStep
+    from .forecast import UnsolvedWarning
     from .ops import nearest_rotation
     from .plan import Plan, compile_plan
     from .simulator import Simulator
@@ -50,6 +51,7 @@ __all__ = [
     "TetMesh",
     "Track",
     "TriMesh",
+    "UnsolvedWarning",
     "__version__",
     "compile_plan",
     "embed",

@@ -21,6 +21,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import cg, splu
 
+from .newton_krylov import NewtonKrylov
 from .reference import StepProblem
 from .reference_solvers import classic_chebyshev, classic_omegas, guarded_chebyshev, jacobi, newton
 
@@ -44,6 +45,7 @@ class Baseline:
     contacts: bool = False  # knows planes and spheres
     compiled_twin: str | None = None  # the contender that has the same iterates
     iteration: str = "local step + global step"  # what one iteration is
+    few: bool = False  # ten or twenty iterations find the minimum to rounding
 
 
 @dataclass
@@ -53,7 +55,7 @@ class Trace:
     setup_seconds: float  # colouring, factorisation, estimating rho
     displacements: dict[int, Array] = field(default_factory=dict)  # [V, 3] m
     seconds: dict[int, float] = field(default_factory=dict)  # since the set-up, without what observing took
-    local_steps: dict[int, int] = field(default_factory=dict)  # evaluations of E and grad E
+    local_steps: dict[int, int] = field(default_factory=dict)  # evaluations of E and grad E, products with H
     peak_bytes: int = 0  # that Python and NumPy held at once, when asked for
 
     @property
@@ -294,6 +296,11 @@ def _newton(problem: StepProblem, first: Array) -> Run:
     return run
 
 
+def _newton_krylov(problem: StepProblem, first: Array) -> Run:
+    method = NewtonKrylov(problem, problem.calls if isinstance(problem, _Counted) else [0])
+    return lambda iterations, observe: method.minimise(first, iterations, observe)
+
+
 def _lbfgs(problem: StepProblem, first: Array) -> Run:
     """SciPy's L-BFGS-B in the variables sqrt(D) u, which is the preconditioner of the Jacobi family."""
     free = problem.free
@@ -334,6 +341,9 @@ BASELINES: dict[str, Baseline] = {
     ),
     "PCG global step": Baseline(_plain(_conjugate_gradients), iteration="local step + CG to 1e-2"),
     "direct global step": Baseline(_plain(_factorised), iteration="local step + two triangular solves"),
-    "Newton": Baseline(_newton, iteration="Hessian, factorisation, line search"),
+    "Newton": Baseline(_newton, iteration="Hessian, factorisation, line search", few=True),
+    "Newton-PCG with M": Baseline(
+        _newton_krylov, iteration="conjugate gradients on the Hessian, line search; all of it compiled", few=True
+    ),
     "L-BFGS": Baseline(_lbfgs, iteration="local step + two-loop recursion"),
 }

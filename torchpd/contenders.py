@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from .solvers import Chebyshev, Jacobi, Multilevel, Solver
+from .solvers import DEFAULT_ITERATIONS, Chebyshev, Jacobi, Multilevel, Solver
 from .spectrum import estimate_rho
 from .state import State
 
@@ -46,7 +46,6 @@ CONTENDERS: dict[str, Contender] = {
     "Multilevel": Contender(lambda sim, state: Multilevel(), safe=True),
 }
 DEFAULT = "guarded Chebyshev"  # what `Simulator(scene)` does
-DEFAULT_ITERATIONS = 64
 
 
 def safe_solvers(sim: Simulator, state: State) -> dict[str, Solver]:

@@ -103,7 +103,7 @@ def _study(sim: Simulator, solver: Solver) -> Simulator:
             parts.append(Sphere(part.center, part.radius))
         else:
             parts.append(part)
-    study = Simulator(Scene(*parts), sim.time_step, solver=solver, dtype=torch.float64, progress=False)
+    study = Simulator(Scene(*parts), sim.time_step, sim.iterations, solver, dtype=torch.float64, progress=False)
     return study.to(sim.device)
 
 

@@ -20,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from .automatic import Choice
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .embedding import Embedding
 from .mesh import TetMesh, TriMesh
@@ -74,6 +75,7 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         "kernel": sim.kernel,
         "dtype": str(sim.dtype).removeprefix("torch."),
         "solver": {"kind": type(sim.solver).__name__, **dataclasses.asdict(sim.solver)},
+        "choice": None if sim.choice is None else dataclasses.asdict(sim.choice),
         "meshes": [{"flipped": mesh.flipped} for mesh in meshes],
         "parts": [_part_record(part, sim.scene, meshes) for part in sim.scene.parts],
         "trained": [name for name, value in material.items() if value.requires_grad],
@@ -213,6 +215,8 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
         stiffness, inertia = (tensors[f"solver.{name}"] for name in _REFERENCE)
         if not all(map(torch.equal, (stiffness, inertia), reference_of_levels(sim.plan.arrays))):
             sim.plan = precondition_plan(sim.plan, sim.scene.values(), stiffness, inertia)
+    if record.get("choice") is not None:  # of "auto", which chooses anew on another device
+        sim.choice = Choice(**record["choice"])
     return sim
 
 

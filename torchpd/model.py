@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
 
+from .automatic import Choice, choose_solver
 from .checks import check_whole
+from .forecast import warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_material, material_of
 from .multilevel import has_levels
 from .placing import check_wanted_device, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
-from .solvers import Chebyshev, Multilevel, Solver, check_solver
+from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
 from .state import State
 from .targets import Anchors, Targets
 
@@ -44,8 +46,8 @@ class Model(nn.Module):
         self,
         scene: Scene,
         time_step: float = 1 / 60,
-        iterations: int = 64,
-        solver: Solver | None = None,
+        iterations: int | None = None,
+        solver: Solver | Literal["auto"] | None = None,
         dtype: torch.dtype = torch.float32,
         *,
         tolerance: float = 0.0,
@@ -57,9 +59,11 @@ class Model(nn.Module):
             raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
         self.scene = scene
         self.time_step = _positive("time_step", time_step, "s")
-        self.iterations = check_whole("iterations", iterations, minimum=0)
+        self.iterations = DEFAULT_ITERATIONS if iterations is None else check_whole("iterations", iterations, minimum=0)
         self._solver: Solver = Chebyshev()
-        solver = check_solver(self._solver if solver is None else solver, torch.device("cpu"))
+        solver = self._solver if solver is None else solver
+        if solver != "auto":
+            check_solver(solver, torch.device("cpu"))
         self.tolerance = float(tolerance)
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
@@ -71,7 +75,13 @@ class Model(nn.Module):
         self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
         for name, value in material_of(values, dtype).items():
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
-        self.solver = solver
+        self.choice: Choice | None = None  # of "auto"
+        if solver == "auto":
+            self._choose_solver(None if iterations is None else self.iterations)
+        else:
+            self.solver = solver
+            if iterations is None:
+                warn_of_few_iterations(self)
 
     @property
     def vertices(self) -> int:
@@ -90,27 +100,48 @@ class Model(nn.Module):
 
     @property
     def solver(self) -> Solver:
-        """How a step is solved. A multilevel one is prepared when it is set."""
+        """How a step is solved. A multilevel one is prepared when it is set; "auto" sets iterations too."""
         return self._solver
 
     @solver.setter
-    def solver(self, solver: Solver) -> None:
-        before, self._solver = self._solver, check_solver(solver, self.device)
+    def solver(self, solver: Solver | Literal["auto"]) -> None:
+        if solver == "auto":
+            return self._choose_solver(None)
+        before = self._solver, self.choice
+        self._solver, self.choice = check_solver(solver, self.device), None
         if isinstance(solver, Multilevel) == has_levels(self.plan.arrays):
-            return
+            return None
         try:
-            self.prepare_solver()
+            self._prepare()
         except BaseException:
-            self._solver = before
+            self._solver, self.choice = before
             raise
+        return None
+
+    def _choose_solver(self, iterations: int | None) -> None:
+        """What "auto" does, see `choose_solver`."""
+        self.solver, choice = choose_solver(self, iterations)
+        self.iterations, self.choice = choice.iterations, choice
+
+    def _choose_again(self, choice: Choice) -> None:
+        """Iterations that somebody has set since stay."""
+        own = choice.sets_iterations and self.iterations == choice.iterations
+        if self.plan.for_levels:
+            self.solver = Chebyshev()  # its kernel is one of the costs that are compared
+        self._choose_solver(None if own else self.iterations)
 
     def prepare_solver(self) -> None:
-        """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`.
+        """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`, the choice of "auto".
 
         Worth it after the material has changed unevenly, which `Info.rho` and `Info.residual` tell, or time_step has.
         `set_material` does it by itself when it pins other vertices hard, or frees some. Takes 0.3 s for 8 thousand
         vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
         """
+        if self.choice is not None:
+            self._choose_again(self.choice)
+        self._prepare()
+
+    def _prepare(self) -> None:
         self.plan = plan_for_solver(self)
 
     def material(self) -> list[Tensor]:
@@ -136,7 +167,7 @@ class Model(nn.Module):
                     setattr(self, name, nn.Parameter(tensor.clone(), requires_grad=own.requires_grad))
         # what is held belongs to the structure of a preconditioner
         if has_levels(self.plan.arrays) and not torch.equal(held, self._held_everywhere()):
-            self.prepare_solver()
+            self._prepare()
 
     def _held_everywhere(self) -> Tensor:
         """Whether each pin holds exactly in all environments [P]."""
@@ -196,6 +227,15 @@ class Model(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
+        choice = self.choice
+        if choice is not None and wanted.device.type not in (self.device.type, "meta"):
+            # whatever it was, the other device may choose differently
+            iterations, self.solver = self.iterations, Chebyshev()
+            try:
+                return self._apply(fn, recurse)
+            finally:
+                self.iterations = iterations
+                self._choose_again(choice)
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
         changes_precision = wanted.dtype != self.dtype

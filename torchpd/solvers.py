@@ -9,7 +9,7 @@ import torch
 
 from .checks import check_scalar
 
-__all__ = ["Chebyshev", "Jacobi", "Multilevel", "Solver", "SolverNumbers", "check_solver"]
+__all__ = ["DEFAULT_ITERATIONS", "Chebyshev", "Jacobi", "Multilevel", "Solver", "SolverNumbers", "check_solver"]
 
 Diagonal = Literal["weighted", "plain"]
 
@@ -158,12 +158,14 @@ class Multilevel:
 
 
 Solver = Jacobi | Chebyshev | Multilevel
+DEFAULT_ITERATIONS = 64  # of a simulator that is given none
 
 
-def check_solver(solver: Solver, device: torch.device) -> Solver:
+def check_solver(solver: object, device: torch.device) -> Solver:
     """The solver, if a simulator on this device can have it."""
     if not isinstance(solver, Jacobi | Chebyshev | Multilevel):
-        raise TypeError(f"Simulator: solver must be Jacobi, Chebyshev or Multilevel, got {type(solver).__name__}")
+        given = repr(solver) if isinstance(solver, str) else type(solver).__name__
+        raise TypeError(f'Simulator: solver must be Jacobi, Chebyshev, Multilevel or "auto", got {given}')
     if isinstance(solver, Multilevel) and device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"Simulator: Multilevel is prepared on the CPU or on a GPU, not on {device}")
     return solver

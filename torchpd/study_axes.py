@@ -67,7 +67,7 @@ def contender_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting
 def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) -> list[Row]:
     """A method in NumPy at several iteration counts, against the converged step."""
     _, exact = bench.hard_step(setting)
-    most = min(max(counts), _NEWTON_ITERATIONS) if name == "Newton" else max(counts)
+    most = min(max(counts), _NEWTON_ITERATIONS) if BASELINES[name].few else max(counts)
     common: dict[str, Any] = {
         "axis": "solver", "method": name, "compiled": False, "youngs": setting.youngs, "time_step": setting.time_step,
         "vertices": len(exact.first), "tets": len(exact.problem.values.tets),
@@ -85,7 +85,7 @@ def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) 
             traces, iterations, exact.judge(traces[0].displacements[iterations]),
             {**common, "setup_milliseconds": setup, "bytes": memory.peak_bytes, "bytes_by": "tracemalloc"},
         )
-        for iterations in _shown(traces[0], counts, every=name == "Newton")
+        for iterations in _shown(traces[0], counts, every=method.few)
     ]  # fmt: skip
 
 
@@ -216,7 +216,7 @@ def paper_rows(bench: Bench) -> list[Row]:
         mesh = shapes.box((1.0, 0.2, 0.2), cells)
         body = Solid(mesh, youngs=1e5, density=1000.0)
         scene = Scene(body, Pin(body, mesh.vertices[:, 0] == 0.0), Gravity((0.0, -9.81, 0.0)))
-        sim = Simulator(scene, 1 / 60, progress=False).to(bench.device)
+        sim = Simulator(scene, 1 / 60, DEFAULT_ITERATIONS, progress=False).to(bench.device)
         state = sim.rest_state()
         state.velocities[..., 1] = -3.0 * state.positions[..., 0] ** 2
         more = {"constraints": float(constraints), "paper_milliseconds": theirs}

@@ -16,7 +16,7 @@ from .contenders import CONTENDERS
 from .ledger import Row
 from .mesh import TetMesh
 from .simulator import Simulator
-from .solvers import Chebyshev, Solver
+from .solvers import DEFAULT_ITERATIONS, Chebyshev, Solver
 from .state import State
 from .subjects import Subject
 from .summary import workspace_bytes
@@ -70,7 +70,8 @@ class Bench:
     ) -> Simulator:
         """A new one on the device."""
         scene = self.subject.scene(self.mesh(setting.resolution), setting.youngs)
-        sim = Simulator(scene, setting.time_step, solver=solver, dtype=dtype, progress=False, **options)
+        chosen = {"iterations": DEFAULT_ITERATIONS, **options}
+        sim = Simulator(scene, setting.time_step, solver=solver, dtype=dtype, progress=False, **chosen)
         return sim.to(self.device)
 
     def start(self, sim: Simulator) -> State:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from . import _C
+from .forecast import FAR_TOO_FEW, forecast
 from .regimes import shared_bytes
 from .solvers import Chebyshev, Multilevel, Solver
 from .tables import MULTILEVEL_TABLE
@@ -32,7 +33,21 @@ def _solver_line(sim: Simulator) -> str:
     rho = f", rho {numbers['rho']:g}" if numbers["rho"] else ""
     diagonal = "weighted" if numbers["weighted"] else "plain"
     tolerance = f", tolerance {sim.tolerance:g}" if sim.tolerance else ""
-    return f"{name}: {stop} iterations, relaxation {numbers['relaxation']:g}, {diagonal} diagonal{rho}{tolerance}"
+    return (
+        f"solver: {name}: {stop} iterations, relaxation {numbers['relaxation']:g}, {diagonal} diagonal{rho}{tolerance}"
+    )
+
+
+def _expectation_lines(sim: Simulator) -> list[str]:
+    """Why "auto" chose, and what the iterations are worth."""
+    lines = [] if sim.choice is None else [f"chosen because {sim.choice.why}"]
+    expected = forecast(sim)
+    if expected is not None:
+        left = expected.error(sim.iterations)
+        verdict = f"; {sim.iterations} leave about {left:.1g}: far too few" if left > FAR_TOO_FEW else ""
+        counts = " and ".join(f"{error:g} after {expected.words(error)}" for error in (1e-2, 1e-3))
+        lines.append(f"expected: an error of {counts} iterations, from the weights alone{verdict}")
+    return lines
 
 
 def _promise_lines(sim: Simulator) -> list[str]:
@@ -141,6 +156,7 @@ def describe(sim: Simulator) -> str:
     lines = [
         f"{plan.vertices} vertices, time step {sim.time_step:.6g} s, {sim.dtype} on {where}",
         _solver_line(sim),
+        *_expectation_lines(sim),
         *_promise_lines(sim),
         *_preconditioner_lines(sim),
         *_effect_lines(sim),

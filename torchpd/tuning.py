@@ -57,6 +57,7 @@ class Trial(NamedTuple):
     iterations: int
     error: float  # worst over the states, beyond rounding
     residuals: tuple[float, ...]  # of the states
+    errors: tuple[float, ...] = ()  # of the states
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,8 @@ class Promise:
         """Whether the error may still be relied on [B] (bool), from the residual that `return_info=True` reports.
 
         An estimate, calibrated on the studied states: the promise is doubted when the residual is larger than theirs by
-        more than the safety that was kept, and when it is not a number.
+        more than the safety that was kept, and when it is not a number. Residuals weigh short waves and errors long
+        ones, so most steps that break a promise have a residual like any other: see `estimate` and `audit`.
         """
         return info.residual <= self.residual_limit
 
@@ -113,7 +115,10 @@ class Promise:
         return error
 
     def estimate(self, info: Info) -> Tensor:
-        """Error of the step [B] that its residual speaks of; NaN without `return_info=True`."""
+        """Error of the step [B] that its residual may hide, at the largest ratio of the study; NaN without a report.
+
+        High rather than low: where it exceeds `error` an `audit` is worth its three steps.
+        """
         return info.residual * self.error_per_residual
 
     def covers(self, sim: Simulator) -> bool:
@@ -146,7 +151,7 @@ class _Study:
         errors = [
             step.error_beyond_rounding(u, self.sim.dtype, _STUDIED_ROUNDINGS) + step.uncertainty for step, u in pairs
         ]
-        return Trial(solver, iterations, max(errors), tuple(info.residual.tolist()))
+        return Trial(solver, iterations, max(errors), tuple(info.residual.tolist()), tuple(errors))
 
 
 def tune(
@@ -382,7 +387,9 @@ def _promise(
         studied_error=chosen.error,
         milliseconds=cost,
         residual_limit=largest * room,
-        error_per_residual=chosen.error / largest if largest > 0.0 else 0.0,
+        error_per_residual=max(
+            (e / r for e, r in zip(chosen.errors, chosen.residuals, strict=True) if r > 0.0), default=0.0
+        ),
         time_step=sim.time_step,
         dtype=sim.dtype,
         device=str(sim.device),

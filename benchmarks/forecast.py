@@ -1,0 +1,120 @@
+"""Are forecasts of iterations right, and does `solver="auto"` reach its 1e-3? On random scenes, in float64.
+
+The scenes of `tune.py` with other random numbers: bars, slivers, balls and octopuses of 60 to 1700 vertices, 1e3 to
+1e8 Pa, time steps of 1 to 33 ms, held, free or on the ground, some steps into a random motion, friction left out.
+Iterations are counted on a grid of four an octave. Scenes that were measured are kept: a run that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from machine import describe_run
+from tqdm import tqdm
+from tune import random_scene, random_state
+
+import torchpd as pd
+from torchpd.accuracy import ExactStep, exact_steps, frictionless
+from torchpd.automatic import AIM
+from torchpd.forecast import forecast, spectrum_of
+
+ERRORS = (1e-1, 1e-2, 1e-3)
+COUNTS = sorted({round(2.0 ** (k / 4)) for k in range(49)})  # to 4096
+SOLVERS = {"Chebyshev": pd.Chebyshev(), "Multilevel": pd.Multilevel()}
+SURE = 1e-4  # of the error, that the converged step itself may have
+SEED = 77
+Row = dict[str, Any]
+
+
+def error_of(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> float:
+    return exact.judge(sim(state).velocities[0].numpy() * sim.time_step).position
+
+
+def counts_to(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> list[int | None]:
+    """The first of `COUNTS` within each of `ERRORS`; None where that takes more."""
+    found: list[int | None] = []
+    for count in COUNTS:
+        sim.iterations = count
+        reached = error_of(sim, state, exact)
+        found += [count for error in ERRORS[len(found) :] if reached <= error]
+        if len(found) == len(ERRORS):
+            break
+    return found + [None] * (len(ERRORS) - len(found))
+
+
+@torch.no_grad()
+def run_scene(number: int) -> Row:
+    rng = np.random.default_rng([SEED, number])
+    facts, drawn = random_scene(rng)
+    sim = frictionless(drawn, torch.float64)
+    state = random_state(sim, rng)
+    sim.iterations = 256
+    for _ in range(int(rng.integers(0, 10))):
+        state = sim(state)
+    exact = exact_steps(sim, state, iterations=6000)[0]
+    row: Row = {"scene": number, **facts, "uncertainty": exact.uncertainty}
+    if not exact.moves(torch.float32) or not exact.uncertainty <= SURE:
+        return {**row, "left_out": "no motion" if exact.uncertainty <= SURE else "no converged step to compare with"}
+    spectrum = spectrum_of(sim)
+    assert spectrum is not None
+    row.update(spectrum._asdict())
+    for name, solver in SOLVERS.items():
+        sim.solver = solver
+        expected = forecast(sim)
+        assert expected is not None
+        row[name] = {"forecast": [expected.iterations(e) for e in ERRORS], "needed": counts_to(sim, state, exact)}
+    sim.solver = "auto"
+    row["auto"] = {"solver": type(sim.solver).__name__, "iterations": sim.iterations}
+    return {**row, "auto": {**row["auto"], "error": error_of(sim, state, exact)}}
+
+
+def summary(rows: list[Row]) -> Row:
+    """Percentiles of iterations needed over forecast, with and without contacts, and how often auto reached its aim."""
+    used = [row for row in rows if "left_out" not in row]
+    out: Row = {"scenes": len(used), "left out": len(rows) - len(used)}
+    for place, group in (
+        ("no contacts", [row for row in used if row["support"] != "ground"]),
+        ("contacts", [row for row in used if row["support"] == "ground"]),
+    ):
+        for name in SOLVERS if group else ():
+            last = len(ERRORS) - 1
+            ratios = [
+                (row[name]["needed"][last] or np.inf) / row[name]["forecast"][last] for row in group
+            ]  # none needed: worse than all
+            out[f"{name}, {place}: needed / forecast to {ERRORS[last]:g}"] = {
+                f"{p} %": float(np.percentile(ratios, p, method="lower")) for p in (5, 50, 90, 95)
+            }
+        out[f"auto, {place}"] = {
+            "scenes": len(group),
+            f"error {AIM:g} reached": sum(row["auto"]["error"] <= AIM for row in group),
+            "Multilevel": sum(row["auto"]["solver"] == "Multilevel" for row in group),
+        }
+    return out
+
+
+def main(words: list[str]) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=200, help="how many (%(default)s)")
+    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    options = parser.parse_args(words)
+    torch.set_num_threads(1)
+    known = json.loads(options.out.read_text())["rows"] if options.out and options.out.exists() else []
+    rows = {row["scene"]: row for row in known}
+    for number in tqdm(range(options.scenes), desc="scenes", unit="scene"):
+        if number not in rows:
+            rows[number] = run_scene(number)
+        if options.out:
+            record = {"schema": 1, **describe_run(torch.device("cpu"), 1), "summary": summary(list(rows.values()))}
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+            options.out.write_text(json.dumps({**record, "rows": list(rows.values())}, indent=1) + "\n")
+    print(json.dumps(summary([rows[number] for number in range(options.scenes)]), indent=1))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

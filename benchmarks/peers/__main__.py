@@ -1,0 +1,212 @@
+"""One step of a body in Newton's SolverVBD and SolverXPBD, in MuJoCo's flex, and here: error against time.
+
+Same mesh, lumped masses, density, Young's modulus, Poisson ratio 0 where the method allows it, gravity, time step
+1/30 s, start. A method is judged by the distance from its own converged answer, |u - u*| / |u_0 - u*| with u_0 = h v
+for all, so that no method is blamed for its material; the distance from ours stands beside it.
+
+VBD and XPBD take one step as we do, with n iterations. u* of VBD is the minimum of its energy in float64, with which
+its own long run agrees to the rounding of float32; of XPBD its own longest run, where that has settled. MuJoCo has no
+iterations: it and we take the same 1/30 s in n steps, u* being the answer with the most of them.
+
+Newton and MuJoCo are optional: pip install newton warp-lang mujoco. What is not there is left out, and said.
+Cases that were measured are kept: a run that was stopped goes on.
+
+    python -m benchmarks.peers --cells 3 5 --youngs 1e4 1e5 1e6 1e7 --out benchmarks/results/peers-cpu.json
+    python -m benchmarks.peers --device cuda --cells 3 5 8 12 --out benchmarks/results/peers-cuda.json
+    python -m benchmarks.peers --mesh bunny.mesh
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+import torchpd as pd
+from torchpd.provenance import describe_run
+
+from . import converged, mujoco_flex, newton_physics, ours
+from .problem import Array, Method, MissingPackageError, Problem, beam, from_file
+from .report import draw, table
+
+GOALS = (1e-1, 1e-2, 1e-3)
+LONGEST = 4096  # iterations of a method
+# of a frame, the last being the converged answer
+SUBSTEPS = {
+    "torchpd, substeps": [2**k for k in range(10)],
+    "MuJoCo flex, substeps": [2**k for k in range(10)],
+}
+SETTLED = 1e-2  # relative change over the second half of a longest run
+Row = dict[str, Any]
+Answer = tuple[Array, float]  # u* and the residual that is left, or the change of the last doubling
+
+
+def _own_end(method: Method, longest: int) -> Answer:
+    """The method's answer after `longest` iterations, and how much the second half of them changed."""
+    half, end = method.run(longest // 2), method.run(longest)
+    change = float(np.linalg.norm(end - half) / max(np.linalg.norm(end), 1e-300))
+    if not change < SETTLED:
+        raise RuntimeError(f"does not settle: the answers of {longest // 2} and {longest} differ by {change:.1g}")
+    return end, change
+
+
+def _solvers(problem: Problem, device: str) -> dict[str, Callable[[], tuple[Method, Answer]]]:
+    """Methods of one implicit Euler step, each with its own converged answer."""
+
+    def neo_hookean() -> tuple[Method, Answer]:
+        method = newton_physics.vbd(problem, device)
+        return method, converged.minimise(problem, converged.stable_neo_hookean(problem.youngs / 2.0, 0.0))
+
+    def constraints() -> tuple[Method, Answer]:
+        method = newton_physics.xpbd(problem, device)
+        return method, _own_end(method, 4 * LONGEST if len(problem.mesh.vertices) < 1000 else LONGEST)
+
+    exact = ours.converged(problem)
+    return {
+        "torchpd Chebyshev": lambda: (ours.step(problem, device, pd.Chebyshev(), "torchpd Chebyshev"), exact),
+        "torchpd Multilevel": lambda: (ours.step(problem, device, pd.Multilevel(), "torchpd Multilevel"), exact),
+        "Newton VBD": neo_hookean,
+        "Newton XPBD": constraints,
+    }
+
+
+def _frames(problem: Problem, device: str) -> dict[str, Callable[[], tuple[Method, Answer]]]:
+    """Methods whose knob is the time step."""
+
+    def judged(name: str, make: Callable[[Problem, str], Method]) -> tuple[Method, Answer]:
+        method, most = make(problem, device), SUBSTEPS[name][-1]
+        return method, _own_end(method, most)
+
+    makers = (ours.substeps, mujoco_flex.flex)
+    return {name: partial(judged, name, make) for name, make in zip(SUBSTEPS, makers, strict=True)}
+
+
+def measure(problem: Problem, name: str, method: Method, end: Answer, counts: list[int], seconds: float) -> Row:
+    """Errors and times at growing counts, until the last goal or a run of `seconds`."""
+    exact, left = end
+    points = []
+    for count in counts:
+        found = method.run(count)
+        took = method.milliseconds(count)
+        reached = problem.error(found, exact)
+        points.append({"count": count, "milliseconds": took, "error": reached})
+        if reached <= 0.5 * GOALS[-1] or took > 1e3 * seconds:
+            break
+    return {"method": name, "left_of_converged": left, "note": method.note, "points": points}
+
+
+def run_problem(problem: Problem, options: argparse.Namespace, known: dict[str, Row]) -> list[Row]:
+    """A row for every method; what is missing or refuses stays, with its reason."""
+    iterations = [2**k for k in range(int(np.log2(LONGEST)) + 1)]
+    cases = {name: (make, iterations) for name, make in _solvers(problem, options.device).items()}
+    if len(problem.mesh.vertices) <= options.frames:
+        cases.update({name: (make, SUBSTEPS[name][:-2]) for name, make in _frames(problem, options.device).items()})
+    rows = []
+    for name, (make, counts) in cases.items():
+        if name in known:
+            rows.append(known[name])
+            continue
+        rows.append(_measured(problem, name, make, counts, options))
+    return rows
+
+
+def _ours(problem: Problem, name: str, device: str) -> Array:
+    """Our answer to what a method was asked: the converged step, or the frame with the most substeps."""
+    if name in SUBSTEPS:
+        return ours.substeps(problem, device).run(SUBSTEPS["torchpd, substeps"][-1])
+    return ours.converged(problem)[0]
+
+
+def _measured(
+    problem: Problem,
+    name: str,
+    make: Callable[[], tuple[Method, Answer]],
+    counts: list[int],
+    options: argparse.Namespace,
+) -> Row:
+    try:
+        method, end = make()
+    except RuntimeError as reason:
+        tqdm.write(f"{problem.name}, {problem.youngs:g} Pa, {name}: {reason}")
+        return {
+            "method": name,
+            "refused": str(reason),
+            "missing": isinstance(reason, MissingPackageError),
+            "points": [],
+        }
+    row = measure(problem, name, method, end, counts, options.seconds)
+    return {**row, "own_answer_from_ours": problem.error(end[0], _ours(problem, name, options.device))}
+
+
+def versions() -> dict[str, str]:
+    """Of the simulators that are there; says which are not."""
+
+    def ask(package: ModuleType) -> dict[str, str]:
+        try:
+            found: dict[str, str] = package.versions()
+        except MissingPackageError as reason:
+            print(reason)
+            return {}
+        return found
+
+    return {**ask(newton_physics), **ask(mujoco_flex)}
+
+
+def main(words: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__.splitlines()[0])
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument(
+        "--cells", type=int, nargs="*", default=[3, 5], help="of beams: 3 5 8 12 have 256 to 10309 vertices"
+    )
+    parser.add_argument("--mesh", nargs="*", default=[], help="tetrahedral meshes, beside the beams")
+    parser.add_argument("--youngs", type=float, nargs="*", default=[1e4, 1e5, 1e6, 1e7], help="Young's moduli [Pa]")
+    parser.add_argument(
+        "--seconds", type=float, default=5.0, help="of one run, at which a method gives up (%(default)g)"
+    )
+    parser.add_argument(
+        "--frames", type=int, default=1000, help="vertices up to which substeps are compared (%(default)s)"
+    )
+    parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
+    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--figure", type=Path, help="file for a picture of the errors against time")
+    options = parser.parse_args(words)
+    torch.set_num_threads(options.threads)
+    stored = json.loads(options.out.read_text())["rows"] if options.out and options.out.exists() else []
+    rows = {(row["problem"], row["youngs"]): row for row in stored}
+    peers = versions()
+    run = describe_run(
+        shlex.join(["python", "-m", "benchmarks.peers", *words]), torch.device(options.device), options.threads
+    )
+    run["versions"].update(peers)
+    sources = [*(lambda youngs, c=cells: beam(c, youngs) for cells in options.cells),
+               *(lambda youngs, p=path: from_file(p, youngs) for path in options.mesh)]  # fmt: skip
+    cases = [(make, youngs) for make in sources for youngs in options.youngs]
+    for make, youngs in tqdm(cases, desc="problems", unit="problem"):
+        problem = make(youngs)
+        known = {
+            m["method"]: m for m in rows.get((problem.name, youngs), {}).get("methods", []) if not m.get("missing")
+        }
+        rows[problem.name, youngs] = {
+            "problem": problem.name, "vertices": len(problem.mesh.vertices), "tets": len(problem.mesh.tets),
+            "youngs": youngs, "methods": run_problem(problem, options, known),
+        }  # fmt: skip
+        if options.out:
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+            options.out.write_text(json.dumps({"schema": 1, **run, "rows": list(rows.values())}, indent=1) + "\n")
+    print(table(list(rows.values()), GOALS))
+    if options.figure:
+        draw(list(rows.values()), options.figure)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,67 @@
+"""This library: one step with some iterations, or several smaller steps, each with those that "auto" takes."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import torchpd as pd
+from torchpd.solvers import Solver
+
+from .problem import Method, Problem
+from .timing import fastest
+
+Array = NDArray[np.float64]
+
+
+def _compiled(problem: Problem, device: str, time_step: float, solver: Solver | str) -> tuple[pd.Simulator, pd.State]:
+    sim = pd.Simulator(problem.scene(), time_step, None if solver == "auto" else 64, solver, progress=False).to(device)
+    state = sim.rest_state()
+    state.velocities[:] = torch.from_numpy(problem.velocities).to(state.velocities)
+    return sim, state
+
+
+def step(problem: Problem, device: str, solver: Solver, name: str) -> Method:
+    """One step; n iterations."""
+    sim, state = _compiled(problem, device, problem.time_step, solver)
+
+    @torch.no_grad()
+    def run(iterations: int) -> Array:
+        sim.iterations = iterations
+        return np.asarray(sim(state).velocities[0].double().cpu() * sim.time_step)
+
+    def milliseconds(iterations: int) -> float:
+        sim.iterations = iterations
+        with torch.no_grad():
+            return fastest(lambda: sim(state), device)
+
+    return Method(name, run, milliseconds)
+
+
+def converged(problem: Problem) -> tuple[Array, float]:
+    """Our converged step in float64, and |grad E| there over that at the start."""
+    sim = pd.Simulator(problem.scene(), problem.time_step, 400, pd.Multilevel(), torch.float64, progress=False)
+    state = sim.rest_state()
+    state.velocities[:] = torch.from_numpy(problem.velocities)
+    with torch.no_grad():
+        after, info = sim(state, return_info=True)
+    return np.asarray(after.velocities[0] * sim.time_step), float(info.residual)
+
+
+def substeps(problem: Problem, device: str) -> Method:
+    """The same time in n steps."""
+
+    def compiled(count: int) -> tuple[pd.Simulator, pd.State]:
+        return _compiled(problem, device, problem.time_step / count, "auto")
+
+    def run(count: int) -> Array:
+        sim, state = compiled(count)
+        end = sim.rollout(state, count, every=count).state().positions[0]
+        return np.asarray(end.double().cpu() - state.positions[0].double().cpu())
+
+    def milliseconds(count: int) -> float:
+        sim, state = compiled(count)
+        return fastest(lambda: sim.rollout(state, count, every=count), device)
+
+    return Method('torchpd, solver="auto"', run, milliseconds)

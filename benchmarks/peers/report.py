@@ -1,0 +1,108 @@
+"""The table and the picture of errors against time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+Row = dict[str, Any]
+
+OURS = {
+    "Newton VBD": "torchpd", "Newton XPBD": "torchpd", "MuJoCo flex, substeps": "torchpd, substeps",
+}  # fmt: skip
+COLOURS = {
+    "torchpd Chebyshev": "tab:blue", "torchpd Multilevel": "tab:cyan", "torchpd, substeps": "tab:blue",
+    "Newton VBD": "tab:orange", "Newton XPBD": "tab:red", "MuJoCo flex, substeps": "tab:green",
+}  # fmt: skip
+
+
+def milliseconds_to(method: Row, goal: float) -> float | None:
+    """Of the fastest measured point within an error; None where there is none."""
+    return min((point["milliseconds"] for point in method["points"] if point["error"] <= goal), default=None)
+
+
+def best_of_ours(methods: list[Row], peer: str, goal: float) -> float | None:
+    """Of the solvers here that a peer is compared with, the fastest."""
+    kind = OURS[peer]
+    own = [m for m in methods if m["method"] == kind or (kind == "torchpd" and m["method"].startswith("torchpd "))]
+    found = [time for time in (milliseconds_to(method, goal) for method in own) if time is not None]
+    return min(found, default=None)
+
+
+def cell(methods: list[Row], peer: Row, goal: float) -> str:
+    """Milliseconds of ours and the peer's, and how many times faster ours is; a bound where the peer gave up."""
+    own, other = best_of_ours(methods, peer["method"], goal), milliseconds_to(peer, goal)
+    if own is None and other is None:
+        return "neither"
+    if other is None:
+        last = peer["points"][-1]
+        if not last["error"] < 2.0:
+            return f"{own:.2g} / diverges"
+        return f"{own:.2g} / > {last['milliseconds']:.3g}: more than {last['milliseconds'] / own:.2g} x"
+    if own is None:
+        return f"only the other: {other:.3g}"
+    times = f"{other / own:.2g} x" if other >= own else f"{other / own:.2g} x: slower here"
+    return f"{own:.2g} / {other:.3g}: {times}"
+
+
+def table(rows: list[Row], goals: tuple[float, ...]) -> str:
+    """Rows by problem, stiffness and peer, in Markdown."""
+    lines = [
+        "| body | Young's modulus | against | its answer from ours | "
+        + " | ".join(f"error {g:g}" for g in goals)
+        + " |",
+        "|---" * (4 + len(goals)) + "|",
+    ]
+    for row in rows:
+        for peer in row["methods"]:
+            if peer["method"] not in OURS:
+                continue
+            if "refused" in peer:
+                cells, apart = ["left out" if peer["missing"] else "does not converge"] * len(goals), ""
+            else:
+                cells = [cell(row["methods"], peer, goal) for goal in goals]
+                apart = f"{peer['own_answer_from_ours']:.1g}"
+            lines.append(
+                f"| {row['problem']} | {row['youngs']:.0e} Pa | {peer['method']} | {apart} | "
+                + " | ".join(cells)
+                + " |"
+            )
+    return "\n".join(lines)
+
+
+def draw(rows: list[Row], path: Path) -> None:
+    """A panel a problem and stiffness: own error against milliseconds."""
+    import matplotlib.pyplot as plt
+
+    problems = list(dict.fromkeys(row["problem"] for row in rows))
+    stiffnesses = sorted({row["youngs"] for row in rows})
+    figure, panels = plt.subplots(
+        len(problems),
+        len(stiffnesses),
+        figsize=(3.4 * len(stiffnesses), 2.9 * len(problems)),
+        sharey=True,
+        squeeze=False,
+    )
+    for row in rows:
+        panel = panels[problems.index(row["problem"])][stiffnesses.index(row["youngs"])]
+        for method in row["methods"]:
+            points = [(p["milliseconds"], p["error"]) for p in method["points"] if 0.0 < p["error"] < 100.0]
+            if points:
+                style = "--" if "substeps" in method["method"] else "-"
+                colour = COLOURS[method["method"]]
+                panel.plot(*zip(*points, strict=True), style, marker=".", color=colour, label=method["method"])
+        panel.set(xscale="log", yscale="log", ylim=(3e-4, 10.0), title=f"{row['problem']}\n{row['youngs']:.0e} Pa")
+        panel.title.set_fontsize(9)
+        panel.grid(alpha=0.3)
+    for panel in panels[-1]:
+        panel.set_xlabel("milliseconds")
+    for line in panels:
+        line[0].set_ylabel("distance from its own\nconverged answer")
+    handles = {
+        label: handle for panel in figure.axes for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(handles.values(), handles.keys(), loc="lower center", ncol=len(handles), fontsize=9)
+    figure.tight_layout(rect=(0.0, 0.06, 1.0, 1.0))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

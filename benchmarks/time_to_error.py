@@ -1,0 +1,307 @@
+"""Time of a step to an error of 1e-3: Multilevel against guarded Chebyshev on the same device, and what "auto" chose.
+
+The beam of `python -m torchpd study beam`: 1 x 0.2 x 0.2 m, held at x = 0, thrown downwards with v_y = -10 x^2, time
+step 1/30 s, float32, start "velocity". Error |x - x*| / |x_0 - x*|, x* the converged step in float64: Multilevel on the
+CPU until its residual stops falling; rows have the bound that the residual leaves. Iterations are found by doubling and
+bisection to a sixteenth, up to a limit that the rows name; what does not reach the error stays in the table.
+
+Times are of steps in turns, the lowest and the median: with one thread on a CPU those of the processor, on a GPU those
+of the step as Python calls it, device awaited. Cases that were measured are kept: a run that was stopped goes on.
+
+    python benchmarks/time_to_error.py --device cpu
+    python benchmarks/time_to_error.py --device cuda --threads 16
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from machine import describe_run
+from tqdm import tqdm
+
+import torchpd as pd
+from torchpd.accuracy import problem_of
+from torchpd.automatic import COSTS
+from torchpd.forecast import forecast
+from torchpd.solvers import Solver
+from torchpd.study_bench import clock_of
+from torchpd.subjects import SUBJECTS
+
+SIZES = {"1k": 5, "3k": 8, "10k": 12, "30k": 18, "100k": 26}  # cells across
+YOUNGS = (1e4, 1e5, 1e6, 1e7, 1e8)  # Pa
+MOST = {"1k": 8192, "3k": 8192, "10k": 8192, "30k": 8192, "100k": 4096}  # iterations; ten to thirty seconds of a step
+ERROR = 1e-3
+SOLVERS: dict[str, Solver] = {"Chebyshev": pd.Chebyshev(), "Multilevel": pd.Multilevel()}
+REFERENCE_ITERATIONS = 100  # between two looks at the residual
+Row = dict[str, Any]
+
+
+class Case:
+    """One beam on one device, its converged step, and the error of any answer."""
+
+    def __init__(self, cells: int, youngs: float, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
+        subject = SUBJECTS["beam"]()
+        self.scene = subject.scene(subject.mesh(cells), youngs)
+        self.time_step = subject.time_step
+        wide = self.simulator(torch.float64, torch.device("cpu"), pd.Multilevel())
+        start = pd.State(*(part.float() for part in subject.start(wide)))
+        self.solution, self.uncertainty = converged(wide, pd.State(*(part.double() for part in start)))
+        self.sim = self.simulator(dtype, device, pd.Chebyshev())
+        self.state = pd.State(*(part.to(device, dtype) for part in start))
+        self.first = start.velocities[0].double() * self.time_step
+
+    def simulator(self, dtype: torch.dtype, device: torch.device, solver: Solver) -> pd.Simulator:
+        return pd.Simulator(self.scene, self.time_step, 64, solver, dtype, progress=False).to(device)
+
+    def error(self, solver: Solver, iterations: int) -> float:
+        self.sim.solver, self.sim.iterations = solver, iterations
+        reached = self.sim(self.state).velocities[0].double().cpu() * self.time_step
+        found = float((reached - self.solution).norm() / (self.first - self.solution).norm())
+        return found if np.isfinite(found) else float("inf")
+
+
+@torch.no_grad()
+def converged(sim: pd.Simulator, state: pd.State) -> tuple[torch.Tensor, float]:
+    """u* [V, 3] m in float64, and |grad E| / min m/h^2 / |u_0 - u*|: bounds its error where elements are stable."""
+    sim.iterations, guess = REFERENCE_ITERATIONS, "velocity"
+    best, lowest = state.velocities, np.inf
+    for _ in range(20):
+        after, info = sim(state, start=guess, return_info=True)
+        residual = float(info.residual)
+        if not residual < 0.5 * lowest:
+            break
+        best, lowest, guess = after.velocities, residual, after.positions
+    problem = problem_of(sim, state)
+    solution = best[0] * sim.time_step
+    left = float(np.linalg.norm(problem.residual(solution.numpy())))
+    scale = float((state.velocities[0] * sim.time_step - solution).norm())
+    return solution, left / float(problem.weight[problem.free].min()) / scale
+
+
+def fewest(case: Case, solver: Solver, most: int) -> tuple[int | None, float]:
+    """Iterations to `ERROR` and the error there; None and the error of `most` when these are not enough."""
+    high, reached = 8, case.error(solver, 8)
+    while reached > ERROR:
+        if high >= most:
+            return None, reached
+        high = min(2 * high, most)
+        reached = case.error(solver, high)
+    low = high // 2 if high > 8 else 0
+    while high - low > max(1, high // 16):
+        middle = (low + high) // 2
+        left = case.error(solver, middle)
+        low, high, reached = (low, middle, left) if left <= ERROR else (middle, high, reached)
+    return high, reached
+
+
+@torch.no_grad()
+def milliseconds(case: Case, solvers: dict[str, tuple[Solver, int]], seconds: float) -> Row:
+    """A step of each, in turns, so that all see the same machine."""
+    clock, device = clock_of(case.sim.device), case.sim.device
+    times: dict[str, list[float]] = {name: [] for name in solvers}
+    sims = {}
+    for name, (solver, iterations) in solvers.items():
+        sims[name] = case.simulator(case.sim.dtype, device, solver)
+        sims[name].iterations = iterations
+        sims[name](case.state)
+    while len(min(times.values(), key=len)) < 3 or sum(map(sum, times.values())) < seconds:
+        for name, sim in sims.items():
+            wait_for(device)
+            begin = clock()
+            sim(case.state)
+            wait_for(device)
+            times[name].append(clock() - begin)
+        if len(min(times.values(), key=len)) >= 50:
+            break
+    return {name: {"min": 1e3 * min(t), "median": 1e3 * statistics.median(t)} for name, t in times.items()}
+
+
+def wait_for(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+@torch.no_grad()
+def run_case(size: str, youngs: float, device: torch.device, seconds: float, dtype: torch.dtype = torch.float32) -> Row:
+    """Iterations, errors and times of both solvers and of what "auto" chose."""
+    case, most = Case(SIZES[size], youngs, device, dtype), MOST[size]
+    sim = case.sim
+    row: Row = {
+        "size": size, "youngs": youngs, "vertices": sim.vertices, "tets": len(case.scene.values().tets), "most": most,
+        "kernel": sim.plan.kernel, "uncertainty": case.uncertainty, "solvers": {},
+    }  # fmt: skip
+    timed: dict[str, tuple[Solver, int]] = {}
+    for name, solver in SOLVERS.items():
+        begin = time.perf_counter()
+        sim.solver, expected = solver, forecast(sim, solver)
+        row["solvers"][name] = own = {"setup_ms": 1e3 * (time.perf_counter() - begin)}
+        own["iterations"], own["error"] = fewest(case, solver, most)
+        own["forecast"] = None if expected is None else expected.iterations(ERROR)
+        timed[name] = (solver, own["iterations"] or most)
+        timed[f"{name}, 4 iterations"] = (solver, 4)
+    found = milliseconds(case, timed, seconds)
+    for name, (_, iterations) in list(timed.items()):
+        if name in SOLVERS:
+            few = found[f"{name}, 4 iterations"]["min"]
+            slope = (found[name]["min"] - few) / max(iterations - 4, 1)
+            row["solvers"][name].update(milliseconds=found[name], microseconds_an_iteration=1e3 * slope)
+    row["auto"] = run_auto(case, seconds)
+    return {**row, **judged(row)}
+
+
+@torch.no_grad()
+def run_auto(case: Case, seconds: float) -> Row:
+    """What "auto" chose, its error and time."""
+    sim = case.sim
+    sim.solver = "auto"
+    assert sim.choice is not None
+    solver, count, why = sim.solver, sim.iterations, sim.choice.why
+    return {
+        "solver": type(solver).__name__, "iterations": count, "why": why, "error": case.error(solver, count),
+        "milliseconds": milliseconds(case, {"auto": (solver, count)}, seconds)["auto"],
+    }  # fmt: skip
+
+
+def judged(row: Row) -> Row:
+    """How many times faster Multilevel is, a bound where Chebyshev failed; and whether auto took the faster one."""
+    plain, levels = (row["solvers"][name] for name in SOLVERS)
+    ratio = plain["milliseconds"]["min"] / levels["milliseconds"]["min"]
+    reached = [own["iterations"] is not None for own in (plain, levels)]
+    faster = "Multilevel" if reached[1] and (ratio > 1.0 or not reached[0]) else "Chebyshev" if reached[0] else None
+    return {
+        "times_faster": ratio if reached[1] else None,
+        "at_least": not reached[0],
+        "faster": faster,
+        "auto_took_the_faster": row["auto"]["solver"] == faster,
+        # what a wrong choice costs; near 1 both do
+        "auto_loses": max(ratio, 1.0 / ratio) if all(reached) and row["auto"]["solver"] != faster else 1.0,
+    }
+
+
+def table(rows: list[Row]) -> str:
+    """As the README has it."""
+    lines = [
+        '| vertices | Young\'s modulus | guarded Chebyshev | `Multilevel` | times faster | `solver="auto"` |',
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        cells = []
+        for own in row["solvers"].values():
+            count = own["iterations"]
+            cells.append(
+                f"{count} it., {own['milliseconds']['min']:.3g} ms" if count is not None
+                else f"not in {row['most']} it., {own['milliseconds']['min']:.3g} ms: error {own['error']:.1g}"
+            )  # fmt: skip
+        if row["times_faster"] is not None:
+            cells.append(f"{'more than ' * row['at_least']}{row['times_faster']:.2g}")
+        else:
+            cells.append("Multilevel failed")
+        auto = row["auto"]
+        loses = f", the slower by {row['auto_loses']:.2g}" if row["auto_loses"] > 1.0 else ""
+        cells.append(
+            f"{auto['solver']}{loses}: {auto['iterations']} it., {auto['milliseconds']['min']:.3g} ms, "
+            f"error {auto['error']:.1g}"
+        )
+        lines.append(f"| {row['vertices']:,} | {row['youngs']:.0e} Pa | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def matrix(rows: list[Row]) -> str:
+    """Short, as the README has it: milliseconds of Chebyshev / Multilevel and their ratio, by size and stiffness."""
+    stiffnesses = sorted({row["youngs"] for row in rows})
+    lines = [
+        "| vertices | " + " | ".join(f"{youngs:.0e} Pa" for youngs in stiffnesses) + " |",
+        "|---" * (1 + len(stiffnesses)) + "|",
+    ]
+    for count in sorted({row["vertices"] for row in rows}):
+        cells = {row["youngs"]: _short(row) for row in rows if row["vertices"] == count}
+        lines.append(f"| {count:,} | " + " | ".join(cells.get(youngs, "") for youngs in stiffnesses) + " |")
+    return "\n".join(lines)
+
+
+def _short(row: Row) -> str:
+    plain, levels = (own["milliseconds"]["min"] for own in row["solvers"].values())
+    failed = [own["iterations"] is None for own in row["solvers"].values()]
+    if failed[1]:
+        return f"{_plain(plain)}: `Multilevel` failed"
+    before = "> " * failed[0]
+    return f"{before}{_plain(plain)} / {_plain(levels)}: {before}{_plain(row['times_faster'])} x"
+
+
+def _plain(number: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{number:,.1f}" if number < 10.0 else f"{float(f'{number:.2g}'):,.0f}"
+
+
+def costs(rows: list[Row]) -> str:
+    """Microseconds of an iteration by kernel and size: what `torchpd.automatic.COSTS` holds."""
+    lines = []
+    for kernel in sorted({row["kernel"] or "cpu" for row in rows}):
+        for name in SOLVERS:
+            own = [row for row in rows if (row["kernel"] or "cpu") == kernel]
+            sizes = np.array([row["vertices"] / 1e3 for row in own])
+            times = np.array([row["solvers"][name]["microseconds_an_iteration"] for row in own])
+            if len(set(sizes)) < 2:
+                continue
+            # relative errors count: the table serves every size
+            design = np.stack([1.0 / times, sizes / times], axis=1)
+            latency, each = np.linalg.lstsq(design, np.ones(len(own)), rcond=None)[0]
+            table_has = getattr(COSTS[kernel], name.lower())
+            lines.append(f"{kernel}: {name}: Cost({latency:.2g}, {each:.3g}) measured, {table_has} in use")
+    return "\n".join(lines)
+
+
+def main(words: list[str]) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--sizes", nargs="*", choices=SIZES, default=list(SIZES), help="of the beam")
+    parser.add_argument("--youngs", nargs="*", type=float, default=list(YOUNGS), help="Young's moduli [Pa]")
+    parser.add_argument("--seconds", type=float, default=2.0, help="of timing a case (%(default)g)")
+    parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
+    parser.add_argument(
+        "--dtype", choices=("float32", "float64"), default="float32", help="of the steps that are timed"
+    )
+    parser.add_argument("--auto", action="store_true", help='measure anew what "auto" takes in cases that are kept')
+    parser.add_argument("--out", type=Path, help="file for the result (JSON); by default that of the device")
+    options = parser.parse_args(words)
+    name = "time-to-error-" + "-".join([options.device, *(["float64"] if options.dtype == "float64" else [])])
+    out = options.out or Path(__file__).parent / "results" / f"{name}.json"
+    dtype = getattr(torch, options.dtype)
+    torch.set_num_threads(options.threads)
+    device = torch.device(options.device)
+    rows = {(row["size"], row["youngs"]): row for row in json.loads(out.read_text())["rows"]} if out.exists() else {}
+    cases = [(size, youngs) for size in options.sizes for youngs in options.youngs]
+    with tqdm(cases, desc="cases", unit="case") as bar:
+        for size, youngs in bar:
+            bar.set_postfix_str(f"{size}, {youngs:g} Pa")
+            if (size, youngs) not in rows:
+                rows[size, youngs] = run_case(size, youngs, device, options.seconds, dtype)
+            elif options.auto:
+                row = rows[size, youngs]
+                row["auto"] = run_auto(Case(SIZES[size], youngs, device, dtype), options.seconds)
+                row.update(judged(row))
+            write(out, device, options.threads, rows)
+    found = [rows[key] for key in sorted(rows, key=lambda key: (SIZES[key[0]], key[1]))]
+    print(table(found))
+    print(matrix(found))
+    print(costs(found))
+
+
+def write(out: Path, device: torch.device, threads: int, rows: dict[tuple[str, float], Row]) -> None:
+    """Everything so far, in order of size and stiffness."""
+    ordered = [rows[key] for key in sorted(rows, key=lambda key: (SIZES[key[0]], key[1]))]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    record = {"schema": 1, **describe_run(device, threads), "error": ERROR, "rows": ordered}
+    out.write_text(json.dumps(record, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

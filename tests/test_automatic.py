@@ -1,0 +1,161 @@
+"""`solver="auto"` takes the solver that is expected to be the faster, says why, and chooses the same every time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from devices import missing_gpu
+from runs import same_bits
+
+import torchpd as pd
+from torchpd import automatic
+from torchpd.accuracy import exact_steps
+from torchpd.automatic import AIM, COSTS, Cost, Costs
+from torchpd.plan import KERNELS
+
+
+def beam(youngs: float, cells: int = 5, **options: Any) -> pd.Simulator:
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (5 * cells, cells, cells))
+    body = pd.Solid(mesh, youngs=youngs)
+    scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+    return pd.Simulator(scene, 1 / 30, progress=False, **{"solver": "auto", **options})
+
+
+def swinging(sim: pd.Simulator) -> pd.State:
+    state = sim.rest_state()
+    state.velocities[..., 1] = -10.0 * state.positions[..., 0] ** 2
+    return state
+
+
+@pytest.mark.parametrize(("youngs", "kind"), [(1e3, pd.Chebyshev), (1e6, pd.Multilevel), (1e8, pd.Multilevel)])
+def test_stiff_steps_get_multilevel_and_reach_the_aim(youngs: float, kind: type) -> None:
+    sim = beam(youngs)
+    assert type(sim.solver) is kind
+    exact = exact_steps(beam(youngs, solver=pd.Multilevel()), swinging(sim))[0]
+    left = exact.judge(sim(swinging(sim)).velocities[0].double().numpy() * sim.time_step).position
+    assert left <= AIM
+    again = beam(youngs)
+    assert (again.solver, again.iterations, again.choice) == (sim.solver, sim.iterations, sim.choice)
+
+
+def test_the_relaxation_fits_the_spectrum() -> None:
+    """Where inertia is nearly all, 1.9 of it overshoots: two iterations of the right relaxation do as well as 28."""
+    soft = beam(30.0, cells=2)
+    theta = soft.solver.numbers()["relaxation"]
+    assert isinstance(soft.solver, pd.Chebyshev)
+    assert 1.0 < theta < 1.2
+    assert beam(1e5, iterations=1000).solver == pd.Chebyshev()
+    state = swinging(soft)
+    exact = exact_steps(soft, state)[0]
+    errors = []
+    for solver in (soft.solver, pd.Chebyshev()):
+        soft.solver, soft.iterations = solver, 4
+        errors.append(exact.judge(soft(state).velocities[0].double().numpy() * soft.time_step).position)
+    assert errors[0] < 1e-2 * errors[1]
+
+
+def test_iterations_that_are_given_stay() -> None:
+    enough, few = beam(1e5, iterations=1000), beam(1e5, iterations=30)
+    assert (type(enough.solver), enough.iterations) == (pd.Chebyshev, 1000)
+    assert (type(few.solver), few.iterations) == (pd.Multilevel, 30)
+    assert few.choice is not None
+    assert not few.choice.sets_iterations
+    assert "30 leave about" in repr(few)
+    few.prepare_solver()
+    assert few.iterations == 30
+    # set later: as good as given
+    own = beam(1e6)
+    own.iterations = 7
+    own.prepare_solver()
+    assert own.iterations == 7
+
+
+def test_costs_decide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 1e6 Pa some 370 iterations stand against 25: Chebyshev wins when one of Multilevel costs 100 of its."""
+    monkeypatch.setitem(automatic.COSTS, "cpu", Costs(Cost(1.0, 1.0), Cost(100.0, 100.0)))
+    assert isinstance(beam(1e6).solver, pd.Chebyshev)
+    monkeypatch.setitem(automatic.COSTS, "cpu", Costs(Cost(1.0, 1.0), Cost(1.0, 1.0)))
+    assert isinstance(beam(1e4).solver, pd.Multilevel)
+
+
+def test_every_kind_of_device_has_costs() -> None:
+    assert set(COSTS) == {"cpu", *KERNELS}
+    for costs in COSTS.values():
+        assert costs.multilevel.iteration(10_000) > costs.chebyshev.iteration(10_000) > 0.0
+
+
+def test_print_says_why_and_any_other_solver_ends_it() -> None:
+    sim = beam(1e6)
+    text = repr(sim)
+    assert "solver: Multilevel lbfgs" in text
+    assert (
+        "chosen because about 374 iterations of Chebyshev reach 0.001, or about 25 of Multilevel, each as long as 4.2"
+        in text
+    )
+    sim.solver = pd.Chebyshev()
+    assert sim.choice is None
+    assert "chosen because" not in repr(sim)
+    sim.solver = "auto"
+    assert isinstance(sim.solver, pd.Multilevel)
+    with pytest.raises(TypeError, match=r"solver must be Jacobi, Chebyshev, Multilevel or \"auto\", got 'fast'"):
+        sim.solver = "fast"  # type: ignore[assignment]
+    assert sim.choice is not None
+
+
+def test_prepare_solver_chooses_for_the_present_material() -> None:
+    sim = beam(1e3)
+    sim.set_material(stiffness=1e8)
+    assert isinstance(sim.solver, pd.Chebyshev)
+    sim.prepare_solver()
+    assert isinstance(sim.solver, pd.Multilevel)
+    assert sim.iterations == beam(1e8).iterations
+
+
+def test_a_device_without_multilevel_gets_chebyshev(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(solver: Any, device: torch.device) -> Any:
+        if isinstance(solver, pd.Multilevel):
+            raise RuntimeError("no kernels")
+        return solver
+
+    monkeypatch.setattr(automatic, "check_solver", refuse)
+    sim = beam(1e8)
+    assert isinstance(sim.solver, pd.Chebyshev)
+    assert "Multilevel does not run on cpu" in repr(sim)
+    assert sim.iterations > 3000
+
+
+@pytest.mark.parametrize("youngs", [1e3, 1e6])
+def test_files_keep_the_choice_and_that_it_was_one(youngs: float, tmp_path: Path) -> None:
+    sim = beam(youngs)
+    sim.save(tmp_path / "beam.safetensors")
+    loaded = pd.Simulator.load(tmp_path / "beam.safetensors")
+    assert (loaded.solver, loaded.iterations, loaded.choice) == (sim.solver, sim.iterations, sim.choice)
+    assert same_bits(loaded(swinging(loaded)), sim(swinging(sim)))
+    loaded.solver = pd.Chebyshev()
+    loaded.save(tmp_path / "beam.safetensors")
+    assert pd.Simulator.load(tmp_path / "beam.safetensors").choice is None
+
+
+def test_precision_and_copies_keep_it() -> None:
+    sim = beam(1e6)
+    wide = sim.double()
+    assert isinstance(wide.solver, pd.Multilevel)
+    assert wide.choice is not None
+    state = swinging(wide)
+    assert bool(wide(state).positions.isfinite().all())
+
+
+@pytest.mark.skipif(bool(missing_gpu()), reason=missing_gpu())
+@pytest.mark.parametrize("youngs", [1e3, 1e6])
+def test_moving_chooses_for_the_device(youngs: float) -> None:
+    sim = beam(youngs)
+    there = (sim.solver, sim.iterations)
+    sim.to("cuda")
+    assert sim.choice is not None
+    assert sim.device.type == "cuda"
+    assert bool(sim(swinging(sim)).positions.isfinite().all())
+    sim.to("cpu")
+    assert (sim.solver, sim.iterations) == there

@@ -1,0 +1,101 @@
+"""The comparison with other simulators: the same body for all, errors from each own answer, gaps that are said."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+import torch
+
+import torchpd as pd
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def peers(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The modules, by name."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    return lambda name: importlib.import_module(f"benchmarks.peers.{name}")
+
+
+def test_the_minimiser_finds_our_own_step(peers: Any) -> None:
+    """With the energy of projective dynamics it ends where our solver does: w / 2 |F - R|^2, R through the SVD."""
+    problem = peers("problem").beam(2, 1e5)
+
+    def density(f: torch.Tensor) -> torch.Tensor:
+        # |F - R|^2 = sum (sigma - 1)^2 while nothing is inverted
+        return 0.5 * problem.youngs * (torch.linalg.svdvals(f) - 1.0).square().sum(-1)
+
+    found, left = peers("converged").minimise(problem, density)
+    ours, _ = peers("ours").converged(problem)
+    assert left < 1e-8
+    assert problem.error(found, ours) < 1e-6
+
+
+def test_neo_hookean_agrees_for_small_strain(peers: Any) -> None:
+    """Its second derivatives at rest are those of mu |sym|^2 at Poisson ratio 0, w = 2 mu, and its first vanish."""
+    density = peers("converged").stable_neo_hookean(0.5, 0.0)
+    strain = 1e-4 * torch.randn(50, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    strain = (strain + strain.mT) / 2.0
+    rest = density(torch.eye(3, dtype=torch.float64).expand(1, 3, 3))
+    risen = density(torch.eye(3, dtype=torch.float64) + strain) - rest
+    expected = 0.5 * strain.square().sum((1, 2))
+    # what is left out is of third order
+    assert torch.allclose(risen, expected, rtol=5e-3)
+
+
+def test_a_file_is_held_and_thrown_like_the_beam(peers: Any, tmp_path: Path) -> None:
+    path = tmp_path / "bar.mesh"
+    bar = pd.shapes.box((0.2, 4.0, 0.2), (1, 6, 1))
+    meshio.Mesh(bar.vertices, [("tetra", bar.tets)]).write(path)
+    problem = peers("problem").from_file(str(path), 1e5)
+    size = np.ptp(problem.mesh.vertices, axis=0)
+    assert size.max() == pytest.approx(1.0)
+    assert set(problem.held) == set(np.flatnonzero(problem.mesh.vertices[:, 1] < 0.05))
+    assert not problem.velocities[problem.held].any()
+    assert np.abs(problem.velocities).max() == pytest.approx(10.0)
+
+
+def test_a_table_says_who_is_faster_and_what_failed(peers: Any) -> None:
+    report = peers("report")
+
+    def method(name: str, *points: tuple[float, float]) -> dict[str, Any]:
+        listed = [{"milliseconds": ms, "error": error} for ms, error in points]
+        return {"method": name, "points": listed, "own_answer_from_ours": 0.01}
+
+    row = {
+        "problem": "bar", "youngs": 1e5,
+        "methods": [
+            method("torchpd Chebyshev", (1.0, 0.1), (8.0, 0.01)),
+            method("torchpd Multilevel", (2.0, 0.1), (4.0, 0.01)),
+            method("torchpd, substeps", (5.0, 0.1)),
+            method("Newton VBD", (3.0, 0.1), (100.0, 0.02)),
+            {"method": "Newton XPBD", "points": [], "refused": "does not settle", "missing": False},
+            {"method": "MuJoCo flex, substeps", "points": [], "refused": "not installed", "missing": True},
+        ],
+    }  # fmt: skip
+    lines = report.table([row], (0.1, 0.01)).splitlines()[2:]
+    assert "1 / 3: 3 x | 4 / > 100: more than 25 x" in lines[0]
+    assert lines[1].count("does not converge") == 2
+    assert lines[2].count("left out") == 2
+    row["methods"][3] = method("Newton VBD", (0.5, 0.1), (0.6, 2.5))
+    lines = report.table([row], (0.1, 0.01)).splitlines()[2:]
+    assert "slower here" in lines[0]
+    assert "diverges" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("module", "make", "missing"), [("newton_physics", "vbd", "newton"), ("mujoco_flex", "flex", "mujoco")]
+)
+def test_what_is_not_installed_is_named(
+    peers: Any, module: str, make: str, missing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, missing, None)
+    problem = peers("problem").beam(1, 1e5)
+    with pytest.raises(peers("problem").MissingPackageError, match=f"left out.*pip install.*{missing}"):
+        getattr(peers(module), make)(problem, "cpu")

@@ -1,0 +1,121 @@
+"""`solver="auto"`: guarded Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner.
+
+Decided when the simulator is made, when it moves to another device and by `Simulator.prepare_solver`, from the weights
+of the step (`forecast`) and what an iteration costs on the device. Nothing is run or timed, so the choice is the same
+every time. The batch does not enter: an environment gives the same bits alone and in any batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from .forecast import Forecast, Spectrum, forecast, spectrum_of
+from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
+
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = ["AIM", "COSTS", "Choice", "Cost", "Costs", "choose_solver"]
+
+AIM = 1e-3  # error of a step that "auto" sets its iterations for
+MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes
+
+
+class Cost(NamedTuple):
+    """Time of an iteration: `latency` + `each` * vertices / 1000, microseconds."""
+
+    latency: float
+    each: float
+
+    def iteration(self, vertices: int) -> float:
+        """Microseconds."""
+        return self.latency + self.each * vertices / 1000.0
+
+
+class Costs(NamedTuple):
+    """Of the two solvers where a scene runs; only their ratio matters."""
+
+    chebyshev: Cost
+    multilevel: Cost
+
+
+# Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers.
+# The CPU's are of one AVX-512 core, the GPU's of an H100.
+COSTS: dict[str, Costs] = {
+    "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 190.0)),
+    "block": Costs(Cost(2.6, 5.0), Cost(36.0, 12.0)),
+    "grid": Costs(Cost(3.3, 0.1), Cost(36.0, 1.9)),
+    "stream": Costs(Cost(6.0, 0.18), Cost(36.0, 1.9)),
+}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What "auto" decided."""
+
+    iterations: int
+    sets_iterations: bool  # the user gave none
+    why: str  # follows "chosen because"
+
+
+def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
+    """The solver for this scene and device, and why.
+
+    Chebyshev gets a relaxation of min(1.9, 2 / (1 + mu)), which is best for a spectrum of [mu, 1].
+
+    Args:
+        sim: scene, time step, material and device.
+        iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error. None
+            sets as many as are expected to reach an error of `AIM`, times `MARGIN`.
+    """
+    spectrum = spectrum_of(sim)
+    chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
+    if spectrum is None:
+        return chebyshev, _choice(iterations, DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
+    expected = {solver: forecast(sim, solver, spectrum) for solver in (chebyshev, Multilevel())}
+    plain, levels = (_known(each) for each in expected.values())
+    counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
+    if not _runs(Multilevel(), sim):
+        return chebyshev, _choice(iterations, _enough(plain), f"{counts}, and Multilevel does not run on {sim.device}")
+    costs = COSTS[sim.plan.kernel or "cpu"]
+    ratio = costs.multilevel.iteration(sim.vertices) / costs.chebyshev.iteration(sim.vertices)
+    both = f"{counts}, or {levels.words(AIM)} of Multilevel, each as long as {ratio:.2g}"
+    if iterations is None:
+        better = levels.iterations(AIM) * ratio < plain.iterations(AIM)
+    else:
+        better = iterations < _enough(plain) and levels.rate > plain.rate
+        both += f"; {iterations} leave about {plain.error(iterations):.1g} or {levels.error(iterations):.1g}"
+    if better:
+        return Multilevel(), _choice(iterations, _enough(levels), both)
+    return chebyshev, _choice(iterations, _enough(plain), both)
+
+
+def _known(expected: Forecast | None) -> Forecast:
+    assert expected is not None  # both have the weighted diagonal
+    return expected
+
+
+def _enough(expected: Forecast) -> int:
+    return round(MARGIN * expected.iterations(AIM))
+
+
+def _choice(given: int | None, enough: int, why: str) -> Choice:
+    return Choice(enough if given is None else given, given is None, why)
+
+
+def _relaxation(spectrum: Spectrum | None) -> float | None:
+    """Of Chebyshev; None keeps its default, 1.9, which is best for ill-conditioned steps."""
+    if spectrum is None:
+        return None
+    best = 2.0 / (1.0 + spectrum.least)
+    return best if best < Chebyshev().numbers()["relaxation"] else None
+
+
+def _runs(solver: Solver, sim: Model) -> bool:
+    """Whether there are kernels for the solver where the simulator is."""
+    try:
+        check_solver(solver, sim.device)
+    except RuntimeError:
+        return False
+    return True

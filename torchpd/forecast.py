@@ -1,0 +1,143 @@
+"""How many iterations a solver will need, foretold from the weights of the step alone: nothing is solved.
+
+The smallest ratio mu of inertia to diagonal bounds the spectrum of D^-1 A from below, and with it the rate of the
+Jacobi and Chebyshev iterations. What `Multilevel` needs does not depend on the mesh, but on mu n^(2/3), n vertices of a
+body: about rho L^2 / (E h^2), how far a wave travels in a step against the size L of the body. It grows with the
+logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. Forecasts are about
+right: `benchmarks/forecast.py` says how much so. `Simulator.tune` measures instead.
+
+Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+
+from .diagonal import step_diagonal
+from .solvers import Chebyshev, Multilevel, Solver
+
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = ["Forecast", "Spectrum", "UnsolvedWarning", "forecast", "spectrum_of", "warn_of_few_iterations"]
+
+_LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
+# iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
+_LEVELS_LEAST, _LEVELS_SLOPE = 2.0, 3.0
+_LEVELS_CONTACTS = 1.25  # times as many where vertices may touch something
+_MOST = 10_000
+FAR_TOO_FEW = 0.1  # error that is left
+
+
+class UnsolvedWarning(UserWarning):
+    """The default iterations are far too few for this scene, time step and material."""
+
+
+class Spectrum(NamedTuple):
+    """Bounds on the smallest eigenvalue of D^-1 A, D the weighted diagonal, of the worst environment."""
+
+    least: float  # mu: smallest ratio a / D of a vertex that is free, in (0, 1]
+    slow: float  # the same for modes that reach across the mesh, which one flat element does not slow down
+
+
+class Forecast(NamedTuple):
+    """Of one solver on one scene: the error falls by exp(-rate) an iteration."""
+
+    rate: float
+
+    def iterations(self, error: float) -> int:
+        """About how many reach an error |x - x*| / |x_0 - x*| in (0, 1)."""
+        return max(1, math.ceil(math.log(1.0 / error) / self.rate - 1e-9))
+
+    def words(self, error: float) -> str:
+        """`iterations` in words; of very large numbers the rate is not good enough to tell."""
+        number = self.iterations(error)
+        return f"about {number}" if number <= _MOST else f"more than {_MOST:,}"
+
+    def error(self, iterations: int) -> float:
+        """About what so many leave; 1 is the first iterate."""
+        return math.exp(-self.rate * iterations)
+
+
+@torch.no_grad()
+def spectrum_of(sim: Model) -> Spectrum | None:
+    """From the present material and time step; None on "meta", where there are no values, and without a free vertex."""
+    if sim.device.type == "meta" or (sim.plan.kernel is None) != (sim.device.type == "cpu"):
+        return None
+    inertia, diagonal = step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)
+    inertia, diagonal = (array.detach().double().reshape(-1, sim.vertices) for array in (inertia, diagonal))
+    free = inertia.isfinite()
+    if not bool(free.any()):
+        return None
+    ratio = torch.where(free, inertia / diagonal, 1.0)
+    sums = (torch.where(free, array, 0.0).sum(1) for array in (inertia, diagonal))
+    mean = torch.nan_to_num(next(sums) / next(sums), nan=1.0)
+    least = float(ratio.min())
+    # the guarded schedule takes no more momentum than this ratio asks for, so only below it does a flat element matter
+    floor = (1.0 - _LARGEST_RHO) / Chebyshev().numbers()["relaxation"]
+    slow = float(torch.maximum(ratio.amin(1), mean.clamp(max=floor)).min())
+    valid = math.isfinite(least) and 0.0 < least <= slow <= 1.0
+    return Spectrum(least, slow) if valid else None
+
+
+def _limit(rho: float) -> float:
+    """b of omega = 1 + b, where the weights of the Chebyshev method end."""
+    rho = min(max(rho, 0.0), 1.0 - 1e-15)
+    return ((1.0 - math.sqrt(1.0 - rho * rho)) / rho) ** 2 if rho > 0.0 else 0.0
+
+
+def _decay(eigenvalue: float, limit: float) -> float:
+    """Larger root |r| of r^2 - (1 + b) g r + b = 0: what an iteration leaves of the mode g of the Jacobi iteration."""
+    sum_of_roots = (1.0 + limit) * abs(eigenvalue)
+    discriminant = sum_of_roots**2 - 4.0 * limit
+    return math.sqrt(limit) if discriminant <= 0.0 else (sum_of_roots + math.sqrt(discriminant)) / 2.0
+
+
+def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None = None) -> Forecast | None:
+    """What to expect of a solver on this scene; None where nothing can be said.
+
+    That is so for the plain diagonal, with which iterations may diverge, and where `spectrum_of` has nothing.
+
+    Args:
+        sim: scene, time step and material.
+        solver: its own when None.
+        spectrum: when known already.
+    """
+    solver = sim.solver if solver is None else solver
+    spectrum = spectrum_of(sim) if spectrum is None else spectrum
+    numbers = solver.numbers()
+    if spectrum is None or not numbers["weighted"]:
+        return None
+    if isinstance(solver, Multilevel):
+        body = max(len(solid.mesh.vertices) for solid in sim.scene.solids)
+        reach = min(spectrum.slow * body ** (2.0 / 3.0), 1.0)
+        decade = _LEVELS_LEAST + _LEVELS_SLOPE * math.log10(1.0 / reach)
+        contacts = sim.planes.shape[-2] + sim.spheres.shape[-2]
+        return Forecast(math.log(10.0) / (decade * (_LEVELS_CONTACTS if contacts else 1.0)))
+    theta, rho = numbers["relaxation"], numbers["rho"]
+    slowest = 1.0 - theta * spectrum.slow
+    limit = 0.0
+    if isinstance(solver, Chebyshev):
+        limit = _limit(rho if rho > 0.0 else slowest)
+    # the error has little of the modes at the upper end of the spectrum, [mu, 1], but half of it of the middle
+    middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0
+    left = max(_decay(slowest, limit), _decay(middle, limit), 1e-3)
+    return Forecast(-math.log(min(left, 1.0 - 1e-15)))
+
+
+def warn_of_few_iterations(sim: Model) -> None:
+    """Say so when the default number of iterations leaves most of the error: the user may not know of the setting."""
+    expected = forecast(sim)
+    if expected is None or sim.tolerance > 0.0 or expected.error(sim.iterations) <= FAR_TOO_FEW:
+        return
+    warnings.warn(
+        f"Simulator: the default of {sim.iterations} iterations leaves an error of about "
+        f"{expected.error(sim.iterations):.1g} of a step here (1: nothing solved); {expected.words(1e-2)} "
+        'reach 1e-2. Give iterations=..., or take solver="auto", or ask sim.tune(error=1e-2)',
+        UnsolvedWarning,
+        stacklevel=3,
+    )
