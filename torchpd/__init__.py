@@ -18,7 +18,10 @@ from .version import __version__
 if load_extension()[0] is not None:
     from .capture import CapturedStep
     from .ops import nearest_rotation
+    from .patch_transport import PatchTransport
+    from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
+    from .quadrics import Quadrics
     from .simulator import Simulator
     from .spectrum import estimate_rho
 else:  # meshes, scenes and the doctor work without it
@@ -34,14 +37,19 @@ __all__ = [
     "Chebyshev",
     "Damping",
     "Embedding",
+    "FreeFormPatches",
     "Gravity",
     "Ground",
     "Info",
     "Jacobi",
     "MeshWarning",
     "Multilevel",
+    "PatchPose",
+    "PatchSamples",
+    "PatchTransport",
     "Pin",
     "Plan",
+    "Quadrics",
     "Scene",
     "Simulator",
     "Solid",
