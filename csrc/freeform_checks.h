@@ -3,6 +3,9 @@
 #include "checks.h"
 #include "patches/tasks.h"
 
+#include <optional>
+#include <tuple>
+
 namespace pd::freeform {
 
 // A floating-point argument: the precision and the place of `like`, the sizes given, contiguous.
@@ -89,6 +92,27 @@ inline Constraints constraints_view(at::TensorList arrays, const Place& place) {
 inline void check_batched(const Tensor& t, int dims, const char* name, const char* shape) {
   check_real(t, name, shape);
   TORCH_CHECK_VALUE(t.dim() == dims, name, " must be ", shape, ", got ", describe(t));
+}
+
+using OptionalTensor = std::optional<Tensor>;
+
+template <class Work>
+void for_precision(const Tensor& like, Work work) {
+  if (like.scalar_type() == at::kFloat) {
+    work(float());
+  } else {
+    work(double());
+  }
+}
+
+template <class T>
+const T* read(const Tensor& t) {
+  return t.const_data_ptr<T>();
+}
+
+template <class T>
+T* write(const Tensor& t) {
+  return t.mutable_data_ptr<T>();
 }
 
 }  // namespace pd::freeform

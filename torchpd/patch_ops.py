@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import ops  # noqa: F401  (loads the extension)
+from . import ops, patch_batching  # noqa: F401  (load the extension, register the rules for vmap)
 
 __all__: list[str] = []
 

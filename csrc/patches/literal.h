@@ -100,7 +100,7 @@ PD_HD T perturbation(const Solid<T>& t, Index pose, Index patch, const T (&x)[4]
   return sum;
 }
 
-// The five planes at x, and the smallest: the first of several.
+// The five planes at x.
 template <class T>
 struct Planes {
   Vec3<T> v[3], normal, cross_edges;
@@ -124,6 +124,7 @@ PD_HD Planes<T> planes_at(const Solid<T>& t, Index pose, Index patch, const Vec3
   return p;
 }
 
+// The first of the smallest: it takes the derivative where planes meet.
 template <class T>
 PD_HD int smallest_of(const T (&value)[5]) {
   int least = 0;
@@ -139,8 +140,8 @@ PD_HD void item(const SolidField<T>& t, Index i) {
   load_homogeneous(s.points, i, x);
   Planes<T> p = planes_at(s, pose, patch, load3(s.points, i));
   const T r = perturbation(s, pose, patch, x);
-  if (s.clip) p.value[4] = p.value[4] + r;
-  const T f = p.value[smallest_of(p.value)];
+  T f = s.clip ? p.value[4] + r : p.value[4];
+  for (int k = 0; k < 4; ++k) f = lesser(f, p.value[k]);
   t.out[i] = s.clip ? f : f + r;
 }
 
