@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from patch_cases import F64, KIND_NAMES, KINDS, ball, patches_on, quadrics_on, sheet
+from patch_cases import F64, KIND_NAMES, KINDS, ball, patches_on, quadrics_on, sheet, triangle
 
 import torchpd as pd
 from torchpd.patch_lists import triangle_distances
@@ -91,13 +91,17 @@ def test_lists_are_transposes_of_each_other() -> None:
         assert np.all(np.diff(rows)[np.diff(of) == 0] > 0)  # in a fixed order
 
 
-def test_touching_only_just_counts() -> None:
-    """The boundary of an ellipsoid 1e-3 of its radius inside the triangle, and as far outside."""
-    mesh = pd.TriMesh([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+@pytest.mark.parametrize(
+    ("nearest", "way"),
+    [((0.3, 0.3, 0.0), (0.0, 0.0, 1.0)), ((1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), ((0.5, 0.0, 0.0), (0.0, -1.0, 0.0))],
+    ids=["inside", "corner", "edge"],
+)
+def test_touching_only_just_counts(nearest: tuple[float, ...], way: tuple[float, ...]) -> None:
+    """A ball that reaches 1e-3 of its radius beyond the nearest point of the triangle, and one that stops as far off."""
     for offset, count in ((-1e-3, 1), (1e-3, 0)):
-        centre = torch.tensor([[0.3, 0.3, 0.25 * (1.0 + offset)]], dtype=F64)
-        quadric = pd.Quadrics.from_radii(torch.ones(1, dtype=F64), centre, torch.tensor([0.25], dtype=F64))
-        assert len(listed(pd.FreeFormPatches.from_mesh(mesh, quadric, dtype=F64))) == count
+        centre = torch.tensor([nearest], dtype=F64) + 0.05 * (1.0 + offset) * torch.tensor([way], dtype=F64)
+        quadric = pd.Quadrics.from_radii(torch.ones(1, dtype=F64), centre, torch.tensor([0.05], dtype=F64))
+        assert len(listed(pd.FreeFormPatches.from_mesh(triangle(), quadric, dtype=F64))) == count
 
 
 def test_new_quadrics_have_new_lists() -> None:

@@ -33,8 +33,8 @@ class PatchTransport(nn.Module):
     vertices and apexes carries the surface along exactly.
 
     Args:
-        patches: at rest.
-        apexes: points at rest [K, 3] [m].
+        patches: at rest. Their shape is a constant here, without a gradient.
+        apexes: points at rest [K, 3] [m], likewise.
         apex: which of them each patch takes, integers [P]; one for each patch in order when left out.
         mode: "transport" shears and stretches bumps with their surroundings, "rotation" keeps their shape.
         stretch: the least and the largest singular value that a frame takes over.
@@ -77,9 +77,10 @@ class PatchTransport(nn.Module):
         self.register_buffer("inverse_rest", inverse)
         self.register_buffer("areas", areas)
         self.register_buffer("rest_positions", rest)
-        self._lists = len(patches.lists)
-        for number, gathered in enumerate(patches.lists):
-            self.register_buffer(f"list_{number}", gathered, persistent=False)
+        nowhere = patches.samples(torch.empty(0, dtype=torch.int32), rest[:0])  # frames are asked for at no samples
+        self._lists = tuple(f"list_{number}" for number in range(len(patches.lists) + len(nowhere.lists)))
+        for name, gathered in zip(self._lists, (*patches.lists, *nowhere.lists), strict=True):
+            self.register_buffer(name, gathered, persistent=False)
 
     @property
     def constraints(self) -> list[Tensor]:
@@ -103,10 +104,7 @@ class PatchTransport(nn.Module):
 
     def frames(self, gradients: Tensor) -> Tensor:
         """Frames of the vertices [B, V, 3, 3] from gradients of the patches [B, P, 3, 3]."""
-        empty = self.tets[:0, 0]
-        none = [empty, torch.zeros_like(self.tets[:1, 0]).expand(len(self.tets) + 1).contiguous(), empty]
-        lists = [getattr(self, f"list_{n}") for n in range(self._lists)]
-        A: Tensor = _ops.patch_frames(gradients, self.areas, [*lists, *none])
+        A: Tensor = _ops.patch_frames(gradients, self.areas, [getattr(self, name) for name in self._lists])
         return nearest_rotation(A) if self.mode == "rotation" else A
 
     def forward(self, positions: Tensor, fallback: Tensor | None = None) -> PatchPose:
