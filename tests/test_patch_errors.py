@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 from patch_cases import F64, ball, central, lump, patches_on, quadrics_on, triangle
 
 import torchpd as pd
@@ -39,6 +40,13 @@ def test_surfaces(vertices: Any, triangles: Any, message: str) -> None:
 def test_vertex_numbers() -> None:
     with pytest.raises(IndexError, match=r"triangles must lie in 0..2 .*, got \[0, 1, 3\] at 0"):
         made(CORNERS[:3], [[0, 1, 3]])
+
+
+def test_normals_do_not_depend_on_how_faces_are_cut() -> None:
+    """At the corners of a cube, whichever diagonals its faces are cut along: (+-1, +-1, +-1) / sqrt 3."""
+    box = trimesh.creation.box((2.0, 2.0, 2.0))
+    patches = pd.FreeFormPatches.from_mesh(pd.TriMesh.from_trimesh(box), dtype=F64)
+    torch.testing.assert_close(patches.directors, patches.vertices / math.sqrt(3.0), rtol=0, atol=1e-15)
 
 
 def test_normals_that_cancel() -> None:

@@ -97,11 +97,33 @@ def test_lists_are_transposes_of_each_other() -> None:
     ids=["inside", "corner", "edge"],
 )
 def test_touching_only_just_counts(nearest: tuple[float, ...], way: tuple[float, ...]) -> None:
-    """A ball that reaches 1e-3 of its radius beyond the nearest point of the triangle, and one that stops as far off."""
+    """A ball that reaches 1e-3 of its radius beyond the nearest point of the triangle, one that stops as far off."""
     for offset, count in ((-1e-3, 1), (1e-3, 0)):
         centre = torch.tensor([nearest], dtype=F64) + 0.05 * (1.0 + offset) * torch.tensor([way], dtype=F64)
         quadric = pd.Quadrics.from_radii(torch.ones(1, dtype=F64), centre, torch.tensor([0.05], dtype=F64))
         assert len(listed(pd.FreeFormPatches.from_mesh(triangle(), quadric, dtype=F64))) == count
+
+
+@pytest.mark.parametrize("measured_at", ["base", "surface"])
+def test_small_quadrics_on_a_curved_base(measured_at: str) -> None:
+    """Over the middle of each patch of an icosahedron the curved base is 0.12 above the triangle: out of reach of it."""
+    base = pd.FreeFormPatches.from_mesh(ball(0), dtype=F64, base="phong")
+    count = len(base.triangles)
+    middle = base.samples(torch.arange(count), torch.full((count, 3), 1.0 / 3.0, dtype=F64))
+    points = base.surface(middle).points
+    flat = base.vertices[base.triangles.long()].mean(1)
+    assert float((points - flat).norm(dim=1).min()) > 0.12
+    small = pd.Quadrics.from_radii(torch.full((count,), 0.01, dtype=F64), points, torch.full((count,), 0.05, dtype=F64))
+    patches = pd.FreeFormPatches.from_mesh(
+        ball(0),
+        small,
+        dtype=F64,
+        base="phong",
+        measured_at=measured_at,  # type: ignore[arg-type]
+    )
+    assert {(k, k) for k in range(count)} <= listed(patches)
+    assert float(patches.heights(middle)[0].min()) > 0.009
+    assert not listed(pd.FreeFormPatches.from_mesh(ball(0), small, dtype=F64))
 
 
 def test_new_quadrics_have_new_lists() -> None:
