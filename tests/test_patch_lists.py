@@ -106,7 +106,7 @@ def test_touching_only_just_counts(nearest: tuple[float, ...], way: tuple[float,
 
 @pytest.mark.parametrize("measured_at", ["base", "surface"])
 def test_small_quadrics_on_a_curved_base(measured_at: str) -> None:
-    """Over the middle of each patch of an icosahedron the curved base is 0.12 above the triangle: out of reach of it."""
+    """Over the middle of each patch of an icosahedron the curved base is 0.12 above the triangle: out of its reach."""
     base = pd.FreeFormPatches.from_mesh(ball(0), dtype=F64, base="phong")
     count = len(base.triangles)
     middle = base.samples(torch.arange(count), torch.full((count, 3), 1.0 / 3.0, dtype=F64))
