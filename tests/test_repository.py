@@ -88,6 +88,8 @@ def test_nothing_is_left_unfinished() -> None:
 
 def test_execution_headers_know_no_torch_and_no_cuda() -> None:
     foreign = re.compile(r'#include\s*[<"](torch|ATen|c10|cuda|cub|pybind11)')
-    headers = [path for folder in ("math", "effects", "solver") for path in (ROOT / "csrc" / folder).glob("**/*.h")]
+    headers = [
+        path for folder in ("math", "effects", "solver", "patches") for path in (ROOT / "csrc" / folder).glob("**/*.h")
+    ]
     assert headers
     assert [path.name for path in headers if foreign.search(path.read_text(encoding="utf-8"))] == []

@@ -19,7 +19,10 @@ if load_extension()[0] is not None:
     from .capture import CapturedStep
     from .forecast import UnsolvedWarning
     from .ops import nearest_rotation
+    from .patch_transport import PatchTransport
+    from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
+    from .quadrics import Quadrics
     from .simulator import Simulator
     from .spectrum import estimate_rho
 else:  # meshes, scenes and the doctor work without it
@@ -35,14 +38,19 @@ __all__ = [
     "Chebyshev",
     "Damping",
     "Embedding",
+    "FreeFormPatches",
     "Gravity",
     "Ground",
     "Info",
     "Jacobi",
     "MeshWarning",
     "Multilevel",
+    "PatchPose",
+    "PatchSamples",
+    "PatchTransport",
     "Pin",
     "Plan",
+    "Quadrics",
     "Scene",
     "Simulator",
     "Solid",

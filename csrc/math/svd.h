@@ -1,4 +1,4 @@
-// Nearest rotation of any 3x3 matrix by a signed singular value decomposition: the safe way, for the rare cases.
+// Signed singular value decomposition of any 3x3 matrix, and with it the nearest rotation: the safe way, for the rare cases.
 #pragma once
 #include "math/mat.h"
 #include "math/scalar.h"
@@ -55,10 +55,19 @@ PD_HD Vec3<T> carried(const Vec3<T>& u, const Vec3<T>& from, const Vec3<T>& v) {
   return (T(1) / square_root(dot(w, w))) * w;
 }
 
-// argmax over rotations R of tr(R^T F). One-sided Jacobi: F V = U S with det V = +1, U completed to det U = +1,
-// so the smallest singular value carries the sign of det F. F = 0 gives the identity; a NaN or infinity gives NaN.
+// F = U diag(s) V^T with det U = det V = +1 and s_0 >= s_1 >= |s_2|: the last carries the sign of det F.
 template <class T>
-PD_HD Mat3<T> rotation_by_svd(const Mat3<T>& f) {
+struct SignedSvd {
+  Mat3<T> u, v;
+  T s[3];
+
+  // argmax over rotations R of tr(R^T F)
+  PD_HD Mat3<T> rotation() const { return u * transpose(v); }
+};
+
+// One-sided Jacobi: F V = U S with det V = +1, U completed to det U = +1. F = 0 gives identities; a NaN or infinity gives NaN.
+template <class T>
+PD_HD SignedSvd<T> signed_svd(const Mat3<T>& f) {
   T b[3][3] = {{f.row[0].x, f.row[0].y, f.row[0].z},
                {f.row[1].x, f.row[1].y, f.row[1].z},
                {f.row[2].x, f.row[2].y, f.row[2].z}};
@@ -71,9 +80,11 @@ PD_HD Mat3<T> rotation_by_svd(const Mat3<T>& f) {
   // zero for finite F, NaN otherwise
   const T poison = sum - sum;
   if (!(largest > T(0)) || !(poison == T(0))) {
-    return {{{T(1) + poison, poison, poison},
-             {poison, T(1) + poison, poison},
-             {poison, poison, T(1) + poison}}};
+    const Mat3<T> same = {{{T(1) + poison, poison, poison},
+                           {poison, T(1) + poison, poison},
+                           {poison, poison, T(1) + poison}}};
+    const Mat3<T> one = {{{T(1), T(0), T(0)}, {T(0), T(1), T(0)}, {T(0), T(0), T(1)}}};
+    return {same, one, {poison, poison, poison}};
   }
   for (int sweep = 0; sweep < 10; ++sweep) {
     bool turned = orthogonalise(b, v, 0, 1);
@@ -97,8 +108,14 @@ PD_HD Mat3<T> rotation_by_svd(const Mat3<T>& f) {
   const T s1 = square_root(dot(u1, u1));
   u1 = s1 > T(4) * epsilon<T>() * s0 ? (T(1) / s1) * u1 : carried(u0, v0, v1);
   const Vec3<T> u2 = cross(u0, u1);
-  // R = U V^T
-  return from_columns(u0, u1, u2) * transpose(from_columns(v0, v1, v2));
+  const T s2 = dot(u2, Vec3<T>{b[0][2], b[1][2], b[2][2]});
+  return {from_columns(u0, u1, u2), from_columns(v0, v1, v2), {scale * s0, scale * s1, scale * s2}};
+}
+
+// The nearest rotation, which never fails. F = 0 gives the identity; a NaN or infinity gives NaN.
+template <class T>
+PD_HD Mat3<T> rotation_by_svd(const Mat3<T>& f) {
+  return signed_svd(f).rotation();
 }
 
 }  // namespace pd::inline PD_TARGET

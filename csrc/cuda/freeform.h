@@ -1,0 +1,15 @@
+// The tasks of free-form patches as functions: no torch, no CUDA headers. Work goes to a stream and nobody waits.
+#pragma once
+#include "patches/tasks.h"
+
+namespace pd::freeform {
+
+using Stream = void*;  // cudaStream_t
+
+#define PD_DECLARE(Task)                                              \
+  void run_task(const Task<float>& task, Index count, Stream stream); \
+  void run_task(const Task<double>& task, Index count, Stream stream);
+PD_FREEFORM_TASKS(PD_DECLARE)
+#undef PD_DECLARE
+
+}  // namespace pd::freeform

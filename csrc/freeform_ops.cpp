@@ -1,0 +1,67 @@
+// The ops of free-form patches: schemas, and the CPU behind them.
+//
+// Compiled once, for any processor: the work is gathers and short scalar loops, which wider registers hardly speed up.
+#if defined(__x86_64__)
+#define PD_NO_FMA  // x86-64 has it only since AVX2, and a call to the library would be slow
+#endif
+#define PD_TARGET freeform_cpu
+#include "freeform_ops.h"
+
+#include <ATen/Parallel.h>
+
+namespace pd::freeform {
+namespace {
+
+struct Cpu {
+  // Items of one task differ in cost: small grains keep all threads busy.
+  template <class Task>
+  static void run(const Task& task, std::int64_t count, const Tensor&) {
+    at::parallel_for(0, count, 64, [&](std::int64_t begin, std::int64_t end) {
+      for (std::int64_t i = begin; i < end; ++i) item(task, i);
+    });
+  }
+};
+
+}  // namespace
+
+TORCH_LIBRARY_FRAGMENT(torchpd, m) {
+  m.def(
+      "patch_height(Tensor vertices, Tensor directors, Tensor amplitudes, Tensor centres, Tensor "
+      "factors, Tensor barycentrics, Tensor[] lists, *, bool on_surface, bool phong) -> (Tensor, "
+      "Tensor)");
+  m.def(
+      "patch_height_vjp(Tensor grad_heights, Tensor grad_slopes, Tensor heights, Tensor vertices, "
+      "Tensor directors, Tensor amplitudes, Tensor centres, Tensor factors, Tensor barycentrics, "
+      "Tensor[] lists, *, bool on_surface, bool phong) -> (Tensor, Tensor, Tensor, Tensor, Tensor, "
+      "Tensor)");
+  m.def(
+      "patch_surface(Tensor positions, Tensor frames, Tensor vertices, Tensor directors, Tensor "
+      "heights, Tensor slopes, Tensor barycentrics, Tensor[] lists, *, bool phong) -> (Tensor, "
+      "Tensor)");
+  m.def(
+      "patch_surface_vjp(Tensor grad_points, Tensor grad_tangents, Tensor positions, Tensor "
+      "frames, Tensor vertices, Tensor directors, Tensor heights, Tensor slopes, Tensor "
+      "barycentrics, Tensor[] lists, *, bool phong) -> (Tensor, Tensor, Tensor, Tensor, Tensor, "
+      "Tensor, Tensor)");
+  m.def(
+      "patch_field(Tensor points, Tensor positions, Tensor amplitudes, Tensor matrices, Tensor[] "
+      "lists, *, float thickness, bool clip) -> Tensor");
+  m.def(
+      "patch_field_vjp(Tensor grad, Tensor points, Tensor positions, Tensor amplitudes, Tensor "
+      "matrices, Tensor[] lists, *, float thickness, bool clip) -> (Tensor, Tensor, Tensor, "
+      "Tensor)");
+  m.def(
+      "patch_deformation(Tensor positions, Tensor inverse_rest, Tensor? fallback, Tensor[] "
+      "constraints, *, float lower, float upper) -> Tensor");
+  m.def(
+      "patch_deformation_vjp(Tensor grad, Tensor positions, Tensor inverse_rest, Tensor? fallback, "
+      "Tensor[] constraints, *, float lower, float upper) -> (Tensor, Tensor, Tensor)");
+  m.def("patch_frames(Tensor gradients, Tensor weights, Tensor[] lists) -> Tensor");
+  m.def(
+      "patch_frames_vjp(Tensor grad, Tensor frames, Tensor gradients, Tensor weights, Tensor[] "
+      "lists) -> (Tensor, Tensor)");
+}
+
+TORCH_LIBRARY_IMPL(torchpd, CPU, m) { register_ops<Cpu>(m); }
+
+}  // namespace pd::freeform

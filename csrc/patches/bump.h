@@ -1,0 +1,115 @@
+// One perturbation R = a [Q]_+^3 with Q = 1 - |y|^2, y = M (x - c): value, derivatives and adjoint side by side.
+//
+// R is the soft-object kernel of Wyvill et al. (1986) over an ellipsoid: a at the centre, 27/64 a at half the radius, C2 across
+// the boundary, where it ends. |dR/dr| is at most 96 / (25 sqrt 5) a over the radius.
+//   grad R = -6 a q^2 M^T y,   Hess R w = M^T (24 a q (y.z) y - 6 a q^2 z),   z = M w,   q = [Q]_+
+#pragma once
+#include "patches/views.h"
+
+namespace pd::freeform::inline PD_TARGET {
+
+// A lower triangular matrix.
+template <class T>
+struct Factor {
+  T xx, yy, zz, yx, zx, zy;
+};
+
+template <class T>
+PD_HD Factor<T> load_factor(const T* from, Index row) {
+  const T* m = from + 6 * row;
+  return {m[0], m[1], m[2], m[3], m[4], m[5]};
+}
+
+template <class T>
+PD_HD Vec3<T> operator*(const Factor<T>& m, const Vec3<T>& a) {
+  return {m.xx * a.x, multiply_add(m.yy, a.y, m.yx * a.x),
+          multiply_add(m.zz, a.z, multiply_add(m.zy, a.y, m.zx * a.x))};
+}
+
+template <class T>
+PD_HD Vec3<T> transposed_times(const Factor<T>& m, const Vec3<T>& a) {
+  return {multiply_add(m.zx, a.z, multiply_add(m.yx, a.y, m.xx * a.x)),
+          multiply_add(m.zy, a.z, m.yy * a.y), m.zz * a.z};
+}
+
+template <class T>
+struct Bump {
+  T a;
+  Vec3<T> c;
+  Factor<T> m;
+};
+
+template <class T>
+PD_HD Bump<T> load_bump(const Ellipsoids<T>& of, Index quadric) {
+  return {of.amplitudes[quadric], load3(of.centres, quadric), load_factor(of.factors, quadric)};
+}
+
+// Value and gradient of a sum of bumps.
+template <class T>
+struct Field {
+  T value;
+  Vec3<T> gradient;
+};
+
+// The sum over the quadrics of a patch. Those that x lies outside of are left out, not added as zeros.
+template <class T>
+PD_HD Field<T> bumps_at(const Ellipsoids<T>& of, const Lists& lists, Index patch,
+                        const Vec3<T>& x) {
+  Field<T> sum = {T(0), zero3<T>()};
+  for (int32 e = lists.patch_start[patch]; e < lists.patch_start[patch + 1]; ++e) {
+    const Bump<T> r = load_bump(of, lists.entry_quadric[e]);
+    const Vec3<T> y = r.m * (x - r.c);
+    const T q = T(1) - dot(y, y);
+    if (!(q > T(0))) continue;
+    sum.value = sum.value + r.a * (q * q * q);
+    add(sum.gradient, T(-6) * r.a * (q * q), transposed_times(r.m, y));
+  }
+  return sum;
+}
+
+// Hess R w of the sum over the quadrics of a patch
+template <class T>
+PD_HD Vec3<T> bumps_hessian_product(const Ellipsoids<T>& of, const Lists& lists, Index patch,
+                                    const Vec3<T>& x, const Vec3<T>& w) {
+  Vec3<T> sum = zero3<T>();
+  for (int32 e = lists.patch_start[patch]; e < lists.patch_start[patch + 1]; ++e) {
+    const Bump<T> r = load_bump(of, lists.entry_quadric[e]);
+    const Vec3<T> y = r.m * (x - r.c);
+    const T q = T(1) - dot(y, y);
+    if (!(q > T(0))) continue;
+    const Vec3<T> z = r.m * w;
+    const Vec3<T> g = (T(24) * r.a * q * dot(y, z)) * y - (T(6) * r.a * (q * q)) * z;
+    add(sum, transposed_times(r.m, g));
+  }
+  return sum;
+}
+
+// Gradient of mu R(x) + grad R(x) . w for the ten numbers of a quadric.
+template <class T>
+struct BumpAdjoint {
+  T a;
+  Vec3<T> c;
+  Factor<T> m;
+};
+
+template <class T>
+PD_HD void bump_vjp(const Bump<T>& r, const Vec3<T>& x, const Vec3<T>& w, const T& mu,
+                    BumpAdjoint<T>& g) {
+  const Vec3<T> from = x - r.c, y = r.m * from;
+  const T q = T(1) - dot(y, y);
+  if (!(q > T(0))) return;
+  const Vec3<T> z = r.m * w;
+  const T along = dot(y, z), q2 = q * q;
+  g.a = g.a + (mu * (q2 * q) - T(6) * q2 * along);
+  const Vec3<T> gy = (r.a * (T(24) * q * along - T(6) * mu * q2)) * y - (T(6) * r.a * q2) * z;
+  const Vec3<T> gz = (T(-6) * r.a * q2) * y;
+  g.m.xx = g.m.xx + (gy.x * from.x + gz.x * w.x);
+  g.m.yy = g.m.yy + (gy.y * from.y + gz.y * w.y);
+  g.m.zz = g.m.zz + (gy.z * from.z + gz.z * w.z);
+  g.m.yx = g.m.yx + (gy.y * from.x + gz.y * w.x);
+  g.m.zx = g.m.zx + (gy.z * from.x + gz.z * w.x);
+  g.m.zy = g.m.zy + (gy.z * from.y + gz.z * w.y);
+  g.c = g.c - transposed_times(r.m, gy);
+}
+
+}  // namespace pd::freeform::inline PD_TARGET

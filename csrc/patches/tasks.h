@@ -1,0 +1,29 @@
+// Every task of the free-form patches: what a device has to be able to run.
+#pragma once
+#include "patches/frames.h"
+#include "patches/height.h"
+#include "patches/literal.h"
+#include "patches/surface.h"
+
+// X(task)
+#define PD_FREEFORM_TASKS(X) \
+  X(Height)                  \
+  X(HeightSamples)           \
+  X(HeightEntries)           \
+  X(HeightQuadrics)          \
+  X(CornerSum)               \
+  X(Surface)                 \
+  X(SurfaceSamples)          \
+  X(SurfacePose)             \
+  X(SolidField)              \
+  X(SolidSamples)            \
+  X(SolidVertices)           \
+  X(SolidEntries)            \
+  X(SolidQuadrics)           \
+  X(Deformation)             \
+  X(DeformationGradients)    \
+  X(DeformationPoints)       \
+  X(DeformationRest)         \
+  X(Frames)                  \
+  X(FramesGradients)         \
+  X(FramesWeights)

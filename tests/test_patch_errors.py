@@ -1,0 +1,174 @@
+"""What free-form patches refuse, and how they say it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from patch_cases import F64, ball, central, lump, patches_on, quadrics_on, triangle
+
+import torchpd as pd
+
+CORNERS = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]
+
+
+def made(vertices: Any, triangles: Any, *args: Any, **options: Any) -> pd.FreeFormPatches:
+    return pd.FreeFormPatches(torch.tensor(vertices, dtype=F64), torch.tensor(triangles), *args, **options)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles", "message"),
+    [
+        (CORNERS, [[0, 1, 2], [1, 0, 3], [0, 1, 4]], r"must belong to at most two triangles, got edge \[0, 1\] with 3"),
+        (CORNERS[:4], [[0, 1, 2], [0, 1, 3]], r"must have the same orientation, got edge \[0, 1\] in the same"),
+        ([*CORNERS[:3], [0.5, 0.0, 0.0]], [[0, 1, 2], [1, 0, 3]], r"areas must not vanish, got \[1, 0, 3\] at 1"),
+        (CORNERS[:3], [[0, 1, 1]], r"corners must differ, got \[0, 1, 1\]"),
+        (CORNERS, [[0, 1, 2]], "every vertex must belong to an element, got 2 of 5 that do not"),
+        (CORNERS[:3], np.empty((0, 3), dtype=np.int64), "triangles must hold at least one element"),
+        ([[math.nan, 0, 0], *CORNERS[1:3]], [[0, 1, 2]], "vertices must be finite"),
+    ],
+)  # fmt: skip
+def test_surfaces(vertices: Any, triangles: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        made(vertices, triangles)
+
+
+def test_vertex_numbers() -> None:
+    with pytest.raises(IndexError, match=r"triangles must lie in 0..2 .*, got \[0, 1, 3\] at 0"):
+        made(CORNERS[:3], [[0, 1, 3]])
+
+
+def test_normals_do_not_depend_on_how_faces_are_cut() -> None:
+    """At the corners of a cube, whichever diagonals its faces are cut along: (+-1, +-1, +-1) / sqrt 3."""
+    box = trimesh.creation.box((2.0, 2.0, 2.0))
+    patches = pd.FreeFormPatches.from_mesh(pd.TriMesh.from_trimesh(box), dtype=F64)
+    torch.testing.assert_close(patches.directors, patches.vertices / math.sqrt(3.0), rtol=0, atol=1e-15)
+
+
+def test_normals_that_cancel() -> None:
+    """Two triangles back to back have no normal."""
+    with pytest.raises(
+        ValueError, match="the triangles around a vertex must not cancel, got vertex 0 without a normal"
+    ):
+        made(CORNERS[:3], [[0, 1, 2], [0, 2, 1]])
+    up = torch.tensor([[0.0, 0.0, 1.0]] * 3, dtype=F64)
+    assert len(made(CORNERS[:3], [[0, 1, 2], [0, 2, 1]], directors=up).triangles) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"base": "round"}, ValueError, "base must be one of flat, phong, got 'round'"),
+        ({"measured_at": "top"}, ValueError, "measured_at must be one of base, surface, got 'top'"),
+        ({"thickness": -1.0}, ValueError, "thickness must be >= 0, got -1"),
+        ({"directors": torch.zeros(3, 3, dtype=F64)}, ValueError, r"must be of unit length, got .* at 0 \(3 in all\)"),
+        ({"directors": torch.ones(2, 3, dtype=F64)}, ValueError, r"directors must be \[3, 3\]"),
+        ({"directors": torch.zeros(3, 3)}, ValueError, "directors must be torch.float64 on cpu like vertices"),
+        ({"quadrics": lump(dtype=torch.float32)}, ValueError, "quadrics must be torch.float64 on cpu like vertices"),
+    ],
+)  # fmt: skip
+def test_options(options: Any, error: Any, message: str) -> None:
+    with pytest.raises(error, match=message):
+        made(CORNERS[:3], [[0, 1, 2]], **options)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda a, c, m: (a * math.nan, c, m),
+        lambda a, c, m: (a, c + math.inf, m),
+        lambda a, c, m: (a, c, m + 1e4),  # exp overflows: a radius of 0
+        lambda a, c, m: (a, c, m - 1e4),  # exp underflows: no ellipsoid any more
+    ],
+)
+def test_quadrics_that_are_not_finite(change: Any) -> None:
+    q = lump()
+    with pytest.raises(ValueError, match=r"quadrics must be finite ellipsoids, got amplitude .* at 0"):
+        made(CORNERS[:3], [[0, 1, 2]], pd.Quadrics(*change(q.amplitudes, q.centres, q.factors)))
+
+
+def test_patches_that_may_fold() -> None:
+    """A bump of height 1 and radius 1/4 whose centre hovers over the triangle rises by up to 6.87 along the normal."""
+    centre = torch.tensor([[0.25, 0.25, 0.2]], dtype=F64)
+    steep = pd.Quadrics.from_radii(torch.ones(1, dtype=F64), centre, torch.tensor([0.25], dtype=F64))
+    with pytest.raises(ValueError, match=r"must be unique.* got up to 6.87 on patch 0 \(1 in all\): it may fold"):
+        made(CORNERS[:3], [[0, 1, 2]], steep, measured_at="surface")
+    assert float(made(CORNERS[:3], [[0, 1, 2]], steep).steepness) == 0.0
+    # from below it can rise as high as it likes: on its far side it falls
+    low = pd.Quadrics(steep.amplitudes, centre * centre.new_tensor([1.0, 1.0, -1.0]), steep.factors)
+    assert float(made(CORNERS[:3], [[0, 1, 2]], low, measured_at="surface").steepness) == 0.0
+
+
+def test_bound_of_the_steepness_holds() -> None:
+    """d/dh sum R(P + h D) at heights within reach, of quadrics around and beside the base."""
+    patches = patches_on(kind=("phong", "surface"), count=30, height=0.02)
+    grid = patches.tessellate(5).samples
+    bare = patches.with_quadrics(pd.Quadrics.none(F64))
+    base = bare.surface(grid).points
+    director = (patches.directors[patches.triangles.long()[grid.patch.long()]] * grid.barycentrics[..., None]).sum(1)
+    reach, bound = patches.reach[grid.patch.long()], patches.steepness[grid.patch.long()]
+    h = torch.linspace(-1.0, 1.0, 41, dtype=F64)[:, None] * reach
+    h.requires_grad_()
+    value = patches.quadrics.values(base + h[..., None] * director).sum()
+    (slope,) = torch.autograd.grad(value, h)
+    assert bool((slope <= bound + 1e-12).all())
+    assert float((slope / bound.clamp_min(1e-9)).max()) > 0.2  # and it is no idle bound
+    found = patches.heights(grid)[0].abs()
+    assert bool((found <= reach).all())
+    assert float((found / reach.clamp_min(1e-9)).max()) > 0.5
+
+
+def test_samples() -> None:
+    patches = made(CORNERS[:3], [[0, 1, 2]])
+    b = torch.tensor([[0.2, 0.3, 0.5]], dtype=F64)
+    with pytest.raises(IndexError, match=r"patch must lie in 0..0, got 1 to 1"):
+        patches.samples(torch.tensor([1]), b)
+    with pytest.raises(ValueError, match=r"patch must be integers \[1\] like barycentrics, got torch.int64 \[2\]"):
+        patches.samples(torch.tensor([0, 0]), b)
+    with pytest.raises(ValueError, match=r"barycentrics must be \[n, 3\]"):
+        patches.samples(torch.tensor([0]), b[:, :2])
+    with pytest.raises(ValueError, match="reading must be one of clip, literal, got 'both'"):
+        patches.field(b, torch.tensor([0]), reading="both")  # type: ignore[arg-type]
+
+
+def test_from_mesh_takes_meshes() -> None:
+    with pytest.raises(TypeError, match="mesh must be a TriMesh, got TetMesh"):
+        pd.FreeFormPatches.from_mesh(pd.shapes.single_tet())  # type: ignore[arg-type]
+
+
+def test_transport() -> None:
+    patches = made(CORNERS[:3], [[0, 1, 2]])
+    flat = torch.tensor([[0.3, 0.3, 1e-5]], dtype=F64)
+    with pytest.raises(ValueError, match=r"apexes must lie off the plane of their patch, .*, got 1e-05 m for patch 0"):
+        pd.PatchTransport(patches, flat)
+    below = torch.tensor([[0.3, 0.3, -1.0]], dtype=F64)
+    with pytest.raises(ValueError, match=r"apex must lie in 0..0 \(there are 1 apexes\), got 1 to 1"):
+        pd.PatchTransport(patches, below, torch.tensor([1]))
+    with pytest.raises(ValueError, match=r"apex must be integers \[1\], one for each patch, got \[2\]"):
+        pd.PatchTransport(patches, below, torch.tensor([0, 0]))
+    with pytest.raises(ValueError, match="mode must be transport or rotation, got 'none'"):
+        pd.PatchTransport(patches, below, mode="none")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="stretch must be"):
+        pd.PatchTransport(patches, below, stretch=(0.0, 2.0))
+    with pytest.raises(ValueError, match=r"positions must be \[2, 4, 3\]"):
+        pd.PatchTransport(patches, below)(torch.zeros(2, 5, 3, dtype=F64))
+
+
+def test_transport_moves_with_its_module(dtype: torch.dtype, device: torch.device) -> None:
+    patches = patches_on()
+    transport = central(patches).to(device=device, dtype=dtype)
+    pose = transport(transport.rest_positions[None])
+    assert pose.frames.dtype == dtype
+    assert pose.frames.device.type == device.type
+    assert pose.positions.shape == (1, len(patches.vertices), 3)
+    assert "list_0" not in transport.state_dict()
+
+
+def test_printed() -> None:
+    patches = pd.FreeFormPatches.from_mesh(triangle(), lump(), dtype=F64)
+    assert repr(patches) == "FreeFormPatches(1 patches, 3 vertices, 1 quadrics, base='flat', measured_at='base')"
+    assert len(quadrics_on(ball())) == 12
