@@ -117,7 +117,7 @@ class Promise:
     def estimate(self, info: Info) -> Tensor:
         """Error of the step [B] that its residual may hide, at the largest ratio of the study; NaN without a report.
 
-        High rather than low: where it exceeds `error` an `audit` is worth its three steps.
+        High rather than low: it exceeds `error` at about one step in four that keep the promise. An `audit` tells which.
         """
         return info.residual * self.error_per_residual
 
