@@ -80,7 +80,7 @@ def test_a_table_says_who_is_faster_and_what_failed(peers: Any) -> None:
         ],
     }  # fmt: skip
     lines = report.table([row], (0.1, 0.01)).splitlines()[2:]
-    assert "1 / 3: 3 x | 4 / > 100: more than 25 x" in lines[0]
+    assert "1.0 / 3.0: 3.0 x | 4.0 / > 100: > 25 x" in lines[0]
     assert lines[1].count("does not converge") == 2
     assert lines[2].count("left out") == 2
     row["methods"][3] = method("Newton VBD", (0.5, 0.1), (0.6, 2.5))

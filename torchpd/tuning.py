@@ -117,7 +117,7 @@ class Promise:
     def estimate(self, info: Info) -> Tensor:
         """Error of the step [B] that its residual may hide, at the largest ratio of the study; NaN without a report.
 
-        High rather than low: where it exceeds `error` an `audit` is worth its three steps.
+        High rather than low: it exceeds `error` on one in four steps that keep the promise; an `audit` tells which.
         """
         return info.residual * self.error_per_residual
 

@@ -29,20 +29,23 @@ def best_of_ours(methods: list[Row], peer: str, goal: float) -> float | None:
     return min(found, default=None)
 
 
+def plain(number: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{number:.2g}" if number < 1.0 else f"{number:.1f}" if number < 10.0 else f"{float(f'{number:.2g}'):,.0f}"
+
+
 def cell(methods: list[Row], peer: Row, goal: float) -> str:
     """Milliseconds of ours and the peer's, and how many times faster ours is; a bound where the peer gave up."""
     own, other = best_of_ours(methods, peer["method"], goal), milliseconds_to(peer, goal)
-    if own is None and other is None:
-        return "neither"
+    if own is None:
+        return "neither" if other is None else f"only the other: {plain(other)}"
     if other is None:
         last = peer["points"][-1]
         if not last["error"] < 2.0:
-            return f"{own:.2g} / diverges"
-        return f"{own:.2g} / > {last['milliseconds']:.3g}: more than {last['milliseconds'] / own:.2g} x"
-    if own is None:
-        return f"only the other: {other:.3g}"
-    times = f"{other / own:.2g} x" if other >= own else f"{other / own:.2g} x: slower here"
-    return f"{own:.2g} / {other:.3g}: {times}"
+            return f"{plain(own)} / diverges"
+        return f"{plain(own)} / > {plain(last['milliseconds'])}: > {plain(last['milliseconds'] / own)} x"
+    slower = ": slower here" if other < own else ""
+    return f"{plain(own)} / {plain(other)}: {plain(other / own)} x{slower}"
 
 
 def table(rows: list[Row], goals: tuple[float, ...]) -> str:
