@@ -44,9 +44,9 @@ class Costs(NamedTuple):
 # The CPU's are of one AVX-512 core, the GPU's of an H100.
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 190.0)),
-    "block": Costs(Cost(2.6, 5.0), Cost(36.0, 12.0)),
-    "grid": Costs(Cost(3.3, 0.1), Cost(36.0, 1.9)),
-    "stream": Costs(Cost(6.0, 0.18), Cost(36.0, 1.9)),
+    "block": Costs(Cost(2.6, 5.0), Cost(34.0, 14.0)),
+    "grid": Costs(Cost(3.2, 0.093), Cost(40.0, 2.0)),
+    "stream": Costs(Cost(6.0, 0.18), Cost(40.0, 2.0)),
 }
 
 

@@ -6,7 +6,7 @@ same sheet over their edge. The surface is continuous everywhere and C2 inside e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
@@ -222,7 +222,9 @@ class FreeFormPatches:
 
     def _copy(self) -> FreeFormPatches:
         other: FreeFormPatches = object.__new__(FreeFormPatches)
-        store(other, **vars(self))
+        # by name: torch.compile cannot see through the object's dictionary in every version of torch
+        for name in _FIELDS:
+            object.__setattr__(other, name, getattr(self, name))
         return other
 
     # ---- evaluation
@@ -351,6 +353,9 @@ class FreeFormPatches:
             f"FreeFormPatches({len(self.triangles)} patches, {len(self.vertices)} vertices, {len(self.quadrics)} "
             f"quadrics, base={self.base!r}, measured_at={self.measured_at!r})"
         )
+
+
+_FIELDS = tuple(field.name for field in fields(FreeFormPatches))
 
 
 def _choose(name: str, value: object, among: tuple[str, ...]) -> None:
