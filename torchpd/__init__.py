@@ -18,6 +18,7 @@ from .version import __version__
 if load_extension()[0] is not None:
     from .capture import CapturedStep
     from .ops import nearest_rotation
+    from .patch_body import PatchBody
     from .patch_transport import PatchTransport
     from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
@@ -44,6 +45,7 @@ __all__ = [
     "Jacobi",
     "MeshWarning",
     "Multilevel",
+    "PatchBody",
     "PatchPose",
     "PatchSamples",
     "PatchTransport",
