@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -213,6 +215,15 @@ def test_pins_address_the_vertices_of_the_patches() -> None:
         body.pose(state.positions)
 
 
+def test_it_is_saved_as_the_solid_that_it_is(tmp_path: Path) -> None:
+    body = body_of(ball(), "skeleton")
+    sim = pd.Simulator(pd.Scene(body, pd.Pin(body, [0]), pd.Gravity()), dtype=F64)
+    sim.save(tmp_path / "sim.safetensors")
+    again = pd.Simulator.load(tmp_path / "sim.safetensors")
+    assert type(again.scene.solids[0]) is pd.Solid
+    assert torch.equal(again(again.rest_state()).positions, sim(sim.rest_state()).positions)
+
+
 # ---- the surface
 
 
@@ -342,12 +353,21 @@ def test_flat_constraints_are_refused_by_name() -> None:
 
 def test_depth_of_a_cube_and_what_blocks_the_view() -> None:
     cube = pd.TriMesh.from_trimesh(trimesh.creation.box((1.0, 2.0, 3.0)))
-    far = cube.translated((1e7, 0.0, 0.0))
-    corners = far.vertices[far.triangles]
-    starts = np.array([[1e7 - 0.5, 0.3, 0.2], [1e7 + 0.1, -1.0, 0.2]])
-    assert depths(starts, np.array([[1.0, 0, 0], [0, 1.0, 0]]), corners) == pytest.approx([1.0, 2.0], abs=1e-8)
+    corners = cube.vertices[cube.triangles]
+    starts = np.array([[-0.5, 0.3, 0.2], [0.1, -1.0, 0.2]])
+    assert depths(starts, np.array([[1.0, 0, 0], [0, 1.0, 0]]), corners) == pytest.approx([1.0, 2.0], abs=1e-14)
     ends = starts + np.array([[0.9, 0.1, 0.0], [0.0, 2.5, 0.0]])
     assert is_blocked(starts, ends, corners).tolist() == [False, True]
+
+
+def test_depths_do_not_depend_on_the_place_of_the_body() -> None:
+    mesh = ball(2)
+    corners = mesh.vertices[mesh.triangles]
+    middles = corners.mean(axis=1)
+    here = depths(middles, -middles / np.linalg.norm(middles, axis=1, keepdims=True), corners)
+    assert here == pytest.approx(np.full(320, 2.0), abs=0.05)
+    away = depths(middles + 1e7, -middles / np.linalg.norm(middles, axis=1, keepdims=True), corners + 1e7)
+    assert away == pytest.approx(here, abs=1e-6)  # rounding of 1e7, times the slope of a facet
 
 
 @pytest.mark.parametrize(

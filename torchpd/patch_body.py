@@ -36,7 +36,9 @@ class PatchBody(Solid):
     space between is filled, so that the constraints resist bending and change of volume. "prism", for open sheets, or
     for a shell without a filling: a second layer under the patches, three constraints a patch. The layer takes part in
     contacts and in the mass. Being one element thick, it bends less than a plate of its thickness would: three times
-    less where it is about as thick as patches are wide, ten times where it is a quarter of that.
+    less where it is thicker than patches are wide, five times where about as thick, ten times where half as thick.
+
+    `Simulator.save` writes the Solid that it is; `patches.save` keeps the surface, which the same body is made of anew.
 
     Args:
         patches: at rest. Their shape and quadrics are constants of the body; `pose` works on their device and in
