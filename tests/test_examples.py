@@ -81,3 +81,11 @@ def test_fit_stiffness(run) -> None:
     distances = [float(d) for d in re.findall(r"^ +\d+ +[\d,]+ +[\d,]+ +(\S+)$", text, flags=re.MULTILINE)]
     assert len(distances) == 2
     assert distances[1] < distances[0]
+
+
+def test_patch_body(run, tmp_path: Path) -> None:
+    text = run("patch_body.py", "--steps", "3", "--level", "2")
+    assert trimesh.load(tmp_path / "patches.glb", force="mesh").faces.shape == (4 * 400, 3)
+    gap, mean, most = numbers(text, r"gaps up to (\S+) m, creases of (\S+) degrees, up to (\S+)\n")
+    assert gap == 0.0
+    assert 0.0 < mean < most < 60.0

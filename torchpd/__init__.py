@@ -19,6 +19,7 @@ if load_extension()[0] is not None:
     from .capture import CapturedStep
     from .forecast import UnsolvedWarning
     from .ops import nearest_rotation
+    from .patch_body import PatchBody
     from .patch_transport import PatchTransport
     from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
@@ -45,6 +46,7 @@ __all__ = [
     "Jacobi",
     "MeshWarning",
     "Multilevel",
+    "PatchBody",
     "PatchPose",
     "PatchSamples",
     "PatchTransport",

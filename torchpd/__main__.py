@@ -17,7 +17,10 @@ _DEMO = """\
 Drops an elastic body on the ground and writes pictures, films and a convergence plot.
 
 MESH is a surface (.obj, .ply, .stl, .glb and whatever else trimesh reads), which is filled with a lattice of
-tetrahedra, or a tetrahedral mesh (.mesh, .msh, .vtk, .vtu). It is scaled to a metre. Without MESH: an octopus."""
+tetrahedra, or a tetrahedral mesh (.mesh, .msh, .vtk, .vtu). It is scaled to a metre. Without MESH: an octopus.
+
+--patches: bodies of free-form patches instead, as large as the three scenes of the source paper, which are twisted,
+bent and dropped; a picture, moving surfaces, and what a frame costs beside the published times."""
 
 _STUDY = """\
 Measures what accuracy costs: the error of the solver against iterations, milliseconds and memory, beside methods of
@@ -25,6 +28,9 @@ the literature; the errors of the time step, of the mesh and of float32; and wha
 
 SUBJECT is beam, octopus, or the file of a mesh, which lands on the ground. Results go to --out: study.json, study.csv,
 pictures and report.html. A study that was stopped goes on where it was."""
+
+
+_CELLS = 24
 
 
 def _whole(text: str) -> int:
@@ -60,13 +66,14 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     demo.add_argument("mesh", nargs="?", type=Path, metavar="MESH", help="file of a surface or a tetrahedral mesh")
-    demo.add_argument("--cells", type=_whole, default=24, help="lattice cells along the longest side (%(default)s)")
+    demo.add_argument("--cells", type=_whole, help=f"lattice cells along the longest side ({_CELLS})")
     demo.add_argument("--steps", type=_whole, default=120, help="time steps of 1/60 s (%(default)s)")
     demo.add_argument("--youngs", type=_positive, default=3e4, help="Young's modulus in Pa (%(default)g)")
     demo.add_argument("--iterations", type=_whole, default=64, help="iterations of a time step (%(default)s)")
     demo.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
     demo.add_argument("--out", type=Path, default=Path("out"), help="folder for the files (%(default)s)")
     demo.add_argument("--quick", action="store_true", help="fewer and smaller pictures")
+    demo.add_argument("--patches", action="store_true", help="bodies of free-form patches, without MESH and --cells")
     _add_study(commands)
     commands.add_parser("doctor", help="print versions, devices, and what is missing")
     return parser
@@ -103,9 +110,14 @@ def _study(arguments: argparse.Namespace) -> str:
 
 def _demo(arguments: argparse.Namespace) -> str:
     from .demo import DemoOptions, run_demo
+    from .patch_demo import run_patch_demo
 
-    options = vars(arguments)
-    return run_demo(DemoOptions(**{name: value for name, value in options.items() if name != "command"}))
+    options = {name: value for name, value in vars(arguments).items() if name != "command"}
+    patches, cells = options.pop("patches"), options.pop("cells")
+    if patches and not (options["mesh"] is None and cells is None):
+        raise ValueError("demo --patches makes its own bodies: leave out MESH and --cells")
+    chosen = DemoOptions(**options, cells=cells or _CELLS)
+    return run_patch_demo(chosen) if patches else run_demo(chosen)
 
 
 def _doctor() -> int:

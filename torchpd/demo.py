@@ -24,7 +24,7 @@ from .simulator import Simulator
 from .state import State, Track
 from .tetrahedralize import tetrahedralize
 
-__all__ = ["DemoOptions", "run_demo"]
+__all__ = ["DemoOptions", "check_packages", "find_device", "run_demo"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -77,11 +77,8 @@ class _Motion(NamedTuple):
 
 def run_demo(options: DemoOptions) -> str:
     """Write pictures, films and the convergence plot to `options.out`; the report to print."""
-    missing = missing_packages(package for package in OPTIONAL if package.module in _DRAWING)
-    if missing:  # said before the work, not after it
-        names = ", ".join(package.pip_name for package in missing)
-        raise ModuleNotFoundError(f"the demo draws with {names}, not installed: pip install torchpd[demo]")
-    device = _device(options.device)
+    check_packages()
+    device = find_device(options.device)
     name = options.mesh.name if options.mesh else "octopus"
     mesh = _place(_load(options.mesh), options.cells)
     scene = Scene(Solid(mesh, youngs=options.youngs, density=1000.0), Gravity(), Ground(friction=0.5))
@@ -95,7 +92,16 @@ def run_demo(options: DemoOptions) -> str:
     return _report(name, mesh, sim, motion, files)
 
 
-def _device(name: str) -> torch.device:
+def check_packages() -> None:
+    """Say that something to draw with is missing, before the work and not after it."""
+    missing = missing_packages(package for package in OPTIONAL if package.module in _DRAWING)
+    if missing:
+        names = ", ".join(package.pip_name for package in missing)
+        raise ModuleNotFoundError(f"the demo draws with {names}, not installed: pip install torchpd[demo]")
+
+
+def find_device(name: str) -> torch.device:
+    """What --device names, if it is there."""
     kind = name.split(":")[0]
     if kind not in ("cpu", "cuda"):
         raise ValueError(f"--device must be cpu or cuda, got {name}")

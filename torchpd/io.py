@@ -126,7 +126,8 @@ def _part_arrays(part: Part) -> dict[str, NDArray[Any]]:
 
 def _part_record(part: Part, scene: Scene, meshes: list[TetMesh]) -> Record:
     """The fields of a part that are no arrays: numbers as they are, other objects by their number."""
-    record: Record = {"kind": type(part).__name__}
+    kind = next(kind for kind in _KINDS.values() if isinstance(part, kind))  # a body of patches as the Solid it is
+    record: Record = {"kind": kind.__name__}
     if isinstance(part, Solid):
         record["mesh"] = next(number for number, mesh in enumerate(meshes) if mesh is part.mesh)
     elif isinstance(part, Pin):
