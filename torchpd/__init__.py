@@ -18,6 +18,8 @@ from .version import __version__
 if load_extension()[0] is not None:
     from .capture import CapturedStep
     from .ops import nearest_rotation
+    from .patch_fit import FitReport, PatchFit, fit_patches
+    from .patch_loss import PatchLoss
     from .patch_transport import PatchTransport
     from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
@@ -37,6 +39,7 @@ __all__ = [
     "Chebyshev",
     "Damping",
     "Embedding",
+    "FitReport",
     "FreeFormPatches",
     "Gravity",
     "Ground",
@@ -44,6 +47,8 @@ __all__ = [
     "Jacobi",
     "MeshWarning",
     "Multilevel",
+    "PatchFit",
+    "PatchLoss",
     "PatchPose",
     "PatchSamples",
     "PatchTransport",
@@ -62,6 +67,7 @@ __all__ = [
     "compile_plan",
     "embed",
     "estimate_rho",
+    "fit_patches",
     "nearest_rotation",
     "shapes",
     "tetrahedralize",
