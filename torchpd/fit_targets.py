@@ -132,19 +132,28 @@ class FieldTarget:
             raise ValueError(f"{_NAME}: a function must be differentiable by torch, got values without a gradient")
         (slope,) = torch.autograd.grad(values.sum(), x)
         value, gradient = values.detach().double().numpy(), slope.double().numpy()
-        if not (np.isfinite(value).all() and np.isfinite(gradient).all()):
-            bad = int(np.flatnonzero(~(np.isfinite(value) & np.isfinite(gradient).all(axis=1)))[0])
-            raise ValueError(f"{_NAME}: a function must have finite values and gradients, not so at {points[bad]}")
+        _refuse_nonsense(points, np.column_stack([value, gradient]))
         length = np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
         normal = gradient / length[:, None]
         return value / length, normal, normal
 
     def _values(self, points: Array) -> Array:
         with torch.no_grad():
-            return np.asarray(self.function(torch.tensor(points)).double().numpy())
+            values = np.asarray(self.function(torch.tensor(points)).double().numpy())
+        _refuse_nonsense(points, values[:, None])
+        return values
 
     def mesh(self) -> TriMesh:
         return _contour(self._values, *self.bounds)
+
+
+def _refuse_nonsense(points: Array, numbers: Array) -> None:
+    bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
+    if len(bad):
+        raise ValueError(
+            f"{_NAME}: a function must have finite values and gradients, got {numbers[bad[0]].tolist()} at "
+            f"{points[bad[0]].tolist()} ({len(bad)} in all)"
+        )
 
 
 class CloudTarget:
@@ -331,4 +340,4 @@ def _barycentrics(corners: Array, points: Array) -> Array:
     pa, pb = (p * a).sum(1), (p * b).sum(1)
     det = aa * bb - ab * ab
     second, third = (bb * pa - ab * pb) / det, (aa * pb - ab * pa) / det
-    return np.clip(np.stack([1.0 - second - third, second, third], axis=1), 0.0, 1.0)
+    return np.asarray(np.clip(np.stack([1.0 - second - third, second, third], axis=1), 0.0, 1.0))
