@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 import trimesh
 
+import torchpd
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -81,3 +83,16 @@ def test_fit_stiffness(run) -> None:
     distances = [float(d) for d in re.findall(r"^ +\d+ +[\d,]+ +[\d,]+ +(\S+)$", text, flags=re.MULTILINE)]
     assert len(distances) == 2
     assert distances[1] < distances[0]
+
+
+def test_fit_patches(run, tmp_path: Path) -> None:
+    out = tmp_path / "patches.glb"
+    words = ("--patches", "200", "--quadrics", "10", "--iterations", "3", "--level", "2", "--out", str(out))
+    text = run("fit_patches.py", *words)
+    for base in ("flat", "phong"):
+        size, rms = numbers(text, rf"{base}: 200 patches, \d+ quadrics .*, ([\d,]+) bytes: (\S+) m rms")
+        assert size <= 200 * 6 + 102 * 20 + 10 * 40
+        assert 1e-4 < rms < 0.02  # of a body of 1 m
+    assert trimesh.load(out, force="mesh").faces.shape == (800, 3)
+    assert "closed" in text
+    assert len(torchpd.FreeFormPatches.load(out.with_suffix(".safetensors")).triangles) == 200

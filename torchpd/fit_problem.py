@@ -157,10 +157,16 @@ def ridge_amplitudes(problem: HeightProblem, numbers: QuadricNumbers, ridge: flo
 
 
 def _normal_matrix(J: csr_array) -> Array | csc_array:
-    """J^T J; dense by blocks of rows, because a sparse product takes ten times as long when much of it is not 0."""
-    if J.shape[1] > _DENSE:
+    """J^T J, as a sparse matrix when it is large.
+
+    A sparse product costs about ten times as much for each number as a dense one, which counts zeros too.
+    """
+    unknowns = J.shape[1]
+    if unknowns > _DENSE:
         return csc_array(J.T @ J)
-    H = np.zeros((J.shape[1],) * 2)
+    if J.nnz < 0.1 * J.shape[0] * unknowns:
+        return np.asarray((J.T @ J).toarray())
+    H = np.zeros((unknowns, unknowns))
     for start in range(0, J.shape[0], 4096):
         block = J[start : start + 4096].toarray()
         H += block.T @ block

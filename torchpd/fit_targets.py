@@ -31,7 +31,7 @@ Answer: TypeAlias = tuple[Array, Array, Array]
 
 _NAME = "FreeFormPatches.fit: target"
 _NEIGHBOURS = 16  # points of a cloud that make up the surface at a place
-_CELLS = 32  # of the lattice that finds the surface of a function or a cloud
+_CELLS = 24  # of the lattice that finds the surface of a function or a cloud
 _FACING = 0.1  # least cosine between a director and the normal where it meets the surface
 
 
@@ -157,8 +157,8 @@ def _refuse_nonsense(points: Array, numbers: Array) -> None:
 
 
 class CloudTarget:
-    """Points with normals: the surface where the mean of the distances from the tangent planes nearby vanishes,
-    weighted by [1 - |x - p|^2 / r^2]^3 (an implicit moving least-squares surface, Kolluri 2008)."""
+    """Points with normals: the surface where the mean of the distances from planes through the points nearby vanishes,
+    weighted by [1 - |x - p|^2 / r^2]^3 (an implicit moving least-squares surface, Kolluri 2008; exact on spheres)."""
 
     def __init__(self, points: Any, normals: Any = None) -> None:
         self.points = as_array(_NAME, points, np.float64)
@@ -187,8 +187,9 @@ class CloudTarget:
         weight = np.where(weight.sum(axis=1, keepdims=True) > 0, weight, 1.0)
         weight /= weight.sum(axis=1, keepdims=True)
         normal = self.normals[chosen[:, :-1]]
-        planes = ((points[:, None] - self.points[chosen[:, :-1]]) * normal).sum(axis=2)
         mean = _unit(np.einsum("nk,nkx->nx", weight, normal))
+        # half way between both normals the plane through p meets a sphere again: no bias where the surface bends
+        planes = ((points[:, None] - self.points[chosen[:, :-1]]) * 0.5 * (normal + mean[:, None])).sum(axis=2)
         return (weight * planes).sum(axis=1), mean, mean
 
     def mesh(self) -> TriMesh:
@@ -226,7 +227,7 @@ def _estimated_normals(points: Array, tree: cKDTree) -> Array:
 def _contour(values: Callable[[Array], Array], low: Array, high: Array) -> TriMesh:
     margin = 2.0 * float((high - low).max()) / _CELLS
     try:
-        mesh = contour(values, low - margin, high + margin, _CELLS)
+        mesh = contour(values, low - margin, high + margin, _CELLS, rounds=2)
         check_surface(torch.tensor(mesh.vertices), torch.tensor(mesh.triangles))
     except ValueError as error:
         raise ValueError(
