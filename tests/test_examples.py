@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 import trimesh
 
+import torchpd
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -89,3 +91,16 @@ def test_patch_body(run, tmp_path: Path) -> None:
     gap, mean, most = numbers(text, r"gaps up to (\S+) m, creases of (\S+) degrees, up to (\S+)\n")
     assert gap == 0.0
     assert 0.0 < mean < most < 60.0
+
+
+def test_fit_patches(run, tmp_path: Path) -> None:
+    out = tmp_path / "patches.glb"
+    words = ("--patches", "200", "--quadrics", "10", "--iterations", "3", "--level", "2", "--out", str(out))
+    text = run("fit_patches.py", *words)
+    for base in ("flat", "phong"):
+        size, rms = numbers(text, rf"{base}: 200 patches, \d+ quadrics .*, ([\d,]+) bytes: (\S+) m rms")
+        assert size <= 200 * 6 + 102 * 20 + 10 * 40
+        assert 1e-4 < rms < 0.02  # of a body of 1 m
+    assert trimesh.load(out, force="mesh").faces.shape == (800, 3)
+    assert "closed" in text
+    assert len(torchpd.FreeFormPatches.load(out.with_suffix(".safetensors")).triangles) == 200

@@ -20,6 +20,8 @@ if load_extension()[0] is not None:
     from .forecast import UnsolvedWarning
     from .ops import nearest_rotation
     from .patch_body import PatchBody
+    from .patch_fit import FitReport, PatchFit, fit_patches
+    from .patch_loss import PatchLoss
     from .patch_transport import PatchTransport
     from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
@@ -39,6 +41,7 @@ __all__ = [
     "Chebyshev",
     "Damping",
     "Embedding",
+    "FitReport",
     "FreeFormPatches",
     "Gravity",
     "Ground",
@@ -47,6 +50,8 @@ __all__ = [
     "MeshWarning",
     "Multilevel",
     "PatchBody",
+    "PatchFit",
+    "PatchLoss",
     "PatchPose",
     "PatchSamples",
     "PatchTransport",
@@ -66,6 +71,7 @@ __all__ = [
     "compile_plan",
     "embed",
     "estimate_rho",
+    "fit_patches",
     "nearest_rotation",
     "shapes",
     "tetrahedralize",

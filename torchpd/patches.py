@@ -23,6 +23,7 @@ from .patch_lists import Touching, gather_lists, touching
 from .quadrics import Quadrics, check_real_tensor
 
 if TYPE_CHECKING:
+    from .patch_fit import PatchFit
     from .patch_mesh import Tessellation
 
 __all__ = ["FreeFormPatches", "PatchPose", "PatchSamples", "SurfacePoints"]
@@ -172,6 +173,13 @@ class FreeFormPatches:
         if not isinstance(mesh, TriMesh):
             raise TypeError(f"FreeFormPatches.from_mesh: mesh must be a TriMesh, got {type(mesh).__name__}")
         return cls(torch.tensor(mesh.vertices, dtype=dtype), torch.tensor(mesh.triangles), quadrics, **options)
+
+    @classmethod
+    def fit(cls, target: Any, quadrics: int = 60, **options: Any) -> PatchFit:
+        """Patches fitted to a surface, and how far they are from it; `options` are those of `torchpd.fit_patches`."""
+        from .patch_fit import fit_patches
+
+        return fit_patches(target, quadrics, **options)
 
     def with_quadrics(self, quadrics: Quadrics, *, keep_lists: bool = False) -> FreeFormPatches:
         """The same base with other quadrics.

@@ -1,0 +1,40 @@
+"""Fit free-form patches to a surface, say how far they are from it, and save them: as patches and as a mesh."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torchpd as pd
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("mesh", nargs="?", type=Path, help="an oriented surface; the octopus when left out")
+    parser.add_argument("--patches", type=int, default=400, help="triangles of the base, at most")
+    parser.add_argument("--quadrics", type=int, default=100, help="at most")
+    parser.add_argument("--iterations", type=int, default=40, help="of each stage of the fit, at most")
+    parser.add_argument("--level", type=int, default=6, help="segments along an edge of the mesh that is written")
+    parser.add_argument("--out", type=Path, default=Path("patches.glb"), help="file for the mesh")
+    options = parser.parse_args()
+
+    target = pd.TriMesh.from_file(options.mesh) if options.mesh else pd.shapes.octopus()
+    index = 2 if len(target.vertices) <= 65536 else 4
+    size = 12 * len(target.vertices) + 3 * index * len(target.triangles)
+    print(f"{target}, {size:,} bytes")
+
+    for base in ("flat", "phong"):
+        fit = pd.FreeFormPatches.fit(
+            target, options.quadrics, patches=options.patches, base=base, iterations=options.iterations, progress=True
+        )
+        print(f"{base:>6}: {fit.report}")
+
+    surface = fit.patches.mesh(options.level)
+    surface.to_file(options.out)
+    fit.patches.save(options.out.with_suffix(".safetensors"))
+    closed = surface.to_trimesh().is_watertight
+    print(f"{options.out}: {surface}, {'closed' if closed else 'open'}")
+
+
+if __name__ == "__main__":
+    main()
