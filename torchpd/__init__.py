@@ -18,6 +18,8 @@ from .version import __version__
 if load_extension()[0] is not None:
     from .capture import CapturedStep
     from .ops import nearest_rotation
+    from .patch_image import PatchImage
+    from .patch_rays import PatchHits, PatchRays
     from .patch_transport import PatchTransport
     from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
@@ -44,7 +46,10 @@ __all__ = [
     "Jacobi",
     "MeshWarning",
     "Multilevel",
+    "PatchHits",
+    "PatchImage",
     "PatchPose",
+    "PatchRays",
     "PatchSamples",
     "PatchTransport",
     "Pin",
