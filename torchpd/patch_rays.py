@@ -45,9 +45,9 @@ class PatchHits:
 class PatchRays:
     """Finds where rays hit free-form patches.
 
-    Every patch is cut into `level` x `level` cells, which a tree of boxes holds; the boxes follow each pose. A cell that
-    a ray may meet is searched by Newton's method, from several places where the cell is seen edge-on. Both sides of the
-    surface are hit. Rays that hit a grid of cells exactly on an edge hit one of its patches.
+    Every patch is cut into `level` x `level` cells, which a tree of boxes holds; the boxes follow each pose. A cell
+    that a ray may meet is searched by Newton's method, from several places where the cell is seen edge-on. Both sides
+    of the surface are hit, and patches leave no gap along their edges. A ray within the plane of a flat patch may pass.
 
     How far the surface bulges over a cell is measured at 12 points in it. That is trustworthy where a cell is not much
     larger than the quadrics on it; the default level sees to it up to 32.
