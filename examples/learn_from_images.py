@@ -71,9 +71,8 @@ def main() -> None:
         if step % max(1, options.steps // 10) == 0 or step == options.steps:
             height = 1e3 * float((amplitudes - truth.amplitudes).detach().abs().mean())
             place = 1e3 * float((centres - truth.centres).detach().norm(dim=1).mean())
-            print(
-                f"{step:4d} {float(color.detach()) ** 0.5:8.5f} {1e3 * float(depth.detach()) ** 0.5:12.3f} {height:13.3f} {place:13.3f}"
-            )
+            errors = (1e3 * float(depth.detach()) ** 0.5, height, place)
+            print(f"{step:4d} {float(color.detach()) ** 0.5:8.5f} " + " ".join(f"{error:12.3f}" for error in errors))
         optimiser.zero_grad()
         (color + 10.0 * depth).backward()
         optimiser.step()

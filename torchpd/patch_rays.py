@@ -63,8 +63,7 @@ class PatchRays:
             raise TypeError(f"PatchRays: patches must be FreeFormPatches, got {type(patches).__name__}")
         if level is None:
             level = _fine_enough(patches)
-        if isinstance(level, bool) or not isinstance(level, int) or not 1 <= level <= _FINEST:
-            raise ValueError(f"PatchRays: level must be a whole number in 1..{_FINEST}, got {level!r}")
+        _check_level(level)
         self.patches, self.level = patches, level
         self._samples = tessellate(patches, _CHECKS * level).samples
         device, dtype = patches.vertices.device, patches.vertices.dtype
@@ -94,16 +93,41 @@ class PatchRays:
             patches: in place of those given at the start, with the same triangles.
             near, far: hits count between these distances along the ray [m].
         """
+        depth, patch, b = self.search(origins, directions, pose, patches=patches, near=near, far=far)
+        surface = self.patches if patches is None else patches
+        o, d = _rays(origins, directions, surface)
+        rest = _at_rest(surface) if pose is None else pose
+        return _fill(surface, rest, depth, patch, b, o.expand(len(depth), -1, -1), d.expand(len(depth), -1, -1))
+
+    @torch.no_grad()
+    def search(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        pose: PatchPose | None = None,
+        *,
+        patches: FreeFormPatches | None = None,
+        near: float = 0.0,
+        far: float = math.inf,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What `cast` finds before it looks at the hits: nothing waits for the device, nothing has a gradient.
+
+        Returns:
+            Depth [B, R] in m, infinite for a miss; patch int32 [B, R], -1 for a miss; barycentrics [B, R, 3].
+        """
         surface = self.patches if patches is None else patches
         self._check_patches(surface)
-        if pose is None:
-            eye = torch.eye(3, dtype=surface.vertices.dtype, device=surface.vertices.device)
-            pose = PatchPose(surface.vertices[None], eye.expand(1, len(surface.vertices), 3, 3))
-        o, d = (_batched(name, t, surface) for name, t in (("origins", origins), ("directions", directions)))
-        d = torch.nn.functional.normalize(d, dim=-1, eps=0.0)
-        with torch.no_grad():
-            depth, patch, b = self._search(surface, o, d, pose, near, far)
-        return _fill(surface, pose, depth, patch, b, o.expand(len(depth), -1, -1), d.expand(len(depth), -1, -1))
+        o, d = _rays(origins, directions, surface)
+        at = _at_rest(surface) if pose is None else pose
+        points = surface.surface(self._samples, at).points
+        q = surface.quadrics
+        depth, patch, b = _ops.patch_surface_rays(
+            o, d, points, self._cells, self._weights, self._places, *at, surface.vertices, surface.directors,
+            q.amplitudes, q.centres, q.entries(), [*surface.lists, *self._samples.lists],
+            level=self.level, on_surface=surface.measured_at == "surface", phong=surface.base == "phong",
+            near=near, far=far,
+        )  # fmt: skip
+        return depth, patch, b
 
     def render(
         self,
@@ -149,8 +173,7 @@ class PatchRays:
         surface = self.patches
         if reading not in ("clip", "literal"):
             raise ValueError(f"reading must be one of clip, literal, got {reading!r}")
-        o, d = (_batched(name, t, surface) for name, t in (("origins", origins), ("directions", directions)))
-        d = torch.nn.functional.normalize(d, dim=-1, eps=0.0)
+        o, d = _rays(origins, directions, surface)
         W = surface.quadrics.normalized_matrices() if matrices is None else matrices
         v = surface.vertices[None] if positions is None else positions
         nowhere = surface.samples(torch.empty(0, dtype=torch.int32), surface.vertices[:0])
@@ -172,18 +195,10 @@ class PatchRays:
                 f"on {mine.vertices.device}, got {theirs!r} in {theirs.vertices.dtype} on {theirs.vertices.device}"
             )
 
-    def _search(
-        self, surface: FreeFormPatches, o: Tensor, d: Tensor, pose: PatchPose, near: float, far: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        points = surface.surface(self._samples, pose).points
-        q = surface.quadrics
-        depth, patch, b = _ops.patch_surface_rays(
-            o.detach(), d.detach(), points, self._cells, self._weights, self._places, *pose, surface.vertices,
-            surface.directors, q.amplitudes, q.centres, q.entries(), [*surface.lists, *self._samples.lists],
-            level=self.level, on_surface=surface.measured_at == "surface", phong=surface.base == "phong",
-            near=near, far=far,
-        )  # fmt: skip
-        return depth, patch, b
+
+def _check_level(level: Any) -> None:
+    if isinstance(level, bool) or not isinstance(level, int) or not 1 <= level <= _FINEST:
+        raise ValueError(f"PatchRays: level must be a whole number in 1..{_FINEST}, got {level!r}")
 
 
 def _batched(name: str, rays: Tensor, surface: FreeFormPatches) -> Tensor:
@@ -195,6 +210,17 @@ def _batched(name: str, rays: Tensor, surface: FreeFormPatches) -> Tensor:
             f"cast: {name} must be {like.dtype} on {like.device} like the patches, got {rays.dtype} on {rays.device}"
         )
     return rays if rays.dim() == 3 else rays[None]
+
+
+def _rays(origins: Tensor, directions: Tensor, surface: FreeFormPatches) -> tuple[Tensor, Tensor]:
+    """With a batch, and of unit length."""
+    o, d = _batched("origins", origins, surface), _batched("directions", directions, surface)
+    return o, torch.nn.functional.normalize(d, dim=-1, eps=0.0)
+
+
+def _at_rest(surface: FreeFormPatches) -> PatchPose:
+    eye = torch.eye(3, dtype=surface.vertices.dtype, device=surface.vertices.device)
+    return PatchPose(surface.vertices[None], eye.expand(1, len(surface.vertices), 3, 3))
 
 
 def _fine_enough(patches: FreeFormPatches) -> int:

@@ -179,14 +179,17 @@ PD_HD SurfaceElement<T> surface_at(const SurfaceRays<T>& t, Index pose, Index pa
 // A ray and two directions across it (Duff et al. 2017): what meets it has no component along either.
 template <class T>
 struct Sight {
-  Vec3<T> o, d, u, v;
+  Vec3<T> o, d, u, v, inverse;  // of d, component by component
 };
 
 template <class T>
 PD_HD Sight<T> sight_along(const Vec3<T>& o, const Vec3<T>& d) {
   const T sign = d.z < T(0) ? T(-1) : T(1), a = T(-1) / (sign + d.z), b = d.x * d.y * a;
-  return {
-      o, d, {T(1) + sign * d.x * d.x * a, sign * b, -sign * d.x}, {b, sign + d.y * d.y * a, -d.y}};
+  return {o,
+          d,
+          {T(1) + sign * d.x * d.x * a, sign * b, -sign * d.x},
+          {b, sign + d.y * d.y * a, -d.y},
+          {T(1) / d.x, T(1) / d.y, T(1) / d.z}};
 }
 
 template <class T>
@@ -287,16 +290,16 @@ PD_HD void meet_cell(const SurfaceRays<T>& t, Index pose, Index number, const Si
 
 // Whether a ray enters a box before `far`, and where.
 template <class T>
-PD_HD bool enters(const T* box, const Vec3<T>& origin, const Vec3<T>& direction, const T& near,
-                  const T& far, T& entry) {
-  const T o[3] = {origin.x, origin.y, origin.z}, d[3] = {direction.x, direction.y, direction.z};
+PD_HD bool enters(const T* box, const Sight<T>& ray, const T& near, const T& far, T& entry) {
+  const T o[3] = {ray.o.x, ray.o.y, ray.o.z};
+  const T inverse[3] = {ray.inverse.x, ray.inverse.y, ray.inverse.z};
   T from = near, to = far;
   for (int k = 0; k < 3; ++k) {
-    if (d[k] == T(0)) {
+    if (!(absolute(inverse[k]) <= biggest<T>())) {  // along two of the sides
       if (o[k] < box[k] || o[k] > box[3 + k]) return false;
       continue;
     }
-    const T a = (box[k] - o[k]) / d[k], b = (box[3 + k] - o[k]) / d[k];
+    const T a = (box[k] - o[k]) * inverse[k], b = (box[3 + k] - o[k]) * inverse[k];
     const T widened = T(4) * epsilon<T>();  // more than the rounding of either
     const T first = lesser(a, b), last = greater(a, b);
     from = greater(from, first - widened * absolute(first));
@@ -314,7 +317,7 @@ PD_HD void first_hit(const SurfaceRays<T>& t, Index pose, const Sight<T>& ray, H
   Index waiting[40];
   T entry[40];
   int depth = 0;
-  if (enters(boxes, ray.o, ray.d, t.rays.near, hit.depth, entry[0])) waiting[depth++] = 0;
+  if (enters(boxes, ray, t.rays.near, hit.depth, entry[0])) waiting[depth++] = 0;
   while (depth > 0) {
     --depth;
     const Index node = waiting[depth];
@@ -328,7 +331,7 @@ PD_HD void first_hit(const SurfaceRays<T>& t, Index pose, const Sight<T>& ray, H
     T at[2];
     bool in[2];
     for (int k = 0; k < 2; ++k)
-      in[k] = enters(boxes + 6 * (2 * node + 1 + k), ray.o, ray.d, t.rays.near, hit.depth, at[k]);
+      in[k] = enters(boxes + 6 * (2 * node + 1 + k), ray, t.rays.near, hit.depth, at[k]);
     const int nearer = in[0] && in[1] && at[1] < at[0] ? 1 : 0;  // on top of the other
     for (int k = 0; k < 2; ++k) {
       const int child = k == 0 ? 1 - nearer : nearer;
