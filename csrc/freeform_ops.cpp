@@ -60,6 +60,15 @@ TORCH_LIBRARY_FRAGMENT(torchpd, m) {
   m.def(
       "patch_frames_vjp(Tensor grad, Tensor frames, Tensor gradients, Tensor weights, Tensor[] "
       "lists) -> (Tensor, Tensor)");
+  m.def(
+      "patch_surface_rays(Tensor origins, Tensor directions, Tensor points, Tensor cells, Tensor "
+      "weights, Tensor places, Tensor positions, Tensor frames, Tensor vertices, Tensor directors, "
+      "Tensor amplitudes, Tensor centres, Tensor factors, Tensor[] lists, *, int level, bool "
+      "on_surface, bool phong, float near, float far) -> (Tensor, Tensor, Tensor)");
+  m.def(
+      "patch_field_rays(Tensor origins, Tensor directions, Tensor positions, Tensor amplitudes, "
+      "Tensor matrices, Tensor[] lists, *, float thickness, bool clip, float near, float far) -> "
+      "(Tensor, Tensor)");
 }
 
 TORCH_LIBRARY_IMPL(torchpd, CPU, m) { register_ops<Cpu>(m); }

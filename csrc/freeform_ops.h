@@ -2,7 +2,7 @@
 //
 // A Backend has `run(task, count, like)`, which computes the items of a task on the device of the tensor `like`.
 #pragma once
-#include "freeform_field_ops.h"
+#include "freeform_ray_ops.h"
 #include "freeform_surface_ops.h"
 #include "freeform_transport_ops.h"
 
@@ -22,6 +22,8 @@ void register_ops(torch::Library& m) {
   m.impl("patch_deformation_vjp", &deformation_vjp<Backend>);
   m.impl("patch_frames", &frames<Backend>);
   m.impl("patch_frames_vjp", &frames_vjp<Backend>);
+  m.impl("patch_surface_rays", &surface_rays<Backend>);
+  m.impl("patch_field_rays", &field_rays<Backend>);
 }
 
 }  // namespace pd::freeform

@@ -7,6 +7,7 @@ import runpy
 import sys
 from pathlib import Path
 
+import imageio.v3 as imageio
 import pytest
 import trimesh
 
@@ -104,3 +105,14 @@ def test_fit_patches(run, tmp_path: Path) -> None:
     assert trimesh.load(out, force="mesh").faces.shape == (800, 3)
     assert "closed" in text
     assert len(torchpd.FreeFormPatches.load(out.with_suffix(".safetensors")).triangles) == 200
+
+
+def test_learn_from_images(run, tmp_path: Path) -> None:
+    out = tmp_path / "views.png"
+    text = run("learn_from_images.py", "--steps", "12", "--pixels", "24", "--out", str(out))
+    rows = re.findall(r"^ *(\d+) +(\S+) +(\S+) +(\S+) +(\S+)$", text, flags=re.MULTILINE)
+    first, last = ([float(number) for number in row] for row in (rows[0], rows[-1]))
+    assert last[0] == 12
+    assert all(end < 0.6 * begin for end, begin in zip(last[1:4], first[1:4], strict=True))
+    assert last[4] < first[4]
+    assert imageio.imread(out).shape == (3 * 24, 4 * 24, 3)

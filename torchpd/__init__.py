@@ -21,7 +21,9 @@ if load_extension()[0] is not None:
     from .ops import nearest_rotation
     from .patch_body import PatchBody
     from .patch_fit import FitReport, PatchFit, fit_patches
+    from .patch_image import PatchImage
     from .patch_loss import PatchLoss
+    from .patch_rays import PatchHits, PatchRays
     from .patch_transport import PatchTransport
     from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
@@ -51,8 +53,11 @@ __all__ = [
     "Multilevel",
     "PatchBody",
     "PatchFit",
+    "PatchHits",
+    "PatchImage",
     "PatchLoss",
     "PatchPose",
+    "PatchRays",
     "PatchSamples",
     "PatchTransport",
     "Pin",

@@ -88,5 +88,5 @@ for _name, _batched, _grown in (
     _op = getattr(_ops, f"patch_{_name}")
     torch.library.register_vmap(f"torchpd::patch_{_name}", _with_batch(_op, _batched, grown=_grown))
     torch.library.register_vmap(f"torchpd::patch_{_name}_vjp", _one_by_one(getattr(_ops, f"patch_{_name}_vjp")))
-for _name in ("height", "height_vjp"):
+for _name in ("height", "height_vjp", "surface_rays", "field_rays"):
     torch.library.register_vmap(f"torchpd::patch_{_name}", _one_by_one(getattr(_ops, f"patch_{_name}")))

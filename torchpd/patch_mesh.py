@@ -54,7 +54,7 @@ def grid(level: int) -> tuple[Index, Index]:
     return steps, np.array(up + down)
 
 
-def _weld(elements: Index, vertices: int, steps: Index, level: int) -> Index:
+def weld(elements: Index, vertices: int, steps: Index, level: int) -> Index:
     """The number of every grid point [P, points]: vertices first, then points on edges, then points inside."""
     sides = np.stack([elements, elements[:, [1, 2, 0]]], axis=2)  # side k runs from corner k to corner k + 1
     low, high = sides.min(axis=2), sides.max(axis=2)
@@ -80,7 +80,7 @@ def tessellate(patches: FreeFormPatches, level: Any) -> Tessellation:
         raise ValueError(f"tessellate: level must be a whole number of segments >= 1, got {level!r}")
     elements = patches.triangles.cpu().numpy().astype(np.int64)
     steps, triangles = grid(level)
-    number = _weld(elements, len(patches.vertices), steps, level)
+    number = weld(elements, len(patches.vertices), steps, level)
     _, chosen = np.unique(number, return_index=True)
     patch, place = np.divmod(chosen, len(steps))
     device, dtype = patches.vertices.device, patches.vertices.dtype

@@ -95,6 +95,18 @@ def _(grad: Tensor, frames: Tensor, gradients: Tensor, weights: Tensor, lists: _
     return gradients.new_empty(gradients.shape), weights.new_empty(weights.shape)
 
 
+@torch.library.register_fake("torchpd::patch_surface_rays")
+def _(origins: Tensor, directions: Tensor, points: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
+    shape = (points.shape[0], origins.shape[1])
+    return points.new_empty(shape), points.new_empty(shape, dtype=torch.int32), points.new_empty((*shape, 3))
+
+
+@torch.library.register_fake("torchpd::patch_field_rays")
+def _(origins: Tensor, directions: Tensor, positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+    shape = (positions.shape[0], origins.shape[1])
+    return positions.new_empty(shape), positions.new_empty(shape, dtype=torch.int32)
+
+
 # ---- derivatives: each is another op
 
 
@@ -148,6 +160,10 @@ def _no_second_derivative(ctx: Any, *_: Any) -> None:
     raise RuntimeError("torchpd: second derivatives of free-form patches are not provided; detach the first")
 
 
+def _no_derivative(ctx: Any, *_: Any) -> None:
+    raise RuntimeError("torchpd: the search along rays has no derivative; PatchRays.cast gives that of its result")
+
+
 def _save_nothing(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     """Nothing to save."""
 
@@ -169,3 +185,5 @@ for _name, _backward, _setup in (
         _no_second_derivative,
         setup_context=_save_nothing if _name == "frames" else _save_nothing_named,
     )
+for _name in ("surface_rays", "field_rays"):
+    torch.library.register_autograd(f"torchpd::patch_{_name}", _no_derivative, setup_context=_save_nothing_named)

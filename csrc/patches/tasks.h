@@ -1,8 +1,10 @@
 // Every task of the free-form patches: what a device has to be able to run.
 #pragma once
+#include "patches/field_rays.h"
 #include "patches/frames.h"
 #include "patches/height.h"
 #include "patches/literal.h"
+#include "patches/rays.h"
 #include "patches/surface.h"
 
 // X(task)
@@ -26,4 +28,8 @@
   X(DeformationRest)         \
   X(Frames)                  \
   X(FramesGradients)         \
-  X(FramesWeights)
+  X(FramesWeights)           \
+  X(CellBoxes)               \
+  X(JoinedBoxes)             \
+  X(SurfaceRays)             \
+  X(FieldRays)

@@ -1,0 +1,134 @@
+"""Free-form patches: heights, surface points and rays a second, beside what their arithmetic takes at the least.
+
+A ball of 20 x 4^n patches with as many quadrics as vertices, float32. Floors on the CPU: the fewest additions and
+multiplications that the formulas need, at the rate at which all threads finish scalar ones (that of the extension's
+SIMD multiply-adds over the lanes), or the bytes read and written at the rate of a large copy, whichever is slower. For
+a ray: boxes down one path of the tree, and two places on the surface if it hits, one to correct and one to see that it
+is right. "search" is the op, "hits" adds points and normals, "picture" shades.
+
+    python benchmarks/patches.py --device cpu --out benchmarks/results/NAME.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from machine import describe_run, measure, multiply_adds_per_second
+
+import torchpd as pd
+from torchpd import _C
+from torchpd.render import Camera
+
+LANES = {"avx512": 16, "avx2": 8}
+CAMERA = Camera((0.0, 0.0, 4.2), (0.0, 0.0, 0.0), 32.0)
+# additions and multiplications
+POINT, ENTRY, ACTIVE, SLOPES = 15, 18, 30, 16  # P; Q; R and its gradient where Q > 0; dh along the chart
+POSED = 3 * (15 + 3 + 3 * 5 + 3) + 15 + 2 * (3 * (6 + 15) + 15 + 6)  # sum_k b_k (v_k + A_k u_k), and two tangents
+BOX = 12
+
+
+def ball(subdivisions: int, device: torch.device) -> pd.FreeFormPatches:
+    """Bumps over the vertices, about as wide as the patches."""
+    mesh = pd.TriMesh.from_trimesh(trimesh.creation.icosphere(subdivisions=subdivisions))
+    rng = np.random.default_rng(0)
+    count = len(mesh.vertices)
+    radius = 1.2 / 2**subdivisions
+    amplitudes = torch.tensor(0.15 * radius * rng.uniform(-1, 1, count), dtype=torch.float32)
+    quadrics = pd.Quadrics.from_radii(
+        amplitudes, torch.tensor(mesh.vertices, dtype=torch.float32), torch.full((count,), radius)
+    )
+    return pd.FreeFormPatches.from_mesh(mesh, quadrics).to(device)
+
+
+def places(patches: pd.FreeFormPatches, count: int) -> pd.PatchSamples:
+    generator = torch.Generator().manual_seed(0)
+    number = torch.arange(count) * len(patches.triangles) // count
+    b = torch.rand(count, 3, generator=generator)
+    return patches.samples(number.to(patches.vertices.device), (b / b.sum(1, keepdim=True)).to(patches.vertices))
+
+
+def floors(
+    patches: pd.FreeFormPatches, where: pd.PatchSamples, cells: int, hits: float
+) -> dict[str, tuple[float, float]]:
+    """Arithmetic and bytes of one height, surface point (with its height) and ray."""
+    entries = len(patches.lists[2]) / len(patches.triangles)
+    rest = (where.barycentrics[:, :, None] * patches.vertices[patches.triangles.long()[where.patch.long()]]).sum(1)
+    some = rest[:: max(1, len(rest) // 2000)]
+    active = float((patches.quadrics.values(some) != 0).sum(1).double().mean())
+    height = POINT + entries * ENTRY + active * ACTIVE + SLOPES
+    surface = height + POSED
+    ray = 2 * BOX * math.log2(cells / 2) + hits * 2 * surface
+    return {
+        "heights": (height, 4.0 * (4 + 3)),
+        "surface points": (surface, 4.0 * (4 + 3 + 3 + 9)),
+        "rays": (ray, 4.0 * (6 + 5)),
+    }
+
+
+def copied_bytes_per_second(device: torch.device) -> float:
+    a = torch.ones(2**25, device=device)
+    b = torch.empty_like(a)
+    return 2 * 4 * len(a) / min(measure(lambda: b.copy_(a), device, repetitions=3, seconds=0.2))
+
+
+def measure_patches(subdivisions: int, options: argparse.Namespace) -> list[dict[str, Any]]:
+    device = torch.device(options.device)
+    patches = ball(subdivisions, device)
+    rays, where = pd.PatchRays(patches), places(patches, options.samples)
+    size = (options.pixels, options.pixels)
+    directions = torch.as_tensor(CAMERA.rays(size)).to(patches.vertices).reshape(-1, 3)
+    origins = patches.vertices.new_tensor(CAMERA.origin).expand_as(directions)
+    hits = float(rays.cast(origins, directions).hit.double().mean())
+    per_item = floors(patches, where, len(patches.triangles) * rays.level**2, hits)
+    pixels = options.pixels**2
+    work: dict[str, tuple[Callable[[], object], int, str]] = {
+        "heights": (lambda: patches.heights(where), options.samples, "heights"),
+        "surface points": (lambda: patches.surface(where), options.samples, "surface points"),
+        "rays, search": (lambda: rays.search(origins, directions), pixels, "rays"),
+        "rays, hits": (lambda: rays.cast(origins, directions), pixels, "rays"),
+        "picture": (lambda: rays.render(CAMERA, size), pixels, "rays"),
+    }
+    rows = []
+    for name, (run, count, floor) in work.items():
+        rate = multiply_adds_per_second() / LANES.get(_C.build_info()["simd"], 4) * torch.get_num_threads()
+        with torch.no_grad():
+            seconds = min(measure(run, device, repetitions=options.repetitions, seconds=options.seconds))
+        row: dict[str, Any] = {"patches": len(patches.triangles), "what": name, "per_second": count / seconds}
+        if device.type == "cpu":
+            arithmetic, moved = per_item[floor]
+            row["floor_per_second"] = min(rate / arithmetic, copied_bytes_per_second(device) / moved)
+            row["times_floor"] = row["floor_per_second"] / row["per_second"]
+        rows.append(row)
+        beside = f"{row['times_floor']:8.1f} x the floor" if device.type == "cpu" else ""
+        print(f"{row['patches']:6d} patches  {name:<16} {row['per_second'] / 1e6:10.3f} M/s {beside}", flush=True)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    parser.add_argument(
+        "--subdivisions", type=int, nargs="+", default=[1, 4], help="of the icosahedron: 20 x 4^n patches"
+    )
+    parser.add_argument("--samples", type=int, default=1_000_000, help="places for heights and surface points")
+    parser.add_argument("--pixels", type=int, default=1024, help="along the side of the picture")
+    parser.add_argument("--repetitions", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=0.5, help="of every measurement at least")
+    parser.add_argument("--out", type=Path, help="file for the results (JSON)")
+    options = parser.parse_args()
+    rows = [row for n in options.subdivisions for row in measure_patches(n, options)]
+    if options.out:
+        record = describe_run(torch.device(options.device), torch.get_num_threads()) | {"rows": rows}
+        options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+// Rays, on either device: checks, views, the tasks one after another.
+#pragma once
+#include "freeform_field_ops.h"
+
+#include <limits>
+
+namespace pd::freeform {
+
+// Origins and directions, of every pose or the same for all.
+struct RayTensors {
+  Tensor origins, directions;
+  std::int64_t count;
+  double near, far;
+
+  RayTensors(const Tensor& o, const Tensor& d, std::int64_t batch, double from, double to)
+      : near(from), far(to) {
+    check_batched(o, 3, "origins", "[1 or batch, rays, 3] (m)");
+    check_batched(d, 3, "directions", "[1 or batch, rays, 3]");
+    TORCH_CHECK_VALUE(from >= 0 && from <= to,
+                      "near and far must satisfy 0 <= near <= far [m], got ", from, " and ", to);
+    count = o.size(1);
+    for (const Tensor& t : {o, d}) {
+      TORCH_CHECK_VALUE(t.size(0) == 1 || t.size(0) == batch,
+                        "origins and directions must be of 1 or of all ", batch, " poses, got ",
+                        describe(t));
+    }
+    origins = real_argument(o, o, {o.size(0), count, 3}, "origins", "m");
+    directions = real_argument(d, o, {d.size(0), count, 3}, "directions", "of unit length");
+  }
+
+  template <class T>
+  Rays<T> view() const {
+    return {read<T>(origins),
+            read<T>(directions),
+            count,
+            origins.size(0) > 1 ? 3 * count : 0,
+            directions.size(0) > 1 ? 3 * count : 0,
+            T(near),
+            T(far)};
+  }
+};
+
+// The checks of a cell are those of a grid of four segments.
+inline void check_cells(const Tensor& cells, const Tensor& points, std::int64_t level) {
+  TORCH_CHECK_VALUE(level >= 1, "level must be at least 1, got ", level);
+  TORCH_CHECK_VALUE(cells.dim() == 2 && cells.size(0) >= 1, "cells must be int32 [count > 0, ",
+                    cell_numbers, "], got ", describe(cells));
+  check_array(cells, at::kInt, cells.size(0), cell_numbers, {points.device(), "points"}, "cells",
+              "corners, checks, patch and place of each");
+}
+
+template <class Backend>
+std::tuple<Tensor, Tensor, Tensor> surface_rays(
+    const Tensor& origins, const Tensor& directions, const Tensor& points, const Tensor& cells,
+    const Tensor& weights, const Tensor& places, const Tensor& positions, const Tensor& frames,
+    const Tensor& vertices, const Tensor& directors, const Tensor& amplitudes,
+    const Tensor& centres, const Tensor& factors, at::TensorList arrays, std::int64_t level,
+    bool on_surface, bool phong, double near, double far) {
+  check_batched(points, 3, "points", "[batch, grid, 3] (m)");
+  const Lists lists = lists_view(arrays, {points.device(), "points"});
+  const auto batch = points.size(0), q = lists.quadrics, v = lists.vertices;
+  const RayTensors rays(origins, directions, batch, near, far);
+  check_cells(cells, points, level);
+  const auto real = [&](const Tensor& t, at::IntArrayRef sizes, const char* name,
+                        const char* meaning) {
+    return real_argument(t, points, sizes, name, meaning);
+  };
+  const Tensor at_rest = real(vertices, {v, 3}, "vertices", "m"),
+               n = real(directors, {v, 3}, "directors", "of unit length"),
+               a = real(amplitudes, {q}, "amplitudes", "m"),
+               c = real(centres, {q, 3}, "centres", "m"),
+               m = real(factors, {q, 6}, "factors", "1/m"),
+               posed = real(positions, {batch, v, 3}, "positions", "m"),
+               turned = real(frames, {batch, v, 3, 3}, "frames", "of the vertices"),
+               grid = real(points, points.sizes(), "points", "m"),
+               inner = real(weights, {check_points, 3}, "weights", "of the checks of a cell"),
+               place =
+                   real(places, {level * level, 9}, "places", "corners of the cells of a patch");
+  real(rays.origins, rays.origins.sizes(), "origins", "m");
+  int levels = 0;
+  while ((std::int64_t(4) << levels) <= cells.size(0)) ++levels;  // two cells a leaf or more
+  const Tensor slack = at::empty({batch, cells.size(0)}, points.options());
+  const Tensor boxes = at::empty({batch, (std::int64_t(2) << levels) - 1, 6}, points.options());
+  const Tensor depth = at::empty({batch, rays.count}, points.options());
+  const Tensor patch = at::empty({batch, rays.count}, points.options().dtype(at::kInt));
+  const Tensor b = at::empty({batch, rays.count, 3}, points.options());
+  for_precision(points, [&](auto number) {
+    using T = decltype(number);
+    const Cells<T> tree{
+        read<int32>(cells), read<T>(inner), read<T>(place), read<T>(grid), write<T>(slack),
+        write<T>(boxes),    cells.size(0),  points.size(1), levels,        T(1) / T(level)};
+    Backend::run(CellBoxes<T>{tree}, batch << levels, points);
+    for (int k = levels - 1; k >= 0; --k) Backend::run(JoinedBoxes<T>{tree, k}, batch << k, points);
+    const Base<T> base{read<T>(at_rest), read<T>(n), phong ? T(0.75) : T(0)};
+    const Ellipsoids<T> ellipsoids{read<T>(a), read<T>(c), read<T>(m)};
+    const SurfaceRays<T> task{lists,           base,
+                              ellipsoids,      tree,
+                              rays.view<T>(),  read<T>(posed),
+                              read<T>(turned), on_surface,
+                              write<T>(depth), write<int32>(patch),
+                              write<T>(b)};
+    Backend::run(task, batch * rays.count, points);
+  });
+  return {depth, patch, b};
+}
+
+template <class Backend>
+std::tuple<Tensor, Tensor> field_rays(const Tensor& origins, const Tensor& directions,
+                                      const Tensor& positions, const Tensor& amplitudes,
+                                      const Tensor& matrices, at::TensorList arrays,
+                                      double thickness, bool clip, double near, double far) {
+  check_thickness(thickness);
+  check_batched(positions, 3, "positions", "[batch, vertices, 3] (m)");
+  TORCH_CHECK_VALUE(far <= std::numeric_limits<float>::max(), "far must be finite [m], got ", far);
+  const RayTensors rays(origins, directions, positions.size(0), near, far);
+  // no samples: a point of each pose stands in for them
+  const Tensor points = at::empty({positions.size(0), 0, 3}, positions.options());
+  const SolidTensors in(points, positions, amplitudes, matrices, arrays);
+  real_argument(rays.origins, positions, rays.origins.sizes(), "origins", "m");
+  const Tensor depth = in.empty({in.batch, rays.count});
+  const Tensor patch = at::empty({in.batch, rays.count}, positions.options().dtype(at::kInt));
+  for_precision(positions, [&](auto real) {
+    using T = decltype(real);
+    const FieldRays<T> task{in.view<T>(thickness, clip), rays.view<T>(), write<T>(depth),
+                            write<int32>(patch)};
+    Backend::run(task, depth.numel(), positions);
+  });
+  return {depth, patch};
+}
+
+}  // namespace pd::freeform

@@ -1,0 +1,402 @@
+"""Rays on free-form patches: against marches in small steps, a triangle mesh, closed forms, gradients, refusals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from patch_cases import (
+    F64,
+    KIND_NAMES,
+    KINDS,
+    ball,
+    central,
+    lump,
+    patches_on,
+    quadrics_on,
+    samples_on,
+    triangle,
+    tumbled,
+)
+from torch import Tensor
+
+import torchpd as pd
+
+STEPS = 6001
+TOUCH = 1e-9  # m: how near to the surface a ray must come for a hit that no march sees
+
+
+def level_sheet(cells: int = 3) -> pd.TriMesh:
+    """A square in the plane z = 0: over it a surface of patches is the graph of a function."""
+    n = cells + 1
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij"))
+    corner = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]))
+    return pd.TriMesh(np.stack([x, y, 0 * x], axis=1), np.concatenate([np.stack(t, 1) for t in ((a, b, c), (a, c, d))]))
+
+
+def unit(vectors: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(vectors, dim=-1)
+
+
+def segments(count: int, height: float, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Ends of segments over the square, half of them nearly level: those graze the bumps."""
+    rng = np.random.default_rng(seed)
+    ends = rng.uniform(-0.99, 0.99, (2, count, 3))
+    ends[:, : count // 2, 2] = height * (
+        rng.uniform(-1.0, 1.0, count // 2) + 0.02 * rng.standard_normal((2, count // 2))
+    )
+    return torch.tensor(ends[0]), torch.tensor(ends[1])
+
+
+def first_change(values: Tensor) -> Tensor:
+    """The step [R] after which values [R, steps] first change sign; as many as there are steps if never."""
+    change = (values[:, :-1] < 0) != (values[:, 1:] < 0)
+    steps = torch.arange(change.shape[1])
+    return torch.where(change, steps, change.shape[1] + 1).amin(1)
+
+
+def compare_with_march(
+    excess: Callable[[Tensor, Tensor, Tensor], Tensor], start: Tensor, end: Tensor, depth: Tensor
+) -> int:
+    """Rays on which a march and `depth` disagree: a crossing that was missed, or a hit where there is none.
+
+    A hit before the first crossing that the march sees must be one at a finer look: 6001 steps within two of the coarse
+    ones, or the surface within TOUCH there.
+    """
+    length = (end - start).norm(dim=1)
+    wrong = 0
+    for part in torch.arange(len(start)).split(50):
+        a, b, t = start[part], end[part], depth[part] / length[part]
+        values = excess(a, b, torch.linspace(0, 1, STEPS, dtype=F64).expand(len(a), -1))
+        at = first_change(values)
+        missed = (at < STEPS) & ~(t <= (at + 1.001) / (STEPS - 1))
+        early = t < (at - 0.001) / (STEPS - 1)
+        wrong += int(missed.sum())
+        if early.any():
+            near = t[early, None] + torch.linspace(-2, 2, STEPS, dtype=F64) / (STEPS - 1)
+            closer = excess(a[early], b[early], near)
+            wrong += int(((first_change(closer) > STEPS) & (closer.abs().amin(1) > TOUCH)).sum())
+    return wrong
+
+
+def graph(measured_at: str = "base", base: str = "flat", dtype: torch.dtype = F64) -> pd.FreeFormPatches:
+    mesh = level_sheet()
+    quadrics = quadrics_on(mesh, 8, height=0.1, seed=3)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=F64).expand(len(mesh.vertices), 3)
+    made = pd.FreeFormPatches.from_mesh(mesh, quadrics, dtype=F64, directors=up, measured_at=measured_at, base=base)
+    return made.to(dtype)
+
+
+def march_over_graph(measured_at: str, count: int) -> int:
+    patches = graph(measured_at)
+    start, end = segments(count, 0.1)
+    hits = pd.PatchRays(patches).cast(start, end - start, far=1e6)
+    length = (end - start).norm(dim=1)
+    depth = torch.where(hits.depth[0] <= length, hits.depth[0], math.inf)
+    assert 0.3 < float(depth.isfinite().double().mean()) < 0.95
+
+    flat = 1.0 if measured_at == "surface" else 0.0
+    q, scale = patches.quadrics, start.new_tensor([1.0, 1.0, flat])
+    M = q.triangular()
+
+    def excess(a: Tensor, b: Tensor, s: Tensor) -> Tensor:
+        """z - sum_i R_i, where each Q_i is a quadratic in s."""
+        y0 = torch.einsum("qij,rqj->rqi", M, (scale * a)[:, None] - q.centres)
+        y1 = torch.einsum("qij,rj->rqi", M, scale * (b - a))
+        coefficients = (1 - (y0 * y0).sum(2), -2 * (y0 * y1).sum(2), -(y1 * y1).sum(2))
+        value = a[:, 2:] + s * (b - a)[:, 2:]
+        for i in range(len(q)):
+            c0, c1, c2 = (c[:, i, None] for c in coefficients)
+            Q = torch.addcmul(c0, s, torch.addcmul(c1, s, c2)).clamp_min_(0)
+            value.sub_(q.amplitudes[i] * Q * Q * Q)
+        return value
+
+    return compare_with_march(excess, start, end, depth)
+
+
+def test_march_over_a_graph() -> None:
+    assert march_over_graph("base", 10_000) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("measured_at", ["base", "surface"])
+def test_long_march_over_a_graph(measured_at: str) -> None:
+    assert march_over_graph(measured_at, 100_000) == 0
+
+
+def march_through_field(reading: str, count: int) -> int:
+    """One patch with quadrics of every kind, cones and hyperboloids among them."""
+    rng = np.random.default_rng(5)
+    matrices = rng.standard_normal((5, 4, 4))
+    W = torch.tensor(matrices + matrices.transpose(0, 2, 1))
+    amplitudes = torch.tensor([0.2, -0.1, 0.05, 0.02, -0.03], dtype=F64)
+    q = pd.Quadrics.from_radii(amplitudes, torch.zeros(5, 3, dtype=F64), torch.ones(5, dtype=F64))
+    ellipsoids = quadrics_on(triangle(), 5, height=0.1, seed=2).normalized_matrices()
+    W[:3] = ellipsoids[:3]
+    patches = pd.FreeFormPatches.from_mesh(triangle(), q, dtype=F64, thickness=0.05)
+    start = torch.tensor(rng.uniform(-0.7, 1.3, (count, 3)))
+    end = torch.tensor(rng.uniform(-0.3, 1.0, (count, 3)))
+    start[: count // 2, 2] = end[: count // 2, 2] = torch.tensor(rng.uniform(-0.15, 0.3, count // 2))
+    length = (end - start).norm(dim=1)
+    depth, patch = pd.PatchRays(patches).cast_field(start, end - start, far=10.0, reading=reading, matrices=W)
+    assert torch.equal(depth[0].isfinite(), patch[0] == 0)
+    depth = torch.where(depth[0] <= length, depth[0], math.inf)
+    assert 0.1 < float(depth.isfinite().double().mean()) < 0.9
+
+    def field(a: Tensor, b: Tensor, s: Tensor) -> Tensor:
+        x = a[:, None] + s[..., None] * (b - a)[:, None]
+        flat = x.reshape(-1, 3)
+        zero = torch.zeros(len(flat), dtype=torch.int32)
+        return patches.field(flat, zero, reading=reading, matrices=W).reshape(x.shape[:-1])
+
+    inside = field(start, end, torch.zeros(count, 1, dtype=F64))[:, 0] >= 0
+    assert torch.equal(inside, depth == 0)
+    return compare_with_march(field, start[~inside], end[~inside], depth[~inside])
+
+
+@pytest.mark.parametrize("reading", ["clip", "literal"])
+def test_march_through_the_field(reading: str) -> None:
+    assert march_through_field(reading, 10_000) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reading", ["clip", "literal"])
+def test_long_march_through_the_field(reading: str) -> None:
+    assert march_through_field(reading, 100_000) == 0
+
+
+def towards_ball(count: int, seed: int = 1) -> tuple[Tensor, Tensor]:
+    rng = np.random.default_rng(seed)
+    o, target = rng.standard_normal((2, count, 3))
+    o *= 3.0 / np.linalg.norm(o, axis=1, keepdims=True)
+    target *= rng.uniform(0, 1.3, (count, 1)) / np.linalg.norm(target, axis=1, keepdims=True)
+    return torch.tensor(o), torch.tensor(target - o)
+
+
+@pytest.mark.parametrize("kind", [KINDS[0], KINDS[3]], ids=[KIND_NAMES[0], KIND_NAMES[3]])
+def test_against_trimesh_on_the_tessellation(kind: tuple[str, str], device: torch.device) -> None:
+    """A posed ball against its mesh of level 8, on rays that meet the mesh alike when shifted by 5e-3, its error."""
+    patches = patches_on(kind=kind, device=device, count=20)
+    transport = central(patches)
+    pose = transport(tumbled(transport, 1, 0.02))
+    middle = pose.positions.mean(1)[0].cpu().double()
+    o, d = towards_ball(300)
+    o = o + middle
+    hits = pd.PatchRays(patches).cast(o.to(patches.vertices), d.to(patches.vertices), pose)
+    along = unit(d)
+    across = unit(torch.linalg.cross(along, torch.tensor([[0.3, 0.5, 0.8]], dtype=F64)))
+    both = (across, torch.linalg.cross(along, across))
+    mesh = patches.mesh(8, pose).to_trimesh()
+    found = []
+    for shift in (0 * along, *(sign * 5e-3 * axis for axis in both for sign in (-1, 1))):
+        place, ray, _ = mesh.ray.intersects_location((o + shift).numpy(), d.numpy(), multiple_hits=True)
+        depth = np.full(len(o), np.inf)
+        np.minimum.at(depth, ray, ((place - (o + shift).numpy()[ray]) * along.numpy()[ray]).sum(1))
+        found.append(torch.tensor(depth))
+    depths = torch.stack(found)
+    same = depths.isfinite() == depths[:1].isfinite()
+    jump = (depths - depths[:1]).abs().nan_to_num(0.0).amax(0)
+    clear = same.all(0) & (jump < 0.05)
+    assert float(clear.double().mean()) > 0.9
+    assert torch.equal(hits.hit[0].cpu()[clear], depths[0].isfinite()[clear])
+    compare = clear & depths[0].isfinite()
+    assert int(compare.sum()) > 100
+    apart = (hits.depth[0].cpu().double() - depths[0])[compare].abs()
+    steep = (hits.normals[0].cpu().double() * along).sum(-1)[compare].abs()
+    assert float((apart * steep).max()) < 5e-3
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=KIND_NAMES)
+def test_hits_lie_on_rays_and_on_the_surface(kind: tuple[str, str], device: torch.device, dtype: torch.dtype) -> None:
+    patches = patches_on(kind=kind, dtype=dtype, device=device)
+    transport = central(patches)
+    pose = transport(tumbled(transport, 3))
+    o, d = (t.to(patches.vertices) for t in towards_ball(400))
+    o = o + pose.positions.mean(1, keepdim=True)
+    hits = pd.PatchRays(patches).cast(o, d, pose)
+    small = 1e-12 if dtype == F64 else 2e-5
+    assert float(hits.barycentrics[hits.hit].min()) >= -512 * torch.finfo(dtype).eps
+    assert float((hits.normals[hits.hit].norm(dim=-1) - 1).abs().max()) < small
+    for n in range(3):
+        hit = hits.hit[n]
+        assert 100 < int(hit.sum()) < 400
+        on = patches.surface(patches.samples(hits.patch[n][hit], hits.barycentrics[n][hit]), pose)
+        assert float((on.points[n] - hits.points[n][hit]).abs().max()) < small
+        assert float((on.normals[n] - hits.normals[n][hit]).abs().max()) < small
+        ray = o[n] + torch.where(hit, hits.depth[n], 0)[:, None] * unit(d)
+        assert float((ray - hits.points[n])[hit].abs().max()) < small
+        assert (hits.patch[n][~hit] == -1).all()
+        assert hits.depth[n][~hit].isinf().all()
+        alone = pd.PatchRays(patches).cast(o[n], d, pd.PatchPose(*(t[n : n + 1] for t in pose)))
+        assert torch.equal(alone.depth[0], hits.depth[n])
+
+
+def test_closed_forms(device: torch.device) -> None:
+    """Down onto the lump, level through it at half its height, from inside, past it, before `near`, beyond `far`."""
+    up = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64).expand(3, 3)
+    patches = pd.FreeFormPatches.from_mesh(triangle(), lump(), dtype=F64, directors=up).to(device)
+    rays = pd.PatchRays(patches)
+
+    def depth(o: list[float], d: list[float], **options: float) -> float:
+        return float(rays.cast(*(torch.tensor([x], dtype=F64, device=device) for x in (o, d)), **options).depth)
+
+    half = 0.25 * math.sqrt(1.0 - 0.5 ** (1 / 3))
+    assert depth([0.25, 0.25, 1.0], [0, 0, -2]) == pytest.approx(0.8, abs=1e-14)
+    assert depth([0.25, 0.25, 0.0], [0, 0, 1]) == pytest.approx(0.2, abs=1e-14)
+    assert depth([-1.0, 0.25, 0.1], [1, 0, 0]) == pytest.approx(1.25 - half, abs=1e-13)
+    assert depth([0.25, 0.25, 0.1], [1, 0, 0]) == pytest.approx(half, abs=1e-13)
+    assert depth([-1.0, 0.25, 0.1], [1, 0, 0], near=1.25) == pytest.approx(1.25 + half, abs=1e-13)
+    assert depth([-1.0, 0.25, 0.1], [1, 0, 0], far=1.1) == math.inf
+    assert depth([-1.0, 0.25, 0.2 + 1e-6], [1, 0, 0]) == math.inf
+    assert depth([-1.0, 0.25, 0.2 - 1e-6], [1, 0, 0]) == pytest.approx(1.25, abs=1e-3)
+    assert depth([0.6, 0.6, 1.0], [0, 0, -1]) == math.inf
+    assert depth([0.25, 0.25, 1.0], [0, 0, 1]) == math.inf
+    assert depth([math.nan, 0.25, 1.0], [0, 0, -1]) == math.inf
+    assert depth([0.25, 0.25, 1.0], [0, 0, 0]) == math.inf
+
+
+def test_rays_in_the_plane_of_a_patch(device: torch.device) -> None:
+    """A convex body of flat patches: just below the plane of a face a ray hits, just above it misses, in it either."""
+    patches = pd.FreeFormPatches.from_mesh(ball(), dtype=F64).to(device)
+    corners = patches.vertices[patches.triangles.long()]
+    middle = corners.mean(1)
+    normal = unit(torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    along = unit(corners[:, 1] - 0.7 * corners[:, 0] - 0.3 * corners[:, 2])
+    rays = pd.PatchRays(patches)
+    for offset, expected in ((-1e-7, True), (1e-7, False), (0.0, None)):
+        hits = rays.cast(middle + offset * normal - 3 * along, along)
+        if expected is None:
+            assert not hits.depth.isnan().any()
+            assert not hits.normals.isnan().any()
+        else:
+            assert bool((hits.hit == expected).all())
+
+
+def test_no_gaps_between_patches(dtype: torch.dtype, device: torch.device) -> None:
+    """From the middle outwards every ray hits, those through vertices and edges too."""
+    patches = patches_on(dtype=dtype, device=device)
+    corners = patches.vertices[patches.triangles.long()]
+    steps = torch.linspace(0, 1, 9, dtype=dtype, device=device)[:, None, None, None]
+    targets = (steps * corners + (1 - steps) * corners.roll(1, dims=1)).reshape(-1, 3)
+    hits = pd.PatchRays(patches).cast(torch.zeros_like(targets), targets)
+    assert bool(hits.hit.all())
+
+
+def gradient_case(device: torch.device) -> tuple[pd.FreeFormPatches, pd.PatchRays, pd.PatchPose, Tensor, Tensor]:
+    patches = patches_on(ball(0), ("phong", "surface"), device=device, count=6)
+    transport = central(patches)
+    pose = transport(tumbled(transport, 2, 0.05))
+    where = samples_on(patches, 5)
+    on = patches.surface(where, pose)
+    target = on.points
+    o = target + 0.5 * on.normals + 0.1
+    return patches, pd.PatchRays(patches), pose, o, target - o
+
+
+def test_gradients(device: torch.device) -> None:
+    """Of depth, points, normals and coordinates for quadrics, pose, base and rays, against central differences."""
+    patches, rays, pose, o, d = gradient_case(device)
+    q = patches.quadrics
+
+    def run(*leaves: Tensor) -> tuple[Tensor, ...]:
+        a, c, m, x, A, v, n, o, d = leaves
+        shaped = patches.with_shape(v, n).with_quadrics(pd.Quadrics(a, c, m), keep_lists=True)
+        hits = rays.cast(o, d, pd.PatchPose(x, A), patches=shaped)
+        assert bool(hits.hit.all())
+        return hits.depth, hits.points, hits.normals, hits.barycentrics
+
+    leaves = [q.amplitudes, q.centres, q.factors, *pose, patches.vertices, patches.directors, o, d]
+    assert torch.autograd.gradcheck(run, [t.detach().clone().requires_grad_() for t in leaves])
+
+
+def test_gradients_do_not_move_the_values(device: torch.device) -> None:
+    _, rays, pose, o, d = gradient_case(device)
+    plain = rays.cast(o, d, pose)
+    wanted = pd.PatchPose(*(t.detach().clone().requires_grad_() for t in pose))
+    traced = rays.cast(o, d, wanted)
+    for name in ("depth", "points", "normals", "barycentrics"):
+        assert torch.equal(getattr(plain, name), getattr(traced, name))
+        assert getattr(traced, name).requires_grad
+    assert not plain.depth.requires_grad
+
+
+def op_arguments(name: str, dtype: torch.dtype, device: torch.device) -> tuple[list[Any], dict[str, Any]]:
+    patches = patches_on(ball(0), dtype=dtype, device=device, count=5)
+    rays = pd.PatchRays(patches)
+    o, d = (t[:7].to(patches.vertices)[None] for t in towards_ball(7))
+    nowhere = patches.samples(torch.empty(0, dtype=torch.int32), patches.vertices[:0])
+    v, q = patches.vertices, patches.quadrics
+    span = {"near": 0.0, "far": 9.0}
+    if name == "field":
+        lists = [*patches.lists, *nowhere.lists]
+        options = {"thickness": 0.1, "clip": True, **span}
+        return [o, unit(d), v[None], q.amplitudes, q.normalized_matrices()[None], lists], options
+    eye = torch.eye(3, dtype=dtype, device=device).expand(1, len(v), 3, 3)
+    points = patches.surface(rays._samples).points[None]
+    quadrics = [q.amplitudes, q.centres, q.entries()]
+    arrays = [rays._cells, rays._weights, rays._places, v[None], eye, v, patches.directors, *quadrics]
+    options = {"level": rays.level, "on_surface": False, "phong": False, **span}
+    return [o, unit(d), points, *arrays, [*patches.lists, *rays._samples.lists]], options
+
+
+@pytest.mark.parametrize("name", ["surface", "field"])
+def test_ops(name: str, dtype: torch.dtype, device: torch.device, poisoned: None) -> None:
+    """opcheck; the same bits again; vmap over origins; no derivative of their own."""
+    op = getattr(torch.ops.torchpd, f"patch_{name}_rays")
+    args, options = op_arguments(name, dtype, device)
+    assert set(torch.library.opcheck(op.default, tuple(args), options).values()) == {"SUCCESS"}
+    once, again = op(*args, **options), op(*args, **options)
+    assert all(torch.equal(a, b) for a, b in zip(once, again, strict=True))
+    moved = torch.stack([args[0], args[0] + 0.1])
+    mapped = torch.vmap(lambda o: op(o, *args[1:], **options))(moved)
+    for n in range(2):
+        single = op(moved[n], *args[1:], **options)
+        assert all(torch.equal(a[n], b) for a, b in zip(mapped, single, strict=True))
+    with pytest.raises(RuntimeError, match="no derivative"):
+        op(args[0].requires_grad_(), *args[1:], **options)[0].sum().backward()
+
+
+def test_no_rays(dtype: torch.dtype, device: torch.device) -> None:
+    patches = patches_on(dtype=dtype, device=device)
+    none = patches.vertices[:0]
+    hits = pd.PatchRays(patches).cast(none, none)
+    assert hits.depth.shape == (1, 0)
+    assert hits.normals.shape == (1, 0, 3)
+    depth, patch = pd.PatchRays(patches).cast_field(none, none, far=1.0)
+    assert depth.shape == patch.shape == (1, 0)
+
+
+def test_level_follows_the_quadrics() -> None:
+    mesh = triangle()
+    assert pd.PatchRays(pd.FreeFormPatches.from_mesh(mesh)).level == 4
+    # the longest edge is sqrt 2
+    assert pd.PatchRays(pd.FreeFormPatches.from_mesh(mesh, lump(0.1), dtype=F64)).level == 15
+    assert pd.PatchRays(pd.FreeFormPatches.from_mesh(mesh, lump(0.01), dtype=F64)).level == 32
+
+
+def test_refusals() -> None:
+    patches = patches_on()
+    rays = pd.PatchRays(patches)
+    o, d = towards_ball(4)
+    with pytest.raises(TypeError, match="patches must be FreeFormPatches"):
+        pd.PatchRays(ball())  # type: ignore[arg-type]
+    for level in (0, 33, 2.0, True):
+        with pytest.raises(ValueError, match=r"level must be a whole number in 1\.\.32"):
+            pd.PatchRays(patches, level)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"origins must be torch\.float64"):
+        rays.cast(o.float(), d)
+    with pytest.raises(ValueError, match="near and far"):
+        rays.cast(o, d, near=2.0, far=1.0)
+    with pytest.raises(ValueError, match="triangles of those given at the start"):
+        rays.cast(o, d, patches=patches_on(ball(0)))
+    with pytest.raises(ValueError, match="of 1 or of all 1 poses"):
+        rays.cast(o.expand(2, -1, -1), d)
+    with pytest.raises(ValueError, match="far must be finite"):
+        rays.cast_field(o, d, far=math.inf)
+    with pytest.raises(ValueError, match="reading must be one of"):
+        rays.cast_field(o, d, far=1.0, reading="other")  # type: ignore[arg-type]
