@@ -43,7 +43,7 @@ STYLES = {
 # of the patches and quadrics that are fitted
 FITS = {
     "blob": ((20, (20, 40, 60)), (80, (60, 120))),
-    "other": ((100, (40, 80)), (300, (90,)), (600, (120,))),
+    "other": ((200, (60,)), (300, (90,)), (600, (120,))),
 }
 QUICK = {"blob": ((20, (8,)),), "other": ((100, (8,)),)}
 
@@ -118,8 +118,8 @@ def study(name: str, shape: Any, *, quick: bool) -> tuple[float, list[Row]]:
     # by the vertices of a base, which do not know the bounds of a function
     size = float(np.ptp(base_triangles(target, balls(1280))[0].bounds, axis=0).max()) if is_blob else target.size
     fits = (QUICK if quick else FITS)["blob" if is_blob else "other"]
-    counts = (80, 320) if quick else (80, 320, 1280, 5120) if is_blob else (100, 200, 400, 800, 1600, 3200)
-    fine = target.mesh() if quick or not is_blob else base_triangles(target, balls(20480))[0]
+    counts = (80, 320) if quick else (80, 320, 1280) if is_blob else (100, 200, 400, 800, 1600, 3200)
+    fine = target.mesh() if quick or not is_blob else base_triangles(target, balls(5120))[0]
     rows = []
     for count in tqdm(counts, desc=f"{name}: triangles", leave=False):
         coarse = simplify(fine, count)
@@ -130,7 +130,11 @@ def study(name: str, shape: Any, *, quick: bool) -> tuple[float, list[Row]]:
     todo = [(patches, count, base) for patches, some in fits for count in some for base in ("flat", "phong")]
     for patches, count, base in tqdm(todo, desc=f"{name}: fits", leave=False):
         over = balls(patches) if is_blob else patches
-        report = pd.FreeFormPatches.fit(shape, count, patches=over, base=base, **options).report
+        try:
+            report = pd.FreeFormPatches.fit(shape, count, patches=over, base=base, **options).report
+        except ValueError as error:  # a base too coarse for the shape: nothing to compare
+            tqdm.write(f"{name}, {patches} patches, {count} quadrics, {base} base: {error}")
+            continue
         chosen = {k: v for k, v in asdict(report).items() if k != "size"}
         rows.append({"method": f"patches, {base} base", **chosen})
     return size, rows
@@ -192,7 +196,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="file for the picture (PNG)")
     parser.add_argument("--quick", action="store_true", help="few fits: only to see that it runs")
     options = parser.parse_args()
-    shapes: dict[str, Any] = {"blob": blob, "octopus": pd.shapes.octopus(cells=16 if options.quick else 32)}
+    shapes: dict[str, Any] = {"blob": blob, "octopus": pd.shapes.octopus(cells=16 if options.quick else 24)}
     shapes |= {path.stem: pd.TriMesh.from_file(path) for path in options.meshes}
     rows: list[Row] = []
     for name, shape in shapes.items():

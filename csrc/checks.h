@@ -169,7 +169,8 @@ void check_levels(const P& plan, bool wanted) {
                     "plan has no multilevel preconditioner; a Simulator with solver=Multilevel() "
                     "makes one");
   if constexpr (requires { plan.kernel; }) {
-    TORCH_CHECK_VALUE(plan.kernel == 2,
+    constexpr int stream = 2;  // of DeviceKernel, which this file does not see
+    TORCH_CHECK_VALUE(plan.kernel == stream,
                       "plan must be one for kernel 2 (stream), which the multilevel solver runs "
                       "with, got kernel ",
                       plan.kernel);

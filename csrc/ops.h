@@ -1,8 +1,7 @@
 // What every op does on either device: checks, views, one call of the backend.
 //
-// A Backend has `Plan<T>`, the plan that its kernels see; `plan_view<T>(arrays, place)`; and `step`, `field`, `precondition` and
-// `rotation`, which
-// run a call on the device of the tensor they are given.
+// A Backend has `Plan<T>`, the plan that its kernels see; `plan_view<T>(arrays, place)`; and `step`, `field`,
+// `precondition` and `rotation`, which run a call on the device of the tensor they are given.
 #pragma once
 #include "checks.h"
 

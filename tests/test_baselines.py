@@ -112,6 +112,14 @@ def test_newton_krylov_has_the_energy_of_the_reference_and_its_derivatives(probl
     assert passes == [2]
 
 
+def test_newton_krylov_holds_and_frees_what_the_step_does(problem: StepProblem) -> None:
+    """M is zero at the held vertices and nowhere else."""
+    method = NewtonKrylov(problem, [0])
+    field = torch.from_numpy(np.random.default_rng(0).normal(size=problem.positions.shape))
+    image = torch.ops.torchpd.precondition(field[None], method.levels)[0].numpy()
+    assert np.array_equal(np.any(image != 0.0, axis=1), problem.free)
+
+
 def test_memory_is_watched_and_contacts_are_refused(problem: StepProblem) -> None:
     trace = run_baseline(BASELINES["direct global step"], problem, problem.first_iterate(), 2, memory=True)
     # at least the iterates that are kept, and the sparse operator

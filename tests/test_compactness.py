@@ -28,7 +28,7 @@ def compactness(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_pn_triangles_are_those_of_the_paper(compactness) -> None:
-    """Flat where normals are, through the corners, and of fourth order on a sphere: half the edge, 1/16 the error."""
+    """Flat where the normals are, through the corners, and of fourth order on a sphere."""
     corners = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
     b = np.random.default_rng(0).dirichlet((1, 1, 1), 50)
     flat = compactness.pn_points(corners, np.broadcast_to([0.0, 0, 1], (1, 3, 3)), b)

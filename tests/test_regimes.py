@@ -100,6 +100,22 @@ def test_a_patch_with_a_busy_vertex_is_split_until_it_fits() -> None:
     assert shared_bytes(plan, 0, 0) <= SMALL.shared
 
 
+@pytest.mark.parametrize("gpu", [Properties(1, 232_448), Properties(20, 101_376)])
+def test_patches_of_a_multilevel_solver_fit(gpu: Properties, dtype: torch.dtype) -> None:
+    """As many for every multiprocessor as fit, also where more entries than 16 bits count would ask for more patches."""
+    values = values_of((54, 11, 11))  # 39 204 tetrahedra
+    plan = choose_plan(values, dtype, gpu, levels=True, progress=False)
+    assert plan.for_levels
+    assert plan.kernel == "stream"
+    assert plan.patches % gpu.multiprocessors == 0
+    assert shared_bytes(plan, 0, 0) <= gpu.shared
+    # not many more than it takes
+    assert shared_bytes(plan, 0, 0) >= 0.3 * gpu.shared
+    assert choose_plan(values_of((3, 3, 3)), dtype, gpu, levels=True).patches == 1
+    with pytest.raises(ValueError, match='Multilevel runs with kernel="stream" on a GPU'):
+        choose_plan(values, dtype, gpu, "block", levels=True)
+
+
 def test_contacts_take_shared_memory() -> None:
     values = values_of((3, 3, 3))
     plan = choose_plan(values, torch.float32, H100, "block")

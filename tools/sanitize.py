@@ -180,8 +180,8 @@ def into_one_place(corners: Tensor) -> Tensor:
 def plant(tool: str, kernel: str) -> None:
     """A step in which `tool` must find an error."""
     built = scene(contacts=False, pieces=True, pins=False)
-    options: dict[str, Any] = {"kernel": kernel, "progress": False}
-    sim = pd.Simulator(built, 1 / 60, 5, **options).to("cuda")
+    options: dict[str, Any] = {"solver": pd.Multilevel()} if kernel == "levels" else {"kernel": kernel}
+    sim = pd.Simulator(built, 1 / 60, 5, progress=False, **options).to("cuda")
     state = sim.rest_state(2)
     if tool == "memcheck":
         change_plan(sim, "part_slot", without_last)

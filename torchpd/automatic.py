@@ -77,7 +77,8 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     plain, levels = (_known(each) for each in expected.values())
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
     if not _runs(Multilevel(), sim):
-        return chebyshev, _choice(iterations, _enough(plain), f"{counts}, and Multilevel does not run on {sim.device}")
+        where = f"{sim.device} with kernel={sim.kernel!r}" if sim.device.type == "cuda" else str(sim.device)
+        return chebyshev, _choice(iterations, _enough(plain), f"{counts}, and Multilevel does not run on {where}")
     costs = COSTS[sim.plan.kernel or "cpu"]
     ratio = costs.multilevel.iteration(sim.vertices) / costs.chebyshev.iteration(sim.vertices)
     both = f"{counts}, or {levels.words(AIM)} of Multilevel, each as long as {ratio:.2g}"
@@ -118,4 +119,4 @@ def _runs(solver: Solver, sim: Model) -> bool:
         check_solver(solver, sim.device)
     except RuntimeError:
         return False
-    return True
+    return sim.device.type != "cuda" or not isinstance(solver, Multilevel) or sim.kernel in ("auto", "stream")

@@ -39,7 +39,7 @@ _KEY = "torchpd"  # of the metadata, beside which others may write theirs
 _KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in (Solid, Pin, Gravity, Ground, Sphere, Damping)}
 _SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel)}
 # what a preconditioner was made of: together with the mesh it decides its bits
-_REFERENCE = ("reference_stiffness", "reference_inertia")
+_REFERENCE = ("stiffness", "inertia")
 _DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in (torch.float32, torch.float64)}
 
 Record = dict[str, Any]

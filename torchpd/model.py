@@ -126,9 +126,14 @@ class Model(nn.Module):
     def _choose_again(self, choice: Choice) -> None:
         """Iterations that somebody has set since stay."""
         own = choice.sets_iterations and self.iterations == choice.iterations
-        if self.plan.for_levels:
-            self.solver = Chebyshev()  # its kernel is one of the costs that are compared
-        self._choose_solver(None if own else self.iterations)
+        before = self.plan, self._solver, self.choice, self.iterations
+        try:
+            if self.plan.for_levels:
+                self.solver = Chebyshev()  # its kernel is one of the costs that are compared
+            self._choose_solver(None if own else self.iterations)
+        except BaseException:
+            self.plan, self._solver, self.choice, self.iterations = before
+            raise
 
     def prepare_solver(self) -> None:
         """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`, the choice of "auto".
@@ -137,9 +142,11 @@ class Model(nn.Module):
         `set_material` does it by itself when it pins other vertices hard, or frees some. Takes 0.3 s for 8 thousand
         vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
         """
+        before = self.plan
         if self.choice is not None:
             self._choose_again(self.choice)
-        self._prepare()
+        if self.plan is before:
+            self._prepare()
 
     def _prepare(self) -> None:
         self.plan = plan_for_solver(self)
@@ -228,7 +235,9 @@ class Model(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
         choice = self.choice
-        if choice is not None and wanted.device.type not in (self.device.type, "meta"):
+        ends = {self.device.type, wanted.device.type}
+        # coming from "meta" there are no values to choose by
+        if choice is not None and len(ends) == 2 and "meta" not in ends:
             # whatever it was, the other device may choose differently
             iterations, self.solver = self.iterations, Chebyshev()
             try:

@@ -43,7 +43,7 @@ class NewtonKrylov:
         plan = compile_plan(values, dtype=torch.float64, progress=False)
         self.stiffness = torch.from_numpy(values.stiffness.copy())
         inertia = torch.from_numpy(np.where(problem.free, problem.weight, np.inf))
-        levels = precondition_plan(plan, values, self.stiffness, inertia[plan.vertex_order.long()])
+        levels = precondition_plan(plan, values, self.stiffness, inertia)
         self.elements, self.levels = list(plan.arrays), list(levels.arrays)
         self.free = torch.from_numpy(problem.free.copy())[:, None]
         self.weight = torch.from_numpy(problem.weight.copy())[:, None]

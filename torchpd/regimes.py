@@ -73,7 +73,11 @@ class _Scene(NamedTuple):
         if kernel == "levels":
             if self.tets <= _LEVEL_ALONE:
                 return 1
-            return min(-(-self.tets // _LEVEL_TETS), gpu.multiprocessors)
+            # 2.5 entries and at least a third of a slot a tetrahedron, see pass_shared_bytes
+            each = (4 * 2.5 + 8 / 3) * torch.finfo(self.dtype).bits / 8
+            least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes))
+            rounds = -(-int(least) // gpu.multiprocessors)
+            return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
         return -(-self.tets // _STREAM_TETS[self.dtype])
 
     def least_shared_bytes(self, patches: int) -> int:
@@ -98,15 +102,29 @@ def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | Non
     return (plan if needed <= gpu.shared else None), f"{needed:,} B"
 
 
-def _stream_plan(scene: _Scene, gpu: Properties, *, levels: bool) -> Plan:
+def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
     """More patches where many tetrahedra share a vertex, whose forces one patch sums."""
-    patches = scene.patches("levels" if levels else "stream", gpu)
+    patches = scene.patches("stream", gpu)
+    plan = scene.plan("stream", patches)
+    while scene.shared_bytes(plan) > gpu.shared and patches < scene.tets:
+        patches = min(2 * patches, scene.tets)
+        plan = scene.plan("stream", patches)
+    return plan
+
+
+def _level_plan(scene: _Scene, gpu: Properties) -> Plan:
+    """For a multilevel solver: as many patches for every multiprocessor, where one each is not enough."""
+    patches = min(scene.patches("levels", gpu), scene.tets)
     while True:
-        plan = replace(scene.plan("stream", patches), for_levels=levels)
-        if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
-            return plan
-        # of which all multiprocessors have the same number
-        patches = min(patches + gpu.multiprocessors if levels else 2 * patches, scene.tets)
+        try:
+            plan = replace(scene.plan("stream", patches), for_levels=True)
+            if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
+                return plan
+        except ValueError:  # more entries in a patch than 16 bits count
+            if patches == scene.tets:
+                raise
+        rounds = -(-patches // gpu.multiprocessors)
+        patches = min((rounds + 1 + rounds // 4) * gpu.multiprocessors, scene.tets)
 
 
 def choose_plan(
@@ -135,7 +153,7 @@ def choose_plan(
             raise ValueError(
                 f'Simulator: Multilevel runs with kernel="stream" on a GPU, got kernel={kernel!r}; leave it at "auto"'
             )
-        return replace(_stream_plan(scene, gpu, levels=True), why="what Multilevel runs with")
+        return replace(_level_plan(scene, gpu), why="what Multilevel runs with")
     needs = []
     for name in ("block", "grid"):
         if kernel not in ("auto", name):
@@ -150,7 +168,7 @@ def choose_plan(
                 f"Simulator: kernel={kernel!r} does not fit this GPU: it needs {needed} of shared memory a thread "
                 f'block, and {gpu.shared:,} B are there; take {others}, or "auto", which takes the first that fits'
             )
-    return replace(_stream_plan(scene, gpu, levels=False), why=_reason(kernel, needs, gpu))
+    return replace(_stream_plan(scene, gpu), why=_reason(kernel, needs, gpu))
 
 
 def _reason(kernel: str, needs: list[str], gpu: Properties) -> str:

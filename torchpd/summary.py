@@ -141,7 +141,13 @@ def _step_bytes(sim: Simulator, real: int) -> str:
         return f"{workspace_bytes(plan, real, sim.solver):,} B an environment during a step"
     slots = plan.size("slots")
     if plan.kernel == "stream":
-        return f"{4 * real * (5 * plan.vertices + 2 * slots):,} B an environment during a step"
+        own = f"{4 * real * (5 * plan.vertices + 2 * slots):,} B an environment during a step"
+        if not isinstance(sim.solver, Multilevel):
+            return own
+        # three vectors of the outer iteration, four of a cycle, eight pairs; two more and two matrices with contacts
+        held = 26 if sim.scene.grounds or sim.scene.spheres else 0
+        numbers = 4 * (7 + (16 if sim.solver.outer == "lbfgs" else 0)) + held
+        return f"{own}, and {real * plan.vertices * numbers:,} B for each that the GPU has in work at a time"
     # five vectors of four numbers a slot, the weights of 32 pairs a block
     team = real * (20 * slots + 64 * plan.size("blocks"))
     return f"{team:,} B for each environment that the GPU has in work at a time"

@@ -129,7 +129,7 @@ struct OuterLaunch {
   // The fields of the cycle in shared memory, where one block has an environment to itself and there is room.
   void keep_cycle(const DeviceStep<T>& step) {
     const bool one = step.plan.patches == 1;
-    if (!one && step.batch < resident) return;
+    if (resident == 0 || (!one && step.batch < resident)) return;
     Arena arena(nullptr);
     CycleMemory<T> fields;
     arrange(arena, step.plan.levels, 1, fields);
@@ -201,6 +201,7 @@ OuterCall<T> outer_call(const StreamCall<T>& stream, const OuterLaunch<T>& launc
 template <class T>
 void run_comparison(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
   OuterCall<T> call = outer_call(stream, OuterLaunch<T>(stream.step), memory);
+  // its blocks are fewer registers and less shared memory than those that the teams were counted by
   launch_teams(reinterpret_cast<const void*>(compare_material<T>), call, call.memory.counter, 0,
                to);
 }

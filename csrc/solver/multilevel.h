@@ -27,7 +27,7 @@ PD_HD void multilevel_step(Runner& run, const Settings& settings) {
   if (settings.report) run.measure_course();
   run.start();
   run.translate();
-  if (settings.iterations > 0) run.descend();  // multilevel_iterations
+  run.descend();  // multilevel_iterations
   run.translate();
   if (settings.report) run.measure();
   run.finish();
@@ -187,7 +187,11 @@ struct Outer {
   bool diagonal = false;  // momentum with 1 / D in place of M, to the end of the step
 
   // how much of the direction the next trial takes
-  PD_HD double length() const { return failures > 1 ? 1.0 / double(1 << (failures - 1)) : 1.0; }
+  PD_HD double length() const {
+    const int halved =
+        failures < patience ? failures - 1 : patience - 1;  // what more fail goes another way
+    return halved > 0 ? 1.0 / double(1 << halved) : 1.0;
+  }
 
   // Whether to go on from a trial of this energy. False for NaN, unless there is nothing to go back to.
   PD_HD bool accept(double trial, bool armijo) {
