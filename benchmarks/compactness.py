@@ -181,6 +181,8 @@ def draw(rows: list[Row], path: Path) -> None:
                 label=method,
             )
         axis.set(title=shape, xscale="log", yscale="log", xlabel="bytes")
+        axis.set_xticks([1000, 3000, 10000, 30000], ["1 k", "3 k", "10 k", "30 k"])
+        axis.tick_params(axis="x", which="minor", labelbottom=False)
         axis.grid(which="both", color="#e4e5e8", lw=0.6)
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("distance, rms / size of the shape")
