@@ -102,7 +102,7 @@ def test_a_patch_with_a_busy_vertex_is_split_until_it_fits() -> None:
 
 @pytest.mark.parametrize("gpu", [Properties(1, 232_448), Properties(20, 101_376)])
 def test_patches_of_a_multilevel_solver_fit(gpu: Properties, dtype: torch.dtype) -> None:
-    """As many for every multiprocessor as fit, also where more entries than 16 bits count would ask for more patches."""
+    """As many for every multiprocessor as fit, also where 16 bits would not count the entries of fewer."""
     values = values_of((54, 11, 11))  # 39 204 tetrahedra
     plan = choose_plan(values, dtype, gpu, levels=True, progress=False)
     assert plan.for_levels
