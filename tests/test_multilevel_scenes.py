@@ -271,6 +271,17 @@ def test_precision_can_be_changed() -> None:
     assert float((after.positions - expected.positions).abs().max()) <= 1e-4
 
 
+def test_what_it_was_made_of_goes_along() -> None:
+    """Into another precision as into a file: stiffness that has changed since does not make another M."""
+    sim = simulate(torch.float64, solver=pd.Multilevel())
+    sim.set_material(stiffness=3.0 * sim.stiffness)
+    before = sim(moving(sim), return_info=True)[1].rho
+    sim.float()
+    assert torch.equal(sim.plan.reference_stiffness, (sim.stiffness / 3.0))
+    assert torch.allclose(sim(moving(sim), return_info=True)[1].rho, before, rtol=1e-5)
+    assert float(before[0]) > 0.5
+
+
 def test_meta_is_refused() -> None:
     there = simulate(torch.float32).to("meta")
     with pytest.raises(RuntimeError, match="Multilevel is prepared on the CPU or on a GPU, not on meta"):

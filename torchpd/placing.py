@@ -11,7 +11,7 @@ from torch import Tensor
 from . import _C
 from .gpu import free_memory, properties_of, refuse_full_memory, why_not
 from .material import material_of
-from .multilevel import precondition_plan, reference_of, without_levels
+from .multilevel import precondition_plan, reference_of, reference_of_levels, without_levels
 from .plan import Plan, compile_plan
 from .regimes import choose_plan
 from .solvers import Multilevel
@@ -80,11 +80,14 @@ def plan_on(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
     else:
         plan = _compile(sim, dtype, device)
         if isinstance(sim.solver, Multilevel):
-            # coming from "meta" the values of the material are lost
-            lost = sim.device.type == "meta"
-            arrays = list(material_of(sim.scene.values(), sim.dtype).values()) if lost else sim.material()
-            source = compile_plan(sim.scene.values(), dtype=sim.dtype, progress=False) if lost else sim.plan
-            plan = precondition_plan(plan, sim.scene.values(), *reference_of(source, arrays, sim.time_step))
+            # what M was made of goes along, as into a file; coming from "meta" the values are lost
+            if sim.device.type == "meta":
+                arrays = list(material_of(sim.scene.values(), sim.dtype).values())
+                source = compile_plan(sim.scene.values(), dtype=sim.dtype, progress=False)
+                reference = reference_of(source, arrays, sim.time_step)
+            else:
+                reference = reference_of_levels(sim.plan.arrays)
+            plan = precondition_plan(plan, sim.scene.values(), *reference)
     if device.type == "cuda" and device != sim.device:
         material = sum(array.numel() for array in (*sim.material(), sim.rest_positions))
         refuse_full_memory(plan.bytes + material * (torch.finfo(dtype).bits // 8), free_memory(device))

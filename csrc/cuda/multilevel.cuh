@@ -123,7 +123,12 @@ struct OuterLaunch {
   }
 
   int blocks_with(std::size_t bytes) const {
-    return resident_blocks(reinterpret_cast<const void*>(kernel), outer_threads, bytes);
+    const auto of = [](const void* any, std::size_t shared_bytes) {
+      return resident_blocks(any, outer_threads, shared_bytes);
+    };
+    // the material is compared by the same teams
+    return std::min(of(reinterpret_cast<const void*>(kernel), bytes),
+                    of(reinterpret_cast<const void*>(compare_material<T>), 0));
   }
 
   // The fields of the cycle in shared memory, where one block has an environment to itself and there is room.
@@ -201,7 +206,6 @@ OuterCall<T> outer_call(const StreamCall<T>& stream, const OuterLaunch<T>& launc
 template <class T>
 void run_comparison(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
   OuterCall<T> call = outer_call(stream, OuterLaunch<T>(stream.step), memory);
-  // its blocks are fewer registers and less shared memory than those that the teams were counted by
   launch_teams(reinterpret_cast<const void*>(compare_material<T>), call, call.memory.counter, 0,
                to);
 }
