@@ -127,8 +127,8 @@ def study(name: str, shape: Any, *, quick: bool) -> tuple[float, list[Row]]:
         rows.append(triangle_row("triangles, vertices on the shape", target, mesh, flat_points, 3))
         rows.append(triangle_row("triangles, least quadric error", target, coarse, flat_points, 3))
         rows.append(triangle_row("PN triangles", target, mesh, pn_points, 5))
-    todo = [(patches, count, base) for patches, some in fits for count in some for base in ("flat", "phong")]
-    for patches, count, base in tqdm(todo, desc=f"{name}: fits", leave=False):
+    settings = [(patches, count, base) for patches, some in fits for count in some for base in ("flat", "phong")]
+    for patches, count, base in tqdm(settings, desc=f"{name}: fits", leave=False):
         over = balls(patches) if is_blob else patches
         try:
             report = pd.FreeFormPatches.fit(shape, count, patches=over, base=base, **options).report
