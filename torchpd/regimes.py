@@ -116,13 +116,9 @@ def _level_plan(scene: _Scene, gpu: Properties) -> Plan:
     """For a multilevel solver: as many patches for every multiprocessor, where one each is not enough."""
     patches = min(scene.patches("levels", gpu), scene.tets)
     while True:
-        try:
-            plan = replace(scene.plan("stream", patches), for_levels=True)
-            if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
-                return plan
-        except ValueError:  # more entries in a patch than 16 bits count
-            if patches == scene.tets:
-                raise
+        plan = replace(scene.plan("stream", patches), for_levels=True)
+        if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
+            return plan
         rounds = -(-patches // gpu.multiprocessors)
         patches = min((rounds + 1 + rounds // 4) * gpu.multiprocessors, scene.tets)
 
