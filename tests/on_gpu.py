@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -12,26 +14,40 @@ from cases import Case, box
 from runs import simulate, simulator, small
 
 import torchpd as pd
+from torchpd import regimes
 
-KERNELS = ("block", "grid", "stream")
+KERNELS = ("block", "cluster", "grid", "stream")  # for few patches the kernel "grid" forms clusters
 GPU = torch.device("cuda", 0)
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def on_gpu(case: Case, dtype: torch.dtype, kernel: str, **options: Any) -> pd.Simulator:
     """The scene of a case, compiled for one of the kernels."""
-    return with_kernel(simulator(case, dtype, GPU, kernel=kernel, **options), kernel)
+    with compiled_for(kernel) as name:
+        return with_kernel(simulator(case, dtype, GPU, kernel=name, **options), name)
 
 
 def full_on_gpu(dtype: torch.dtype, kernel: str, **options: Any) -> pd.Simulator:
     """`runs.full_scene` for one of the kernels."""
-    return with_kernel(simulate(dtype, GPU, kernel=kernel, **options), kernel)
+    with compiled_for(kernel) as name:
+        return with_kernel(simulate(dtype, GPU, kernel=name, **options), name)
 
 
 def small_on_gpu(dtype: torch.dtype, kernel: str, batch: int = 3) -> tuple[pd.Simulator, pd.State]:
     """`runs.small` for one of the kernels."""
-    sim, state = small(dtype, GPU, batch, kernel=kernel)
-    return with_kernel(sim, kernel), state
+    with compiled_for(kernel) as name:
+        sim, state = small(dtype, GPU, batch, kernel=name)
+    return with_kernel(sim, name), state
+
+
+@contextmanager
+def compiled_for(kernel: str) -> Iterator[str]:
+    """The name that a simulator knows one of KERNELS by; a "grid" gets many patches of two tetrahedra and more."""
+    if kernel == "grid":
+        with mock.patch.multiple(regimes, _CLUSTER_TETS=0, _GRID_TETS=2):
+            yield kernel
+    else:
+        yield "grid" if kernel == "cluster" else kernel
 
 
 def with_kernel(sim: pd.Simulator, kernel: str) -> pd.Simulator:

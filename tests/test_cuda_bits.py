@@ -19,7 +19,7 @@ from torchpd.state import Info
 require_gpu()
 
 # more than fit on the device at once for the block and the grid, an odd number for the stream
-BATCH = {"block": 4096, "grid": 300, "stream": 17}
+BATCH = {"block": 4096, "cluster": 300, "grid": 130, "stream": 17}
 pytestmark = pytest.mark.parametrize("precision", DTYPES)
 
 
@@ -49,7 +49,7 @@ def test_runs_and_batches_do_not_matter(kernel: str, tolerance: float, precision
     assert_same_bits(run(sim, state, forces, some), [t[some] for t in together])
 
 
-@pytest.mark.parametrize("kernel", ["grid", "stream"])
+@pytest.mark.parametrize("kernel", ["cluster", "grid", "stream"])
 def test_many_patches_many_times(kernel: str, precision: str) -> None:
     """What blocks of a grid say to each other arrives in any order; a hundred runs are the same."""
     case = bar((24, 5, 5), pd.Gravity(), pd.Ground(-0.02, friction=0.4), pinned=False)

@@ -10,7 +10,20 @@ import numpy as np
 import pytest
 import torch
 from devices import require_gpu
-from on_gpu import DTYPES, GPU, KERNELS, bar, crowd, device_work, full_on_gpu, moved, on_gpu, relative, small_on_gpu
+from on_gpu import (
+    DTYPES,
+    GPU,
+    KERNELS,
+    bar,
+    compiled_for,
+    crowd,
+    device_work,
+    full_on_gpu,
+    moved,
+    on_gpu,
+    relative,
+    small_on_gpu,
+)
 from runs import ULP, moving, noise, numbers_of, plan_of, same_bits, simulate, simulator, small, small_case, state_of
 from test_ops import OPS, samples
 from test_rotation import CLASSES
@@ -129,7 +142,8 @@ def test_gradients_are_those_of_the_cpu(kernel: str) -> None:
     body = case.scene.solids[0]
     scene = pd.Scene(*case.scene.parts, pd.Pin(body, [len(case.positions) - 1], 1e3))
     options = {"dtype": torch.float64, "iterations": 600, "progress": False}
-    sim = pd.Simulator(scene, 1 / 60, kernel=kernel, **options).to(GPU)
+    with compiled_for(kernel) as name:
+        sim = pd.Simulator(scene, 1 / 60, kernel=name, **options).to(GPU)
     plain = pd.Simulator(scene, 1 / 60, **options)
     state = plain.rest_state(2)
     state = pd.State(state.positions + 0.002 * noise(state.positions, 4), 0.3 * noise(state.positions, 5))
@@ -162,7 +176,8 @@ def test_gradcheck_of_the_energy(kernel: str) -> None:
 @pytest.mark.parametrize("name", OPS)
 def test_opcheck(name: str, kernel: str) -> None:
     for dtype in DTYPES.values():
-        arguments, keywords = samples(name, dtype, GPU, kernel=kernel)
+        with compiled_for(kernel) as known:
+            arguments, keywords = samples(name, dtype, GPU, kernel=known)
         report = torch.library.opcheck(getattr(ops, name).default, arguments, keywords)
         assert set(report.values()) == {"SUCCESS"}
 
@@ -192,17 +207,24 @@ def ours(names: list[str]) -> list[str]:
 
 
 @pytest.mark.parametrize("precision", DTYPES)
-def test_a_step_is_one_launch(precision: str) -> None:
-    dtype = DTYPES[precision]
-    sim, state = small_on_gpu(dtype, "block", batch=9)
+@pytest.mark.parametrize("kernel", ["block", "cluster"])
+def test_a_step_is_one_launch(kernel: str, precision: str) -> None:
+    if kernel == "cluster" and torch.cuda.get_device_capability(GPU) < (9, 0):
+        pytest.skip("clusters of blocks need compute capability 9.0")
+    sim, state = small_on_gpu(DTYPES[precision], kernel, batch=9)
+    assert (sim.plan.patches > 1) == (kernel == "cluster")
     assert len(device_work(lambda: sim(state))) == 1
     assert len(device_work(lambda: sim.step_(state))) == 1
     # torch's own kernels make the columns of the report that every track carries
     assert len(ours(device_work(lambda: sim.rollout(state, 20)))) == 1
     assert len(device_work(lambda: sim(state, return_info=True))) <= 1 + 6  # and the columns of the report
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+def test_a_step_of_many_patches_is_two_launches(precision: str) -> None:
     case = bar((20, 4, 4))
-    sim = on_gpu(case, dtype, "grid")
-    assert sim.plan.patches > 1
+    sim = on_gpu(case, DTYPES[precision], "grid")
+    assert sim.plan.patches > 16
     state = state_of(case, sim, 5)
     for call in (lambda: sim(state), lambda: sim.step_(state), lambda: sim.rollout(state, 20, 10)):
         names = ours(device_work(call))
@@ -332,7 +354,7 @@ def test_there_and_back_again() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif("TORCHPD_LARGE_TESTS" not in os.environ, reason="TORCHPD_LARGE_TESTS=1 runs it; needs 40 GB")
-@pytest.mark.parametrize("kernel", ["block", "grid", "stream"])
+@pytest.mark.parametrize("kernel", KERNELS)
 def test_more_numbers_than_32_bits_count(kernel: str) -> None:
     sim = full_on_gpu(torch.float32, kernel, iterations=2)
     batch = (1 << 31) // (3 * sim.vertices) + 1000

@@ -53,9 +53,11 @@ def test_number_of_patches() -> None:
     for dtype in REAL:
         assert choose_plan(small, dtype, H100, "block").patches == 1
         grid, tets = choose_plan(small, dtype, H100, "grid").patches, len(small.tets)
-        assert 2 < grid < 132
-        assert tets / grid >= regimes._GRID_TETS > tets / (grid + 1)
+        assert 2 < grid < 16
+        assert tets / grid >= regimes._CLUSTER_EACH > tets / (grid + 1)
         assert choose_plan(small, dtype, Properties(5, 232_448), "grid").patches == 5
+        assert choose_plan(values_of((11, 11, 11)), dtype, H100, "grid").patches == 16  # a cluster has no more
+        assert choose_plan(values_of((12, 12, 12)), dtype, H100, "grid").patches == 6 * 12**3 // regimes._GRID_TETS
         stream, tets = choose_plan(large, dtype, H100, "stream").patches, len(large.tets)
         assert stream > 1
         assert tets / stream <= regimes._STREAM_TETS[dtype] < tets / (stream - 1)

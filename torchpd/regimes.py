@@ -1,7 +1,9 @@
 """Which kernel of a GPU steps a scene, and the plan for it.
 
     block   one thread block an environment, all iterations in one launch: the mesh fits a block's shared memory
-    grid    a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
+    grid    a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors. Up to 16
+            patches exchange through each other's shared memory where the GPU has clusters of blocks (9.0 on), and then a
+            few environments of a small mesh are done in half the time of "block", which is for many
     stream  launches for every iteration: any mesh
 
 The batch does not enter: an environment gives the same bits alone and in any batch.
@@ -24,6 +26,8 @@ from .tables import DEVICE_PLAN_TABLE
 __all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
 _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
+# of meshes that are cut in so few patches that their blocks may form a cluster (csrc/cuda/cluster.h)
+_CLUSTER_TETS, _CLUSTER_PATCHES, _CLUSTER_EACH = 8000, 16, 200
 # with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block
 _LEVEL_TETS, _LEVEL_ALONE = 384, 1152
 _STREAM_TETS = {torch.float32: 2000, torch.float64: 960}  # a patch, so that two share a multiprocessor of an H100
@@ -69,7 +73,9 @@ class _Scene(NamedTuple):
         if kernel == "block":
             return 1
         if kernel == "grid":
-            return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
+            small = self.tets <= _CLUSTER_TETS
+            most = min(_CLUSTER_PATCHES, gpu.multiprocessors) if small else gpu.multiprocessors
+            return min(most, max(2, self.tets // (_CLUSTER_EACH if small else _GRID_TETS)), self.tets)
         if kernel == "levels":
             if self.tets <= _LEVEL_ALONE:
                 return 1

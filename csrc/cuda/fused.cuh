@@ -12,17 +12,19 @@
 
 namespace pd {
 
-static_assert(sizeof(Control) <= fused_control_bytes);
+static_assert(sizeof(Control<double>) <= fused_control_bytes);
 static_assert(sizeof(Plane<float>) == 5 * sizeof(float) &&
               sizeof(Ball<float>) == 8 * sizeof(float));
 
-template <class T, bool Touching, bool Many, int Threads, int Blocks>
-__global__ void __launch_bounds__(Threads, Blocks)
+template <class T, bool Touching, Blocks Kind, int Threads, int Together>
+__global__ void __launch_bounds__(Threads, Together)
     fused_step(const __grid_constant__ FusedCall<T> call) {
   extern __shared__ __align__(16) std::byte shared[];
-  FusedRunner<T, Touching, Many> runner(call, shared);
-  const int team = Many ? int(blockIdx.x) / call.step.plan.patches : int(blockIdx.x);
+  FusedRunner<T, Touching, Kind> runner(call, shared);
+  const int team = Kind != Blocks::one ? int(blockIdx.x) / call.step.plan.patches : int(blockIdx.x);
   for (std::int64_t e = team; e < call.step.batch; e += call.teams) runner.roll(e);
+  // nobody leaves while others may still write to its shared memory
+  if constexpr (Kind == Blocks::cluster) cluster_barrier();
 }
 
 // of a block that has a multiprocessor to itself
@@ -33,40 +35,46 @@ template <class T>
 using FusedKernel = void (*)(FusedCall<T>);
 
 // One environment a multiprocessor has its registers to itself; several small ones share them.
-template <class T, bool Touching, bool Many>
-FusedKernel<T> fused_kernel_for(int threads) {
-  if constexpr (Many) {
-    if (threads <= 256) return fused_step<T, Touching, true, 256, 1>;
-    return fused_step<T, Touching, true, most_grid_threads<T>, 1>;
-  } else if constexpr (sizeof(T) == 8) {
-    if (threads <= 128) return fused_step<T, Touching, false, 128, 2>;
-    return fused_step<T, Touching, false, 256, 1>;
+template <class T, bool Touching>
+FusedKernel<T> fused_kernel_for(Blocks kind, int threads) {
+  constexpr int most = most_grid_threads<T>;
+  if (kind == Blocks::cluster) return fused_step<T, Touching, Blocks::cluster, most, 1>;
+  if (kind == Blocks::grid) {
+    if (threads <= 256) return fused_step<T, Touching, Blocks::grid, 256, 1>;
+    return fused_step<T, Touching, Blocks::grid, most, 1>;
+  }
+  if constexpr (sizeof(T) == 8) {
+    if (threads <= 128) return fused_step<T, Touching, Blocks::one, 128, 2>;
+    return fused_step<T, Touching, Blocks::one, 256, 1>;
   } else {
-    if (threads <= 128) return fused_step<T, Touching, false, 128, 5>;
-    if (threads <= 192) return fused_step<T, Touching, false, 192, 3>;
-    if (threads <= 320) return fused_step<T, Touching, false, 320, 2>;
-    return fused_step<T, Touching, false, most_threads, 1>;
+    if (threads <= 128) return fused_step<T, Touching, Blocks::one, 128, 5>;
+    if (threads <= 192) return fused_step<T, Touching, Blocks::one, 192, 3>;
+    if (threads <= 320) return fused_step<T, Touching, Blocks::one, 320, 2>;
+    return fused_step<T, Touching, Blocks::one, most_threads, 1>;
   }
 }
 
 template <class T>
-FusedKernel<T> fused_kernel(const DeviceStep<T>& step, int threads) {
+FusedKernel<T> fused_kernel(const DeviceStep<T>& step, Blocks kind, int threads) {
   const bool touching = step.material.planes_count + step.material.spheres_count > 0;
-  if (step.plan.kernel == int(DeviceKernel::grid))
-    return touching ? fused_kernel_for<T, true, true>(threads)
-                    : fused_kernel_for<T, false, true>(threads);
-  return touching ? fused_kernel_for<T, true, false>(threads)
-                  : fused_kernel_for<T, false, false>(threads);
+  return touching ? fused_kernel_for<T, true>(kind, threads)
+                  : fused_kernel_for<T, false>(kind, threads);
 }
 
 // How a call is launched.
 template <class T>
 struct FusedLaunch {
+  Blocks kind;
   FusedKernel<T> kernel;
   int threads, teams, patches;
   std::size_t shared;
 
   explicit FusedLaunch(const DeviceStep<T>& step);
+
+  const void* function() const { return reinterpret_cast<const void*>(kernel); }
+
+ private:
+  bool form_clusters(const DeviceStep<T>& step);
 };
 
 // A multiprocessor has registers for some 640 threads of float32: they are dealt out to as many environments as its shared
@@ -81,24 +89,22 @@ inline int block_threads(std::size_t real, std::size_t shared) {
   return real == 4 ? threads : std::min(threads, 256);
 }
 
-// One patch a multiprocessor: a thread for every tetrahedron and slot, as far as there are, and a warp without any to lead.
+// One patch a block: a thread for every tetrahedron and slot, as far as there are, and a warp without any to lead.
 template <class T>
-int grid_threads(int pairs, int slots) {
-  const int wanted = std::max(2 * pairs + warp_size, slots);
+int patch_threads(const DevicePlan<T>& plan) {
+  const int wanted = std::max(2 * plan.most_pairs + warp_size, plan.most_slots);
   return std::clamp((wanted + warp_size - 1) / warp_size * warp_size, 64, most_grid_threads<T>);
 }
 
 template <class T>
-FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step) {
-  const DevicePlan<T>& plan = step.plan;
-  const bool many = plan.kernel == int(DeviceKernel::grid);
-  shared = fused_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries,
-                              step.material.planes_count, step.material.spheres_count);
-  threads =
-      many ? grid_threads<T>(plan.most_pairs, plan.most_slots) : block_threads(sizeof(T), shared);
-  kernel = fused_kernel(step, threads);
-  patches = many ? plan.patches : 1;
-  const int resident = resident_blocks(reinterpret_cast<const void*>(kernel), threads, shared);
+FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
+    : kind(step.plan.kernel == int(DeviceKernel::grid) ? Blocks::grid : Blocks::one),
+      patches(kind == Blocks::grid ? step.plan.patches : 1) {
+  if (kind == Blocks::grid && form_clusters(step)) return;
+  shared = fused_shared_bytes(step);
+  threads = kind == Blocks::grid ? patch_threads(step.plan) : block_threads(sizeof(T), shared);
+  kernel = fused_kernel(step, kind, threads);
+  const int resident = resident_blocks(function(), threads, shared);
   if (resident < patches)
     throw std::runtime_error(
         "torchpd: this device runs " + std::to_string(resident) + " blocks of " +
@@ -107,15 +113,30 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step) {
   teams = int(std::min<std::int64_t>(step.batch, resident / patches));
 }
 
+// Few patches, whose blocks reach each other's shared memory. The batch does not enter here either.
+template <class T>
+bool FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
+  if (patches > most_cluster_blocks) return false;
+  shared = cluster_shared_bytes(step);
+  threads = patch_threads(step.plan);
+  kernel = fused_kernel(step, Blocks::cluster, threads);
+  if (resident_blocks(function(), threads, shared) == 0) return false;
+  const int clusters = resident_clusters(function(), threads, shared, patches);
+  if (clusters == 0) return false;
+  kind = Blocks::cluster;
+  teams = int(std::min<std::int64_t>(step.batch, clusters));
+  return true;
+}
+
 template <class T>
 FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaunch<T>& launch) {
   const DevicePlan<T>& plan = step.plan;
-  const bool many = step.plan.kernel == int(DeviceKernel::grid);
-  const std::int64_t teams = launch.teams, letters = many ? teams * 2 * plan.slots : 0;
+  const bool many = launch.kind != Blocks::one, grid = launch.kind == Blocks::grid;
+  const std::int64_t teams = launch.teams;
   FusedScratch<T> s;
   // what must start as zero comes first
-  arena.place(s.letters, letters * Letter<T>::words);
-  arena.place(s.sums, many ? teams * 2 * plan.patches * sums_count : 0);
+  arena.place(s.letters, grid ? teams * 2 * plan.slots * Letter<T>::words : 0);
+  arena.place(s.sums, grid ? teams * 2 * plan.patches * sums_count : 0);
   for (Quad<T>** array : {&s.x, &s.velocity, &s.target, &s.origin, &s.before})
     arena.place(*array, teams * plan.slots);
   arena.place(s.u, many ? teams * plan.slots : 0);
@@ -139,16 +160,17 @@ void run_fused(const DeviceStep<T>& step, void* memory, Stream to) {
   Arena arena(memory);
   FusedCall<T> call{step, arrange(arena, step, launch), launch.teams};
   void* arguments[] = {&call};
-  const dim3 grid(launch.teams * launch.patches), block(launch.threads);
-  const void* kernel = reinterpret_cast<const void*>(launch.kernel);
-  if (step.plan.kernel == int(DeviceKernel::grid)) {
-    const auto* begin = reinterpret_cast<const std::byte*>(call.scratch.letters);
-    const auto* end = reinterpret_cast<const std::byte*>(call.scratch.x);
-    check(cudaMemsetAsync(call.scratch.letters, 0, end - begin, stream));
-    check(cudaLaunchCooperativeKernel(kernel, grid, block, arguments, launch.shared, stream));
-  } else {
-    check(cudaLaunchKernel(kernel, grid, block, arguments, launch.shared, stream));
+  const unsigned blocks = unsigned(launch.teams) * unsigned(launch.patches);
+  if (launch.kind == Blocks::one) {
+    check(cudaLaunchKernel(launch.function(), dim3(blocks), dim3(launch.threads), arguments,
+                           launch.shared, stream));
+    return;
   }
+  const auto* begin = reinterpret_cast<const std::byte*>(call.scratch.letters);
+  const auto* end = reinterpret_cast<const std::byte*>(call.scratch.x);
+  if (begin != end) check(cudaMemsetAsync(call.scratch.letters, 0, end - begin, stream));
+  pd::launch(launch.function(), blocks, launch.threads, arguments, launch.shared,
+             launch.kind == Blocks::cluster ? launch.patches : 0, stream);
 }
 
 }  // namespace pd

@@ -6,6 +6,7 @@
 #pragma once
 #include "cuda/fused_call.h"
 #include "cuda/half.h"
+#include "cuda/mail.h"
 #include "cuda/patch.h"
 #include "cuda/vertices.h"
 #include "plan/shared_memory.h"
@@ -13,9 +14,10 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: the scene has contacts. `Many`: several patches an environment.
-template <class T, bool Touching, bool Many>
+// `Touching`: the scene has contacts.
+template <class T, bool Touching, Blocks Kind>
 class FusedRunner {
+  static constexpr bool Many = Kind != Blocks::one;  // patches an environment
   using Lanes = Thread<T>;
   using Letter = pd::Letter<T>;
   using Seen = typename Vertices<T, Touching>::Seen;
@@ -28,7 +30,7 @@ class FusedRunner {
   };
 
  public:
-  // `shared`: as many bytes as fused_shared_bytes (plan/shared_memory.h) says
+  // `shared`: as many bytes as fused_shared_bytes (plan/shared_memory.h) says, a cluster's with those of its mail
   PD_DEVICE FusedRunner(const FusedCall<T>& call, std::byte* shared)
       : call_(call.step),
         plan_(call.step.plan),
@@ -37,21 +39,36 @@ class FusedRunner {
         patch_(call.step.plan, index_),
         team_(Many ? int(blockIdx.x) / call.step.plan.patches : int(blockIdx.x)),
         memory_(call.scratch),
-        control_(*reinterpret_cast<Control*>(shared)),
+        control_(*reinterpret_cast<Control<T>*>(shared)),
         sums_(control_.totals,
-              call.scratch.sums + std::int64_t(team_) * 2 * plan_.patches * sums_count, index_,
-              plan_.patches),
+              call.scratch.sums + std::int64_t(team_) * 2 * plan_.patches * sums_count,
+              ClusterSums(shared + sums_begin(call.step)), index_, plan_.patches),
         h_(T(call.step.settings.time_step)),
-        theta_(T(call.step.settings.relaxation)) {
+        theta_(T(call.step.settings.relaxation)),
+        mail_(shared + mail_begin(call.step), plan_.most_shared, plan_.patches, index_) {
     position_ = reinterpret_cast<Quad<T>*>(shared + fused_control_bytes);
     Quad<T>* second = position_ + plan_.most_slots;
-    v_ = {memory_.x + first_slot(), memory_.velocity + first_slot(), memory_.target + first_slot(),
-          Many ? memory_.u + first_slot() : second, memory_.before + first_slot()};
+    const FusedScratch<T>& m = call.scratch;
+    v_ = {m.x + first_slot(), m.velocity + first_slot(), m.target + first_slot(),
+          Many ? m.u + first_slot() : second, m.before + first_slot()};
+    origin_ = m.origin + first_slot();
+    if constexpr (Kind == Blocks::cluster) {
+      Quad<T>* own = reinterpret_cast<Quad<T>*>(shared + vertices_begin(call.step));
+      for (Quad<T>** array : {&v_.x, &v_.velocity, &v_.target, &v_.u, &v_.before, &origin_}) {
+        *array = own;
+        own += plan_.most_slots;
+      }
+    }
     rest_ = reinterpret_cast<RestPoint<T>*>(second);
     entries_ = position_ + 2 * plan_.most_slots;
     balls_ = reinterpret_cast<Ball<T>*>(entries_ + plan_.most_entries);
     planes_ = reinterpret_cast<Plane<T>*>(balls_ + call_.material.spheres_count);
     if (Many && int(threadIdx.x) < patch_.slots) row_ = patch_.row(slot_of_seat(threadIdx.x));
+    if constexpr (Kind == Blocks::cluster) {
+      mail_.open(patch_, senders(), earlier_shared());
+      if (threadIdx.x == 0) ClusterSums(shared + sums_begin(call.step)).open();
+      cluster_barrier();
+    }
   }
 
   // All steps of one environment, with a record every `every`.
@@ -72,7 +89,7 @@ class FusedRunner {
     const Vec3<T> anchor = vec3(v_.x[0]);
     each_slot([&](int s) {
       v_.predict(s, in_, patch_.vertex(s), h_);
-      origin()[s] = quad(vec3(v_.x[s]) - anchor);
+      origin_[s] = quad(vec3(v_.x[s]) - anchor);
     });
   }
 
@@ -118,7 +135,9 @@ class FusedRunner {
     if (pending_ && leads()) sums_.send(Add{});
     const auto lead = [&] {
       conclude();
-      if (is_leader()) control_.omega = control_.progress.schedule.next(k);
+      if (!is_leader()) return;
+      control_.omega = T(control_.progress.schedule.next(k));
+      if (!control_.progress.done) ++control_.progress.used;
     };
     if constexpr (Many) {
       // one copy of the code, which several patches have to hold in the cache
@@ -145,7 +164,6 @@ class FusedRunner {
       pending_ = true;
     }
     guarding_ = guard;
-    if (threadIdx.x == 0) ++control_.progress.used;
     __syncthreads();
   }
 
@@ -186,7 +204,6 @@ class FusedRunner {
   PD_DEVICE std::int64_t first_slot() const {
     return std::int64_t(team_) * plan_.slots + patch_.first_slot;
   }
-  PD_DEVICE Quad<T>* origin() const { return memory_.origin + first_slot(); }
   PD_DEVICE T* weights() const {
     return memory_.weights + std::int64_t(team_) * plan_.blocks * 2 * pair_lanes;
   }
@@ -206,7 +223,7 @@ class FusedRunner {
 
   PD_DEVICE void move(int s, const Vec3<T>& u) {
     v_.set(s, u);
-    position_[s] = quad(vec3(origin()[s]) + u);
+    position_[s] = quad(vec3(origin_[s]) + u);
   }
 
   PD_DEVICE void update(const Seat& at, const Seen& seen, const Vec3<T>& force) {
@@ -224,7 +241,11 @@ class FusedRunner {
   template <class Element>
   PD_DEVICE T each_element(const Element& element) {
     if constexpr (Many) {
-      return each_half(patch_, position_, rest_, weights(), entries_, element, half_);
+      // a cluster's patches are small: what they do not work out again they have registers for
+      const auto inverse_of = [&](const HalfNumbers<T>& numbers, bool first) {
+        return Kind == Blocks::cluster && first ? inverse_ : half_inverse(numbers, rest_);
+      };
+      return each_half(patch_, position_, inverse_of, weights(), entries_, element, half_);
     } else {
       const Quad<T>* const fields[1] = {position_};
       return each_pair(patch_, fields, rest_of<Many>(patch_), weights(), entries_, element);
@@ -241,13 +262,13 @@ class FusedRunner {
     __syncthreads();
     finished_ = MayStop && control_.progress.done;
     if (finished_) return;
-    omega_ = T(control_.omega);
+    omega_ = control_.omega;
     if constexpr (Many) {
       visit_patch(visit);
     } else {
       each_slot([&](int s) {
         const Seen seen = v_.see(s);
-        const Seat at = {s, true, vec3(origin()[s])};
+        const Seat at = {s, true, vec3(origin_[s])};
         visit(at, seen, sum_entries(entries_, plan_.slot_row[s]));
       });
     }
@@ -267,9 +288,7 @@ class FusedRunner {
   template <class Visit>
   PD_DEVICE void visit_patch(const Visit& visit) {
     ++round_;
-    Word* box = letter_box();
-    const auto* senders = reinterpret_cast<const Senders*>(plan_.slot_sender);
-    const int before = patch_.first_slot - patch_.first_vertex;  // shared slots of earlier patches
+    if (Kind == Blocks::cluster && threadIdx.x == 0 && patch_.shared() > 0) mail_.expect(round_);
     const int begin = int(threadIdx.x) - lane(), step = blockDim.x, shared = patch_.shared();
     bool again = false;
     for (int from = begin; from < (again ? shared : patch_.slots);) {
@@ -277,15 +296,15 @@ class FusedRunner {
       const bool sends = seat < shared, mine = again ? sends : !sends && seat < patch_.slots;
       const int slot = slot_of_seat(seat < patch_.slots ? seat : 0);
       const int row = row_of_seat(seat < patch_.slots ? seat : 0);
-      const Seen seen = v_.see(slot);
-      const Seat at = {slot, row >= 0, vec3(origin()[slot])};
+      // lanes without a seat look at nothing that others write
+      const Seen seen = seat < patch_.slots ? v_.see(slot) : Seen{};
+      const Seat at = {slot, row >= 0, vec3(origin_[slot])};
       Vec3<T> force;
       if (again) {
-        force = read_letters<T>(box, senders, before + seat, sends, round_);
+        force = receive(seat, sends);
       } else {
         force = sum_entries(entries_, row);
-        if (sends)
-          Letter::post(box + std::int64_t(patch_.first_slot + slot) * Letter::words, force, round_);
+        if (sends) send(seat, slot, force);
       }
       if (mine) visit(at, seen, force);
       __syncwarp();
@@ -295,6 +314,26 @@ class FusedRunner {
         from = begin;
       }
     }
+  }
+
+  PD_DEVICE const Senders* senders() const {
+    return reinterpret_cast<const Senders*>(plan_.slot_sender);
+  }
+  // shared slots of earlier patches
+  PD_DEVICE int earlier_shared() const { return patch_.first_slot - patch_.first_vertex; }
+
+  PD_DEVICE void send(int seat, int slot, const Vec3<T>& force) const {
+    if constexpr (Kind == Blocks::cluster) {
+      mail_.send(seat, force, round_);
+    } else {
+      const std::int64_t at = patch_.first_slot + slot;
+      Letter::post(letter_box() + at * Letter::words, force, round_);
+    }
+  }
+  // a warp together; what its lanes get that are not `here` means nothing
+  PD_DEVICE Vec3<T> receive(int seat, bool here) const {
+    if constexpr (Kind == Blocks::cluster) return mail_.receive(seat, here, round_);
+    return read_letters<T>(letter_box(), senders(), earlier_shared() + seat, here, round_);
   }
 
   // Leading warp: what follows from the sums of the last iteration.
@@ -364,6 +403,7 @@ class FusedRunner {
     weigh_pairs(patch_, rest_of<Many>(patch_), stiffness, bounded, weights());
     __syncthreads();  // one lane has left the weights of two
     if constexpr (Many) half_ = read_half(patch_, weights(), threadIdx.x);
+    if constexpr (Kind == Blocks::cluster) inverse_ = half_inverse(half_, rest_);
   }
 
   // ---- momentum: cuda/fused_momentum.h
@@ -396,17 +436,20 @@ class FusedRunner {
   Patch<T> patch_;
   int team_;
   const FusedScratch<T>& memory_;
-  Control& control_;
-  TeamSums<Many> sums_;
+  Control<T>& control_;
+  TeamSums<Kind> sums_;
   RestPoint<T>* rest_;  // with many patches: rest positions
   Quad<T>*position_,
       *entries_;  // where elements read vertices, from the patch's first; their forces
   Vertices<T, Touching> v_;
+  Quad<T>* origin_;  // start of the step, from the patch's first
   Plane<T>* planes_;
   Ball<T>* balls_;
   Inputs<T> in_;
   Contacts<T> contacts_;
+  ClusterMail<T> mail_;  // of a cluster
   HalfNumbers<T> half_;  // with many patches: this thread's first tetrahedron
+  Mat3<T> inverse_;      // in a cluster: its Dm^-1
   int row_ = 0;          // with many patches: slot_row of this thread's first seat
   T h_, theta_, omega_ = T(1);
   double energy_ = 0, first_ = 0, second_ = 0;  // this thread's part of the sums

@@ -1,7 +1,9 @@
 // What the fused kernel is given, and what it keeps where.
 #pragma once
 #include "cuda/inputs.h"
+#include "cuda/mail.h"
 #include "cuda/team.h"
+#include "plan/shared_memory.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -13,8 +15,8 @@ struct FusedScratch {
   T* weights;                                       // [teams, blocks, 2, 32] w V
   Quad<T>* shift;                                   // [teams, patches, pieces]
   double* part_sum;  // [teams, parts, 4] of the vertices that a patch owns of a piece
-  Word* letters;     // [teams, 2, slots, words] forces on shared vertices
-  Word* sums;        // [teams, 2, patches, sums_count]
+  Word* letters;     // of a grid: [teams, 2, slots, words] forces on shared vertices
+  Word* sums;        // of a grid: [teams, 2, patches, sums_count]
 };
 
 template <class T>
@@ -24,10 +26,37 @@ struct FusedCall {
   int teams;
 };
 
+// Shared memory of a block, without a cluster's mail.
+template <class T>
+PD_HD std::size_t fused_shared_bytes(const DeviceStep<T>& step) {
+  return pd::fused_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries,
+                                step.material.planes_count, step.material.spheres_count);
+}
+
+// Where the parts lie that a block of a cluster has behind those: cuda/cluster_sums.h, cuda/mail.h, and x, velocity, target,
+// u, before and origin of every slot; and all of its bytes.
+template <class T>
+PD_HD std::size_t sums_begin(const DeviceStep<T>& step) {
+  return (fused_shared_bytes(step) + 15) / 16 * 16;
+}
+template <class T>
+PD_HD std::size_t mail_begin(const DeviceStep<T>& step) {
+  return sums_begin(step) + ClusterSums::bytes;
+}
+template <class T>
+PD_HD std::size_t vertices_begin(const DeviceStep<T>& step) {
+  return mail_begin(step) + ClusterMail<T>::bytes(step.plan.most_shared, step.plan.patches);
+}
+template <class T>
+PD_HD std::size_t cluster_shared_bytes(const DeviceStep<T>& step) {
+  return vertices_begin(step) + 6 * sizeof(Quad<T>) * step.plan.most_slots;
+}
+
 // What the leading warp of a block decides for it.
+template <class T>
 struct Control {
   Progress progress;
-  double omega;
+  T omega;
   TeamTotals totals;
 };
 

@@ -26,6 +26,14 @@ PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int 
   return numbers;
 }
 
+// Dm^-1 of a lane's tetrahedron, worked out from `rest`, where elements read rest positions.
+template <class T>
+PD_DEVICE Mat3<T> half_inverse(const HalfNumbers<T>& numbers, const RestPoint<T>* rest) {
+  RestPoint<T> point[4];
+  for (int c = 0; c < 4; ++c) point[c] = rest[numbers.corner[c] & 0xffff];
+  return ComputedRest<T>::between(point, numbers.factor);
+}
+
 template <class T>
 struct HalfElement {
   using R = T;
@@ -53,9 +61,9 @@ PD_DEVICE Vec3<T> add_partner(const Vec3<T>& a) {
 }
 
 // Runs an effect on every pair; returns the sum of energies that this thread has met. `now`: what `read_half` gave for this
-// thread's first tetrahedron. `rest`: where elements read rest positions.
-template <class T, class Element>
-PD_DEVICE T each_half(const Patch<T>& patch, const Quad<T>* position, const RestPoint<T>* rest,
+// thread's first tetrahedron. `inverse_of(numbers, first)`: Dm^-1 of a tetrahedron, and whether it is the thread's first.
+template <class T, class Element, class InverseOf>
+PD_DEVICE T each_half(const Patch<T>& patch, const Quad<T>* position, const InverseOf& inverse_of,
                       const T* weights, Quad<T>* entries, const Element& element,
                       HalfNumbers<T> now) {
   T energy = T(0);
@@ -65,14 +73,10 @@ PD_DEVICE T each_half(const Patch<T>& patch, const Quad<T>* position, const Rest
     if (first + int(blockDim.x) < 2 * patch.pairs)
       next = read_half(patch, weights, first + int(blockDim.x) + lane);
     Vec3<T> x[4], force[4];
-    RestPoint<T> point[4];
-    for (int c = 0; c < 4; ++c) {
-      x[c] = vec3(position[now.corner[c] & 0xffff]);
-      point[c] = rest[now.corner[c] & 0xffff];
-    }
+    for (int c = 0; c < 4; ++c) x[c] = vec3(position[now.corner[c] & 0xffff]);
     T met = T(0);
     element.template run<1>(
-        HalfElement<T>{x, ComputedRest<T>::between(point, now.factor), now.weight, force, met});
+        HalfElement<T>{x, inverse_of(now, first < int(blockDim.x)), now.weight, force, met});
     for (int c = 0; c < 3; ++c) force[c] = add_partner(force[c]);
     const bool here = first + lane < 2 * patch.pairs, second = lane & 1;
     // the first writes corners 0 and 1, the second corner 2, each its own apex

@@ -28,22 +28,84 @@ static int ask_for_resident_blocks(const void* kernel, int device, int threads,
   return blocks * multiprocessors;
 }
 
-int resident_blocks(const void* kernel, int threads, std::size_t shared_bytes) {
+// What a launch is and how many fit, asked for once.
+template <class Ask>
+static int known_or(const void* kernel, int threads, std::size_t shared_bytes, int cluster,
+                    const Ask& ask) {
   static std::mutex lock;
-  static std::map<std::tuple<const void*, int, int, std::size_t>, int> known;
+  static std::map<std::tuple<const void*, int, int, std::size_t, int>, int> known;
   int device = 0;
   check(cudaGetDevice(&device));
   const std::lock_guard guard(lock);
-  const auto [found, is_new] = known.try_emplace({kernel, device, threads, shared_bytes}, 0);
-  if (is_new) {
-    try {
-      found->second = ask_for_resident_blocks(kernel, device, threads, shared_bytes);
-    } catch (...) {
-      known.erase(found);
-      throw;
+  const std::tuple key{kernel, device, threads, shared_bytes, cluster};
+  if (const auto found = known.find(key); found != known.end()) return found->second;
+  return known[key] = ask(device);
+}
+
+int resident_blocks(const void* kernel, int threads, std::size_t shared_bytes) {
+  return known_or(kernel, threads, shared_bytes, 0, [&](int device) {
+    return ask_for_resident_blocks(kernel, device, threads, shared_bytes);
+  });
+}
+
+// The launch of a kernel in clusters, with the attributes that it points at.
+struct ClusterLaunch {
+  cudaLaunchAttribute attribute = {};
+  cudaLaunchConfig_t config = {};
+
+  ClusterLaunch(unsigned blocks, int threads, std::size_t shared_bytes, int cluster) {
+    attribute.id = cluster ? cudaLaunchAttributeClusterDimension : cudaLaunchAttributeCooperative;
+    if (cluster) {
+      attribute.val.clusterDim.x = unsigned(cluster);
+      attribute.val.clusterDim.y = attribute.val.clusterDim.z = 1;
+    } else {
+      attribute.val.cooperative = 1;
     }
+    config.gridDim = dim3(blocks);
+    config.blockDim = dim3(unsigned(threads));
+    config.dynamicSmemBytes = shared_bytes;
+    config.attrs = &attribute;
+    config.numAttrs = 1;
   }
-  return found->second;
+  ClusterLaunch(const ClusterLaunch&) = delete;
+};
+
+static int ask_for_resident_clusters(const void* kernel, int device, int threads,
+                                     std::size_t shared_bytes, int blocks) {
+  int major = 0, clusters = 0;
+  check(cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device));
+  cudaFuncAttributes attributes;
+  check(cudaFuncGetAttributes(&attributes, kernel));
+  // code for older devices, translated for this one, has nothing of clusters in it
+  constexpr int first = 90;
+  if (major * 10 < first || attributes.ptxVersion < first || attributes.binaryVersion < first)
+    return 0;
+  constexpr int portable = 8;
+  if (blocks > portable &&
+      cudaFuncSetAttribute(kernel, cudaFuncAttributeNonPortableClusterSizeAllowed, 1) !=
+          cudaSuccess) {
+    cudaGetLastError();
+    return 0;
+  }
+  const ClusterLaunch launch(unsigned(blocks), threads, shared_bytes, blocks);
+  if (cudaOccupancyMaxActiveClusters(&clusters, kernel, &launch.config) != cudaSuccess) {
+    cudaGetLastError();
+    return 0;
+  }
+  return clusters;
+}
+
+int resident_clusters(const void* kernel, int threads, std::size_t shared_bytes, int blocks) {
+  return known_or(kernel, threads, shared_bytes, blocks, [&](int device) {
+    return ask_for_resident_clusters(kernel, device, threads, shared_bytes, blocks);
+  });
+}
+
+void launch(const void* kernel, unsigned blocks, int threads, void** arguments,
+            std::size_t shared_bytes, int cluster, cudaStream_t stream) {
+  ClusterLaunch how(blocks, threads, shared_bytes, cluster);
+  how.config.stream = stream;
+  check(cudaLaunchKernelExC(&how.config, kernel, arguments));
 }
 
 std::size_t shared_memory_per_multiprocessor() {

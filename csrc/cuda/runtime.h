@@ -13,6 +13,13 @@ void check(cudaError_t status);
 // Blocks of a kernel that the current device runs at once; also lets it have that much shared memory. 0: too much for it.
 int resident_blocks(const void* kernel, int threads, std::size_t shared_bytes);
 
+// Clusters of so many blocks that the current device runs at once, after resident_blocks; 0: it has none, or none so large.
+int resident_clusters(const void* kernel, int threads, std::size_t shared_bytes, int blocks);
+
+// Launches clusters of `cluster` blocks; with 0 instead blocks that are all there at once.
+void launch(const void* kernel, unsigned blocks, int threads, void** arguments,
+            std::size_t shared_bytes, int cluster, cudaStream_t stream);
+
 std::size_t shared_memory_per_multiprocessor();
 
 // A number of blocks, refused when one launch cannot have so many.

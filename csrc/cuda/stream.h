@@ -176,8 +176,11 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
     rest_position[s] = rest[s];
   }
   __syncthreads();
+  const auto inverse_of = [&](const HalfNumbers<T>& numbers, bool) {
+    return half_inverse(numbers, rest_position);
+  };
   const double energy =
-      double(each_half(patch, position, rest_position, w.weights, entries, element, first));
+      double(each_half(patch, position, inverse_of, w.weights, entries, element, first));
   __syncthreads();
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const int slot = patch.first_slot + s;

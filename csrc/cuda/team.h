@@ -1,9 +1,13 @@
 // Sums over all threads that work on an environment: every thread leaves its part, the leading warp adds up after a barrier and
 // exchanges with the leading warps of the other blocks.
 #pragma once
+#include "cuda/cluster_sums.h"
 #include "cuda/exchange.h"
 
 namespace pd::inline PD_TARGET {
+
+// The blocks that have an environment together: one; several whose shared memory they have in common; several without.
+enum class Blocks { one, cluster, grid };
 
 // In shared memory.
 struct TeamTotals {
@@ -16,13 +20,14 @@ PD_DEVICE bool leads() { return threadIdx.x + warp_size >= blockDim.x; }
 PD_DEVICE bool is_leader() { return threadIdx.x + warp_size == blockDim.x; }
 PD_DEVICE int lane() { return int(threadIdx.x) % warp_size; }
 
-// `Many`: several blocks an environment, patch by patch.
-template <bool Many>
+template <Blocks Kind>
 class TeamSums {
+  static constexpr bool Many = Kind != Blocks::one;  // blocks, patch by patch
+
  public:
-  // `box` [2, patches, sums_count] starts with tags of zero
-  PD_DEVICE TeamSums(TeamTotals& totals, Word* box, int patch, int patches)
-      : totals_(totals), box_(box), patch_(patch), patches_(patches) {}
+  // `box` [2, patches, sums_count], of a grid, starts with tags of zero; `cluster`: of a cluster
+  PD_DEVICE TeamSums(TeamTotals& totals, Word* box, ClusterSums cluster, int patch, int patches)
+      : totals_(totals), box_(box), cluster_(cluster), patch_(patch), patches_(patches) {}
 
   PD_DEVICE double total(int n) const { return totals_.total[n]; }
 
@@ -46,10 +51,14 @@ class TeamSums {
 #pragma unroll 1
     for (int n = 0; n < wanted_; ++n) {
       const double sum = across_warp(lane() < warps ? totals_.warp_sum[n][lane()] : Op::none, op);
+      if constexpr (Kind == Blocks::cluster) {
+        if (n == 0 && lane() == 0) cluster_.expect(round_, wanted_ * patches_);
+        if (lane() < patches_) cluster_.send(lane(), patch_, n, sum, round_);
+      }
       if (lane() != 0) continue;
-      if constexpr (Many) {
+      if constexpr (Kind == Blocks::grid) {
         post(box(patch_, n), {std::uint64_t(__double_as_longlong(sum)), round_});
-      } else {
+      } else if constexpr (Kind == Blocks::one) {
         totals_.total[n] = sum;
       }
     }
@@ -62,7 +71,12 @@ class TeamSums {
     if constexpr (Many) {
 #pragma unroll 1
       for (int n = 0; n < wanted_; ++n) {
-        const double mine = over_patches<Op>(box(0, n), patches_, round_);
+        double mine = Op::none;
+        if constexpr (Kind == Blocks::grid) {
+          mine = over_patches<Op>(box(0, n), patches_, round_);
+        } else if (lane() < patches_) {
+          mine = cluster_.receive(lane(), n, round_);
+        }
         __syncwarp();
         const double sum = across_warp(mine, op);
         if (lane() == 0) totals_.total[n] = sum;
@@ -103,6 +117,7 @@ class TeamSums {
 
   TeamTotals& totals_;
   Word* box_;
+  ClusterSums cluster_;
   int patch_, patches_;
   int wanted_ = 0;      // sums that were left
   unsigned round_ = 0;  // exchanges so far

@@ -1,0 +1,121 @@
+// Blocks that reach each other's shared memory: a cluster of them, from compute capability 9.0 on. Elsewhere nobody launches
+// what calls these.
+#pragma once
+#include "cuda/memory.h"
+
+#include <cstdint>
+
+#if !defined(__CUDA_ARCH__) || __CUDA_ARCH__ >= 900
+#define PD_HAS_CLUSTERS 1
+#else
+#define PD_HAS_CLUSTERS 0
+#endif
+
+namespace pd::inline PD_TARGET {
+
+constexpr int most_cluster_blocks = 16;
+
+// What any thread of the cluster wrote before can be read after.
+PD_DEVICE void cluster_barrier() {
+#if PD_HAS_CLUSTERS
+  asm volatile(
+      "barrier.cluster.arrive.release.aligned;\n\t"
+      "barrier.cluster.wait.acquire.aligned;" ::
+          : "memory");
+#endif
+}
+
+using SharedAddress = std::uint32_t;  // in the shared memory of this block, or of the cluster
+
+PD_DEVICE SharedAddress shared_address(const void* in_shared) {
+  return SharedAddress(__cvta_generic_to_shared(in_shared));
+}
+
+// The same place in the shared memory of another block of the cluster.
+PD_DEVICE SharedAddress at_block(SharedAddress here, int rank) {
+  SharedAddress there = here;
+#if PD_HAS_CLUSTERS
+  asm("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(there) : "r"(here), "r"(rank));
+#endif
+  return there;
+}
+
+// A barrier in shared memory that one arrival and a number of bytes from other blocks let through, round after round.
+class ByteBarrier {
+ public:
+  PD_DEVICE explicit ByteBarrier(std::uint64_t* word) : at_(shared_address(word)) {}
+
+  PD_DEVICE SharedAddress address() const { return at_; }
+
+  // one thread, before a barrier of the cluster
+  PD_DEVICE void open() const {
+#if PD_HAS_CLUSTERS
+    asm volatile("mbarrier.init.shared::cta.b64 [%0], 1;" ::"r"(at_) : "memory");
+    asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");
+#endif
+  }
+
+  // one thread, once a round
+  PD_DEVICE void expect(int bytes) const {
+#if PD_HAS_CLUSTERS
+    asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" ::"r"(at_), "r"(bytes)
+                 : "memory");
+#endif
+  }
+
+  // `parity`: of the number of rounds before this one. The bytes are there then, in shared memory; of other memory nothing is
+  // said, and so the first level of cache may keep what it has.
+  PD_DEVICE void wait(unsigned parity) const {
+#if PD_HAS_CLUSTERS
+    unsigned through;
+    do {
+      asm volatile(
+          "{.reg .pred p; mbarrier.try_wait.parity.shared::cta.b64 p, [%1], %2; "
+          "selp.u32 %0, 1, 0, p;}"
+          : "=r"(through)
+          : "r"(at_), "r"(parity)
+          : "memory");
+    } while (!through);
+#endif
+  }
+
+ private:
+  SharedAddress at_;
+};
+
+// To another block's shared memory, whose barrier counts the bytes.
+PD_DEVICE void send(SharedAddress to, SharedAddress barrier, double a) {
+#if PD_HAS_CLUSTERS
+  asm volatile(
+      "st.async.shared::cluster.mbarrier::complete_tx::bytes.f64 [%0], %1, [%2];" ::"r"(to), "d"(a),
+      "r"(barrier)
+      : "memory");
+#endif
+}
+
+PD_DEVICE void send(SharedAddress to, SharedAddress barrier, const Quad<float>& a) {
+#if PD_HAS_CLUSTERS
+  asm volatile(
+      "st.async.shared::cluster.mbarrier::complete_tx::bytes.v4.f32 [%0], {%1, %2, %3, %4}, "
+      "[%5];" ::"r"(to),
+      "f"(a.x), "f"(a.y), "f"(a.z), "f"(a.w), "r"(barrier)
+      : "memory");
+#endif
+}
+
+PD_DEVICE void send(SharedAddress to, SharedAddress barrier, const Quad<double>& a) {
+#if PD_HAS_CLUSTERS
+  asm volatile(
+      "st.async.shared::cluster.mbarrier::complete_tx::bytes.v2.f64 [%0], {%1, %2}, [%3];" ::"r"(
+          to),
+      "d"(a.x), "d"(a.y), "r"(barrier)
+      : "memory");
+  asm volatile(
+      "st.async.shared::cluster.mbarrier::complete_tx::bytes.v2.f64 [%0], {%1, %2}, [%3];" ::"r"(
+          to + 16),
+      "d"(a.z), "d"(a.w), "r"(barrier)
+      : "memory");
+#endif
+}
+
+}  // namespace pd::inline PD_TARGET

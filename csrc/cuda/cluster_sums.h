@@ -1,0 +1,50 @@
+// Sums that the blocks of a cluster tell each other: each sends its own to all, itself among them.
+#pragma once
+#include "cuda/cluster.h"
+#include "cuda/collect.h"
+
+namespace pd::inline PD_TARGET {
+
+// In shared memory: two barriers, then numbers [2, blocks, sums_count].
+class ClusterSums {
+ public:
+  static constexpr int bytes =
+      2 * int(sizeof(std::uint64_t)) + 2 * most_cluster_blocks * sums_count * int(sizeof(double));
+
+  PD_DEVICE explicit ClusterSums(std::byte* shared)
+      : barrier_(reinterpret_cast<std::uint64_t*>(shared)),
+        numbers_(reinterpret_cast<double*>(barrier_ + 2)) {}
+
+  // one thread, before a barrier of the cluster
+  PD_DEVICE void open() const {
+    for (int round = 0; round < 2; ++round) barrier(round).open();
+  }
+
+  // one thread, once a round: numbers that all blocks together will send; rounds count from 1
+  PD_DEVICE void expect(unsigned round, int count) const {
+    barrier(round).expect(count * int(sizeof(double)));
+  }
+
+  PD_DEVICE void send(int to, int from, int n, double number, unsigned round) const {
+    pd::send(at_block(shared_address(place(from, n, round)), to),
+             at_block(barrier(round).address(), to), number);
+  }
+
+  PD_DEVICE double receive(int from, int n, unsigned round) const {
+    barrier(round).wait((round - 1) >> 1 & 1);
+    return *place(from, n, round);
+  }
+
+ private:
+  PD_DEVICE ByteBarrier barrier(unsigned round) const {
+    return ByteBarrier(barrier_ + (round & 1));
+  }
+  PD_DEVICE double* place(int block, int n, unsigned round) const {
+    return numbers_ + ((round & 1) * most_cluster_blocks + block) * sums_count + n;
+  }
+
+  std::uint64_t* barrier_;
+  double* numbers_;
+};
+
+}  // namespace pd::inline PD_TARGET
