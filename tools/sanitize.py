@@ -28,17 +28,32 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from torch import Tensor
 
 import torchpd as pd
+from torchpd import regimes
 from torchpd.device_plan import compile_device_plan
+from torchpd.plan import KERNELS as PLAN_KERNELS
 from torchpd.plan import Plan
+from torchpd.render import Camera
 from torchpd.tables import DEVICE_PLAN_TABLE
 
-KERNELS = ("block", "grid", "stream")
-RUNS = (*KERNELS, "levels")  # and what the multilevel solver runs with
+KERNELS = ("block", "cluster", "grid", "stream")  # for few patches the kernel "grid" forms clusters
+RUNS = (*KERNELS, "levels", "patches")  # and what the multilevel solver runs with, and the ops of free-form patches
 SOLVERS = (pd.Chebyshev(), pd.Jacobi(), pd.Chebyshev("classic", rho=0.9, delay=1))
 ops = torch.ops.torchpd
+
+
+FEW_PATCHES = {"_CLUSTER_TETS": regimes._CLUSTER_TETS, "_GRID_TETS": regimes._GRID_TETS}
+MANY_PATCHES = {"_CLUSTER_TETS": 0, "_GRID_TETS": 8}
+
+
+def compiled_for(kernel: str) -> str:
+    """The name that a simulator knows one of KERNELS by; a "grid" gets more patches than a cluster has blocks."""
+    for name, value in (MANY_PATCHES if kernel == "grid" else FEW_PATCHES).items():
+        setattr(regimes, name, value)
+    return "grid" if kernel == "cluster" else kernel
 
 
 def scene(*, contacts: bool, pieces: bool, pins: bool, cells: tuple[int, int, int] = (6, 2, 2)) -> pd.Scene:
@@ -101,7 +116,7 @@ def rotations(dtype: torch.dtype) -> None:
 
 def in_many_patches(sim: pd.Simulator) -> Plan:
     """For the grid, with vertices of more patches than a row of senders holds."""
-    arrays = compile_device_plan(sim.scene.values(), 36, KERNELS.index("grid"), sim.dtype, progress=False)
+    arrays = compile_device_plan(sim.scene.values(), 36, PLAN_KERNELS.index("grid"), sim.dtype, progress=False)
     plan = Plan(arrays, DEVICE_PLAN_TABLE).to("cuda")
     if not bool((plan.slot_sender[:, 7] > 0).any()):
         raise RuntimeError("no vertex has more than seven patches")
@@ -110,20 +125,50 @@ def in_many_patches(sim: pd.Simulator) -> Plan:
 
 def levels(dtype: torch.dtype) -> int:
     """The multilevel solver: one block an environment, several, and several environments one after another."""
-    count = 0
-    for outer, contacts in itertools.product(("lbfgs", "momentum"), (False, True)):
-        for cells, batch in (((6, 2, 2), 3), ((14, 4, 4), 3)):
-            built = scene(contacts=contacts, pieces=contacts, pins=True, cells=cells)
-            solver = pd.Multilevel(outer)  # type: ignore[arg-type]
-            options: dict[str, Any] = {"solver": solver, "tolerance": 1e-2 * contacts, "dtype": dtype}
-            sim = pd.Simulator(built, 1 / 60, 5, progress=False, **options).to("cuda")
-            step_all_ways(sim, batch)
-            ops.precondition(sim.rest_state(batch).positions, list(sim.plan.arrays))
-            count += 1
-    many = pd.Simulator(scene(contacts=False, pieces=False, pins=True), 1 / 60, 2, solver=pd.Multilevel(), dtype=dtype)
+    small, large = (6, 2, 2), (14, 4, 4)
+    ways = (("lbfgs", False, small, 3), ("lbfgs", True, large, 2), ("momentum", True, small, 2))
+    for outer, contacts, cells, batch in ways:
+        built = scene(contacts=contacts, pieces=contacts, pins=True, cells=cells)
+        solver = pd.Multilevel(outer)  # type: ignore[arg-type]
+        options: dict[str, Any] = {"solver": solver, "tolerance": 1e-2 * contacts, "dtype": dtype}
+        sim = pd.Simulator(built, 1 / 60, 3, progress=False, **options).to("cuda")
+        step_all_ways(sim, batch)
+        ops.precondition(sim.rest_state(batch).positions, list(sim.plan.arrays))
+    many = pd.Simulator(scene(contacts=False, pieces=False, pins=True), 1 / 60, 1, solver=pd.Multilevel(), dtype=dtype)
     many.to("cuda")(many.rest_state(300))
     torch.cuda.synchronize()
-    return count + 1
+    return len(ways) + 1
+
+
+def free_form(dtype: torch.dtype) -> int:
+    """Every op of free-form patches and its adjoint, two poses at once."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    rng = np.random.default_rng(0)
+    centres = torch.tensor(ball.vertices[::2])
+    amplitudes = torch.tensor(0.02 * rng.choice([-1.0, 1.0], len(centres)))
+    quadrics = pd.Quadrics.from_radii(amplitudes, centres, torch.full((len(centres),), 0.4, dtype=torch.float64))
+    bases = (("flat", "base"), ("phong", "surface"))
+    for base, measured_at in bases:
+        mesh = pd.TriMesh.from_trimesh(ball)
+        patches = pd.FreeFormPatches.from_mesh(mesh, quadrics, dtype=torch.float64, base=base, measured_at=measured_at)  # type: ignore[arg-type]
+        patches = patches.to(device="cuda", dtype=dtype)
+        q = patches.quadrics
+        leaves = [t.requires_grad_() for t in (q.amplitudes, q.centres, q.factors)]
+        body = pd.PatchBody(patches, stiffness=1e4, density=1000.0)
+        sim = pd.Simulator(pd.Scene(body, pd.Gravity(), pd.Ground(-1.01)), 1 / 60, 3, dtype=dtype, progress=False)
+        sim.to("cuda")
+        state = sim(sim.rest_state(2))
+        pose = body.pose(state.positions.requires_grad_())
+        image = pd.PatchRays(patches).render(Camera((0.0, 0.6, 4.2), (0.0, 0.0, 0.0), 36.0), (9, 7), pose)
+        inside = torch.tensor(rng.uniform(-1, 1, (77, 3)), dtype=dtype, device="cuda")
+        number = torch.tensor(rng.integers(0, 80, 77), device="cuda")
+        field = patches.field(inside, number)
+        (image.color.sum() + patches.surface(patches.tessellate(3).samples, pose).points.sum() + field.sum()).backward()
+        pd.PatchRays(patches).cast_field(2 * inside, -inside, far=4.0)
+        if not all(bool(t.grad is not None and t.grad.isfinite().all()) for t in leaves):
+            raise RuntimeError("a gradient has not stayed finite")
+        torch.cuda.synchronize()
+    return len(bases)
 
 
 def run(kernels: Sequence[str]) -> int:
@@ -134,15 +179,19 @@ def run(kernels: Sequence[str]) -> int:
         if kernel == "levels":
             count += levels(dtype)
             continue
+        if kernel == "patches":
+            count += free_form(dtype)
+            continue
+        name = compiled_for(kernel)
         for number, (contacts, pieces) in enumerate(flags):
             solver, tolerance = SOLVERS[number % len(SOLVERS)], 1e-2 if number % 2 else 0.0
-            options = {"solver": solver, "tolerance": tolerance, "dtype": dtype, "kernel": kernel, "progress": False}
+            options = {"solver": solver, "tolerance": tolerance, "dtype": dtype, "kernel": name, "progress": False}
             built = scene(contacts=contacts, pieces=pieces, pins=True)
             sim = pd.Simulator(built, 1 / 60, 5, **options).to("cuda")  # type: ignore[arg-type]
             step_all_ways(sim, 3)
             count += 1
         fields(sim, 3)
-        options = {"dtype": dtype, "kernel": kernel, "progress": False}
+        options = {"dtype": dtype, "kernel": name, "progress": False}
         free = pd.Simulator(scene(contacts=True, pieces=True, pins=False), 1 / 60, 5, **options)  # type: ignore[arg-type]
         step_all_ways(free.to("cuda"), 2)
         count += 1
@@ -180,7 +229,7 @@ def into_one_place(corners: Tensor) -> Tensor:
 def plant(tool: str, kernel: str) -> None:
     """A step in which `tool` must find an error."""
     built = scene(contacts=False, pieces=True, pins=False)
-    options: dict[str, Any] = {"solver": pd.Multilevel()} if kernel == "levels" else {"kernel": kernel}
+    options: dict[str, Any] = {"solver": pd.Multilevel()} if kernel == "levels" else {"kernel": compiled_for(kernel)}
     sim = pd.Simulator(built, 1 / 60, 5, progress=False, **options).to("cuda")
     state = sim.rest_state(2)
     if tool == "memcheck":
