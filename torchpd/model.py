@@ -149,7 +149,7 @@ class Model(nn.Module):
             self._prepare()
 
     def _prepare(self) -> None:
-        self.plan = plan_for_solver(self)
+        self.plan = plan_for_solver(self, self.material())
 
     def material(self) -> list[Tensor]:
         """The differentiable arrays in the order of the ops."""
@@ -164,22 +164,28 @@ class Model(nn.Module):
             arrays: by name, see `Simulator`. Shapes and values are checked here, once.
         """
         checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
-        held = self._held_everywhere()
+        parameters = {
+            name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)
+            for name, tensor in checked.items()
+            if tensor.shape != getattr(self, name).shape
+        }
+        # before anything is replaced, because it may fail
+        plan = self._plan_with(checked)
         with torch.no_grad():
             for name, tensor in checked.items():
-                own = getattr(self, name)
-                if own.shape == tensor.shape:
-                    own.copy_(tensor)
+                if name in parameters:
+                    setattr(self, name, parameters[name])
                 else:
-                    setattr(self, name, nn.Parameter(tensor.clone(), requires_grad=own.requires_grad))
-        # what is held belongs to the structure of a preconditioner
-        if has_levels(self.plan.arrays) and not torch.equal(held, self._held_everywhere()):
-            self._prepare()
+                    getattr(self, name).copy_(tensor)
+        self.plan = plan
 
-    def _held_everywhere(self) -> Tensor:
-        """Whether each pin holds exactly in all environments [P]."""
-        hard = self.pin_stiffness.isinf()
-        return hard.all(0) if hard.dim() == 2 else hard
+    def _plan_with(self, arrays: dict[str, Tensor]) -> Plan:
+        """The plan that serves the material with some arrays replaced."""
+        # what is held belongs to the structure of a preconditioner
+        held = _held_everywhere(self.pin_stiffness), _held_everywhere(arrays.get("pin_stiffness", self.pin_stiffness))
+        if not has_levels(self.plan.arrays) or torch.equal(*held):
+            return self.plan
+        return plan_for_solver(self, [arrays.get(name, getattr(self, name)) for name in MATERIAL_ROWS])
 
     def _checked_material(self, name: str, value: Tensor | float) -> Tensor:
         if name not in MATERIAL_ROWS:
@@ -200,9 +206,7 @@ class Model(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Checks values, and takes arrays of every environment where this simulator had shared ones."""
-        for name in MATERIAL_ROWS:
-            if prefix + name in state_dict:
-                self.set_material(**{name: state_dict[prefix + name]})
+        self.set_material(**{name: state_dict[prefix + name] for name in MATERIAL_ROWS if prefix + name in state_dict})
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def check_state(self, state: State) -> None:
@@ -258,6 +262,12 @@ class Model(nn.Module):
             positions = self.scene.values().rest_positions
             self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
         return self
+
+
+def _held_everywhere(pin_stiffness: Tensor) -> Tensor:
+    """Whether each pin holds exactly in all environments [P]."""
+    hard = pin_stiffness.isinf()
+    return hard.all(0) if hard.dim() == 2 else hard
 
 
 def _positive(name: str, value: float, unit: str) -> float:
