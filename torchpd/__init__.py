@@ -28,6 +28,7 @@ if load_extension()[0] is not None:
     from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
     from .quadrics import Quadrics
+    from .rigid_pieces import RigidPieces
     from .simulator import Simulator
     from .spectrum import estimate_rho
 else:  # meshes, scenes and the doctor work without it
@@ -64,6 +65,7 @@ __all__ = [
     "Pin",
     "Plan",
     "Quadrics",
+    "RigidPieces",
     "Scene",
     "Simulator",
     "Solid",
