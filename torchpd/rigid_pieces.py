@@ -47,9 +47,9 @@ class RigidPieces:
     """Stiff pieces of a scene, and steps that move them as rigid bodies between the iterations of the simulator.
 
     A piece is a connected set of elements that are stiffer than the rest; one that hard pins hold is left to the
-    solver. Worth it from contrasts of about a thousand, with `Multilevel`. Made of the material and time step of now.
-    Contacts are not known to these motions: such scenes are refused. Results may depend on the batch by rounding. Holds
-    eight numbers for each vertex and piece, in the precision of the simulator.
+    solver. Worth it from contrasts of about a thousand, with `Multilevel`. Made for the material, time step, precision
+    and device of now. Contacts are not known to these motions: such scenes are refused. Results may depend on the batch
+    by rounding. Holds eight numbers for each vertex and piece, in the precision of the simulator.
 
     Args:
         sim: whose steps; it keeps its settings.
@@ -132,7 +132,7 @@ class RigidPieces:
         pull = (self._functions.T @ gradient).double().view(batch, nodes, 4, 3)
         shape = (self._fits @ positions).double().view(batch, nodes, 4, 3)[:, :, 1:]
         motion = _newton(pull, shape, self._coarse)
-        turned = shape @ torch.linalg.matrix_exp(_cross(motion[..., 3:])).mT - shape
+        turned = shape @ _rotation(motion[..., 3:]).mT - shape
         change = torch.cat([motion[..., None, :3], turned], dim=2).view(batch, 4 * nodes, 3)
         inertia, _ = step_diagonal(self.sim.plan.arrays, self.sim.material(), self.sim.time_step)
         inertia = inertia.unsqueeze(-1)
@@ -208,6 +208,14 @@ def _cross(vectors: Tensor) -> Tensor:
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(*x.shape, 3, 3)
+
+
+def _rotation(vectors: Tensor) -> Tensor:
+    """Rodrigues' formula, [..., 3, 3]: sinc(x) is sin(pi x) / (pi x)."""
+    angle = torch.linalg.vector_norm(vectors, dim=-1)[..., None, None] / torch.pi
+    turn = _cross(vectors)
+    one = torch.eye(3, dtype=vectors.dtype, device=vectors.device)
+    return one + torch.sinc(angle) * turn + 0.5 * torch.sinc(0.5 * angle).square() * (turn @ turn)
 
 
 def _newton(pull: Tensor, shape: Tensor, coarse: Tensor) -> Tensor:
