@@ -5,8 +5,13 @@ Boxes of 5r x r x r cells (1 x 0.2 x 0.2 m, six tetrahedra a cell), held at x = 
 residual is printed. A mesh is held where it is low, thrown sideways, and has stiffness random over 1e4..1e6 Pa from tet
 to tet.
 
+With --blocks the box is of 1e4 Pa and has pieces that are stiffer by a contrast: five slabs across it, or a grid of
+cubes. Rigid motions of the pieces (`RigidPieces`, rounds of four iterations) beside the solver alone; milliseconds are
+of the processor, one thread.
+
     python benchmarks/multilevel.py --cells 11 26 --youngs 1e6 1e8
     python benchmarks/multilevel.py --mesh bunny.mesh
+    python benchmarks/multilevel.py --blocks 12 16
     python benchmarks/multilevel.py --setup 32
 """
 
@@ -26,12 +31,28 @@ from torchpd.tables import PLAN_TABLE
 ERRORS = (1e-2, 1e-3, 1e-4)
 OUTERS: tuple[Literal["lbfgs", "momentum"], ...] = ("lbfgs", "momentum")
 MOST = 160
+ROUND, MOST_OF_BLOCKS = 4, 512  # iterations
 CHEBYSHEV = 512
 
 
 def box(cells: int, youngs: float) -> tuple[pd.Scene, pd.State]:
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (5 * cells, cells, cells))
     solid = pd.Solid(mesh, youngs=youngs, density=1000.0)
+    scene = pd.Scene(solid, pd.Pin(solid, mesh.vertices[:, 0] == 0.0), pd.Gravity((0.0, -9.8, 0.0)))
+    x = torch.tensor(mesh.vertices)
+    v = torch.zeros_like(x)
+    v[:, 1] = -10.0 * x[:, 0] ** 2
+    return scene, pd.State(x[None], v[None])
+
+
+def blocks(cells: int, kind: str, contrast: float) -> tuple[pd.Scene, pd.State]:
+    """Slabs of 0.1 m, or cubes of a third to two thirds of that, every 0.2 or 0.1 m; 6, 8, 10 ... cells across."""
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (5 * cells, cells, cells))
+    cell = np.floor(mesh.vertices[mesh.tets].mean(axis=1) * 5 * cells).astype(int)
+    each = cells // 2  # cells of a slab
+    slabs, inner = cell // each % 2 == 1, np.abs(cell % each - (each - 1) / 2) < 0.3 * each
+    stiff = slabs[:, 0] if kind == "slabs" else inner.all(axis=1)
+    solid = pd.Solid(mesh, youngs=np.where(stiff, 1e4 * contrast, 1e4), density=1000.0)
     scene = pd.Scene(solid, pd.Pin(solid, mesh.vertices[:, 0] == 0.0), pd.Gravity((0.0, -9.8, 0.0)))
     x = torch.tensor(mesh.vertices)
     v = torch.zeros_like(x)
@@ -91,6 +112,43 @@ def measure(name: str, scene: pd.Scene, state: pd.State) -> None:
     print(f"    {CHEBYSHEV} iterations of guarded Chebyshev leave {left:.1e}")
 
 
+def measure_blocks(name: str, scene: pd.Scene, state: pd.State) -> None:
+    """Iterations and milliseconds to each error, with rigid motions and alone."""
+    sim = pd.Simulator(scene, 1 / 30, ROUND, pd.Multilevel(), torch.float64, progress=False)
+    start = time.process_time()
+    pieces = pd.RigidPieces(sim)
+    setup = time.process_time() - start
+    solution, info = pieces.step(state, 64, start="inertial", return_info=True)
+    first = moved(sim, state, 0)[0]
+    scale = float((first - solution.velocities * sim.time_step).norm())
+    print(f"{name}: {sim.vertices} vertices, {len(pieces.pieces)} pieces, set-up {setup:.2f} s, "
+          f"residual of x* {float(info.residual):.0e}")  # fmt: skip
+
+    def rigid(iterations: int) -> pd.State:
+        sim.iterations = ROUND
+        return pieces.step(state, iterations // ROUND, start="inertial")
+
+    def alone(iterations: int) -> pd.State:
+        sim.iterations = iterations
+        return sim(state, start="inertial")
+
+    for label, solve in (("rigid motions", rigid), ("alone", alone)):
+        columns, count = [], ROUND
+        for goal in ERRORS:
+            while True:
+                start = time.process_time()
+                after = solve(count)
+                took = time.process_time() - start
+                if float((after.velocities - solution.velocities).norm()) * sim.time_step <= goal * scale:
+                    columns.append(f"{count} it., {1e3 * took:.0f} ms")
+                    break
+                if count >= MOST_OF_BLOCKS:
+                    columns.append(f"> {MOST_OF_BLOCKS} it.")
+                    break
+                count += ROUND
+        print(f"    {label:<15}" + "".join(f"{column:>18}" for column in columns))
+
+
 def setup_of(cells: int) -> None:
     """Set-up, memory and time of an iteration in float32."""
     scene, state = box(cells, 1e6)
@@ -119,12 +177,19 @@ def main() -> None:
     parser.add_argument("--youngs", type=float, nargs="*", default=[1e6, 1e8], help="Young's moduli of the boxes [Pa]")
     parser.add_argument("--mesh", nargs="*", default=[], help="tetrahedral meshes, in place of the boxes")
     parser.add_argument("--setup", type=int, nargs="*", default=[], help="r of boxes to set up in float32 instead")
+    parser.add_argument("--blocks", type=int, nargs="*", default=[], help="even r, from 6, of boxes with stiff pieces")
+    parser.add_argument("--contrasts", type=float, nargs="*", default=[1e2, 1e4, 1e6], help="of these pieces")
     arguments = parser.parse_args()
+    for cells in arguments.blocks:
+        torch.set_num_threads(1)
+        for kind in ("slabs", "cubes"):
+            for contrast in arguments.contrasts:
+                measure_blocks(f"box {cells}, {kind} at {contrast:g}", *blocks(cells, kind, contrast))
     for path in arguments.mesh:
         measure(path, *loaded(path))
     for cells in arguments.setup:
         setup_of(cells)
-    if not arguments.mesh and not arguments.setup:
+    if not (arguments.mesh or arguments.setup or arguments.blocks):
         for cells in arguments.cells:
             for youngs in arguments.youngs:
                 measure(f"box {cells}, {youngs:g} Pa", *box(cells, youngs))

@@ -6,10 +6,12 @@ CPU until its residual stops falling; rows have the bound that the residual leav
 bisection to a sixteenth, up to a limit that the rows name; what does not reach the error stays in the table.
 
 Times are of steps in turns, the lowest and the median: with one thread on a CPU those of the processor, on a GPU those
-of the step as Python calls it, device awaited. Cases that were measured are kept: a run that was stopped goes on.
+of the step as Python calls it, device awaited. With --batch as many equal environments take the step together. Cases
+that were measured are kept: a run that was stopped goes on.
 
     python benchmarks/time_to_error.py --device cpu
     python benchmarks/time_to_error.py --device cuda --threads 16
+    python benchmarks/time_to_error.py --device cuda --threads 16 --batch 1024 --sizes 256 1k
 """
 
 from __future__ import annotations
@@ -35,9 +37,10 @@ from torchpd.solvers import Solver
 from torchpd.study_bench import clock_of
 from torchpd.subjects import SUBJECTS
 
-SIZES = {"1k": 5, "3k": 8, "10k": 12, "30k": 18, "100k": 26}  # cells across
+SIZES = {"256": 3, "1k": 5, "3k": 8, "10k": 12, "30k": 18, "100k": 26}  # cells across
+ALONE = [size for size in SIZES if size != "256"]  # unless asked for: smaller ones come in batches
 YOUNGS = (1e4, 1e5, 1e6, 1e7, 1e8)  # Pa
-MOST = {"1k": 8192, "3k": 8192, "10k": 8192, "30k": 8192, "100k": 4096}  # iterations; ten to thirty seconds of a step
+MOST = {**dict.fromkeys(SIZES, 8192), "100k": 4096}  # iterations; up to thirty seconds of a step
 ERROR = 1e-3
 SOLVERS: dict[str, Solver] = {"Chebyshev": pd.Chebyshev(), "Multilevel": pd.Multilevel()}
 REFERENCE_ITERATIONS = 100  # between two looks at the residual
@@ -47,7 +50,9 @@ Row = dict[str, Any]
 class Case:
     """One beam on one device, its converged step, and the error of any answer."""
 
-    def __init__(self, cells: int, youngs: float, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
+    def __init__(
+        self, cells: int, youngs: float, device: torch.device, dtype: torch.dtype = torch.float32, batch: int = 1
+    ) -> None:
         subject = SUBJECTS["beam"]()
         self.scene = subject.scene(subject.mesh(cells), youngs)
         self.time_step = subject.time_step
@@ -55,7 +60,7 @@ class Case:
         start = pd.State(*(part.float() for part in subject.start(wide)))
         self.solution, self.uncertainty = converged(wide, pd.State(*(part.double() for part in start)))
         self.sim = self.simulator(dtype, device, pd.Chebyshev())
-        self.state = pd.State(*(part.to(device, dtype) for part in start))
+        self.state = pd.State(*(part.to(device, dtype).repeat(batch, 1, 1) for part in start))
         self.first = start.velocities[0].double() * self.time_step
 
     def simulator(self, dtype: torch.dtype, device: torch.device, solver: Solver) -> pd.Simulator:
@@ -130,13 +135,16 @@ def wait_for(device: torch.device) -> None:
 
 
 @torch.no_grad()
-def run_case(size: str, youngs: float, device: torch.device, seconds: float, dtype: torch.dtype = torch.float32) -> Row:
+def run_case(
+    size: str, youngs: float, device: torch.device, seconds: float, dtype: torch.dtype = torch.float32, batch: int = 1
+) -> Row:
     """Iterations, errors and times of both solvers and of what "auto" chose."""
-    case, most = Case(SIZES[size], youngs, device, dtype), MOST[size]
+    case, most = Case(SIZES[size], youngs, device, dtype, batch), MOST[size]
     sim = case.sim
     row: Row = {
-        "size": size, "youngs": youngs, "vertices": sim.vertices, "tets": len(case.scene.values().tets), "most": most,
-        "kernel": sim.plan.kernel, "uncertainty": case.uncertainty, "solvers": {},
+        "size": size, "youngs": youngs, "batch": batch, "vertices": sim.vertices,
+        "tets": len(case.scene.values().tets), "most": most, "kernel": sim.plan.kernel,
+        "uncertainty": case.uncertainty, "solvers": {},
     }  # fmt: skip
     timed: dict[str, tuple[Solver, int]] = {}
     for name, solver in SOLVERS.items():
@@ -159,9 +167,9 @@ def run_case(size: str, youngs: float, device: torch.device, seconds: float, dty
 
 @torch.no_grad()
 def run_auto(case: Case, seconds: float) -> Row:
-    """What "auto" chose, its error and time."""
+    """What "auto" chose for this batch, its error and time."""
     sim = case.sim
-    sim.solver = "auto"
+    sim.solver = pd.Auto(len(case.state.positions))
     assert sim.choice is not None
     solver, count, why = sim.solver, sim.iterations, sim.choice.why
     return {
@@ -241,6 +249,21 @@ def _plain(number: float) -> str:
     return f"{number:,.1f}" if number < 10.0 else f"{float(f'{number:.2g}'):,.0f}"
 
 
+def costs_of_batches(rows: list[Row]) -> str:
+    """What `torchpd.automatic.COSTS` holds as `more`, from each row, the first environment as the table has it."""
+    lines = []
+    for row in rows:
+        kernel, vertices = row["kernel"] or "cpu", row["vertices"]
+        for name, own in row["solvers"].items():
+            cost, took = getattr(COSTS[kernel], name.lower()), own["microseconds_an_iteration"]
+            more = 1e3 * (took - cost.iteration(vertices)) / ((row["batch"] - 1) * vertices)
+            lines.append(
+                f"{kernel}: {name}, {row['batch']} of {vertices:,} vertices: {took:.3g} us an iteration, "
+                f"{cost.iteration(vertices, row['batch']):.3g} by the table; more={more:.2g} measured, {cost} in use"
+            )
+    return "\n".join(lines)
+
+
 def costs(rows: list[Row]) -> str:
     """Microseconds of an iteration by kernel and size: what `torchpd.automatic.COSTS` holds."""
     lines = []
@@ -262,9 +285,10 @@ def costs(rows: list[Row]) -> str:
 def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--sizes", nargs="*", choices=SIZES, default=list(SIZES), help="of the beam")
+    parser.add_argument("--sizes", nargs="*", choices=SIZES, default=ALONE, help="of the beam")
     parser.add_argument("--youngs", nargs="*", type=float, default=list(YOUNGS), help="Young's moduli [Pa]")
     parser.add_argument("--seconds", type=float, default=2.0, help="of timing a case (%(default)g)")
+    parser.add_argument("--batch", type=int, default=1, help="environments of a step (%(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
     parser.add_argument(
         "--dtype", choices=("float32", "float64"), default="float32", help="of the steps that are timed"
@@ -272,7 +296,8 @@ def main(words: list[str]) -> None:
     parser.add_argument("--auto", action="store_true", help='measure anew what "auto" takes in cases that are kept')
     parser.add_argument("--out", type=Path, help="file for the result (JSON); by default that of the device")
     options = parser.parse_args(words)
-    name = "time-to-error-" + "-".join([options.device, *(["float64"] if options.dtype == "float64" else [])])
+    float64, batch = ["float64"] * (options.dtype == "float64"), [f"batch-{options.batch}"] * (options.batch > 1)
+    name = "-".join(["time-to-error", options.device, *float64, *batch])
     out = options.out or Path(__file__).parent / "results" / f"{name}.json"
     dtype = getattr(torch, options.dtype)
     torch.set_num_threads(options.threads)
@@ -283,16 +308,16 @@ def main(words: list[str]) -> None:
         for size, youngs in bar:
             bar.set_postfix_str(f"{size}, {youngs:g} Pa")
             if (size, youngs) not in rows:
-                rows[size, youngs] = run_case(size, youngs, device, options.seconds, dtype)
+                rows[size, youngs] = run_case(size, youngs, device, options.seconds, dtype, options.batch)
             elif options.auto:
                 row = rows[size, youngs]
-                row["auto"] = run_auto(Case(SIZES[size], youngs, device, dtype), options.seconds)
+                row["auto"] = run_auto(Case(SIZES[size], youngs, device, dtype, options.batch), options.seconds)
                 row.update(judged(row))
             write(out, device, options.threads, rows)
     found = [rows[key] for key in sorted(rows, key=lambda key: (SIZES[key[0]], key[1]))]
     print(table(found))
     print(matrix(found))
-    print(costs(found))
+    print(costs(found) if options.batch == 1 else costs_of_batches(found))
 
 
 def write(out: Path, device: torch.device, threads: int, rows: dict[tuple[str, float], Row]) -> None:

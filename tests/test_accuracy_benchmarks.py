@@ -174,6 +174,16 @@ def test_costs_are_fitted_to_the_times_of_iterations() -> None:
 
 
 @pytest.mark.usefixtures("on_path")
+def test_costs_of_a_batch_come_beside_the_first_environment() -> None:
+    from time_to_error import COSTS, costs_of_batches
+
+    row = {**_time_to_error_row(300, 20, "Multilevel"), "kernel": "block", "vertices": 500, "batch": 11}
+    for own, cost in zip(row["solvers"].values(), COSTS["block"], strict=True):
+        own["microseconds_an_iteration"] = cost.iteration(500) + 10 * 0.5 * 0.3
+    assert [line.split("more=")[1].split()[0] for line in costs_of_batches([row]).splitlines()] == ["0.3", "0.3"]
+
+
+@pytest.mark.usefixtures("on_path")
 def test_time_to_error_on_a_small_beam(monkeypatch: pytest.MonkeyPatch) -> None:
     """The iterations that it finds are the fewest, to a sixteenth; more of them it refuses to try."""
     import time_to_error
@@ -182,7 +192,8 @@ def test_time_to_error_on_a_small_beam(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(time_to_error.SIZES, "1k", 2)
     monkeypatch.setitem(time_to_error.MOST, "1k", 64)
     monkeypatch.setattr(time_to_error, "milliseconds", lambda case, timed, seconds: {n: {"min": 1.0} for n in timed})
-    row = time_to_error.run_case("1k", 1e6, torch.device("cpu"), 0.0)
+    row = time_to_error.run_case("1k", 1e6, torch.device("cpu"), 0.0, batch=2)
+    assert row["batch"] == 2
     assert row["uncertainty"] < 1e-8
     assert row["solvers"]["Chebyshev"]["iterations"] is None
     assert row["solvers"]["Chebyshev"]["error"] > 1e-3

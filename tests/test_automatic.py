@@ -84,7 +84,43 @@ def test_costs_decide(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_every_kind_of_device_has_costs() -> None:
     assert set(COSTS) == {"cpu", *KERNELS}
     for costs in COSTS.values():
-        assert costs.multilevel.iteration(10_000) > costs.chebyshev.iteration(10_000) > 0.0
+        for batch in (1, 1024):
+            times = [cost.iteration(10_000, batch) for cost in (costs.chebyshev, costs.multilevel)]
+            assert times[1] > times[0] > 0.0
+
+
+def test_time_of_a_batch() -> None:
+    """2 + 4 * 0.5 us of one environment of 500 vertices; two others take turns, or 0.8 * 0.5 us each."""
+    assert Cost(2.0, 4.0).iteration(500) == 4.0
+    assert Cost(2.0, 4.0).iteration(500, 3) == 12.0
+    assert Cost(2.0, 4.0, 0.8).iteration(500, 3) == pytest.approx(4.0 + 2 * 0.4)
+
+
+def test_the_batch_decides_where_environments_share_a_device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As on a GPU: Multilevel's iteration costs 9 times as much for one environment, 19 times for a thousand."""
+    monkeypatch.setitem(automatic.COSTS, "cpu", Costs(Cost(1.0, 0.0, 0.04), Cost(9.0, 0.0, 0.76)))
+    alone, many = beam(1e6), beam(1e6, solver=pd.Auto(batch=1024))
+    assert isinstance(alone.solver, pd.Multilevel)
+    assert isinstance(many.solver, pd.Chebyshev)
+    assert "each as long as 19 in a batch of 1024" in repr(many)
+    assert "in a batch" not in repr(alone)
+    # another choice is for the same batch: after a change, in a file, on another precision
+    many.prepare_solver()
+    assert isinstance(many.solver, pd.Chebyshev)
+    many.save(tmp_path / "beam.safetensors")
+    loaded = pd.Simulator.load(tmp_path / "beam.safetensors")
+    loaded.prepare_solver()
+    assert isinstance(loaded.solver, pd.Chebyshev)
+    alone.solver = pd.Auto(batch=1024)
+    assert isinstance(alone.solver, pd.Chebyshev)
+    alone.solver = "auto"
+    assert isinstance(alone.solver, pd.Multilevel)
+
+
+@pytest.mark.parametrize("youngs", [1e3, 1e4, 1e5, 1e6])
+def test_on_the_cpu_the_batch_changes_nothing(youngs: float) -> None:
+    alone, many = beam(youngs), beam(youngs, solver=pd.Auto(batch=1024))
+    assert (alone.solver, alone.iterations) == (many.solver, many.iterations)
 
 
 def test_print_says_why_and_any_other_solver_ends_it() -> None:
@@ -100,7 +136,7 @@ def test_print_says_why_and_any_other_solver_ends_it() -> None:
     assert "chosen because" not in repr(sim)
     sim.solver = "auto"
     assert isinstance(sim.solver, pd.Multilevel)
-    with pytest.raises(TypeError, match=r"solver must be Jacobi, Chebyshev, Multilevel or \"auto\", got 'fast'"):
+    with pytest.raises(TypeError, match=r"solver must be Jacobi, Chebyshev, Multilevel, Auto or \"auto\", got 'fast'"):
         sim.solver = "fast"  # type: ignore[assignment]
     assert sim.choice is not None
 

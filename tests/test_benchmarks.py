@@ -148,6 +148,18 @@ def test_multilevel_counts_iterations() -> None:
     assert chebyshev.split()[:4] == ["512", "iterations", "of", "guarded"]
 
 
+def test_multilevel_counts_iterations_with_stiff_pieces() -> None:
+    command = [sys.executable, "benchmarks/multilevel.py", "--blocks", "6", "--contrasts", "1e3"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    slabs, *rows, cubes, _, _ = result.stdout.splitlines()
+    assert slabs.startswith("box 6, slabs at 1000: 1519 vertices, 5 pieces")
+    assert cubes.startswith("box 6, cubes at 1000: 1519 vertices, 40 pieces")
+    rigid, alone = ([int(cell.split()[-1]) for cell in row.split(" it.")[:3]] for row in rows)
+    # iterations to 1e-2, 1e-3 and 1e-4
+    assert rigid == sorted(rigid)
+    assert all(count < other for count, other in zip(rigid, alone, strict=True))
+
+
 @pytest.fixture
 def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmarks are scripts, which find each other in their folder."""

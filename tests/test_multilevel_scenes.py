@@ -16,6 +16,7 @@ from test_determinism import run as outputs
 from test_determinism import scene as everything
 
 import torchpd as pd
+from torchpd import placing
 from torchpd.reference_solvers import relative_error, solve_with_contact
 
 pytestmark = pytest.mark.usefixtures("poisoned")
@@ -151,6 +152,41 @@ def test_hard_pins_by_set_material_prepare_it_anew() -> None:
     assert sim.plan is not before
     _, info = sim(state_of(case, sim), return_info=True)
     assert float(info.rho) == 0.0
+
+
+@pytest.mark.parametrize("how", ["set_material", "load_state_dict"])
+def test_a_preparation_that_fails_changes_nothing(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The arrays that come before and after the pins included; and once it works, the same call does."""
+    case = pinned_beam(1.0)
+    sim, ready = (simulator(case, torch.float64, solver=pd.Multilevel(), iterations=4) for _ in range(2))
+    hard = torch.full_like(sim.pin_stiffness, float("inf"))
+    wanted = {
+        "masses": 3.0 * sim.masses, "stiffness": torch.stack([sim.stiffness, 2.0 * sim.stiffness]),
+        "pin_stiffness": hard, "damping": torch.tensor(0.5, dtype=torch.float64),
+    }  # fmt: skip
+    ready.set_material(**wanted)
+
+    def change() -> None:
+        if how == "set_material":
+            sim.set_material(**wanted)
+        else:
+            sim.load_state_dict(ready.state_dict())
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise MemoryError("no room")
+
+    plan, parameters = sim.plan, sim.material()
+    before = [array.clone() for array in parameters]
+    with monkeypatch.context() as broken:
+        broken.setattr(placing, "precondition_plan", refuse)
+        with pytest.raises(MemoryError, match="no room"):
+            change()
+    assert sim.plan is plan
+    assert all(one is other for one, other in zip(sim.material(), parameters, strict=True))
+    assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
+    change()
+    state = state_of(case, sim, 2)
+    assert same_bits(sim(state), ready(state))
 
 
 def test_some_environments_held_and_others_not() -> None:

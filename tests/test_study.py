@@ -17,12 +17,14 @@ from PIL import Image
 
 from torchpd import study
 from torchpd.__main__ import main
+from torchpd.baselines import BASELINES
+from torchpd.contenders import CONTENDERS, DEFAULT
 from torchpd.ledger import Row
 from torchpd.shapes import box
 from torchpd.study import AXES, StudyOptions, cost_table, paper_table, run_study, study_rows, study_table
 from torchpd.study_axes import baseline_rows, contender_rows, float_rows, mesh_rows, paper_rows, time_step_rows
 from torchpd.study_bench import Bench, Setting, Timing, count_kernels, time_calls
-from torchpd.study_plots import pareto_front
+from torchpd.study_plots import STYLES, pareto_front
 from torchpd.subjects import SUBJECTS, subject_of
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -117,6 +119,12 @@ def test_the_front_has_what_nothing_beats() -> None:
         for ms, error in points
     ]
     assert pareto_front(rows) == [rows[0], rows[1], rows[3]]
+
+
+def test_every_curve_looks_different() -> None:
+    drawn = [name for name, method in BASELINES.items() if method.compiled_twin in (None, DEFAULT)]
+    styles = [STYLES[name] for name in (*CONTENDERS, *drawn)]
+    assert len(set(styles)) == len(styles)
 
 
 def test_table_says_what_is_not_reached() -> None:

@@ -10,7 +10,7 @@ from .embedding import Embedding, embed
 from .extension import extension_error, load_extension
 from .mesh import MeshWarning, TetMesh, TriMesh
 from .scene import Scene
-from .solvers import Chebyshev, Jacobi, Multilevel
+from .solvers import Auto, Chebyshev, Jacobi, Multilevel
 from .state import Info, State, Track
 from .tetrahedralize import tetrahedralize
 from .version import __version__
@@ -28,6 +28,7 @@ if load_extension()[0] is not None:
     from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
     from .quadrics import Quadrics
+    from .rigid_pieces import RigidPieces
     from .simulator import Simulator
     from .spectrum import estimate_rho
 else:  # meshes, scenes and the doctor work without it
@@ -39,6 +40,7 @@ else:  # meshes, scenes and the doctor work without it
 
 
 __all__ = [
+    "Auto",
     "CapturedStep",
     "Chebyshev",
     "Damping",
@@ -63,6 +65,7 @@ __all__ = [
     "Pin",
     "Plan",
     "Quadrics",
+    "RigidPieces",
     "Scene",
     "Simulator",
     "Solid",

@@ -1,8 +1,9 @@
 """`solver="auto"`: guarded Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner.
 
 Decided when the simulator is made, when it moves to another device and by `Simulator.prepare_solver`, from the weights
-of the step (`forecast`) and what an iteration costs on the device. Nothing is run or timed, so the choice is the same
-every time. The batch does not enter: an environment gives the same bits alone and in any batch.
+of the step (`forecast`) and what an iteration costs on the device, for the batch that `Auto` names. Nothing is run or
+timed, so the choice is the same every time. The batch of a state does not enter: an environment gives the same bits
+alone and in any batch.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from .forecast import Forecast, Spectrum, forecast, spectrum_of
-from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
+from .solvers import DEFAULT_ITERATIONS, Auto, Chebyshev, Multilevel, Solver, check_solver
 
 if TYPE_CHECKING:
     from .model import Model
@@ -23,14 +24,21 @@ MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes
 
 
 class Cost(NamedTuple):
-    """Time of an iteration: `latency` + `each` * vertices / 1000, microseconds."""
+    """Time of an iteration in microseconds, n thousand vertices an environment.
+
+    `latency` + `each` n of the first environment, `more` n of every other one; None where they take turns, and every
+    one takes as long as the first.
+    """
 
     latency: float
     each: float
+    more: float | None = None
 
-    def iteration(self, vertices: int) -> float:
-        """Microseconds."""
-        return self.latency + self.each * vertices / 1000.0
+    def iteration(self, vertices: int, batch: int = 1) -> float:
+        """Microseconds, all environments together."""
+        thousands = vertices / 1000.0
+        first = self.latency + self.each * thousands
+        return first + (batch - 1) * (first if self.more is None else self.more * thousands)
 
 
 class Costs(NamedTuple):
@@ -40,11 +48,12 @@ class Costs(NamedTuple):
     multilevel: Cost
 
 
-# Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers.
-# The CPU's are of one AVX-512 core, the GPU's of an H100.
+# Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers,
+# `more` with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were not measured on "grid" and
+# "stream": without `more` the choice for a batch is that for one environment.
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 190.0)),
-    "block": Costs(Cost(2.6, 5.0), Cost(34.0, 14.0)),
+    "block": Costs(Cost(2.6, 5.0, 0.05), Cost(34.0, 14.0, 1.04)),
     "grid": Costs(Cost(3.2, 0.093), Cost(40.0, 2.0)),
     "stream": Costs(Cost(6.0, 0.18), Cost(40.0, 2.0)),
 }
@@ -57,9 +66,10 @@ class Choice:
     iterations: int
     sets_iterations: bool  # the user gave none
     why: str  # follows "chosen because"
+    batch: int = 1  # environments that it is for
 
 
-def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
+def choose_solver(sim: Model, iterations: int | None, wanted: Auto) -> tuple[Solver, Choice]:
     """The solver for this scene and device, and why.
 
     Chebyshev gets a relaxation of min(1.9, 2 / (1 + mu)), which is best for a spectrum of [mu, 1].
@@ -68,28 +78,35 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
         sim: scene, time step, material and device.
         iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error. None
             sets as many as are expected to reach an error of `AIM`, times `MARGIN`.
+        wanted: the batch to choose for.
     """
+
+    def chosen(enough: int, why: str) -> Choice:
+        return Choice(enough if iterations is None else iterations, iterations is None, why, wanted.batch)
+
     spectrum = spectrum_of(sim)
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
     if spectrum is None:
-        return chebyshev, _choice(iterations, DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
+        return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
     expected = {solver: forecast(sim, solver, spectrum) for solver in (chebyshev, Multilevel())}
     plain, levels = (_known(each) for each in expected.values())
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
     if not _runs(Multilevel(), sim):
         where = f"{sim.device} with kernel={sim.kernel!r}" if sim.device.type == "cuda" else str(sim.device)
-        return chebyshev, _choice(iterations, _enough(plain), f"{counts}, and Multilevel does not run on {where}")
+        return chebyshev, chosen(_enough(plain), f"{counts}, and Multilevel does not run on {where}")
     costs = COSTS[sim.plan.kernel or "cpu"]
-    ratio = costs.multilevel.iteration(sim.vertices) / costs.chebyshev.iteration(sim.vertices)
+    times = [cost.iteration(sim.vertices, wanted.batch) for cost in (costs.chebyshev, costs.multilevel)]
+    ratio = times[1] / times[0]
     both = f"{counts}, or {levels.words(AIM)} of Multilevel, each as long as {ratio:.2g}"
+    both += f" in a batch of {wanted.batch}" if wanted.batch > 1 else ""
     if iterations is None:
         better = levels.iterations(AIM) * ratio < plain.iterations(AIM)
     else:
         better = iterations < _enough(plain) and levels.rate > plain.rate
         both += f"; {iterations} leave about {plain.error(iterations):.1g} or {levels.error(iterations):.1g}"
     if better:
-        return Multilevel(), _choice(iterations, _enough(levels), both)
-    return chebyshev, _choice(iterations, _enough(plain), both)
+        return Multilevel(), chosen(_enough(levels), both)
+    return chebyshev, chosen(_enough(plain), both)
 
 
 def _known(expected: Forecast | None) -> Forecast:
@@ -99,10 +116,6 @@ def _known(expected: Forecast | None) -> Forecast:
 
 def _enough(expected: Forecast) -> int:
     return round(MARGIN * expected.iterations(AIM))
-
-
-def _choice(given: int | None, enough: int, why: str) -> Choice:
-    return Choice(enough if given is None else given, given is None, why)
 
 
 def _relaxation(spectrum: Spectrum | None) -> float | None:

@@ -17,7 +17,7 @@ from .placing import check_wanted_device, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
-from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
+from .solvers import DEFAULT_ITERATIONS, Auto, Chebyshev, Multilevel, Solver, auto_of, check_solver
 from .state import State
 from .targets import Anchors, Targets
 
@@ -47,7 +47,7 @@ class Model(nn.Module):
         scene: Scene,
         time_step: float = 1 / 60,
         iterations: int | None = None,
-        solver: Solver | Literal["auto"] | None = None,
+        solver: Solver | Auto | Literal["auto"] | None = None,
         dtype: torch.dtype = torch.float32,
         *,
         tolerance: float = 0.0,
@@ -61,9 +61,8 @@ class Model(nn.Module):
         self.time_step = _positive("time_step", time_step, "s")
         self.iterations = DEFAULT_ITERATIONS if iterations is None else check_whole("iterations", iterations, minimum=0)
         self._solver: Solver = Chebyshev()
-        solver = self._solver if solver is None else solver
-        if solver != "auto":
-            check_solver(solver, torch.device("cpu"))
+        wanted = auto_of(solver)
+        given = self._solver if solver is None or wanted is not None else check_solver(solver, torch.device("cpu"))
         self.tolerance = float(tolerance)
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
@@ -76,10 +75,10 @@ class Model(nn.Module):
         for name, value in material_of(values, dtype).items():
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
         self.choice: Choice | None = None  # of "auto"
-        if solver == "auto":
-            self._choose_solver(None if iterations is None else self.iterations)
+        if wanted is not None:
+            self._choose_solver(None if iterations is None else self.iterations, wanted)
         else:
-            self.solver = solver
+            self.solver = given
             if iterations is None:
                 warn_of_few_iterations(self)
 
@@ -100,13 +99,14 @@ class Model(nn.Module):
 
     @property
     def solver(self) -> Solver:
-        """How a step is solved. A multilevel one is prepared when it is set; "auto" sets iterations too."""
+        """How a step is solved. A multilevel one is prepared when it is set; "auto" and `Auto` set iterations too."""
         return self._solver
 
     @solver.setter
-    def solver(self, solver: Solver | Literal["auto"]) -> None:
-        if solver == "auto":
-            return self._choose_solver(None)
+    def solver(self, solver: Solver | Auto | Literal["auto"]) -> None:
+        wanted = auto_of(solver)
+        if wanted is not None:
+            return self._choose_solver(None, wanted)
         before = self._solver, self.choice
         self._solver, self.choice = check_solver(solver, self.device), None
         if isinstance(solver, Multilevel) == has_levels(self.plan.arrays):
@@ -118,9 +118,9 @@ class Model(nn.Module):
             raise
         return None
 
-    def _choose_solver(self, iterations: int | None) -> None:
+    def _choose_solver(self, iterations: int | None, wanted: Auto) -> None:
         """What "auto" does, see `choose_solver`."""
-        self.solver, choice = choose_solver(self, iterations)
+        self.solver, choice = choose_solver(self, iterations, wanted)
         self.iterations, self.choice = choice.iterations, choice
 
     def _choose_again(self, choice: Choice) -> None:
@@ -130,7 +130,7 @@ class Model(nn.Module):
         try:
             if self.plan.for_levels:
                 self.solver = Chebyshev()  # its kernel is one of the costs that are compared
-            self._choose_solver(None if own else self.iterations)
+            self._choose_solver(None if own else self.iterations, Auto(choice.batch))
         except BaseException:
             self.plan, self._solver, self.choice, self.iterations = before
             raise
@@ -149,7 +149,7 @@ class Model(nn.Module):
             self._prepare()
 
     def _prepare(self) -> None:
-        self.plan = plan_for_solver(self)
+        self.plan = plan_for_solver(self, self.material())
 
     def material(self) -> list[Tensor]:
         """The differentiable arrays in the order of the ops."""
@@ -164,22 +164,28 @@ class Model(nn.Module):
             arrays: by name, see `Simulator`. Shapes and values are checked here, once.
         """
         checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
-        held = self._held_everywhere()
+        parameters = {
+            name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)
+            for name, tensor in checked.items()
+            if tensor.shape != getattr(self, name).shape
+        }
+        # before anything is replaced, because it may fail
+        plan = self._plan_with(checked)
         with torch.no_grad():
             for name, tensor in checked.items():
-                own = getattr(self, name)
-                if own.shape == tensor.shape:
-                    own.copy_(tensor)
+                if name in parameters:
+                    setattr(self, name, parameters[name])
                 else:
-                    setattr(self, name, nn.Parameter(tensor.clone(), requires_grad=own.requires_grad))
-        # what is held belongs to the structure of a preconditioner
-        if has_levels(self.plan.arrays) and not torch.equal(held, self._held_everywhere()):
-            self._prepare()
+                    getattr(self, name).copy_(tensor)
+        self.plan = plan
 
-    def _held_everywhere(self) -> Tensor:
-        """Whether each pin holds exactly in all environments [P]."""
-        hard = self.pin_stiffness.isinf()
-        return hard.all(0) if hard.dim() == 2 else hard
+    def _plan_with(self, arrays: dict[str, Tensor]) -> Plan:
+        """The plan that serves the material with some arrays replaced."""
+        # what is held belongs to the structure of a preconditioner
+        held = _held_everywhere(self.pin_stiffness), _held_everywhere(arrays.get("pin_stiffness", self.pin_stiffness))
+        if not has_levels(self.plan.arrays) or torch.equal(*held):
+            return self.plan
+        return plan_for_solver(self, [arrays.get(name, getattr(self, name)) for name in MATERIAL_ROWS])
 
     def _checked_material(self, name: str, value: Tensor | float) -> Tensor:
         if name not in MATERIAL_ROWS:
@@ -200,9 +206,7 @@ class Model(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Checks values, and takes arrays of every environment where this simulator had shared ones."""
-        for name in MATERIAL_ROWS:
-            if prefix + name in state_dict:
-                self.set_material(**{name: state_dict[prefix + name]})
+        self.set_material(**{name: state_dict[prefix + name] for name in MATERIAL_ROWS if prefix + name in state_dict})
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def check_state(self, state: State) -> None:
@@ -258,6 +262,12 @@ class Model(nn.Module):
             positions = self.scene.values().rest_positions
             self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
         return self
+
+
+def _held_everywhere(pin_stiffness: Tensor) -> Tensor:
+    """Whether each pin holds exactly in all environments [P]."""
+    hard = pin_stiffness.isinf()
+    return hard.all(0) if hard.dim() == 2 else hard
 
 
 def _positive(name: str, value: float, unit: str) -> float:

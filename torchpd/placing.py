@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -61,15 +61,15 @@ def _compile(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
     return choose_plan(values, dtype, properties_of(device), sim.kernel, levels=levels, progress=False)
 
 
-def plan_for_solver(sim: Model) -> Plan:
-    """The plan of a simulator for its solver, where it is, with what the solver prepares of the material now."""
+def plan_for_solver(sim: Model, material: Sequence[Tensor]) -> Plan:
+    """The plan of a simulator for its solver, where it is, with what the solver prepares of a material."""
     wants = isinstance(sim.solver, Multilevel)
     plan = without_levels(sim.plan)
     # kernels of a GPU want other patches for a multilevel solver than for the others
     if plan.kernel is not None and wants != plan.for_levels:
         plan = _compile(sim, sim.dtype, sim.device).to(sim.device)
     if wants:
-        plan = precondition_plan(plan, sim.scene.values(), *reference_of(plan, sim.material(), sim.time_step))
+        plan = precondition_plan(plan, sim.scene.values(), *reference_of(plan, material, sim.time_step))
     return plan
 
 

@@ -45,7 +45,8 @@ class Simulator(Model):
         solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later. None is Chebyshev.
             "auto" takes Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner on the device,
             and as many iterations as that takes unless they are given; `print(sim)` says why. It chooses anew when the
-            simulator moves to another device and in `prepare_solver`.
+            simulator moves to another device and in `prepare_solver`. `Auto(batch=1024)` chooses for so many
+            environments, "auto" for one.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "grid" or "stream", see `torchpd.regimes`;

@@ -7,9 +7,19 @@ from typing import Literal, TypedDict
 
 import torch
 
-from .checks import check_scalar
+from .checks import check_scalar, check_whole
 
-__all__ = ["DEFAULT_ITERATIONS", "Chebyshev", "Jacobi", "Multilevel", "Solver", "SolverNumbers", "check_solver"]
+__all__ = [
+    "DEFAULT_ITERATIONS",
+    "Auto",
+    "Chebyshev",
+    "Jacobi",
+    "Multilevel",
+    "Solver",
+    "SolverNumbers",
+    "auto_of",
+    "check_solver",
+]
 
 Diagonal = Literal["weighted", "plain"]
 
@@ -157,15 +167,37 @@ class Multilevel:
         }
 
 
+@dataclass(frozen=True)
+class Auto:
+    """In place of a solver: `Chebyshev` or `Multilevel`, whichever is expected to reach an error of 1e-3 sooner.
+
+    "auto" is short for `Auto()`. On a GPU many environments share the time of one, unequally for the two solvers, so
+    say how many there will be. States of any other batch may come: the choice stays, and with it the bits of each.
+
+    Args:
+        batch: environments that a step will have, a whole number >= 1.
+    """
+
+    batch: int = 1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "batch", check_whole("Auto.batch", self.batch, minimum=1))
+
+
 Solver = Jacobi | Chebyshev | Multilevel
 DEFAULT_ITERATIONS = 64  # of a simulator that is given none
+
+
+def auto_of(solver: object) -> Auto | None:
+    """What asks to choose, if it does."""
+    return Auto() if isinstance(solver, str) and solver == "auto" else solver if isinstance(solver, Auto) else None
 
 
 def check_solver(solver: object, device: torch.device) -> Solver:
     """The solver, if a simulator on this device can have it."""
     if not isinstance(solver, Jacobi | Chebyshev | Multilevel):
         given = repr(solver) if isinstance(solver, str) else type(solver).__name__
-        raise TypeError(f'Simulator: solver must be Jacobi, Chebyshev, Multilevel or "auto", got {given}')
+        raise TypeError(f'Simulator: solver must be Jacobi, Chebyshev, Multilevel, Auto or "auto", got {given}')
     if isinstance(solver, Multilevel) and device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"Simulator: Multilevel is prepared on the CPU or on a GPU, not on {device}")
     return solver

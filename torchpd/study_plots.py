@@ -21,6 +21,7 @@ _LOWEST = 1e-7
 STYLES: dict[str, tuple[str, float, str]] = {
     DEFAULT: ("#d55e00", 2.8, "solid"),
     "classic Chebyshev": ("#0072b2", 2.0, "solid"),
+    "Multilevel": ("#56b4e9", 2.0, "solid"),
     "Jacobi": ("#6f737b", 2.0, "solid"),
     "damped Jacobi": ("#a9adb5", 1.4, "solid"),
     "guarded Chebyshev, NumPy": ("#d55e00", 1.2, "dashed"),
@@ -29,9 +30,11 @@ STYLES: dict[str, tuple[str, float, str]] = {
     "PCG global step": ("#e69f00", 1.2, "dashed"),
     "direct global step": ("#8c5f00", 1.2, "dashed"),
     "Newton": ("#cc79a7", 1.2, "dashed"),
+    "Newton-PCG with M": ("#1b1b1b", 1.2, "solid"),
     "L-BFGS": ("#7d3c98", 1.2, "dashed"),
 }
-_OTHER = ("#56b4e9", 2.0, "solid")  # of a solver that has joined since
+_OTHER = ("#b0447b", 2.0, "solid")  # of a solver that has joined since
+_LABELS = {"Newton-PCG with M": "Newton-PCG with M, C++ float64"}  # of methods that are neither
 _INK, _PAPER_GRID = "#3e4046", "#e4e5e8"
 # left out of the picture of all methods, where it would lie beside Jacobi's curve; the report has it
 _REPEATED = ("damped Jacobi",)
@@ -134,6 +137,7 @@ def _draw_solvers(rows: list[Row], path: Path, subject: str) -> Path:
             refused.append(name)
             continue
         label = f"{name}, C++ float32" if own[0].compiled else name if "NumPy" in name else f"{name}, NumPy"
+        label = _LABELS.get(name, label)
         for axis, xs in ((left, [row.iterations for row in timed]), (right, [row.milliseconds for row in timed])):
             axis.plot(
                 xs, _drawn(timed), color=color, linewidth=width, linestyle=dash, label=label if axis is left else ""

@@ -11,7 +11,7 @@ iterations: it and we take the same 1/30 s in n steps, u* being the answer with 
 Newton and MuJoCo are optional: pip install newton warp-lang mujoco. What is not there is left out, and said.
 Cases that were measured are kept: a run that was stopped goes on.
 
-    python -m benchmarks.peers --cells 3 5 --youngs 1e4 1e5 1e6 1e7 --out benchmarks/results/peers-cpu.json
+    python -m benchmarks.peers --cells 3 5 8 12 --youngs 1e4 1e5 1e6 1e7 --out benchmarks/results/peers-cpu.json
     python -m benchmarks.peers --device cuda --cells 3 5 8 12 --out benchmarks/results/peers-cuda.json
     python -m benchmarks.peers --mesh bunny.mesh
 """
