@@ -1,10 +1,11 @@
 """Which kernel of a GPU steps a scene, and the plan for it.
 
     block   one thread block an environment, all iterations in one launch: the mesh fits a block's shared memory
-    grid    a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors. Up to 16
-            patches exchange through each other's shared memory where the GPU has clusters of blocks (9.0 on), and then a
-            few environments of a small mesh are done in half the time of "block", which is for many
+    grid    a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
     stream  launches for every iteration: any mesh
+
+Up to 16 patches of a "grid" exchange through each other's shared memory where the GPU has clusters of blocks (compute
+capability 9.0): a few environments of a small mesh are then done in half the time of "block", which is for many.
 
 The batch does not enter: an environment gives the same bits alone and in any batch.
 """
