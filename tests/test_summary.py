@@ -84,7 +84,10 @@ def test_absent_effects_change_no_bits(dtype: torch.dtype, device: torch.device)
 @pytest.mark.parametrize(
     ("kernel", "facts"),
     [
-        ("block", ("1 patch,", "one thread block an environment", '"grid" or "stream"')),
+        (
+            "block",
+            ("1 patch,", "one thread block an environment", '"grid", sooner done with a few environments, or "stream"'),
+        ),
         ("grid", ("2 patches,", "a thread block for each patch, all iterations in one launch", '"block" or "stream"')),
         ("stream", ("1 patch,", "launches for every iteration", "B an environment during a step")),
     ],

@@ -117,6 +117,8 @@ def _kernel_lines(sim: Simulator) -> list[str]:
     )
     launches = _LEVEL_LAUNCHES if plan.for_levels else _LAUNCHES[kernel]
     others = " or ".join(f'"{name}"' for name in _LAUNCHES if name != kernel)
+    if kernel == "block":
+        others = others.replace('"grid"', '"grid", sooner done with a few environments,')
     return [
         f"kernel {kernel}: {launches}",
         f"mesh: {mesh} that patches share, {block:,} B of shared memory a thread block",
