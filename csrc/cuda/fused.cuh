@@ -38,7 +38,10 @@ using FusedKernel = void (*)(FusedCall<T>);
 template <class T, bool Touching>
 FusedKernel<T> fused_kernel_for(Blocks kind, int threads) {
   constexpr int most = most_grid_threads<T>;
-  if (kind == Blocks::cluster) return fused_step<T, Touching, Blocks::cluster, most, 1>;
+  if (kind == Blocks::cluster) {
+    if (threads <= 256) return fused_step<T, Touching, Blocks::cluster, 256, 1>;
+    return fused_step<T, Touching, Blocks::cluster, most, 1>;
+  }
   if (kind == Blocks::grid) {
     if (threads <= 256) return fused_step<T, Touching, Blocks::grid, 256, 1>;
     return fused_step<T, Touching, Blocks::grid, most, 1>;
@@ -119,6 +122,7 @@ bool FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
   if (patches > most_cluster_blocks) return false;
   shared = cluster_shared_bytes(step);
   threads = patch_threads(step.plan);
+  if (step.plan.most_slots > threads) return false;
   kernel = fused_kernel(step, Blocks::cluster, threads);
   if (resident_blocks(function(), threads, shared) == 0) return false;
   const int clusters = resident_clusters(function(), threads, shared, patches);

@@ -65,7 +65,7 @@ class FusedRunner {
     planes_ = reinterpret_cast<Plane<T>*>(balls_ + call_.material.spheres_count);
     if (Many && int(threadIdx.x) < patch_.slots) row_ = patch_.row(slot_of_seat(threadIdx.x));
     if constexpr (Kind == Blocks::cluster) {
-      mail_.open(patch_, senders(), earlier_shared());
+      mail_.open(patch_, reinterpret_cast<const Senders*>(plan_.slot_sender), earlier_shared());
       if (threadIdx.x == 0) ClusterSums(shared + sums_begin(call.step)).open();
       cluster_barrier();
     }
@@ -263,7 +263,9 @@ class FusedRunner {
     finished_ = MayStop && control_.progress.done;
     if (finished_) return;
     omega_ = control_.omega;
-    if constexpr (Many) {
+    if constexpr (Kind == Blocks::cluster) {
+      visit_seat(visit);
+    } else if constexpr (Many) {
       visit_patch(visit);
     } else {
       each_slot([&](int s) {
@@ -288,7 +290,8 @@ class FusedRunner {
   template <class Visit>
   PD_DEVICE void visit_patch(const Visit& visit) {
     ++round_;
-    if (Kind == Blocks::cluster && threadIdx.x == 0 && patch_.shared() > 0) mail_.expect(round_);
+    Word* box = letter_box();
+    const auto* senders = reinterpret_cast<const Senders*>(plan_.slot_sender);
     const int begin = int(threadIdx.x) - lane(), step = blockDim.x, shared = patch_.shared();
     bool again = false;
     for (int from = begin; from < (again ? shared : patch_.slots);) {
@@ -296,15 +299,15 @@ class FusedRunner {
       const bool sends = seat < shared, mine = again ? sends : !sends && seat < patch_.slots;
       const int slot = slot_of_seat(seat < patch_.slots ? seat : 0);
       const int row = row_of_seat(seat < patch_.slots ? seat : 0);
-      // lanes without a seat look at nothing that others write
-      const Seen seen = seat < patch_.slots ? v_.see(slot) : Seen{};
+      const Seen seen = v_.see(slot);
       const Seat at = {slot, row >= 0, vec3(origin_[slot])};
       Vec3<T> force;
       if (again) {
-        force = receive(seat, sends);
+        force = read_letters<T>(box, senders, earlier_shared() + seat, sends, round_);
       } else {
         force = sum_entries(entries_, row);
-        if (sends) send(seat, slot, force);
+        if (sends)
+          Letter::post(box + std::int64_t(patch_.first_slot + slot) * Letter::words, force, round_);
       }
       if (mine) visit(at, seen, force);
       __syncwarp();
@@ -316,24 +319,30 @@ class FusedRunner {
     }
   }
 
-  PD_DEVICE const Senders* senders() const {
-    return reinterpret_cast<const Senders*>(plan_.slot_sender);
-  }
   // shared slots of earlier patches
   PD_DEVICE int earlier_shared() const { return patch_.first_slot - patch_.first_vertex; }
 
-  PD_DEVICE void send(int seat, int slot, const Vec3<T>& force) const {
-    if constexpr (Kind == Blocks::cluster) {
-      mail_.send(seat, force, round_);
-    } else {
-      const std::int64_t at = patch_.first_slot + slot;
-      Letter::post(letter_box() + at * Letter::words, force, round_);
+  // The same in a cluster, where each thread has the one seat of its number, and keeps what it has read while it waits.
+  template <class Visit>
+  PD_DEVICE void visit_seat(const Visit& visit) {
+    ++round_;
+    const int seat = threadIdx.x, shared = patch_.shared();
+    if (seat == 0) mail_.expect(round_);
+    const bool here = seat < patch_.slots, sends = seat < shared;
+    Seen seen;
+    Seat at;
+    if (here) {
+      const int slot = slot_of_seat(seat);
+      seen = v_.see(slot);
+      at = {slot, row_ >= 0, vec3(origin_[slot])};
     }
-  }
-  // a warp together; what its lanes get that are not `here` means nothing
-  PD_DEVICE Vec3<T> receive(int seat, bool here) const {
-    if constexpr (Kind == Blocks::cluster) return mail_.receive(seat, here, round_);
-    return read_letters<T>(letter_box(), senders(), earlier_shared() + seat, here, round_);
+    Vec3<T> force = sum_entries(entries_, row_);
+    if (sends) {
+      mail_.send(force, round_);
+      force = mail_.receive(round_);
+    }
+    if (here) visit(at, seen, force);
+    __syncwarp();
   }
 
   // Leading warp: what follows from the sums of the last iteration.
