@@ -228,6 +228,10 @@ PYBIND11_MODULE(_C, m) {
   m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("slots"),
         py::arg("entries"), py::arg("planes"), py::arg("balls"),
         "Shared memory of a block of the kernels block and grid.");
+  m.def("cluster_shared_bytes", &pd::cluster_shared_bytes, py::arg("real"), py::arg("fused_bytes"),
+        py::arg("slots"), py::arg("seats"), py::arg("patches"),
+        "The same of a block of the kernel grid whose blocks form a cluster.");
+  m.attr("most_cluster_blocks") = pd::most_cluster_blocks;
   m.attr("outer_static_bytes") = pd::outer_static_bytes;
   m.attr("pass_static_bytes") = pd::pass_static_bytes;
   m.def("pass_shared_bytes", &pd::pass_shared_bytes, py::arg("real"), py::arg("slots"),

@@ -220,6 +220,20 @@ def test_a_step_is_one_launch(kernel: str, precision: str) -> None:
     assert len(device_work(lambda: sim(state, return_info=True))) <= 1 + 6  # and the columns of the report
 
 
+@pytest.mark.parametrize("cells", [(4, 2, 2), (22, 5, 5)])
+@pytest.mark.parametrize("precision", DTYPES)
+def test_patches_of_small_meshes_form_a_cluster(cells: tuple[int, int, int], precision: str) -> None:
+    """Two patches, and as many as a cluster has at most; the name of a kernel tells."""
+    if torch.cuda.get_device_capability(GPU) < (9, 0):
+        pytest.skip("clusters of blocks need compute capability 9.0")
+    case = bar(cells, pd.Gravity())
+    sim = on_gpu(case, DTYPES[precision], "cluster")
+    assert sim.plan.patches == min(16, max(2, len(case.scene.values().tets) // 200))
+    state = state_of(case, sim, 3)
+    (name,) = ours(device_work(lambda: sim(state)))
+    assert "Blocks)1" in name or "Blocks::cluster" in name, name
+
+
 @pytest.mark.parametrize("precision", DTYPES)
 def test_a_step_of_many_patches_is_two_launches(precision: str) -> None:
     case = bar((20, 4, 4))

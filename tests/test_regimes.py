@@ -18,7 +18,7 @@ from torchpd.regimes import choose_plan, shared_bytes
 from torchpd.scene import SceneValues
 from torchpd.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 
-H100 = Properties(132, 232_448)
+H100, A100 = Properties(132, 232_448, cluster=16), Properties(108, 166_912)
 SMALL = Properties(20, 101_376)
 REAL = {torch.float32: 4, torch.float64: 8}
 
@@ -33,7 +33,7 @@ def test_auto_takes_the_first_that_fits() -> None:
     for dtype in REAL:
         needs = {}
         for name in ("block", "grid"):
-            needs[name] = shared_bytes(choose_plan(values, dtype, H100, name), 0, 0)
+            needs[name] = shared_bytes(choose_plan(values, dtype, H100._replace(cluster=1), name), 0, 0)
         assert needs["grid"] < needs["block"]
         for shared, kernel in (
             (needs["block"], "block"),
@@ -47,6 +47,19 @@ def test_auto_takes_the_first_that_fits() -> None:
             assert all(f"{name} needs" in plan.why for name in KERNELS[: KERNELS.index(kernel)])
 
 
+def test_small_meshes_are_cut_for_a_cluster_where_there_is_one() -> None:
+    small, large = values_of((11, 11, 11)), values_of((12, 12, 12))
+    assert choose_plan(small, torch.float32, H100, "grid").patches == 16
+    assert choose_plan(large, torch.float32, H100, "grid").patches == len(large.tets) // regimes._GRID_TETS
+    alone = len(small.tets) // regimes._GRID_TETS
+    assert choose_plan(small, torch.float32, A100, "grid").patches == alone
+    plan = choose_plan(small, torch.float32, H100, "grid")
+    sizes = [plan.size(name) for name in ("most_slots", "most_shared", "patches")]
+    needed = _C.cluster_shared_bytes(4, shared_bytes(plan, 0, 0), *sizes)
+    assert choose_plan(small, torch.float32, Properties(132, needed, 16), "grid").patches == 16
+    assert choose_plan(small, torch.float32, Properties(132, needed - 16, 16), "grid").patches == alone
+
+
 def test_number_of_patches() -> None:
     """As many for a grid as leave each its least number of tetrahedra, as few for a stream as leave none too many."""
     small, large = values_of((6, 6, 6)), values_of((10, 10, 10))
@@ -56,8 +69,6 @@ def test_number_of_patches() -> None:
         assert 2 < grid < 16
         assert tets / grid >= regimes._CLUSTER_EACH > tets / (grid + 1)
         assert choose_plan(small, dtype, Properties(5, 232_448), "grid").patches == 5
-        assert choose_plan(values_of((11, 11, 11)), dtype, H100, "grid").patches == 16  # a cluster has no more
-        assert choose_plan(values_of((12, 12, 12)), dtype, H100, "grid").patches == 6 * 12**3 // regimes._GRID_TETS
         stream, tets = choose_plan(large, dtype, H100, "stream").patches, len(large.tets)
         assert stream > 1
         assert tets / stream <= regimes._STREAM_TETS[dtype] < tets / (stream - 1)

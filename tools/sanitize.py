@@ -45,12 +45,12 @@ SOLVERS = (pd.Chebyshev(), pd.Jacobi(), pd.Chebyshev("classic", rho=0.9, delay=1
 ops = torch.ops.torchpd
 
 
-FEW_PATCHES = {"_CLUSTER_TETS": regimes._CLUSTER_TETS, "_GRID_TETS": regimes._GRID_TETS}
+FEW_PATCHES = {"_CLUSTER_TETS": 8000, "_CLUSTER_EACH": 40}
 MANY_PATCHES = {"_CLUSTER_TETS": 0, "_GRID_TETS": 8}
 
 
 def compiled_for(kernel: str) -> str:
-    """The name that a simulator knows one of KERNELS by; a "grid" gets more patches than a cluster has blocks."""
+    """The name that a simulator knows one of KERNELS by, from now on: a "grid" gets more patches than a cluster has."""
     for name, value in (MANY_PATCHES if kernel == "grid" else FEW_PATCHES).items():
         setattr(regimes, name, value)
     return "grid" if kernel == "cluster" else kernel
@@ -252,6 +252,8 @@ def main(words: list[str]) -> None:
     if options.plant:
         if len(options.kernel) != 1:
             parser.error("--plant wants one kernel: --kernel grid")
+        if options.kernel == ["patches"]:
+            parser.error("--plant makes its errors in a step: any kernel but patches")
         if options.plant != "racecheck" and os.environ.get("PYTORCH_NO_CUDA_MEMORY_CACHING") != "1":
             parser.error("the tool sees single tensors with PYTORCH_NO_CUDA_MEMORY_CACHING=1 alone")
         plant(options.plant, *options.kernel)

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import torch
 
+from . import _C
+
 __all__ = ["LEAST_CAPABILITY", "Properties", "free_memory", "properties_of", "refuse_full_memory", "why_not"]
 
 LEAST_CAPABILITY = (8, 0)
@@ -17,6 +19,7 @@ class Properties(NamedTuple):
 
     multiprocessors: int
     shared: int  # bytes of shared memory that a block may have
+    cluster: int = 1  # blocks that may reach each other's shared memory, at most
 
 
 def properties_of(device: torch.device) -> Properties:
@@ -24,7 +27,14 @@ def properties_of(device: torch.device) -> Properties:
     found = torch.cuda.get_device_properties(device)
     # missing from the stubs of torch
     shared: int = found.shared_memory_per_block_optin  # type: ignore[attr-defined]
-    return Properties(found.multi_processor_count, shared)
+    return Properties(found.multi_processor_count, shared, _cluster_of((found.major, found.minor)))
+
+
+def _cluster_of(capability: tuple[int, int]) -> int:
+    """Blocks of a cluster: 8 is what every device with clusters has, Hopper and the large Blackwells have more."""
+    if capability < (9, 0):
+        return 1
+    return _C.most_cluster_blocks if capability[0] in (9, 10) else 8
 
 
 def why_not(built: bool, torch_cuda: str | None, devices: int, capability: tuple[int, int] | None = None) -> str:

@@ -28,7 +28,7 @@ __all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
 _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
 # of meshes that are cut in so few patches that their blocks may form a cluster (csrc/cuda/cluster.h)
-_CLUSTER_TETS, _CLUSTER_PATCHES, _CLUSTER_EACH = 8000, 16, 200
+_CLUSTER_TETS, _CLUSTER_EACH = 8000, 200
 # with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block
 _LEVEL_TETS, _LEVEL_ALONE = 384, 1152
 _STREAM_TETS = {torch.float32: 2000, torch.float64: 960}  # a patch, so that two share a multiprocessor of an H100
@@ -70,13 +70,19 @@ class _Scene(NamedTuple):
     def shared_bytes(self, plan: Plan) -> int:
         return shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
 
+    def cluster_bytes(self, plan: Plan) -> int:
+        """Of a block, where the blocks of a "grid" form a cluster."""
+        real = torch.finfo(self.dtype).bits // 8
+        slots, seats = plan.size("most_slots"), plan.size("most_shared")
+        return _C.cluster_shared_bytes(real, self.shared_bytes(plan), slots, seats, plan.patches)
+
     def patches(self, kernel: str, gpu: Properties) -> int:
         if kernel == "block":
             return 1
+        if kernel == "cluster":
+            return min(gpu.cluster, gpu.multiprocessors, max(2, self.tets // _CLUSTER_EACH), self.tets)
         if kernel == "grid":
-            small = self.tets <= _CLUSTER_TETS
-            most = min(_CLUSTER_PATCHES, gpu.multiprocessors) if small else gpu.multiprocessors
-            return min(most, max(2, self.tets // (_CLUSTER_EACH if small else _GRID_TETS)), self.tets)
+            return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
         if kernel == "levels":
             if self.tets <= _LEVEL_ALONE:
                 return 1
@@ -97,6 +103,11 @@ class _Scene(NamedTuple):
 
 def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | None, str]:
     """The plan, and the shared memory of a block; None where that is more than there is."""
+    if kernel == "grid" and gpu.cluster > 1 and scene.tets <= _CLUSTER_TETS:
+        plan = scene.plan("grid", scene.patches("cluster", gpu))
+        needed = scene.cluster_bytes(plan)
+        if needed <= gpu.shared:
+            return plan, f"{needed:,} B"
     patches = scene.patches(kernel, gpu)
     least = scene.least_shared_bytes(patches)
     if least > gpu.shared:

@@ -101,7 +101,7 @@ def _pass_line(sim: Simulator) -> str:
 
 _LAUNCHES = {
     "block": "one thread block an environment, all iterations in one launch",
-    "grid": "a thread block for each patch, all iterations in one launch",
+    "grid": "a thread block for each patch, all iterations in one launch",  # up to 16 form a cluster where they can
     "stream": "a thread block for each patch, launches for every iteration",
 }
 _LEVEL_LAUNCHES = "some thread blocks an environment, all iterations in one launch"

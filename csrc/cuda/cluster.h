@@ -2,6 +2,7 @@
 // what calls these.
 #pragma once
 #include "cuda/memory.h"
+#include "plan/shared_memory.h"
 
 #include <cstdint>
 
@@ -13,14 +14,12 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr int most_cluster_blocks = 16;
-
 // What any thread of the cluster wrote before can be read after.
 PD_DEVICE void cluster_barrier() {
 #if PD_HAS_CLUSTERS
   asm volatile(
-      "barrier.cluster.arrive.release.aligned;\n\t"
-      "barrier.cluster.wait.acquire.aligned;" ::
+      "barrier.cluster.arrive.release;\n\t"
+      "barrier.cluster.wait.acquire;" ::
           : "memory");
 #endif
 }
@@ -63,14 +62,14 @@ class ByteBarrier {
 #endif
   }
 
-  // `parity`: of the number of rounds before this one. The bytes are there then, in shared memory; of other memory nothing is
-  // said, and so the first level of cache may keep what it has.
+  // `parity`: of the number of rounds before this one. Empties the first level of cache, in which nothing of the iterations
+  // is to lie therefore.
   PD_DEVICE void wait(unsigned parity) const {
 #if PD_HAS_CLUSTERS
     unsigned through;
     do {
       asm volatile(
-          "{.reg .pred p; mbarrier.try_wait.parity.shared::cta.b64 p, [%1], %2; "
+          "{.reg .pred p; mbarrier.try_wait.parity.acquire.cluster.shared::cta.b64 p, [%1], %2; "
           "selp.u32 %0, 1, 0, p;}"
           : "=r"(through)
           : "r"(at_), "r"(parity)

@@ -5,12 +5,11 @@
 
 namespace pd::inline PD_TARGET {
 
-// In shared memory: two barriers, then numbers [2, blocks, sums_count].
+static_assert(sums_count == 3);  // cluster_sums_bytes
+
+// In shared memory, cluster_sums_bytes: two barriers, then numbers [2, blocks, sums_count].
 class ClusterSums {
  public:
-  static constexpr int bytes =
-      2 * int(sizeof(std::uint64_t)) + 2 * most_cluster_blocks * sums_count * int(sizeof(double));
-
   PD_DEVICE explicit ClusterSums(std::byte* shared)
       : barrier_(reinterpret_cast<std::uint64_t*>(shared)),
         numbers_(reinterpret_cast<double*>(barrier_ + 2)) {}
@@ -40,7 +39,7 @@ class ClusterSums {
     return ByteBarrier(barrier_ + (round & 1));
   }
   PD_DEVICE double* place(int block, int n, unsigned round) const {
-    return numbers_ + ((round & 1) * most_cluster_blocks + block) * sums_count + n;
+    return numbers_ + ((round & 1) * int(most_cluster_blocks) + block) * sums_count + n;
   }
 
   std::uint64_t* barrier_;

@@ -119,7 +119,7 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
 // Few patches, whose blocks reach each other's shared memory. The batch does not enter here either.
 template <class T>
 bool FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
-  if (patches > most_cluster_blocks) return false;
+  if (patches > int(most_cluster_blocks)) return false;
   shared = cluster_shared_bytes(step);
   threads = patch_threads(step.plan);
   if (step.plan.most_slots > threads) return false;

@@ -33,23 +33,23 @@ PD_HD std::size_t fused_shared_bytes(const DeviceStep<T>& step) {
                                 step.material.planes_count, step.material.spheres_count);
 }
 
-// Where the parts lie that a block of a cluster has behind those: cuda/cluster_sums.h, cuda/mail.h, and x, velocity, target,
-// u, before and origin of every slot; and all of its bytes.
+// Where the parts lie that a block of a cluster has behind those.
 template <class T>
 PD_HD std::size_t sums_begin(const DeviceStep<T>& step) {
-  return (fused_shared_bytes(step) + 15) / 16 * 16;
+  return aligned(fused_shared_bytes(step));
 }
 template <class T>
 PD_HD std::size_t mail_begin(const DeviceStep<T>& step) {
-  return sums_begin(step) + ClusterSums::bytes;
+  return sums_begin(step) + cluster_sums_bytes;
 }
 template <class T>
 PD_HD std::size_t vertices_begin(const DeviceStep<T>& step) {
-  return mail_begin(step) + ClusterMail<T>::bytes(step.plan.most_shared, step.plan.patches);
+  return mail_begin(step) + mail_bytes(sizeof(T), step.plan.most_shared, step.plan.patches);
 }
 template <class T>
 PD_HD std::size_t cluster_shared_bytes(const DeviceStep<T>& step) {
-  return vertices_begin(step) + 6 * sizeof(Quad<T>) * step.plan.most_slots;
+  return pd::cluster_shared_bytes(sizeof(T), fused_shared_bytes(step), step.plan.most_slots,
+                                  step.plan.most_shared, step.plan.patches);
 }
 
 // What the leading warp of a block decides for it.

@@ -7,17 +7,13 @@
 
 namespace pd::inline PD_TARGET {
 
-// Each thread has the seat of its number: shared slots have the first ones. In shared memory: two barriers, letters [2, patches,
-// seats], and [patches, seats] which seat the vertex has there.
+static_assert(most_cluster_blocks <= 16);  // others of a seat are counted in four bits
+
+// Each thread has the seat of its number: shared slots have the first ones. In shared memory, mail_bytes: two barriers, letters
+// [2, patches, seats], and [patches, seats] which seat the vertex has there.
 template <class T>
 class ClusterMail {
  public:
-  PD_HD static std::size_t bytes(int seats, int patches) {
-    const std::size_t letters = 2 * sizeof(Quad<T>) * seats * patches;
-    const std::size_t names = sizeof(std::uint16_t) * seats * patches;
-    return barriers_bytes + letters + (names + 15) / 16 * 16;
-  }
-
   // `seats`: the most that any patch shares
   PD_DEVICE ClusterMail(std::byte* shared, int seats, int patches, int own)
       : barrier_(reinterpret_cast<std::uint64_t*>(shared)),
@@ -27,7 +23,7 @@ class ClusterMail {
         patches_(patches),
         own_(own) {}
 
-  // All threads, before a barrier of the cluster; `before`: rows of `senders` that other patches have.
+  // All threads, before a barrier of the cluster; `before`: rows of `senders`, in the order of patches, that others have.
   PD_DEVICE void open(const Patch<T>& patch, const Senders* senders, int before) {
     const int seat = threadIdx.x;
     for (int p = 0, row = before + seat, more = seat < patch.shared(); more > 0; row = more) {
@@ -95,7 +91,8 @@ class ClusterMail {
   std::uint16_t* seat_;
   int seats_, patches_, own_;
   unsigned sharers_ = 0;  // a bit for each patch that has the vertex of this thread's seat
-  int expected_ = 0;      // bytes a round
+  int expected_ =
+      0;  // bytes a round: at most 512 seats of 15 letters, and a barrier counts to 2^20
 };
 
 }  // namespace pd::inline PD_TARGET

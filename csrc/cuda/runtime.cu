@@ -48,12 +48,12 @@ int resident_blocks(const void* kernel, int threads, std::size_t shared_bytes) {
   });
 }
 
-// The launch of a kernel in clusters, with the attributes that it points at.
-struct ClusterLaunch {
+// A launch of blocks that meet, with the attribute that it points at: in clusters, or with `cluster` 0 all at once.
+struct GroupLaunch {
   cudaLaunchAttribute attribute = {};
   cudaLaunchConfig_t config = {};
 
-  ClusterLaunch(unsigned blocks, int threads, std::size_t shared_bytes, int cluster) {
+  GroupLaunch(unsigned blocks, int threads, std::size_t shared_bytes, int cluster) {
     attribute.id = cluster ? cudaLaunchAttributeClusterDimension : cudaLaunchAttributeCooperative;
     if (cluster) {
       attribute.val.clusterDim.x = unsigned(cluster);
@@ -67,7 +67,7 @@ struct ClusterLaunch {
     config.attrs = &attribute;
     config.numAttrs = 1;
   }
-  ClusterLaunch(const ClusterLaunch&) = delete;
+  GroupLaunch(const GroupLaunch&) = delete;
 };
 
 static int ask_for_resident_clusters(const void* kernel, int device, int threads,
@@ -87,7 +87,7 @@ static int ask_for_resident_clusters(const void* kernel, int device, int threads
     cudaGetLastError();
     return 0;
   }
-  const ClusterLaunch launch(unsigned(blocks), threads, shared_bytes, blocks);
+  const GroupLaunch launch(unsigned(blocks), threads, shared_bytes, blocks);
   if (cudaOccupancyMaxActiveClusters(&clusters, kernel, &launch.config) != cudaSuccess) {
     cudaGetLastError();
     return 0;
@@ -103,7 +103,7 @@ int resident_clusters(const void* kernel, int threads, std::size_t shared_bytes,
 
 void launch(const void* kernel, unsigned blocks, int threads, void** arguments,
             std::size_t shared_bytes, int cluster, cudaStream_t stream) {
-  ClusterLaunch how(blocks, threads, shared_bytes, cluster);
+  GroupLaunch how(blocks, threads, shared_bytes, cluster);
   how.config.stream = stream;
   check(cudaLaunchKernelExC(&how.config, kernel, arguments));
 }

@@ -1,6 +1,7 @@
 // Shared memory that the kernels of a plan ask for: known without a GPU, because it decides which kernel a plan is for.
 #pragma once
 #include <cstddef>
+#include <cstdint>
 
 namespace pd {
 
@@ -10,6 +11,28 @@ constexpr std::size_t fused_control_bytes = 1024;
 constexpr std::size_t fused_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
                                          std::size_t planes, std::size_t balls) {
   return fused_control_bytes + real * (8 * slots + 4 * entries + 5 * planes + 8 * balls);
+}
+
+// A cluster of blocks: the most that one has, and what each keeps for sums (cuda/cluster_sums.h).
+constexpr std::size_t most_cluster_blocks = 16;
+constexpr std::size_t cluster_sums_bytes =
+    2 * sizeof(std::uint64_t) + 2 * most_cluster_blocks * 3 * sizeof(double);
+
+// `bytes` and what fills them up to a multiple of 16
+constexpr std::size_t aligned(std::size_t bytes) { return (bytes + 15) / 16 * 16; }
+
+// what each keeps for letters (cuda/mail.h); `seats`: shared slots
+constexpr std::size_t mail_bytes(std::size_t real, std::size_t seats, std::size_t patches) {
+  return 2 * sizeof(std::uint64_t) + 8 * real * seats * patches +
+         aligned(sizeof(std::uint16_t) * seats * patches);
+}
+
+// all of a block's in a cluster, which also has x, velocity, target, u, before and origin of every slot there
+constexpr std::size_t cluster_shared_bytes(std::size_t real, std::size_t fused_bytes,
+                                           std::size_t slots, std::size_t seats,
+                                           std::size_t patches) {
+  return aligned(fused_bytes) + cluster_sums_bytes + mail_bytes(real, seats, patches) +
+         6 * 4 * real * slots;
 }
 
 // what a pass keeps beside: three sums of up to 32 warps
