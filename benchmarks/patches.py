@@ -32,6 +32,7 @@ CAMERA = Camera((0.0, 0.0, 4.2), (0.0, 0.0, 0.0), 32.0)
 # additions and multiplications
 POINT, ENTRY, ACTIVE, SLOPES = 15, 18, 30, 16  # P; Q; R and its gradient where Q > 0; dh along the chart
 POSED = 3 * (15 + 3 + 3 * 5 + 3) + 15 + 2 * (3 * (6 + 15) + 15 + 6)  # sum_k b_k (v_k + A_k u_k), and two tangents
+SHEET = 15 + 3 * (7 + 8) + 2 * (3 + 16 + 3 * 8 + 12)  # the same with the frames multiplied out once a patch
 BOX = 12
 
 
@@ -65,7 +66,7 @@ def floors(
     active = float((patches.quadrics.values(some) != 0).sum(1).double().mean())
     height = POINT + entries * ENTRY + active * ACTIVE + SLOPES
     surface = height + POSED
-    ray = 2 * BOX * math.log2(cells / 2) + hits * 2 * surface
+    ray = 2 * BOX * math.log2(cells / 2) + hits * 2 * (height + SHEET)
     return {
         "heights": (height, 4.0 * (4 + 3)),
         "surface points": (surface, 4.0 * (4 + 3 + 3 + 9)),

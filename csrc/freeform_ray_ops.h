@@ -2,6 +2,7 @@
 #pragma once
 #include "freeform_field_ops.h"
 
+#include <algorithm>
 #include <limits>
 
 namespace pd::freeform {
@@ -79,8 +80,10 @@ std::tuple<Tensor, Tensor, Tensor> surface_rays(
   real(rays.origins, rays.origins.sizes(), "origins", "m");
   int levels = 0;
   while ((std::int64_t(4) << levels) <= cells.size(0)) ++levels;  // two cells a leaf or more
+  const Tensor sheets = at::empty({batch, lists.patches, sheet_numbers}, points.options());
   const Tensor slack = at::empty({batch, cells.size(0)}, points.options());
-  const Tensor boxes = at::empty({batch, (std::int64_t(2) << levels) - 1, 6}, points.options());
+  const Tensor boxes = at::empty(
+      {batch, std::max(std::int64_t(1), std::int64_t(1) << levels >> 1), 6, 4}, points.options());
   const Tensor depth = at::empty({batch, rays.count}, points.options());
   const Tensor patch = at::empty({batch, rays.count}, points.options().dtype(at::kInt));
   const Tensor b = at::empty({batch, rays.count, 3}, points.options());
@@ -93,11 +96,17 @@ std::tuple<Tensor, Tensor, Tensor> surface_rays(
     for (int k = levels - 1; k >= 0; --k) Backend::run(JoinedBoxes<T>{tree, k}, batch << k, points);
     const Base<T> base{read<T>(at_rest), read<T>(n), phong ? T(0.75) : T(0)};
     const Ellipsoids<T> ellipsoids{read<T>(a), read<T>(c), read<T>(m)};
-    const SurfaceRays<T> task{lists,           base,
-                              ellipsoids,      tree,
-                              rays.view<T>(),  read<T>(posed),
-                              read<T>(turned), on_surface,
-                              write<T>(depth), write<int32>(patch),
+    Backend::run(PosedSheets<T>{lists, base, read<T>(posed), read<T>(turned), write<T>(sheets)},
+                 batch * lists.patches, points);
+    const SurfaceRays<T> task{lists,
+                              base,
+                              ellipsoids,
+                              tree,
+                              rays.view<T>(),
+                              read<T>(sheets),
+                              on_surface,
+                              write<T>(depth),
+                              write<int32>(patch),
                               write<T>(b)};
     Backend::run(task, batch * rays.count, points);
   });

@@ -25,6 +25,7 @@ from patch_cases import (
 from torch import Tensor
 
 import torchpd as pd
+from torchpd.patch_mesh import grid
 
 STEPS = 6001
 TOUCH = 1e-9  # m: how near to the surface a ray must come for a hit that no march sees
@@ -375,6 +376,23 @@ def test_no_rays(dtype: torch.dtype, device: torch.device) -> None:
     assert hits.normals.shape == (1, 0, 3)
     depth, patch = pd.PatchRays(patches).cast_field(none, none, far=1.0)
     assert depth.shape == patch.shape == (1, 0)
+
+
+@pytest.mark.parametrize("level", [1, 2, 3, 4, 5, 6, 9])
+def test_trees_of_any_depth(level: int, dtype: torch.dtype, device: torch.device) -> None:
+    """One flat patch of 1, 4, 9, ... cells, trees of 0, 1, 2, ... levels: straight down, and level above it."""
+    patches = pd.FreeFormPatches.from_mesh(triangle(), dtype=dtype).to(device)
+    steps, _ = grid(12)
+    b = torch.tensor(steps / 12.0).to(patches.vertices)
+    targets = b @ patches.vertices[patches.triangles[0].long()]
+    up = torch.tensor([0.0, 0.0, 2.0]).to(targets).expand_as(targets)
+    rays = pd.PatchRays(patches, level)
+    hits = rays.cast(targets + up, -up)
+    assert bool(hits.hit.all())
+    assert float((hits.depth - 2).abs().max()) < 8 * torch.finfo(dtype).eps
+    assert float((hits.barycentrics[0] - b).abs().max()) < 64 * torch.finfo(dtype).eps
+    sideways = torch.tensor([1.0, 0.0, 0.0]).to(targets).expand_as(targets)
+    assert not bool(rays.cast(targets + 0.01 * up - sideways, sideways).hit.any())
 
 
 def test_level_follows_the_quadrics() -> None:

@@ -120,7 +120,11 @@ class PatchRays:
         self._check_patches(surface)
         o, d = _rays(origins, directions, surface)
         at = _at_rest(surface) if pose is None else pose
-        points = surface.surface(self._samples, at).points
+        h, slopes = surface.heights(self._samples)
+        points, _ = _ops.patch_surface(
+            *at, surface.vertices, surface.directors, h, slopes, self._samples.barycentrics,
+            [*surface.lists, *self._samples.lists], phong=surface.base == "phong",
+        )  # fmt: skip
         q = surface.quadrics
         depth, patch, b = _ops.patch_surface_rays(
             o, d, points, self._cells, self._weights, self._places, *at, surface.vertices, surface.directors,

@@ -31,5 +31,6 @@
   X(FramesWeights)           \
   X(CellBoxes)               \
   X(JoinedBoxes)             \
+  X(PosedSheets)             \
   X(SurfaceRays)             \
   X(FieldRays)
