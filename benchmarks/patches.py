@@ -4,7 +4,8 @@ A ball of 20 x 4^n patches with as many quadrics as vertices, float32. Floors on
 multiplications that the formulas need, at the rate at which all threads finish scalar ones (that of the extension's
 SIMD multiply-adds over the lanes), or the bytes read and written at the rate of a large copy, whichever is slower. For
 a ray: boxes down one path of the tree, and two places on the surface if it hits, one to correct and one to see that it
-is right. "search" is the op, "hits" adds points and normals, "picture" shades.
+is right. "search" is the op, "hits" adds points and normals, "picture" shades; "field" meets the published field, with
+a tree and with every patch tried for every ray.
 
     python benchmarks/patches.py --device cpu --out benchmarks/results/NAME.json
 """
@@ -88,6 +89,7 @@ def measure_patches(subdivisions: int, options: argparse.Namespace) -> list[dict
     directions = torch.as_tensor(CAMERA.rays(size)).to(patches.vertices).reshape(-1, 3)
     origins = patches.vertices.new_tensor(CAMERA.origin).expand_as(directions)
     hits = float(rays.cast(origins, directions).hit.double().mean())
+    some, along = (t[:: max(1, len(t) * len(patches.triangles) // 10**7)] for t in (origins, directions))
     per_item = floors(patches, where, len(patches.triangles) * rays.level**2, hits)
     pixels = options.pixels**2
     work: dict[str, tuple[Callable[[], object], int, str]] = {
@@ -95,6 +97,8 @@ def measure_patches(subdivisions: int, options: argparse.Namespace) -> list[dict
         "surface points": (lambda: patches.surface(where), options.samples, "surface points"),
         "rays, search": (lambda: rays.search(origins, directions), pixels, "rays"),
         "rays, hits": (lambda: rays.cast(origins, directions), pixels, "rays"),
+        "field": (lambda: rays.cast_field(origins, directions, far=9.0), pixels, ""),
+        "field, exhaustive": (lambda: rays.cast_field(some, along, far=9.0, exhaustive=True), len(some), ""),
         "picture": (lambda: rays.render(CAMERA, size), pixels, "rays"),
     }
     rows = []
@@ -103,12 +107,12 @@ def measure_patches(subdivisions: int, options: argparse.Namespace) -> list[dict
         with torch.no_grad():
             seconds = min(measure(run, device, repetitions=options.repetitions, seconds=options.seconds))
         row: dict[str, Any] = {"patches": len(patches.triangles), "what": name, "per_second": count / seconds}
-        if device.type == "cpu":
+        if device.type == "cpu" and floor:
             arithmetic, moved = per_item[floor]
             row["floor_per_second"] = min(rate / arithmetic, copied_bytes_per_second(device) / moved)
             row["times_floor"] = row["floor_per_second"] / row["per_second"]
         rows.append(row)
-        beside = f"{row['times_floor']:8.1f} x the floor" if device.type == "cpu" else ""
+        beside = f"{row['times_floor']:8.1f} x the floor" if "times_floor" in row else ""
         print(f"{row['patches']:6d} patches  {name:<16} {row['per_second'] / 1e6:10.3f} M/s {beside}", flush=True)
     return rows
 

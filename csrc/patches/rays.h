@@ -1,13 +1,13 @@
 // The first point of the posed surface on each ray.
 //
 // Every patch is cut into cells, triangles of its barycentric grid. The surface over a cell lies within `slack` of the triangle of
-// its corners, which 12 points inside the cell tell; boxes around the cells form a complete binary tree (refitted in every
-// pose). Seen along a ray, the triangle is flat: the ray can meet the surface only if it passes within the slack of it. Then
+// its corners, which 12 points inside the cell tell; the cells lie in a tree of boxes. Seen along a ray, the triangle is flat: the ray can meet the surface only if it passes within the slack of it. Then
 // Newton's method finds S(b) = o + t d from where the ray meets the triangle, and where the cell is seen edge-on, so that it may
 // be met twice, from its corners too. A patch counts as far as its edges, so neighbours leave no gap between them.
 #pragma once
 #include "patches/height.h"
 #include "patches/surface.h"
+#include "patches/tree.h"
 
 namespace pd::freeform {
 
@@ -18,34 +18,19 @@ constexpr int sheet_numbers = 27;
 // Where the surface is, cell by cell.
 template <class T>
 struct Cells {
+  Tree<T> tree;
   const int32* cells;  // [C, 17], in the order of the leaves
   const T* weights;    // [12, 3] barycentric coordinates of the checks in their cell
   const T* places;     // [m^2, 9] barycentric coordinates of the corners of a cell in its patch
   const T* points;     // [B, N, 3] m
   T* slack;            // [B, C] m
-  T* boxes;  // [B, 2^(levels + 1) / 4 or 1, 6, 4] least and greatest coordinates of four nodes, m
-  Index count, samples;
-  int levels;
+  Index samples;
   T size;  // edge of a cell in barycentric coordinates, 1 / m
 };
 
 template <class T>
 struct CellBoxes {
   Cells<T> cells;
-};
-
-template <class T>
-struct JoinedBoxes {
-  Cells<T> cells;
-  int level;
-};
-
-template <class T>
-struct Rays {
-  const T *origins, *directions;  // [1 or B, R, 3] m, and of unit length
-  Index count, origin_step,
-      direction_step;  // from the rays of one pose to those of the next: 0 or 3 R
-  T near, far;         // m
 };
 
 // The posed surface patch by patch, its frames multiplied out: with A_k, v_k, e_k and u_k of patches/surface.h,
@@ -77,63 +62,15 @@ struct SurfaceRays {
 
 namespace pd::freeform::inline PD_TARGET {
 
-template <class T>
-PD_HD T greater(const T& a, const T& b) {
-  return b > a ? b : a;
-}
-
-template <class T>
-PD_HD T largest(const Vec3<T>& a) {
-  return greater(greater(absolute(a.x), absolute(a.y)), absolute(a.z));
-}
-
-template <class T>
-struct Box {
-  Vec3<T> low, high;
-};
-
-template <class T>
-PD_HD void join(Box<T>& box, const Vec3<T>& low, const Vec3<T>& high) {
-  box.low = {lesser(box.low.x, low.x), lesser(box.low.y, low.y), lesser(box.low.z, low.z)};
-  box.high = {greater(box.high.x, high.x), greater(box.high.y, high.y),
-              greater(box.high.z, high.z)};
-}
-
-template <class T>
-PD_HD Index first_cell(const Cells<T>& c, Index leaf) {
-  return (leaf * c.count) >> c.levels;
-}
-
-// Nodes are numbered from the root, 1; below n lie 2 n and 2 n + 1, and below those 4 n up to 4 n + 3, which are kept together.
-// There is no node 0.
-template <class T>
-PD_HD Index numbers_of(const Cells<T>& c) {
-  return 24 * greater(Index(1), Index(1) << c.levels >> 1);
-}
-
-PD_HD Index place_of(Index node) { return 24 * (node / 4) + node % 4; }
-
-template <class T>
-PD_HD Box<T> load_box(const T* boxes, Index node) {
-  const T* from = boxes + place_of(node);
-  return {{from[0], from[4], from[8]}, {from[12], from[16], from[20]}};
-}
-
-template <class T>
-PD_HD void store_box(T* boxes, Index node, const Box<T>& box) {
-  const T numbers[6] = {box.low.x, box.low.y, box.low.z, box.high.x, box.high.y, box.high.z};
-  for (int k = 0; k < 6; ++k) boxes[place_of(node) + 4 * k] = numbers[k];
-}
-
 // Item: a leaf of a pose.
 template <class T>
 PD_HD void item(const CellBoxes<T>& t, Index i) {
   const Cells<T>& c = t.cells;
-  const Index pose = i >> c.levels, leaf = i - (pose << c.levels);
+  const Index pose = i >> c.tree.levels, leaf = i - (pose << c.tree.levels);
   const T* points = c.points + 3 * pose * c.samples;
   const T most = biggest<T>();
   Box<T> box = {{most, most, most}, {-most, -most, -most}};
-  for (Index n = first_cell(c, leaf); n < first_cell(c, leaf + 1); ++n) {
+  for (Index n = first_of(c.tree, leaf); n < first_of(c.tree, leaf + 1); ++n) {
     const int32* cell = c.cells + cell_numbers * n;
     const Vec3<T> p[3] = {load3(points, cell[0]), load3(points, cell[1]), load3(points, cell[2])};
     T apart = T(0);
@@ -147,23 +84,11 @@ PD_HD void item(const CellBoxes<T>& t, Index i) {
     const T rounding = T(16) * epsilon<T>() * greater(largest(own.low), largest(own.high));
     // between the checks it is little more
     const T slack = T(1.5) * square_root(apart) + rounding;
-    c.slack[pose * c.count + n] = slack;
+    c.slack[pose * c.tree.count + n] = slack;
     const Vec3<T> margin = {slack, slack, slack};
     join(box, own.low - margin, own.high + margin);
   }
-  store_box(c.boxes + pose * numbers_of(c), (Index(1) << c.levels) + leaf, box);
-}
-
-// Item: an inner node of a pose at a level, 0 the root, from its children.
-template <class T>
-PD_HD void item(const JoinedBoxes<T>& t, Index i) {
-  const Cells<T>& c = t.cells;
-  const Index pose = i >> t.level, node = (Index(1) << t.level) + i - (pose << t.level);
-  T* boxes = c.boxes + pose * numbers_of(c);
-  Box<T> box = load_box(boxes, 2 * node);
-  const Box<T> other = load_box(boxes, 2 * node + 1);
-  join(box, other.low, other.high);
-  store_box(boxes, node, box);
+  store_leaf(c.tree, pose, leaf, box);
 }
 
 // Item: a patch of a pose.
@@ -272,30 +197,6 @@ PD_HD SurfaceElement<T> surface_at(const SurfaceRays<T>& t, const Sheet<T>& s, c
   return e;
 }
 
-// A ray and two directions across it (Duff et al. 2017): what meets it has no component along either.
-template <class T>
-struct Sight {
-  Vec3<T> o, d, u, v, inverse;  // of d, component by component
-};
-
-// Finite for 0 too, or 0 times it would be NaN. Only along the very face of a box is the answer then open, and the margin of the
-// boxes keeps the surface off their faces.
-template <class T>
-PD_HD T inverse_of(const T& a) {
-  constexpr T least = T(1) / biggest<T>() * T(4);
-  return T(1) / (absolute(a) > least ? a : least);
-}
-
-template <class T>
-PD_HD Sight<T> sight_along(const Vec3<T>& o, const Vec3<T>& d) {
-  const T sign = d.z < T(0) ? T(-1) : T(1), a = T(-1) / (sign + d.z), b = d.x * d.y * a;
-  return {o,
-          d,
-          {T(1) + sign * d.x * d.x * a, sign * b, -sign * d.x},
-          {b, sign + d.y * d.y * a, -d.y},
-          {inverse_of(d.x), inverse_of(d.y), inverse_of(d.z)}};
-}
-
 template <class T>
 struct Hit {
   T depth;
@@ -359,7 +260,7 @@ PD_HD void meet_cell(const SurfaceRays<T>& t, Index pose, Index number, const Si
     nearest = lesser(nearest, along[k]);
     farthest = greater(farthest, along[k]);
   }
-  const T slack = c.slack[pose * c.count + number] +
+  const T slack = c.slack[pose * c.tree.count + number] +
                   T(16) * epsilon<T>() * (largest(ray.o) + absolute(farthest));
   if (nearest - slack > hit.depth || farthest + slack < t.rays.near) return;
   for (int k = 0; k < 3; ++k) area[k] = turn(flat[(k + 1) % 3], flat[(k + 2) % 3]);
@@ -394,72 +295,16 @@ PD_HD void meet_cell(const SurfaceRays<T>& t, Index pose, Index number, const Si
   }
 }
 
-// Which of four boxes a ray enters before `far`, and where: never later than that, for the rounding of six products.
+// Visits leaves with the cells that they hold.
 template <class T>
-PD_HD void enter_four(const T* boxes, const Sight<T>& ray, const T& near, const T& far,
-                      T (&entry)[4], bool (&in)[4]) {
-  constexpr T rounding = T(4) * epsilon<T>();
-  T exit[4];
-  for (int k = 0; k < 4; ++k) {  // in one vector
-    const T a[3] = {(boxes[k] - ray.o.x) * ray.inverse.x, (boxes[4 + k] - ray.o.y) * ray.inverse.y,
-                    (boxes[8 + k] - ray.o.z) * ray.inverse.z};
-    const T b[3] = {(boxes[12 + k] - ray.o.x) * ray.inverse.x,
-                    (boxes[16 + k] - ray.o.y) * ray.inverse.y,
-                    (boxes[20 + k] - ray.o.z) * ray.inverse.z};
-    const T first = greater(greater(lesser(a[0], b[0]), lesser(a[1], b[1])), lesser(a[2], b[2]));
-    const T last = lesser(lesser(greater(a[0], b[0]), greater(a[1], b[1])), greater(a[2], b[2]));
-    entry[k] = greater(near, first * (T(1) - rounding));
-    exit[k] = lesser(far, last * (T(1) + rounding));
-  }
-  for (int k = 0; k < 4; ++k) in[k] = entry[k] <= exit[k];
-}
+struct MeetCells {
+  const SurfaceRays<T>& task;
+  Index pose;
+  const Sight<T>& ray;
+  Hit<T>& hit;
 
-// Nodes still to be looked into, the nearest on top.
-template <class T>
-struct Waiting {
-  int32 node[64];
-  T entry[64];
-  int count;
+  PD_HD void operator()(Index number) const { meet_cell(task, pose, number, ray, hit); }
 };
-
-template <class T>
-PD_HD void put(Waiting<T>& w, int base, Index node, const T& entry) {
-  int at = w.count++;
-  for (; at > base && w.entry[at - 1] < entry; --at) {
-    w.node[at] = w.node[at - 1];
-    w.entry[at] = w.entry[at - 1];
-  }
-  w.node[at] = int32(node);
-  w.entry[at] = entry;
-}
-
-template <class T>
-PD_HD void first_hit(const SurfaceRays<T>& t, Index pose, const Sight<T>& ray, Hit<T>& hit) {
-  const Cells<T>& c = t.cells;
-  const T* boxes = c.boxes + pose * numbers_of(c);
-  const Index leaves = Index(1) << c.levels;
-  Waiting<T> w;
-  w.count = 0;
-  // steps of two levels end at the leaves
-  for (Index node = 1 + c.levels % 2; node <= 1 + 2 * (c.levels % 2); ++node)
-    put(w, w.count, node, t.rays.near);
-  while (w.count > 0) {
-    const Index node = w.node[--w.count];
-    if (w.entry[w.count] > hit.depth) continue;
-    if (node >= leaves) {
-      const Index leaf = node - leaves;
-      for (Index n = first_cell(c, leaf); n < first_cell(c, leaf + 1); ++n)
-        meet_cell(t, pose, n, ray, hit);
-      continue;
-    }
-    T entry[4];
-    bool in[4];
-    enter_four(boxes + place_of(4 * node), ray, t.rays.near, hit.depth, entry, in);
-    const int base = w.count;
-    for (int k = 0; k < 4; ++k)
-      if (in[k]) put(w, base, 4 * node + k, entry[k]);
-  }
-}
 
 // Item: a ray in a pose.
 template <class T>
@@ -469,7 +314,9 @@ PD_HD void item(const SurfaceRays<T>& t, Index i) {
                                      load3(t.rays.directions + pose * t.rays.direction_step, ray));
   Hit<T> hit = {t.rays.far, -1, {T(0), T(0), T(0)}};
   // one that is not finite meets nothing
-  if (dot(sight.o, sight.o) + dot(sight.d, sight.d) <= biggest<T>()) first_hit(t, pose, sight, hit);
+  if (dot(sight.o, sight.o) + dot(sight.d, sight.d) <= biggest<T>())
+    visit(t.cells.tree, pose, sight, t.rays.near, hit.depth, T(0),
+          MeetCells<T>{t, pose, sight, hit});
   t.depth[i] = hit.patch < 0 ? T(HUGE_VAL) : hit.depth;
   t.patch[i] = hit.patch;
   for (int k = 0; k < 3; ++k) t.barycentrics[3 * i + k] = hit.b[k];

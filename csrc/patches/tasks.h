@@ -33,4 +33,5 @@
   X(JoinedBoxes)             \
   X(PosedSheets)             \
   X(SurfaceRays)             \
+  X(FieldBoxes)              \
   X(FieldRays)
