@@ -1,11 +1,12 @@
-"""Free-form patches: heights, surface points and rays a second, beside what their arithmetic takes at the least.
+"""Free-form patches: heights, surface points and rays a second, beside what their arithmetic takes at the least; fits.
 
 A ball of 20 x 4^n patches with as many quadrics as vertices, float32. Floors on the CPU: the fewest additions and
 multiplications that the formulas need, at the rate at which all threads finish scalar ones (that of the extension's
 SIMD multiply-adds over the lanes), or the bytes read and written at the rate of a large copy, whichever is slower. For
 a ray: boxes down one path of the tree, and two places on the surface if it hits, one to correct and one to see that it
 is right. "search" is the op, "hits" adds points and normals, "picture" shades; "field" meets the published field, with
-a tree and with every patch tried for every ray.
+a tree and with every patch tried for every ray. "fit" is `FreeFormPatches.fit` of a bumpy blob, which runs on the CPU
+on any device; "fit, one step" is `PatchLoss` over the same patches and its gradients for the quadrics, on the device.
 
     python benchmarks/patches.py --device cpu --out benchmarks/results/NAME.json
 """
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from compactness import BLOB_BOX, balls, blob
 from machine import describe_run, measure, multiply_adds_per_second
 
 import torchpd as pd
@@ -117,11 +120,46 @@ def measure_patches(subdivisions: int, options: argparse.Namespace) -> list[dict
     return rows
 
 
+def measure_fit(options: argparse.Namespace) -> list[dict[str, Any]]:
+    device = torch.device(options.device)
+    patches, quadrics = options.fit
+    begin = time.perf_counter()
+    fit = pd.FreeFormPatches.fit(blob, quadrics, patches=balls(patches), bounds=BLOB_BOX)
+    seconds = time.perf_counter() - begin
+    fitted = fit.patches.to(device)
+    loss = pd.PatchLoss(fitted, blob, bounds=BLOB_BOX)
+    q = fitted.quadrics
+    leaves = [t.detach().clone().requires_grad_() for t in (q.amplitudes, q.centres, q.factors)]
+
+    def step() -> object:
+        return torch.autograd.grad(loss(fitted.with_quadrics(pd.Quadrics(*leaves), keep_lists=True)), leaves)
+
+    one = min(measure(step, device, repetitions=options.repetitions, seconds=options.seconds))
+    size = {"patches": len(fitted.triangles), "quadrics": len(q)}
+    rows = [
+        size | {"what": "fit", "seconds": seconds, "rms": fit.report.rms, "size": fit.report.size},
+        size | {"what": "fit, one step", "seconds": one, "samples": len(loss.targets)},
+    ]
+    print(f"{size['patches']:6d} patches  fit              {seconds:10.2f} s   {fit.report}")
+    print(
+        f"{size['patches']:6d} patches  fit, one step    {1e3 * one:10.2f} ms  {len(loss.targets)} samples", flush=True
+    )
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument(
         "--subdivisions", type=int, nargs="+", default=[1, 4], help="of the icosahedron: 20 x 4^n patches"
+    )
+    parser.add_argument(
+        "--fit",
+        type=int,
+        nargs=2,
+        default=(20, 20),
+        metavar=("PATCHES", "QUADRICS"),
+        help="of the blob, 20 x 4^n patches",
     )
     parser.add_argument("--samples", type=int, default=1_000_000, help="places for heights and surface points")
     parser.add_argument("--pixels", type=int, default=1024, help="along the side of the picture")
@@ -129,7 +167,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=0.5, help="of every measurement at least")
     parser.add_argument("--out", type=Path, help="file for the results (JSON)")
     options = parser.parse_args()
-    rows = [row for n in options.subdivisions for row in measure_patches(n, options)]
+    rows = [row for n in options.subdivisions for row in measure_patches(n, options)] + measure_fit(options)
     if options.out:
         record = describe_run(torch.device(options.device), torch.get_num_threads()) | {"rows": rows}
         options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
