@@ -1,10 +1,12 @@
-"""Free-form patches: heights, surface points and rays a second, beside what their arithmetic takes at the least.
+"""Free-form patches: heights, surface points and rays a second, beside what their arithmetic takes at the least; fits.
 
 A ball of 20 x 4^n patches with as many quadrics as vertices, float32. Floors on the CPU: the fewest additions and
 multiplications that the formulas need, at the rate at which all threads finish scalar ones (that of the extension's
 SIMD multiply-adds over the lanes), or the bytes read and written at the rate of a large copy, whichever is slower. For
 a ray: boxes down one path of the tree, and two places on the surface if it hits, one to correct and one to see that it
-is right. "search" is the op, "hits" adds points and normals, "picture" shades.
+is right. "search" is the op, "hits" adds points and normals, "picture" shades; "field" meets the published field, with
+a tree and with every patch tried for every ray. "fit" is `FreeFormPatches.fit` of a bumpy blob, which runs on the CPU
+on any device; "fit, one step" is `PatchLoss` over the same patches and its gradients for the quadrics, on the device.
 
     python benchmarks/patches.py --device cpu --out benchmarks/results/NAME.json
 """
@@ -14,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from compactness import BLOB_BOX, balls, blob
 from machine import describe_run, measure, multiply_adds_per_second
 
 import torchpd as pd
@@ -32,6 +36,7 @@ CAMERA = Camera((0.0, 0.0, 4.2), (0.0, 0.0, 0.0), 32.0)
 # additions and multiplications
 POINT, ENTRY, ACTIVE, SLOPES = 15, 18, 30, 16  # P; Q; R and its gradient where Q > 0; dh along the chart
 POSED = 3 * (15 + 3 + 3 * 5 + 3) + 15 + 2 * (3 * (6 + 15) + 15 + 6)  # sum_k b_k (v_k + A_k u_k), and two tangents
+SHEET = 15 + 3 * (7 + 8) + 2 * (3 + 16 + 3 * 8 + 12)  # the same with the frames multiplied out once a patch
 BOX = 12
 
 
@@ -65,7 +70,7 @@ def floors(
     active = float((patches.quadrics.values(some) != 0).sum(1).double().mean())
     height = POINT + entries * ENTRY + active * ACTIVE + SLOPES
     surface = height + POSED
-    ray = 2 * BOX * math.log2(cells / 2) + hits * 2 * surface
+    ray = 2 * BOX * math.log2(cells / 2) + hits * 2 * (height + SHEET)
     return {
         "heights": (height, 4.0 * (4 + 3)),
         "surface points": (surface, 4.0 * (4 + 3 + 3 + 9)),
@@ -87,6 +92,7 @@ def measure_patches(subdivisions: int, options: argparse.Namespace) -> list[dict
     directions = torch.as_tensor(CAMERA.rays(size)).to(patches.vertices).reshape(-1, 3)
     origins = patches.vertices.new_tensor(CAMERA.origin).expand_as(directions)
     hits = float(rays.cast(origins, directions).hit.double().mean())
+    some, along = (t[:: max(1, len(t) * len(patches.triangles) // 10**7)] for t in (origins, directions))
     per_item = floors(patches, where, len(patches.triangles) * rays.level**2, hits)
     pixels = options.pixels**2
     work: dict[str, tuple[Callable[[], object], int, str]] = {
@@ -94,6 +100,8 @@ def measure_patches(subdivisions: int, options: argparse.Namespace) -> list[dict
         "surface points": (lambda: patches.surface(where), options.samples, "surface points"),
         "rays, search": (lambda: rays.search(origins, directions), pixels, "rays"),
         "rays, hits": (lambda: rays.cast(origins, directions), pixels, "rays"),
+        "field": (lambda: rays.cast_field(origins, directions, far=9.0), pixels, ""),
+        "field, exhaustive": (lambda: rays.cast_field(some, along, far=9.0, exhaustive=True), len(some), ""),
         "picture": (lambda: rays.render(CAMERA, size), pixels, "rays"),
     }
     rows = []
@@ -102,13 +110,40 @@ def measure_patches(subdivisions: int, options: argparse.Namespace) -> list[dict
         with torch.no_grad():
             seconds = min(measure(run, device, repetitions=options.repetitions, seconds=options.seconds))
         row: dict[str, Any] = {"patches": len(patches.triangles), "what": name, "per_second": count / seconds}
-        if device.type == "cpu":
+        if device.type == "cpu" and floor:
             arithmetic, moved = per_item[floor]
             row["floor_per_second"] = min(rate / arithmetic, copied_bytes_per_second(device) / moved)
             row["times_floor"] = row["floor_per_second"] / row["per_second"]
         rows.append(row)
-        beside = f"{row['times_floor']:8.1f} x the floor" if device.type == "cpu" else ""
+        beside = f"{row['times_floor']:8.1f} x the floor" if "times_floor" in row else ""
         print(f"{row['patches']:6d} patches  {name:<16} {row['per_second'] / 1e6:10.3f} M/s {beside}", flush=True)
+    return rows
+
+
+def measure_fit(options: argparse.Namespace) -> list[dict[str, Any]]:
+    device = torch.device(options.device)
+    patches, quadrics = options.fit
+    begin = time.perf_counter()
+    fit = pd.FreeFormPatches.fit(blob, quadrics, patches=balls(patches), bounds=BLOB_BOX)
+    seconds = time.perf_counter() - begin
+    fitted = fit.patches.to(device)
+    loss = pd.PatchLoss(fitted, blob, bounds=BLOB_BOX)
+    q = fitted.quadrics
+    leaves = [t.detach().clone().requires_grad_() for t in (q.amplitudes, q.centres, q.factors)]
+
+    def step() -> object:
+        return torch.autograd.grad(loss(fitted.with_quadrics(pd.Quadrics(*leaves), keep_lists=True)), leaves)
+
+    one = min(measure(step, device, repetitions=options.repetitions, seconds=options.seconds))
+    size = {"patches": len(fitted.triangles), "quadrics": len(q)}
+    rows = [
+        size | {"what": "fit", "seconds": seconds, "rms": fit.report.rms, "size": fit.report.size},
+        size | {"what": "fit, one step", "seconds": one, "samples": len(loss.targets)},
+    ]
+    print(f"{size['patches']:6d} patches  fit              {seconds:10.2f} s   {fit.report}")
+    print(
+        f"{size['patches']:6d} patches  fit, one step    {1e3 * one:10.2f} ms  {len(loss.targets)} samples", flush=True
+    )
     return rows
 
 
@@ -118,13 +153,21 @@ def main() -> None:
     parser.add_argument(
         "--subdivisions", type=int, nargs="+", default=[1, 4], help="of the icosahedron: 20 x 4^n patches"
     )
+    parser.add_argument(
+        "--fit",
+        type=int,
+        nargs=2,
+        default=(20, 20),
+        metavar=("PATCHES", "QUADRICS"),
+        help="of the blob, 20 x 4^n patches",
+    )
     parser.add_argument("--samples", type=int, default=1_000_000, help="places for heights and surface points")
     parser.add_argument("--pixels", type=int, default=1024, help="along the side of the picture")
     parser.add_argument("--repetitions", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=0.5, help="of every measurement at least")
     parser.add_argument("--out", type=Path, help="file for the results (JSON)")
     options = parser.parse_args()
-    rows = [row for n in options.subdivisions for row in measure_patches(n, options)]
+    rows = [row for n in options.subdivisions for row in measure_patches(n, options)] + measure_fit(options)
     if options.out:
         record = describe_run(torch.device(options.device), torch.get_num_threads()) | {"rows": rows}
         options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

@@ -67,8 +67,8 @@ TORCH_LIBRARY_FRAGMENT(torchpd, m) {
       "on_surface, bool phong, float near, float far) -> (Tensor, Tensor, Tensor)");
   m.def(
       "patch_field_rays(Tensor origins, Tensor directions, Tensor positions, Tensor amplitudes, "
-      "Tensor matrices, Tensor[] lists, *, float thickness, bool clip, float near, float far) -> "
-      "(Tensor, Tensor)");
+      "Tensor matrices, Tensor order, Tensor[] lists, *, float thickness, bool clip, float near, "
+      "float far, bool exhaustive) -> (Tensor, Tensor)");
 }
 
 TORCH_LIBRARY_IMPL(torchpd, CPU, m) { register_ops<Cpu>(m); }

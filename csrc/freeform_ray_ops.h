@@ -2,6 +2,7 @@
 #pragma once
 #include "freeform_field_ops.h"
 
+#include <algorithm>
 #include <limits>
 
 namespace pd::freeform {
@@ -49,6 +50,24 @@ inline void check_cells(const Tensor& cells, const Tensor& points, std::int64_t 
               "corners, checks, patch and place of each");
 }
 
+// Levels of the tree with so many things a leaf or more, and less than twice as many.
+inline int levels_of(std::int64_t count, std::int64_t per_leaf) {
+  int levels = 0;
+  while ((2 * per_leaf << levels) <= count) ++levels;
+  return levels;
+}
+
+inline Tensor empty_boxes(std::int64_t batch, int levels, const Tensor& like) {
+  const auto fours = std::max(std::int64_t(1), std::int64_t(1) << levels >> 1);
+  return at::empty({batch, fours, 6, 4}, like.options());
+}
+
+template <class Backend, class T>
+void join_boxes(const Tree<T>& tree, std::int64_t batch, const Tensor& like) {
+  for (int k = tree.levels - 1; k >= 0; --k)
+    Backend::run(JoinedBoxes<T>{tree, k}, batch << k, like);
+}
+
 template <class Backend>
 std::tuple<Tensor, Tensor, Tensor> surface_rays(
     const Tensor& origins, const Tensor& directions, const Tensor& points, const Tensor& cells,
@@ -77,27 +96,33 @@ std::tuple<Tensor, Tensor, Tensor> surface_rays(
                place =
                    real(places, {level * level, 9}, "places", "corners of the cells of a patch");
   real(rays.origins, rays.origins.sizes(), "origins", "m");
-  int levels = 0;
-  while ((std::int64_t(4) << levels) <= cells.size(0)) ++levels;  // two cells a leaf or more
+  const int levels = levels_of(cells.size(0), 2);
+  const Tensor sheets = at::empty({batch, lists.patches, sheet_numbers}, points.options());
   const Tensor slack = at::empty({batch, cells.size(0)}, points.options());
-  const Tensor boxes = at::empty({batch, (std::int64_t(2) << levels) - 1, 6}, points.options());
+  const Tensor boxes = empty_boxes(batch, levels, points);
   const Tensor depth = at::empty({batch, rays.count}, points.options());
   const Tensor patch = at::empty({batch, rays.count}, points.options().dtype(at::kInt));
   const Tensor b = at::empty({batch, rays.count, 3}, points.options());
   for_precision(points, [&](auto number) {
     using T = decltype(number);
-    const Cells<T> tree{
-        read<int32>(cells), read<T>(inner), read<T>(place), read<T>(grid), write<T>(slack),
-        write<T>(boxes),    cells.size(0),  points.size(1), levels,        T(1) / T(level)};
-    Backend::run(CellBoxes<T>{tree}, batch << levels, points);
-    for (int k = levels - 1; k >= 0; --k) Backend::run(JoinedBoxes<T>{tree, k}, batch << k, points);
+    const Tree<T> tree{write<T>(boxes), cells.size(0), levels};
+    const Cells<T> in{tree,          read<int32>(cells), read<T>(inner), read<T>(place),
+                      read<T>(grid), write<T>(slack),    points.size(1), T(1) / T(level)};
+    Backend::run(CellBoxes<T>{in}, batch << levels, points);
+    join_boxes<Backend>(tree, batch, points);
     const Base<T> base{read<T>(at_rest), read<T>(n), phong ? T(0.75) : T(0)};
     const Ellipsoids<T> ellipsoids{read<T>(a), read<T>(c), read<T>(m)};
-    const SurfaceRays<T> task{lists,           base,
-                              ellipsoids,      tree,
-                              rays.view<T>(),  read<T>(posed),
-                              read<T>(turned), on_surface,
-                              write<T>(depth), write<int32>(patch),
+    Backend::run(PosedSheets<T>{lists, base, read<T>(posed), read<T>(turned), write<T>(sheets)},
+                 batch * lists.patches, points);
+    const SurfaceRays<T> task{lists,
+                              base,
+                              ellipsoids,
+                              in,
+                              rays.view<T>(),
+                              read<T>(sheets),
+                              on_surface,
+                              write<T>(depth),
+                              write<int32>(patch),
                               write<T>(b)};
     Backend::run(task, batch * rays.count, points);
   });
@@ -107,8 +132,9 @@ std::tuple<Tensor, Tensor, Tensor> surface_rays(
 template <class Backend>
 std::tuple<Tensor, Tensor> field_rays(const Tensor& origins, const Tensor& directions,
                                       const Tensor& positions, const Tensor& amplitudes,
-                                      const Tensor& matrices, at::TensorList arrays,
-                                      double thickness, bool clip, double near, double far) {
+                                      const Tensor& matrices, const Tensor& order,
+                                      at::TensorList arrays, double thickness, bool clip,
+                                      double near, double far, bool exhaustive) {
   check_thickness(thickness);
   check_batched(positions, 3, "positions", "[batch, vertices, 3] (m)");
   TORCH_CHECK_VALUE(far <= std::numeric_limits<float>::max(), "far must be finite [m], got ", far);
@@ -117,11 +143,26 @@ std::tuple<Tensor, Tensor> field_rays(const Tensor& origins, const Tensor& direc
   const Tensor points = at::empty({positions.size(0), 0, 3}, positions.options());
   const SolidTensors in(points, positions, amplitudes, matrices, arrays);
   real_argument(rays.origins, positions, rays.origins.sizes(), "origins", "m");
+  check_array(order, at::kInt, in.lists.patches, 1, {positions.device(), "positions"}, "order",
+              "patches, in the order of the leaves of their tree");
+  const int levels = levels_of(in.lists.patches, 1);
+  const Tensor boxes = empty_boxes(in.batch, levels, positions);
   const Tensor depth = in.empty({in.batch, rays.count});
   const Tensor patch = at::empty({in.batch, rays.count}, positions.options().dtype(at::kInt));
   for_precision(positions, [&](auto real) {
     using T = decltype(real);
-    const FieldRays<T> task{in.view<T>(thickness, clip), rays.view<T>(), write<T>(depth),
+    const Tree<T> tree{write<T>(boxes), in.lists.patches, levels};
+    const Solid<T> solid = in.view<T>(thickness, clip);
+    if (!exhaustive) {
+      Backend::run(FieldBoxes<T>{solid, tree, read<int32>(order)}, in.batch << levels, positions);
+      join_boxes<Backend>(tree, in.batch, positions);
+    }
+    const FieldRays<T> task{solid,
+                            tree,
+                            read<int32>(order),
+                            exhaustive,
+                            rays.view<T>(),
+                            write<T>(depth),
                             write<int32>(patch)};
     Backend::run(task, depth.numel(), positions);
   });

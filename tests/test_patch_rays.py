@@ -25,6 +25,7 @@ from patch_cases import (
 from torch import Tensor
 
 import torchpd as pd
+from torchpd.patch_mesh import grid
 
 STEPS = 6001
 TOUCH = 1e-9  # m: how near to the surface a ray must come for a hit that no march sees
@@ -174,6 +175,36 @@ def test_march_through_the_field(reading: str) -> None:
 @pytest.mark.parametrize("reading", ["clip", "literal"])
 def test_long_march_through_the_field(reading: str) -> None:
     assert march_through_field(reading, 100_000) == 0
+
+
+@pytest.mark.parametrize("reading", ["clip", "literal"])
+@pytest.mark.parametrize("cones", [False, True])
+def test_field_is_the_same_with_every_patch_tried(
+    reading: str, cones: bool, dtype: torch.dtype, device: torch.device
+) -> None:
+    """10,000 rays, half of them grazing a ball of bumps, from outside and from within it, in two poses."""
+    mesh = ball()
+    made = pd.FreeFormPatches.from_mesh(mesh, quadrics_on(mesh, 30), dtype=F64, thickness=0.02)
+    patches = made.to(device=device, dtype=dtype)
+    o, d = towards_ball(10_000)
+    rng = np.random.default_rng(4)
+    closest = torch.tensor(rng.uniform(0.9, 1.15, (5000, 1)))
+    across = unit(torch.linalg.cross(o[:5000], d[:5000]))
+    d[:5000] = closest * unit(torch.linalg.cross(across, o[:5000])) - o[:5000]
+    o[9000:] *= 0.3
+    positions = torch.stack([patches.vertices, 1.1 * patches.vertices + 0.01 * patches.vertices.roll(1, 0)])
+    W = patches.quadrics.normalized_matrices()
+    if cones:  # unbounded: [x^2 + y^2 - z^2]_+ around each centre
+        W = W.clone()
+        W[:3] += torch.diag(torch.tensor([0.0, 0.0, 60.0, 0.0])).to(W)
+    rays = pd.PatchRays(patches)
+    options = {"far": 6.0, "positions": positions, "reading": reading, "matrices": W}
+    o, d = o.to(patches.vertices), d.to(patches.vertices)
+    depth, patch = rays.cast_field(o, d, **options)
+    every_depth, every_patch = rays.cast_field(o, d, exhaustive=True, **options)
+    assert 0.3 < float(depth.isfinite().double().mean()) < 0.995
+    assert torch.equal(depth, every_depth)
+    assert torch.equal(patch, every_patch)
 
 
 def towards_ball(count: int, seed: int = 1) -> tuple[Tensor, Tensor]:
@@ -340,8 +371,8 @@ def op_arguments(name: str, dtype: torch.dtype, device: torch.device) -> tuple[l
     span = {"near": 0.0, "far": 9.0}
     if name == "field":
         lists = [*patches.lists, *nowhere.lists]
-        options = {"thickness": 0.1, "clip": True, **span}
-        return [o, unit(d), v[None], q.amplitudes, q.normalized_matrices()[None], lists], options
+        options = {"thickness": 0.1, "clip": True, "exhaustive": False, **span}
+        return [o, unit(d), v[None], q.amplitudes, q.normalized_matrices()[None], rays._order, lists], options
     eye = torch.eye(3, dtype=dtype, device=device).expand(1, len(v), 3, 3)
     points = patches.surface(rays._samples).points[None]
     quadrics = [q.amplitudes, q.centres, q.entries()]
@@ -375,6 +406,23 @@ def test_no_rays(dtype: torch.dtype, device: torch.device) -> None:
     assert hits.normals.shape == (1, 0, 3)
     depth, patch = pd.PatchRays(patches).cast_field(none, none, far=1.0)
     assert depth.shape == patch.shape == (1, 0)
+
+
+@pytest.mark.parametrize("level", [1, 2, 3, 4, 5, 6, 9])
+def test_trees_of_any_depth(level: int, dtype: torch.dtype, device: torch.device) -> None:
+    """One flat patch of 1, 4, 9, ... cells, trees of 0, 1, 2, ... levels: straight down, and level above it."""
+    patches = pd.FreeFormPatches.from_mesh(triangle(), dtype=dtype).to(device)
+    steps, _ = grid(12)
+    b = torch.tensor(steps / 12.0).to(patches.vertices)
+    targets = b @ patches.vertices[patches.triangles[0].long()]
+    up = torch.tensor([0.0, 0.0, 2.0]).to(targets).expand_as(targets)
+    rays = pd.PatchRays(patches, level)
+    hits = rays.cast(targets + up, -up)
+    assert bool(hits.hit.all())
+    assert float((hits.depth - 2).abs().max()) < 8 * torch.finfo(dtype).eps
+    assert float((hits.barycentrics[0] - b).abs().max()) < 64 * torch.finfo(dtype).eps
+    sideways = torch.tensor([1.0, 0.0, 0.0]).to(targets).expand_as(targets)
+    assert not bool(rays.cast(targets + 0.01 * up - sideways, sideways).hit.any())
 
 
 def test_level_follows_the_quadrics() -> None:

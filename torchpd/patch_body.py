@@ -35,8 +35,10 @@ class PatchBody(Solid):
     "skeleton", for closed bodies: every patch and an apex inside. Apexes are shared by patches that see them, and the
     space between is filled, so that the constraints resist bending and change of volume. "prism", for open sheets, or
     for a shell without a filling: a second layer under the patches, three constraints a patch. The layer takes part in
-    contacts and in the mass. Being one element thick, it bends less than a plate of its thickness would: three times
-    less where it is thicker than patches are wide, five times where about as thick, ten times where half as thick.
+    contacts and in the mass. Being one element thick, it stretches as a plate of its thickness would, but bends less:
+    3.1 + 1.24 (c / thickness)^2 times less, where c is the leg of right-angled patches. A stiffness smaller by as much
+    bends right and stretches too far. A thinner layer is no way out: at the same stretching it still resists bending
+    by 1.24 times what a plate of thickness c would.
 
     `Simulator.save` writes the Solid that it is; `patches.save` keeps the surface, which the same body is made of anew.
 

@@ -70,6 +70,8 @@ class PatchRays:
         device, dtype = patches.vertices.device, patches.vertices.dtype
         cells, weights, places = _cells(patches, level)
         self._cells = torch.as_tensor(cells, dtype=torch.int32, device=device).contiguous()
+        order = _tree_order(patches.vertices.detach()[patches.triangles.long()].cpu().double().mean(1).numpy(), 1)
+        self._order = torch.as_tensor(order, dtype=torch.int32, device=device)
         self._weights, self._places = (torch.as_tensor(a, dtype=dtype, device=device) for a in (weights, places))
 
     def cast(
@@ -120,7 +122,11 @@ class PatchRays:
         self._check_patches(surface)
         o, d = _rays(origins, directions, surface)
         at = _at_rest(surface) if pose is None else pose
-        points = surface.surface(self._samples, at).points
+        h, slopes = surface.heights(self._samples)
+        points, _ = _ops.patch_surface(
+            *at, surface.vertices, surface.directors, h, slopes, self._samples.barycentrics,
+            [*surface.lists, *self._samples.lists], phong=surface.base == "phong",
+        )  # fmt: skip
         q = surface.quadrics
         depth, patch, b = _ops.patch_surface_rays(
             o, d, points, self._cells, self._weights, self._places, *at, surface.vertices, surface.directors,
@@ -154,12 +160,14 @@ class PatchRays:
         positions: Tensor | None = None,
         reading: Literal["clip", "literal"] = "clip",
         matrices: Tensor | None = None,
+        exhaustive: bool = False,
     ) -> tuple[Tensor, Tensor]:
         """The first point on every ray where `FreeFormPatches.field` is not negative on any patch.
 
         A ray that starts inside is there at once. Exact but for rounding, whatever the quadrics: along a ray the field
-        is piecewise a polynomial. Every patch is tried for every ray. Where thickness and quadrics are zero the solid
-        has no inside, and rays pass. No gradients.
+        is piecewise a polynomial. A tree of boxes finds the patches that a ray may enter; one with a quadric that is no
+        ellipsoid and has positive amplitude is tried for every ray. Where thickness and quadrics are zero the solid has
+        no inside, and rays pass. No gradients.
 
         Args:
             origins, directions: as for `cast`.
@@ -167,6 +175,7 @@ class PatchRays:
             near: where to begin [m].
             positions: vertices [B, V, 3] [m]; at rest when left out.
             reading, matrices: as for `FreeFormPatches.field`.
+            exhaustive: try every patch for every ray. The result is the same, later.
 
         Returns:
             Depth [B, R] in m, infinite for a miss, and patch int32 [B, R], -1 for a miss.
@@ -180,8 +189,8 @@ class PatchRays:
         nowhere = surface.samples(torch.empty(0, dtype=torch.int32), surface.vertices[:0])
         arguments = (o, d, v, surface.quadrics.amplitudes, W if W.dim() == 4 else W[None])
         depth, patch = _ops.patch_field_rays(
-            *(t.detach() for t in arguments), [*surface.lists, *nowhere.lists],
-            thickness=surface.thickness, clip=reading == "clip", near=near, far=far,
+            *(t.detach() for t in arguments), self._order, [*surface.lists, *nowhere.lists],
+            thickness=surface.thickness, clip=reading == "clip", near=near, far=far, exhaustive=exhaustive,
         )  # fmt: skip
         return depth, patch
 
@@ -256,18 +265,19 @@ def _cells(patches: FreeFormPatches, level: int) -> tuple[Any, Any, Any]:
     b = steps[triangles] / level
     rest = patches.vertices.detach().cpu().double().numpy()[elements]
     middles = np.einsum("tkc,pcx->ptx", b, rest).reshape(-1, 3) / 3.0
-    return cells[_tree_order(middles)], inner[3:] / _CHECKS, b.reshape(count, 9)
+    return cells[_tree_order(middles, 2)], inner[3:] / _CHECKS, b.reshape(count, 9)
 
 
-def _tree_order(middles: Any) -> Any:
-    """Cells in the order of the leaves: halved at the median of their longest extent, again and again.
+def _tree_order(middles: Any, per_leaf: int) -> Any:
+    """Things in the order of the leaves: halved at the median of their longest extent, again and again.
 
-    The halves are those of the complete tree in csrc/patches/rays.h, leaf l of 2^L from l C / 2^L on.
+    The halves are those of the complete tree in csrc/patches/tree.h, leaf l of 2^L from l C / 2^L on, so many or more
+    in each.
     """
     count = len(middles)
     order = np.arange(count)
     parts = 1
-    while 4 * parts <= count:
+    while 2 * per_leaf * parts <= count:
         start = np.arange(parts + 1) * count // parts
         part = np.repeat(np.arange(parts), np.diff(start))
         low, high = (f.reduceat(middles[order], start[:-1], axis=0) for f in (np.minimum, np.maximum))

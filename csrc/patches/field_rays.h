@@ -3,16 +3,27 @@
 // Along a ray each plane is a line in t and each Q_i a quadratic, positive between its roots if it is an ellipsoid. Between the
 // roots of the quadrics, and of the differences of planes in the literal reading, F' is one polynomial of degree 6. In Bernstein
 // form over such a piece it has no root where its coefficients are all negative; else the piece is halved (de Casteljau), the near
-// half first. Nothing is missed, however thin; where F' only touches 0, a hit may be reported.
+// half first. Nothing is missed, however thin; where F' only touches 0, a hit may be reported. A tree of boxes around the solids
+// spares a ray those that it passes.
 #pragma once
 #include "patches/literal.h"
-#include "patches/rays.h"
+#include "patches/tree.h"
 
 namespace pd::freeform {
 
 template <class T>
+struct FieldBoxes {
+  Solid<T> solid;  // without points
+  Tree<T> tree;
+  const int32* order;  // [P] patches, in the order of the leaves
+};
+
+template <class T>
 struct FieldRays {
   Solid<T> solid;  // without points
+  Tree<T> tree;
+  const int32* order;
+  bool exhaustive;  // tries every patch
   Rays<T> rays;
   T* depth;      // [B, R] m, infinite without a hit
   int32* patch;  // [B, R], -1 without a hit
@@ -207,24 +218,145 @@ PD_HD bool enter_patch(const Solid<T>& s, const Profile<T>& p, T from, T to, T& 
   }
 }
 
+// Where Q may be positive for all its rounding, and the most that it may be; nothing where it is positive nowhere.
+struct Extent {
+  bool bounded;
+  double most;
+  Vec3<double> centre, half;
+};
+
+// Q = most - (x - c)^T A (x - c) for an ellipsoid, which reaches sqrt(most A^-1_ii) from c along axis i.
+template <class T>
+PD_HD Extent extent_of(const T* w) {
+  const auto mean = [&](int r, int c) {
+    return 0.5 * (double(w[4 * r + c]) + double(w[4 * c + r]));
+  };
+  const Mat3<double> a = {{{-mean(0, 0), -mean(0, 1), -mean(0, 2)},
+                           {-mean(0, 1), -mean(1, 1), -mean(1, 2)},
+                           {-mean(0, 2), -mean(1, 2), -mean(2, 2)}}};
+  const Vec3<double> b = {mean(0, 3), mean(1, 3), mean(2, 3)};
+  const Mat3<double> cofactor = {
+      {cross(a.row[1], a.row[2]), cross(a.row[2], a.row[0]), cross(a.row[0], a.row[1])}};
+  const double minor = cofactor.row[2].z, det = dot(a.row[0], cofactor.row[0]);
+  Extent e = {false, 0.0, zero3<double>(), zero3<double>()};
+  // a cone, a hyperboloid, or too nearly a cylinder
+  if (!(a.row[0].x > 0.0 && minor > 0.0 && det > 1e-9 * a.row[0].x * a.row[1].y * a.row[2].z))
+    return e;
+  const double inverse[3] = {cofactor.row[0].x / det, cofactor.row[1].y / det, minor / det};
+  e.bounded = true;
+  e.centre = (1.0 / det) * (cofactor * b);
+  const double peak = double(w[15]) + dot(b, e.centre), root = square_root(greater(peak, 0.0));
+  const double reach[3] = {absolute(e.centre.x) + root * square_root(inverse[0]),
+                           absolute(e.centre.y) + root * square_root(inverse[1]),
+                           absolute(e.centre.z) + root * square_root(inverse[2])};
+  double terms = absolute(double(w[15]));
+  for (int r = 0; r < 3; ++r) {
+    terms += 2.0 * absolute(mean(r, 3)) * reach[r];
+    for (int c = 0; c < 3; ++c) terms += absolute(mean(r, c)) * reach[r] * reach[c];
+  }
+  e.most = peak + 64.0 * double(epsilon<T>()) * terms;
+  const double most = square_root(greater(e.most, 0.0));
+  e.half = {most * square_root(inverse[0]), most * square_root(inverse[1]),
+            most * square_root(inverse[2])};
+  return e;
+}
+
+// Where the field of a patch may not be negative. With R <= r, the sum of what the positive quadrics are at most: clipped, the
+// prism over the triangle from -tau to tau + r; literal, that from -tau to tau, and wherever a positive quadric is.
+template <class T>
+PD_HD Box<double> field_box(const Solid<T>& s, Index pose, Index patch) {
+  Vec3<double> v[3];
+  for (int k = 0; k < 3; ++k) {
+    const Vec3<T> p =
+        load3(s.positions, pose * s.lists.vertices + s.lists.triangles[3 * patch + k]);
+    v[k] = {double(p.x), double(p.y), double(p.z)};
+  }
+  const Vec3<double> area = cross(v[1] - v[0], v[2] - v[0]), normal = (1.0 / length(area)) * area;
+  const double most = biggest<double>();
+  Box<double> box = {{most, most, most}, {-most, -most, -most}};
+  double risen = 0.0;
+  bool bounded = dot(normal, normal) > 0.5;
+  for (int32 e = s.lists.patch_start[patch]; e < s.lists.patch_start[patch + 1]; ++e) {
+    const double a = double(s.amplitudes[s.lists.entry_quadric[e]]);
+    if (a <= 0.0) continue;
+    const Extent q = extent_of(matrices_of(s, pose, e));
+    bounded = bounded && q.bounded;
+    if (!(q.most > 0.0)) continue;
+    risen += a * (q.most * q.most * q.most);
+    if (!s.clip) join(box, q.centre - q.half, q.centre + q.half);
+  }
+  const double tau = double(s.thickness), up = s.clip ? tau + risen : tau;
+  for (int k = 0; k < 3; ++k) {
+    const Vec3<double> low = v[k] - tau * normal, high = v[k] + up * normal;
+    join(box, low, low);
+    join(box, high, high);
+  }
+  const double margin = 64.0 * double(epsilon<T>()) * greater(largest(box.low), largest(box.high));
+  const double widest = double(biggest<T>());
+  if (!(bounded && margin < 1e-3 * widest))
+    return {{-widest, -widest, -widest}, {widest, widest, widest}};
+  const Vec3<double> around = {margin, margin, margin};
+  return {box.low - around, box.high + around};
+}
+
+template <class T>
+PD_HD Vec3<T> rounded(const Vec3<double>& a) {
+  return {T(a.x), T(a.y), T(a.z)};
+}
+
+// Item: a leaf of a pose.
+template <class T>
+PD_HD void item(const FieldBoxes<T>& t, Index i) {
+  const Index pose = i >> t.tree.levels, leaf = i - (pose << t.tree.levels);
+  const double most = double(biggest<T>());
+  Box<double> box = {{most, most, most}, {-most, -most, -most}};
+  for (Index n = first_of(t.tree, leaf); n < first_of(t.tree, leaf + 1); ++n) {
+    const Box<double> own = field_box(t.solid, pose, t.order[n]);
+    join(box, own.low, own.high);
+  }
+  store_leaf(t.tree, pose, leaf, {rounded<T>(box.low), rounded<T>(box.high)});
+}
+
+// Of the patches that a ray enters, the first, and of those at the same depth the last: whatever their order, the same.
+template <class T>
+struct EnterPatch {
+  const FieldRays<T>& task;
+  Index pose;
+  const Sight<T>& ray;
+  T& depth;
+  int32& found;
+
+  PD_HD void operator()(Index number) const {
+    const Solid<T>& s = task.solid;
+    const int32 patch = task.order[number];
+    const Index corner = pose * s.lists.vertices + s.lists.triangles[3 * patch];
+    const T foot = dot(load3(s.positions, corner) - ray.o, ray.d);
+    const Profile<T> p = profile_of(s, pose, patch, multiply_add(foot, ray.d, ray.o), ray.d);
+    T at;
+    if (!enter_patch(s, p, task.rays.near - foot, task.rays.far - foot, at)) return;
+    const T t = at + foot;
+    if (!(t < depth || (t == depth && patch > found))) return;
+    depth = t;
+    found = patch;
+  }
+};
+
 // Item: a ray in a pose.
 template <class T>
 PD_HD void item(const FieldRays<T>& t, Index i) {
-  const Solid<T>& s = t.solid;
   const Index pose = i / t.rays.count, ray = i % t.rays.count;
-  const Vec3<T> o = load3(t.rays.origins + pose * t.rays.origin_step, ray);
-  const Vec3<T> d = load3(t.rays.directions + pose * t.rays.direction_step, ray);
+  const Sight<T> sight = sight_along(load3(t.rays.origins + pose * t.rays.origin_step, ray),
+                                     load3(t.rays.directions + pose * t.rays.direction_step, ray));
   T depth = t.rays.far;
   int32 found = -1;
-  const bool finite = dot(o, o) + dot(d, d) <= biggest<T>();
-  for (Index patch = 0; finite && patch < s.lists.patches; ++patch) {
-    const Index corner = pose * s.lists.vertices + s.lists.triangles[3 * patch];
-    const T foot = dot(load3(s.positions, corner) - o, d);
-    const Profile<T> p = profile_of(s, pose, patch, multiply_add(foot, d, o), d);
-    T at;
-    if (!enter_patch(s, p, t.rays.near - foot, depth - foot, at)) continue;
-    depth = at + foot;
-    found = int32(patch);
+  if (dot(sight.o, sight.o) + dot(sight.d, sight.d) <= biggest<T>()) {
+    const EnterPatch<T> enter = {t, pose, sight, depth, found};
+    if (t.exhaustive) {
+      for (Index n = 0; n < t.tree.count; ++n) enter(n);
+    } else {
+      visit(t.tree, pose, sight, t.rays.near, depth, T(64) * epsilon<T>() * largest(sight.o),
+            enter);
+    }
   }
   t.depth[i] = found < 0 ? T(HUGE_VAL) : depth;
   t.patch[i] = found;

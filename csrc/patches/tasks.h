@@ -31,5 +31,7 @@
   X(FramesWeights)           \
   X(CellBoxes)               \
   X(JoinedBoxes)             \
+  X(PosedSheets)             \
   X(SurfaceRays)             \
+  X(FieldBoxes)              \
   X(FieldRays)
