@@ -173,12 +173,12 @@ def setup_of(cells: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cells", type=int, nargs="*", default=[11], help="r of the boxes")
-    parser.add_argument("--youngs", type=float, nargs="*", default=[1e6, 1e8], help="Young's moduli of the boxes [Pa]")
-    parser.add_argument("--mesh", nargs="*", default=[], help="tetrahedral meshes, in place of the boxes")
-    parser.add_argument("--setup", type=int, nargs="*", default=[], help="r of boxes to set up in float32 instead")
-    parser.add_argument("--blocks", type=int, nargs="*", default=[], help="even r, from 6, of boxes with stiff pieces")
-    parser.add_argument("--contrasts", type=float, nargs="*", default=[1e2, 1e4, 1e6], help="of these pieces")
+    parser.add_argument("--cells", type=int, nargs="+", default=[11], help="r of the boxes")
+    parser.add_argument("--youngs", type=float, nargs="+", default=[1e6, 1e8], help="Young's moduli of the boxes [Pa]")
+    parser.add_argument("--mesh", nargs="+", default=[], help="tetrahedral meshes, in place of the boxes")
+    parser.add_argument("--setup", type=int, nargs="+", default=[], help="r of boxes to set up in float32 instead")
+    parser.add_argument("--blocks", type=int, nargs="+", default=[], help="even r, from 6, of boxes with stiff pieces")
+    parser.add_argument("--contrasts", type=float, nargs="+", default=[1e2, 1e4, 1e6], help="of these pieces")
     arguments = parser.parse_args()
     for cells in arguments.blocks:
         torch.set_num_threads(1)

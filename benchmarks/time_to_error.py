@@ -45,6 +45,7 @@ ERROR = 1e-3
 SOLVERS: dict[str, Solver] = {"Chebyshev": pd.Chebyshev(), "Multilevel": pd.Multilevel()}
 REFERENCE_ITERATIONS = 100  # between two looks at the residual
 Row = dict[str, Any]
+Rows = dict[tuple[str, float, int], Row]  # by size, Young's modulus and batch
 
 
 class Case:
@@ -282,13 +283,19 @@ def costs(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def _positive(word: str) -> int:
+    if not word.isdecimal() or int(word) < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number >= 1, got {word!r}")
+    return int(word)
+
+
 def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--sizes", nargs="*", choices=SIZES, default=ALONE, help="of the beam")
     parser.add_argument("--youngs", nargs="*", type=float, default=list(YOUNGS), help="Young's moduli [Pa]")
     parser.add_argument("--seconds", type=float, default=2.0, help="of timing a case (%(default)g)")
-    parser.add_argument("--batch", type=int, default=1, help="environments of a step (%(default)s)")
+    parser.add_argument("--batch", type=_positive, default=1, help="environments of a step (%(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
     parser.add_argument(
         "--dtype", choices=("float32", "float64"), default="float32", help="of the steps that are timed"
@@ -302,29 +309,35 @@ def main(words: list[str]) -> None:
     dtype = getattr(torch, options.dtype)
     torch.set_num_threads(options.threads)
     device = torch.device(options.device)
-    rows = {(row["size"], row["youngs"]): row for row in json.loads(out.read_text())["rows"]} if out.exists() else {}
+    kept = json.loads(out.read_text())["rows"] if out.exists() else []
+    rows: Rows = {(row["size"], row["youngs"], row.get("batch", 1)): row for row in kept}
     cases = [(size, youngs) for size in options.sizes for youngs in options.youngs]
     with tqdm(cases, desc="cases", unit="case") as bar:
         for size, youngs in bar:
             bar.set_postfix_str(f"{size}, {youngs:g} Pa")
-            if (size, youngs) not in rows:
-                rows[size, youngs] = run_case(size, youngs, device, options.seconds, dtype, options.batch)
+            key = size, youngs, options.batch
+            if key not in rows:
+                rows[key] = run_case(size, youngs, device, options.seconds, dtype, options.batch)
             elif options.auto:
-                row = rows[size, youngs]
+                row = rows[key]
                 row["auto"] = run_auto(Case(SIZES[size], youngs, device, dtype, options.batch), options.seconds)
                 row.update(judged(row))
             write(out, device, options.threads, rows)
-    found = [rows[key] for key in sorted(rows, key=lambda key: (SIZES[key[0]], key[1]))]
+    found = [row for row in in_order(rows) if row.get("batch", 1) == options.batch]
     print(table(found))
     print(matrix(found))
     print(costs(found) if options.batch == 1 else costs_of_batches(found))
 
 
-def write(out: Path, device: torch.device, threads: int, rows: dict[tuple[str, float], Row]) -> None:
-    """Everything so far, in order of size and stiffness."""
-    ordered = [rows[key] for key in sorted(rows, key=lambda key: (SIZES[key[0]], key[1]))]
+def in_order(rows: Rows) -> list[Row]:
+    """By batch, size and stiffness."""
+    return [rows[key] for key in sorted(rows, key=lambda key: (key[2], SIZES[key[0]], key[1]))]
+
+
+def write(out: Path, device: torch.device, threads: int, rows: Rows) -> None:
+    """Everything so far."""
     out.parent.mkdir(parents=True, exist_ok=True)
-    record = {"schema": 1, **describe_run(device, threads), "error": ERROR, "rows": ordered}
+    record = {"schema": 1, **describe_run(device, threads), "error": ERROR, "rows": in_order(rows)}
     out.write_text(json.dumps(record, indent=1) + "\n")
 
 

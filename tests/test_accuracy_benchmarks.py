@@ -220,3 +220,50 @@ def test_forecasts_are_judged_by_what_was_needed() -> None:
     assert found["Chebyshev, no contacts: needed / forecast to 0.001"]["95 %"] == 1.0
     assert found["Multilevel, contacts: needed / forecast to 0.001"]["50 %"] == np.inf
     assert found["auto, no contacts"] == {"scenes": 2, "error 0.001 reached": 1, "Multilevel": 2}
+
+
+@pytest.mark.parametrize("option", ["--blocks", "--mesh", "--setup", "--cells", "--youngs", "--contrasts"])
+def test_multilevel_does_not_run_something_else_for_an_option_without_values(option: str) -> None:
+    with pytest.raises(subprocess.CalledProcessError) as refusal:
+        run("multilevel.py", option)
+    assert f"argument {option}: expected at least one argument" in refusal.value.stderr
+
+
+@pytest.mark.usefixtures("on_path")
+@pytest.mark.parametrize("batch", ["0", "-3", "1.5"])
+def test_time_to_error_refuses_a_batch_of_none(batch: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from time_to_error import main
+
+    with pytest.raises(SystemExit):
+        main(["--batch", batch, "--sizes", "1k", "--out", str(tmp_path / "times.json")])
+    assert f"argument --batch: must be a whole number >= 1, got '{batch}'" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("on_path")
+def test_time_to_error_keeps_rows_of_every_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One file for two batches; rows of files from before there were batches count as of one environment."""
+    import time_to_error
+
+    measured: list[int] = []
+
+    def measure(size: str, youngs: float, *rest: Any) -> dict[str, Any]:
+        *_, batch = rest
+        measured.append(batch)
+        row = {**_time_to_error_row(300, 20, "Multilevel"), "size": size, "youngs": youngs, "batch": batch}
+        return {**row, **time_to_error.judged(row)}
+
+    monkeypatch.setattr(time_to_error, "run_case", measure)
+    out = tmp_path / "times.json"
+    for words, kept in (([], [1]), (["--batch", "4"], [1, 4]), (["--batch", "4"], [1, 4]), ([], [1, 4])):
+        time_to_error.main([*words, "--sizes", "1k", "--youngs", "1e6", "--out", str(out)])
+        record = json.loads(out.read_text())
+        assert [row.get("batch", 1) for row in record["rows"]] == kept
+        # the tables are of the batch that was asked for
+        printed = capsys.readouterr().out
+        assert printed.count("30 ms") == 1
+        assert ("4 of 1,000 vertices" in printed) == bool(words)
+        record["rows"][0].pop("batch", None)
+        out.write_text(json.dumps(record))
+    assert measured == [1, 4]

@@ -105,6 +105,35 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
     assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
 
 
+def test_batches_of_the_material_must_agree() -> None:
+    """Those that come with each other and with those that stay; nothing is replaced otherwise."""
+    sim, shared = small_simulator(), small_simulator()
+
+    def batch(name: str, count: int) -> dict[str, torch.Tensor]:
+        own = getattr(shared, name)
+        return {name: own.expand(count, *own.shape)}
+
+    for arrays, message in (
+        (batch("stiffness", 2) | batch("masses", 3), r"of 2 environments in stiffness, of 3 in masses"),
+        (
+            batch("damping", 1) | batch("gravity", 2) | batch("planes", 3),
+            r"of 2 environments in gravity, of 3 in planes",
+        ),
+    ):
+        before = sim.material()
+        with pytest.raises(ValueError, match=message):
+            sim.set_material(**arrays)
+        assert all(one is other for one, other in zip(before, sim.material(), strict=True))
+    sim.set_material(**batch("stiffness", 2))
+    with pytest.raises(ValueError, match=r"of 2 environments in stiffness \(kept\), of 3 in masses"):
+        sim.set_material(**batch("masses", 3))
+    assert sim.masses.dim() == 1
+    # one for all, or all of them anew, will do
+    sim.set_material(**batch("masses", 1))
+    sim.set_material(**batch("stiffness", 3), **batch("masses", 3))
+    sim(sim.rest_state(3))
+
+
 def test_solvers_are_checked() -> None:
     for make, message in (
         (lambda: pd.Jacobi(relaxation=0.0), r"Jacobi\.relaxation must lie in \(0, 2\)"),

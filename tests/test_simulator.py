@@ -53,6 +53,26 @@ def test_state_dict_restores_the_material(dtype: torch.dtype, device: torch.devi
     }  # fmt: skip
 
 
+@pytest.mark.parametrize("change", ["missing", "unexpected", "both"])
+def test_a_state_dict_with_other_names_changes_nothing(change: str) -> None:
+    sim, trained = simulate(torch.float32), simulate(torch.float32)
+    trained.set_material(stiffness=trained.stiffness.expand(2, -1) * 0.3, damping=2.0)
+    parameters, before = sim.material(), [array.clone() for array in sim.material()]
+    missing, unexpected = ["pin_targets"] * (change != "unexpected"), ["youngs"] * (change != "missing")
+    wrong = {name: value for name, value in trained.state_dict().items() if name not in missing}
+    wrong |= {name: torch.ones(3) for name in unexpected}
+    with pytest.raises(RuntimeError, match="nothing is loaded") as refusal:
+        sim.load_state_dict(wrong)
+    assert ("Missing key(s) in state_dict: 'pin_targets'" in str(refusal.value)) == bool(missing)
+    assert ("Unexpected key(s) in state_dict: 'youngs'" in str(refusal.value)) == bool(unexpected)
+    assert all(one is other for one, other in zip(parameters, sim.material(), strict=True))
+    assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
+    # those that are there, where that is asked for
+    left = sim.load_state_dict(wrong, strict=False)
+    assert (left.missing_keys, left.unexpected_keys) == (missing, unexpected)
+    assert torch.equal(sim.stiffness, trained.stiffness)
+
+
 def test_copies_are_independent(dtype: torch.dtype) -> None:
     sim = simulate(dtype)
     state = moving(sim)

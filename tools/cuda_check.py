@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import os
 import re
 import runpy
@@ -45,11 +46,15 @@ def command_for(nvcc: str, source: Path, folders: list[str]) -> list[str]:
     return [nvcc, "-c", str(source), "-o", os.devnull, *flags, *targets, "-Xptxas=-v", "-DTORCHPD_CUDA", *folders]
 
 
+def report_of(source: Path) -> Path:
+    return REPORTS / (source.relative_to(ROOT / "csrc").as_posix().replace("/", "-") + ".txt")
+
+
 def compile_source(command: list[str], source: Path) -> bool:
     """Compile one source, keep the report, and say what went wrong."""
     name = source.relative_to(ROOT / "csrc").as_posix()
     result = subprocess.run(command, capture_output=True, text=True, check=False)
-    report = REPORTS / (name.replace("/", "-") + ".txt")
+    report = report_of(source)
     report.write_text(f"{shlex.join(command)}\n{result.stdout}{result.stderr}", encoding="utf-8")
     passed = result.returncode == 0
     print(f"{'ok  ' if passed else 'FAIL'} {name}  ({report.relative_to(ROOT)})", flush=True)
@@ -79,19 +84,33 @@ def kernels_of(report: str) -> list[dict[str, str]]:
     return rows
 
 
-def write_table(path: Path) -> None:
-    """All kernels of all reports, by name."""
+def kernel_name(signature: str) -> str:
+    """A function as c++filt prints it, without what it returns and takes; template arguments stay."""
+    depth = 0
+    for place in reversed(range(len(signature) * signature.endswith(")"))):
+        depth += {")": 1, "(": -1}.get(signature[place], 0)
+        if depth == 0:
+            signature = signature[:place]
+            break
+    return signature.removeprefix("void ")
+
+
+def write_table(path: Path, reports: list[Path]) -> None:
+    """All kernels of some reports, by name."""
     rows = [
-        {"source": report.stem} | row
-        for report in sorted(REPORTS.glob("*.txt"))
-        for row in kernels_of(report.read_text(encoding="utf-8"))
+        {"source": report.stem} | row for report in reports for row in kernels_of(report.read_text(encoding="utf-8"))
     ]
     names = "\n".join(row["kernel"] for row in rows)
     if shutil.which("c++filt"):
         names = subprocess.run(["c++filt"], input=names, capture_output=True, text=True, check=True).stdout
     for row, name in zip(rows, names.splitlines(), strict=True):
-        row["kernel"] = name.split("(pd::")[0].removeprefix("void ")
+        row["kernel"] = kernel_name(name)
     rows.sort(key=lambda row: (row["source"], row["architecture"], row["kernel"]))
+    for one, other in itertools.pairwise(rows):
+        if all(one[column] == other[column] for column in ("source", "architecture", "kernel")):
+            raise ValueError(
+                f"{one['source']} has two kernels of the name {one['kernel']} for sm_{one['architecture']}"
+            )
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
@@ -114,7 +133,7 @@ def main() -> int:
     targets = ", ".join(f"sm_{target}" for target in TARGETS)
     print(f"cuda-check: {sum(passed)} of {len(sources)} CUDA sources compile for {targets} with {nvcc}")
     if options.table and all(passed):
-        write_table(options.table)
+        write_table(options.table, [report_of(source) for source in sources])
     return 0 if all(passed) else 1
 
 

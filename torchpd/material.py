@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,7 +11,7 @@ from torch import Tensor
 from .scene import SceneValues
 from .tables import MATERIAL_TABLE
 
-__all__ = ["MATERIAL_ROWS", "check_material", "material_of"]
+__all__ = ["MATERIAL_ROWS", "check_batches", "check_material", "material_of"]
 
 MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
 
@@ -55,3 +57,18 @@ def check_material(name: str, tensor: Tensor) -> None:
     elif name == "spheres":
         _require(tensor[..., 3] > 0, "spheres: the radius (column 3)", "positive", tensor)
         _require(tensor[..., 4] >= 0, "spheres: friction (column 4)", ">= 0", tensor)
+
+
+def check_batches(new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None:
+    """Refuse arrays of different numbers of environments; those without a batch, or with one of 1, serve any number."""
+    first: tuple[int, str] | None = None
+    for name in MATERIAL_ROWS:
+        array, stays = new.get(name, kept[name]), "" if name in new else " (kept)"
+        count = len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1
+        if first is not None and count not in (1, first[0]):
+            raise ValueError(
+                f"set_material: arrays must be of one number of environments, or of all, got those of {first[0]} "
+                f"environments in {first[1]}, of {count} in {name}{stays}; replace them in one call"
+            )
+        if count != 1:
+            first = count, name + stays

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from .automatic import Choice, choose_solver
 from .checks import check_whole
 from .forecast import warn_of_few_iterations
-from .material import MATERIAL_ROWS, check_material, material_of
+from .material import MATERIAL_ROWS, check_batches, check_material, material_of
 from .multilevel import has_levels
 from .placing import check_wanted_device, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
@@ -161,9 +161,11 @@ class Model(nn.Module):
         An array of the same shape is overwritten, so that optimisers keep it; another batch makes a new parameter.
 
         Args:
-            arrays: by name, see `Simulator`. Shapes and values are checked here, once.
+            arrays: by name, see `Simulator`. Shapes and values are checked here, once, and that batches agree with each
+                other and with those of the arrays that stay.
         """
         checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
+        check_batches(checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
         parameters = {
             name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)
             for name, tensor in checked.items()
@@ -203,6 +205,26 @@ class Model(nn.Module):
             )
         check_material(name, tensor)
         return tensor.contiguous()
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """As of `torch.nn.Module`, but all arrays or none: torch loads what it can before it refuses other names.
+
+        As a part of another module the simulator is not asked whether names are missing; then torch's order holds.
+        """
+        # a hook may give keys other names
+        if strict and not self._load_state_dict_pre_hooks:
+            wanted = self.state_dict()
+            faults = [
+                f"{fault} key(s) in state_dict: {', '.join(map(repr, keys))}"
+                for fault, keys in (
+                    ("Missing", [key for key in wanted if key not in state_dict]),
+                    ("Unexpected", [key for key in state_dict if key not in wanted]),
+                )
+                if keys
+            ]
+            if faults:
+                raise RuntimeError(f"{type(self).__name__}.load_state_dict: nothing is loaded. {'. '.join(faults)}")
+        return super().load_state_dict(state_dict, strict, assign)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Checks values, and takes arrays of every environment where this simulator had shared ones."""

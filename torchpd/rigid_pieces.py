@@ -5,42 +5,32 @@ straining it would, in A; in truth, by the Hessian H, next to nothing. For each 
 about the contrast of the stiffnesses, and that many directions are slow however good M is.
 
 So the pieces are moved as rigid bodies from time to time, by Newton's method on their rigid motions. Z has four
-functions for each piece, 1 and X - c, extended to the rest of the mesh so that the energy of A without the pieces' own
-elements is least. With f_k, where the piece has the axis k of X - c now, its velocity is Z (v, w x f_k), the matrix of
-these motions follows from Z^T A Z, and the step is Z (v, (R - 1) f_k), R the rotation of w: linear in Z, and it does
-not strain the piece.
+functions for each piece, see `stiff_pieces`. With f_k, where the piece has the axis k of X - c now, its velocity is
+Z (v, w x f_k), the matrix of these motions follows from Z^T A Z, and the step is Z (v, (R - 1) f_k), R the rotation of
+w: linear in Z, and it does not strain the piece.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from .checks import check_scalar, check_whole
 from .diagonal import step_diagonal
 from .multilevel import reference_of
+from .simulator import Simulator
 from .state import Info, State
+from .stiff_pieces import find_pieces
 
 if TYPE_CHECKING:
-    from .scene import SceneValues
-    from .simulator import Simulator
     from .targets import Targets
 
 __all__ = ["RigidPieces"]
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
-_CONTRAST = 100.0  # of the stiffnesses, below which there are no pieces by default
 _NOISE = {torch.float32: 1e-5, torch.float64: 1e-12}  # of an energy by rounding, as in csrc/solver/multilevel.h
-_MOST = 256  # pieces: 1536 unknowns of a dense solve
+_MADE_OF = ("stiffness", "masses", "damping", "pin_stiffness")  # what the pieces and their functions depend on
 
 
 class RigidPieces:
@@ -48,8 +38,13 @@ class RigidPieces:
 
     A piece is a connected set of elements that are stiffer than the rest; one that hard pins hold is left to the
     solver. Worth it from contrasts of about a thousand, with `Multilevel`. Made for the material, time step, precision
-    and device of now. Contacts are not known to these motions: such scenes are refused. Results may depend on the batch
-    by rounding. Holds eight numbers for each vertex and piece, in the precision of the simulator.
+    and device of now: after a change of these a step is refused until `prepare`. Contacts are not known to these
+    motions: such scenes are refused. Results may depend on the batch by rounding. `Simulator.rollout`, `capture`,
+    `tune`, `save` and `load` do not know of it: they take the simulator's own steps.
+
+    Holds four numbers for each vertex and piece, in the precision of the simulator. Making it takes a sparse
+    factorisation of the matrix of the surroundings and a solve for each of these columns, on the CPU in float64, a few
+    columns at a time.
 
     Args:
         sim: whose steps; it keeps its settings.
@@ -57,40 +52,51 @@ class RigidPieces:
             and the highest, where these are a hundredfold apart.
 
     Raises:
-        ValueError: a scene with contacts, without a free piece, or with more than 256.
+        ValueError: a scene with contacts, without a free piece, with more than 256, or that does not fit into memory.
     """
 
-    def __init__(self, sim: Simulator, stiffer_than: float | None = None) -> None:
+    def __init__(self, sim: Simulator, *, stiffer_than: float | None = None) -> None:
+        if not isinstance(sim, Simulator):
+            raise TypeError(f"RigidPieces: sim must be a Simulator, got {type(sim).__name__}")
         if sim.planes.shape[-2] or sim.spheres.shape[-2]:
             raise ValueError("RigidPieces: the scene has contacts, which rigid motions do not know of; use sim alone")
         self.sim = sim
-        stiffness, inertia = (
-            array.detach().cpu().double().numpy() for array in reference_of(sim.plan, sim.material(), sim.time_step)
+        self.stiffer_than = (
+            None if stiffer_than is None else check_scalar("RigidPieces.stiffer_than", stiffer_than, minimum=0.0)
         )
-        values = sim.scene.values()
-        stiff = stiffness > _threshold(stiffness, stiffer_than)
-        self.pieces = _free_pieces(values.tets[stiff], inertia)
-        inside = np.zeros(len(inertia), dtype=bool)
-        inside[[vertex for piece in self.pieces for vertex in piece]] = True
-        if not 1 <= len(self.pieces) <= _MOST:
-            raise ValueError(
-                f"RigidPieces: there must be 1 to {_MOST} connected pieces that no hard pin holds, found "
-                f"{len(self.pieces)} among {int(stiff.sum())} stiff elements; choose stiffer_than [Pa]"
-            )
-        strained = ~(stiff & inside[values.tets].all(axis=1))
-        matrix = _matrix(values, np.where(strained, stiffness, 0.0), inertia)
-        functions, fits = _functions(values.rest_positions, self.pieces, matrix, np.isfinite(inertia) & ~inside)
-        nodes = len(self.pieces)
-        coarse = (functions.T @ (matrix @ functions)).reshape(nodes, 4, nodes, 4)
-        self._coarse = torch.from_numpy(coarse).to(sim.device)
-        self._functions, self._fits = (
-            torch.from_numpy(array).to(sim.device, sim.dtype).contiguous() for array in (functions, fits)
+        self.prepare()
+
+    def prepare(self) -> None:
+        """Make it anew, of the material, time step, precision and device that the simulator has now.
+
+        Needed after a change of these, as `Simulator.prepare_solver` is worth it for a solver, and takes as long as
+        making it. A refusal changes nothing.
+        """
+        sim = self.sim
+        if sim.device.type == "meta":
+            raise ValueError('RigidPieces: sim is on "meta", where arrays have no values; move it to the CPU or a GPU')
+        reference = tuple(array.clone() for array in reference_of(sim.plan, sim.material(), sim.time_step))
+        stiffness, inertia = (array.cpu().double().numpy() for array in reference)
+        found = find_pieces(sim.scene.values(), stiffness, inertia, self.stiffer_than, sim.dtype, sim.device)
+        functions, fits = (
+            torch.from_numpy(array).to(sim.device, sim.dtype).contiguous() for array in (found.functions, found.fits)
         )
+        rows, owners, coarse = (
+            torch.from_numpy(array).to(sim.device) for array in (found.rows, found.owners, found.coarse)
+        )
+        self.pieces, self.threshold = found.vertices, found.threshold
+        self._functions, self._fits, self._rows, self._owners, self._coarse = functions, fits, rows, owners, coarse
+        self._reference, self._time_step, self._seen = reference, sim.time_step, _look(sim)
+
+    def __repr__(self) -> str:
+        count = len(self.pieces)
+        return f"RigidPieces({count} piece{'s' * (count != 1)} stiffer than {self.threshold:g} Pa)"
 
     def step(
         self,
         state: State,
         rounds: int,
+        *,
         forces: Tensor | None = None,
         targets: Targets | None = None,
         start: str | Tensor = "velocity",
@@ -108,16 +114,18 @@ class RigidPieces:
             start: first iterate.
             return_info: also how the last round went.
         """
+        self._check_made_of()
+        self._check_state(state)
         for _ in range(check_whole("rounds", rounds, minimum=1) - 1):
             with torch.no_grad():
                 after: State = self.sim(state, forces, targets, start)
-            start = self.move(state, after.positions, forces, targets)
+                start = self._moved(state, after.positions, forces, targets)
         result: State | tuple[State, Info] = self.sim(state, forces, targets, start, return_info)
         return result
 
     @torch.no_grad()
     def move(
-        self, state: State, positions: Tensor, forces: Tensor | None = None, targets: Targets | None = None
+        self, state: State, positions: Tensor, *, forces: Tensor | None = None, targets: Targets | None = None
     ) -> Tensor:
         """A rigid motion of every piece that lowers the objective of a step, and its surroundings with it [B, V, 3] m.
 
@@ -127,10 +135,64 @@ class RigidPieces:
             forces: as in `step`.
             targets: as in `step`.
         """
+        self._check_made_of()
+        self._check_state(state)
+        self._check_field("positions", positions, state[0].shape)
+        if forces is not None:
+            self._check_field("forces", forces, state[0].shape)
+        return self._moved(state, positions, forces, targets)
+
+    def _check_made_of(self) -> None:
+        """Refuse what the simulator has become since `prepare`. Waits for a device only after something was written."""
+        sim, (stiffness, inertia) = self.sim, self._reference
+        if (sim.dtype, sim.device) != (stiffness.dtype, stiffness.device):
+            raise RuntimeError(
+                f"RigidPieces was made for {stiffness.dtype} on {stiffness.device}, and its simulator is "
+                f"{sim.dtype} on {sim.device} now; call prepare() to make it anew"
+            )
+        seen = _look(sim)
+        if all(one[0] is other[0] and one[1:] == other[1:] for one, other in zip(seen, self._seen, strict=True)):
+            return
+        now = reference_of(sim.plan, sim.material(), sim.time_step)
+        faults = [
+            f"time_step was {self._time_step:g} s and is {sim.time_step:g} s" * (sim.time_step != self._time_step),
+            "stiffness has changed" * (not torch.equal(now[0], stiffness)),
+            "masses, damping or pin_stiffness have changed"
+            * (sim.time_step == self._time_step and not torch.equal(now[1], inertia)),
+        ]
+        if any(faults):
+            raise RuntimeError(
+                f"RigidPieces was made for another simulation: {', '.join(filter(None, faults))}; "
+                "call prepare() to make it anew"
+            )
+        self._seen = seen  # the same values were written again
+
+    def _check_state(self, state: Any) -> None:
+        if not isinstance(state, tuple) or len(state) != 2 or not all(isinstance(part, Tensor) for part in state):
+            raise TypeError(
+                f"state must be a State, positions and velocities [B, {self.sim.vertices}, 3], got "
+                f"{type(state).__name__}"
+            )
+        batch = state[0].shape[:1] if state[0].dim() == 3 else (1,)
+        for name, part in zip(State._fields, state, strict=True):
+            self._check_field(f"state.{name}", part, (*batch, self.sim.vertices, 3))
+
+    def _check_field(self, name: str, field: Any, shape: tuple[int, ...]) -> None:
+        wanted = f"{name} must be {list(shape)}, {self.sim.dtype} on {self.sim.device} like state and simulator"
+        if not isinstance(field, Tensor):
+            raise TypeError(f"{wanted}, got {type(field).__name__}")
+        if (field.dtype, field.device) != (self.sim.dtype, self.sim.device):
+            raise TypeError(f"{wanted}, got {field.dtype} on {field.device}")
+        if field.shape != shape:
+            raise ValueError(f"{wanted}, got {list(field.shape)}")
+
+    def _moved(self, state: State, positions: Tensor, forces: Tensor | None, targets: Targets | None) -> Tensor:
+        """`move`, of arguments that were checked."""
         gradient = self.sim.step_gradient(state, positions, forces, targets)
         batch, nodes = len(positions), len(self.pieces)
         pull = (self._functions.T @ gradient).double().view(batch, nodes, 4, 3)
-        shape = (self._fits @ positions).double().view(batch, nodes, 4, 3)[:, :, 1:]
+        fitted = torch.einsum("cas,bcsx->bcax", self._fits, positions[:, self._rows]).double()
+        shape = (self._owners @ fitted.flatten(2)).view(batch, nodes, 4, 3)[:, :, 1:]
         motion = _newton(pull, shape, self._coarse)
         turned = shape @ _rotation(motion[..., 3:]).mT - shape
         change = torch.cat([motion[..., None, :3], turned], dim=2).view(batch, 4 * nodes, 3)
@@ -157,50 +219,13 @@ class RigidPieces:
         return falls
 
 
-def _threshold(stiffness: Array, given: float | None) -> float:
-    if given is not None:
-        return check_scalar("RigidPieces.stiffer_than", given, minimum=0.0)
-    low, high = float(stiffness.min()), float(stiffness.max())
-    return float(np.sqrt(low * high)) if high >= _CONTRAST * low else np.inf
-
-
-def _free_pieces(tets: Index, inertia: Array) -> list[Index]:
-    """Vertices of each connected set of elements, but for those with a vertex that is held."""
-    count = len(inertia)
-    first, other = np.repeat(tets[:, 0], 3), tets[:, 1:].reshape(-1)
-    graph = coo_array((np.ones(len(first)), (first, other)), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
-    used = np.unique(tets)
-    pieces = (used[label[used] == piece] for piece in np.unique(label[used]))
-    return [piece for piece in pieces if np.isfinite(inertia[piece]).all()]
-
-
-def _matrix(values: SceneValues, stiffness: Array, inertia: Array) -> csc_array:
-    """A of projective dynamics [V, V] N/m, with zero for the inertia of what is held."""
-    corners = values.rest_positions[values.tets]
-    edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
-    inner = np.linalg.inv(edges)
-    gradients = np.concatenate([-inner.sum(axis=1, keepdims=True), inner], axis=1)
-    weight = stiffness * np.linalg.det(edges) / 6.0
-    entries = weight[:, None, None] * (gradients @ gradients.transpose(0, 2, 1))
-    rows, columns = np.repeat(values.tets, 4, axis=1).reshape(-1), np.tile(values.tets, (1, 4)).reshape(-1)
-    elastic = coo_array((entries.reshape(-1), (rows, columns)), shape=(len(inertia), len(inertia)))
-    return csc_array(elastic.tocsc() + diags_array(np.where(np.isfinite(inertia), inertia, 0.0)))
-
-
-def _functions(rest: Array, pieces: list[Index], matrix: csc_array, around: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Z [V, 4 P], and what finds its coefficients from positions of the pieces [4 P, V]."""
-    functions, fits = (np.zeros((len(rest), 4 * len(pieces))) for _ in range(2))
-    for node, piece in enumerate(pieces):
-        own = slice(4 * node, 4 * node + 4)
-        arms = rest[piece] - rest[piece].mean(axis=0)
-        functions[piece, own] = np.column_stack([np.ones(len(piece)), arms / np.abs(arms).max()])
-        fits[piece, own] = np.linalg.pinv(functions[piece, own]).T
-    others = np.flatnonzero(around)
-    if len(others):
-        rows = csc_array(matrix[others])
-        functions[others] = splu(csc_array(rows[:, others])).solve(-(rows @ functions))
-    return functions, np.ascontiguousarray(fits.T)
+def _look(sim: Simulator) -> list[tuple[Any, ...]]:
+    """What tells without reading values whether anything was written: the objects, their versions and places."""
+    arrays = [getattr(sim, name) for name in _MADE_OF]
+    # tensors of inference mode count no versions
+    versions = [0 if array.is_inference() else array._version for array in arrays]
+    seen = [(array, version, array.data_ptr()) for array, version in zip(arrays, versions, strict=True)]
+    return [(None, sim.time_step), *seen]
 
 
 def _cross(vectors: Tensor) -> Tensor:
