@@ -27,6 +27,7 @@ if load_extension()[0] is not None:
     from .patch_transport import PatchTransport
     from .patches import FreeFormPatches, PatchPose, PatchSamples
     from .plan import Plan, compile_plan
+    from .quadric_transport import QuadricTransport
     from .quadrics import Quadrics
     from .rigid_pieces import RigidPieces
     from .simulator import Simulator
@@ -64,6 +65,7 @@ __all__ = [
     "PatchTransport",
     "Pin",
     "Plan",
+    "QuadricTransport",
     "Quadrics",
     "RigidPieces",
     "Scene",

@@ -105,6 +105,11 @@ class PatchBody(Solid):
                 scene `state.positions[:, scene.vertex_range(body)]`.
             fallback: see `PatchTransport.gradients`.
         """
+        pose: PatchPose = self.transport(self.points(positions), fallback)
+        return pose
+
+    def points(self, positions: Tensor) -> Tensor:
+        """Vertices of the patches and their apexes, as `transport` takes them, from positions as for `pose`."""
         want = self.patches.vertices
         count = len(self.mesh.vertices)
         if positions.dim() != 3 or tuple(positions.shape[1:]) != (count, 3):
@@ -117,9 +122,7 @@ class PatchBody(Solid):
                 f"PatchBody.pose: positions must be {want.dtype} on {want.device} like the patches, got "
                 f"{positions.dtype} on {positions.device}; make the body of patches.to(...)"
             )
-        vertices = positions[:, : len(want)]
-        pose: PatchPose = self.transport(torch.cat([vertices, self._apexes(positions)], dim=1), fallback)
-        return pose
+        return torch.cat([positions[:, : len(want)], self._apexes(positions)], dim=1)
 
     def _apexes(self, positions: Tensor) -> Tensor:
         """What the frames take for apexes: those of the skeleton, or the middle of the layer under each patch."""

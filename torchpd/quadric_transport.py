@@ -1,0 +1,116 @@
+"""How a pose carries the quadrics of the published field along: a frame for every quadric, the same all over space."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import patch_ops  # noqa: F401  (registers the ops)
+from .ops import nearest_rotation
+from .patch_lists import corner_lists
+from .patch_transport import PatchTransport
+from .patches import FreeFormPatches
+
+__all__ = ["QuadricTransport"]
+
+_ops = torch.ops.torchpd
+_STEPS = 9  # midpoints along an edge, at which the weights are measured
+
+
+class QuadricTransport:
+    """Carries the quadrics of `FreeFormPatches.field` along, as splats are carried.
+
+    Every patch moves by an affine map, x -> v + G (x - V). A quadric goes by T, the mean of the maps of the patches
+    that it touches, weighted by the integral of [Q]_+^3 over each: its matrix becomes W' = T^-T W T^-1. So a quadric
+    stays one quadric, its field is as smooth in a pose as at rest, and an affine motion of vertices and apexes carries
+    it along exactly while no singular value is clamped. (In `FreeFormPatches.surface` quadrics never move.)
+
+    The weights are found once, from `patches` as they are, and are constants; centres and factors have gradients.
+
+    Args:
+        transport: of the same patches: their gradients, clamps and mode.
+        patches: at rest.
+
+    Raises:
+        ValueError: patches with other vertices or triangles than those of the transport.
+    """
+
+    def __init__(self, transport: PatchTransport, patches: FreeFormPatches) -> None:
+        tets = transport.tets
+        same = transport.vertices == len(patches.vertices) and len(tets) == len(patches.triangles)
+        if not same or not torch.equal(tets[:, :3], patches.triangles.to(tets)):
+            raise ValueError(
+                "QuadricTransport: patches must have the vertices and triangles of the transport "
+                f"({transport.vertices} and {len(tets)}), got {len(patches.vertices)} and {len(patches.triangles)}"
+            )
+        self.transport, self.patches = transport, patches
+        self.table, self.weights = _shares(patches)
+        count = len(patches.quadrics)
+        own = np.arange(4 * count, dtype=np.int64).reshape(count, 4)
+        arrays = (own, *corner_lists(own, 4 * count))
+        # constraints of the op that clamps, one for each quadric
+        self._own = [torch.as_tensor(a, dtype=torch.int32, device=tets.device).contiguous() for a in arrays]
+
+    def __call__(self, positions: Tensor, fallback: Tensor | None = None) -> Tensor:
+        """Matrices W' [B, Q, 4, 4], for `matrices` of `FreeFormPatches.field` and `PatchRays.cast_field`.
+
+        Args:
+            positions: of vertices and apexes, in this order, [B, V + K, 3] [m].
+            fallback: see `PatchTransport.gradients`.
+        """
+        patches, table = self.patches, self.table
+        q = patches.quadrics
+        first = patches.triangles[:, 0].long()
+        G = self.transport.gradients(positions, fallback)[:, table]  # [B, Q, m, 3, 3]
+        v, V = positions[:, first][:, table], patches.vertices[first][table]
+        moved = v + (G @ (q.centres[:, None] - V)[..., None])[..., 0]
+        centres = torch.einsum("qm,bqmi->bqi", self.weights, moved)
+        inverse = torch.linalg.inv(self._clamped(torch.einsum("qm,bqmij->bqij", self.weights, G)))
+        # T^-1, which takes a point of the pose back: x -> A^-1 (x - c') + c
+        back = torch.cat([inverse, (q.centres - (inverse @ centres[..., None])[..., 0])[..., None]], dim=3)
+        last = back.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*back.shape[:2], 1, 4)
+        back = torch.cat([back, last], dim=2)
+        return back.mT @ q.normalized_matrices() @ back
+
+    def _clamped(self, mean: Tensor) -> Tensor:
+        """The mean of clamped gradients can still be flat: where patches turn to different sides."""
+        if self.transport.mode == "rotation":
+            return nearest_rotation(mean)
+        corners = torch.cat([torch.zeros_like(mean[..., :1]), mean], dim=3).mT.flatten(1, 2)
+        eye = torch.eye(3, dtype=mean.dtype, device=mean.device).repeat(mean.shape[1], 1, 1)
+        lower, upper = self.transport.stretch
+        clamped: Tensor = _ops.patch_deformation(corners, eye, None, self._own, lower=lower, upper=upper)
+        return clamped
+
+
+@torch.no_grad()
+def _shares(patches: FreeFormPatches) -> tuple[Tensor, Tensor]:
+    """Patches of each quadric [Q, m], filled up with the first one, and their weights [Q, m], which sum to 1."""
+    q = patches.quadrics
+    corners = patches.vertices[patches.triangles.long()]
+    edges = corners[:, 1:] - corners[:, :1]
+    areas = 0.5 * torch.linalg.cross(edges[:, 0], edges[:, 1]).norm(dim=1)
+    patch, number = patches.lists[3].long(), patches.lists[2].long()  # of every pair that touches
+    # middles of the cells of a triangle that is cut into _STEPS x _STEPS of them
+    rows = [((3 * i + 1, 3 * j + 1), (3 * i + 2, 3 * j + 2)) for i in range(_STEPS) for j in range(_STEPS)]
+    b = np.array([p for cell in rows for p in cell if sum(p) < 3 * _STEPS]) / (3 * _STEPS)
+    places = torch.as_tensor(np.column_stack([1.0 - b.sum(1), b])).to(corners) @ corners[patch]
+    y = torch.einsum("nij,nkj->nki", q.triangular()[number], places - q.centres[number][:, None])
+    bump = (1.0 - y.square().sum(2)).clamp_min(0.0).pow(3).mean(1) * areas[patch]
+    # one that no triangle reaches goes by those that it touches, else by the nearest
+    total = torch.zeros_like(q.amplitudes).index_add_(0, number, bump)
+    bump = torch.where(total[number] > 0.0, bump, areas[patch])
+    lonely = torch.ones_like(q.amplitudes, dtype=torch.bool).index_fill_(0, number, False).nonzero()[:, 0]
+    nearest = torch.cdist(q.centres[lonely], corners.mean(1)).argmin(1)
+    patch, number = torch.cat([patch, nearest]), torch.cat([number, lonely])
+    bump = torch.cat([bump, areas[nearest]])
+    order = torch.argsort(number, stable=True)
+    patch, number, bump = patch[order], number[order], bump[order]
+    counts = torch.bincount(number, minlength=len(q))
+    rank = torch.arange(len(number), device=number.device) - (counts.cumsum(0) - counts)[number]
+    most = int(counts.max()) if len(q) else 0
+    table = torch.zeros((len(q), most), dtype=torch.int64, device=number.device)
+    weights = torch.zeros((len(q), most), dtype=bump.dtype, device=number.device)
+    table[number, rank], weights[number, rank] = patch, bump
+    return table, weights / weights.sum(1, keepdim=True)
