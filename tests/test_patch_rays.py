@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -28,6 +29,7 @@ import torchpd as pd
 from torchpd.patch_mesh import grid
 
 STEPS = 6001
+LONG = pytest.mark.skipif("TORCHPD_LARGE_TESTS" not in os.environ, reason="TORCHPD_LARGE_TESTS=1 runs it, in minutes")
 TOUCH = 1e-9  # m: how near to the surface a ray must come for a hit that no march sees
 
 
@@ -94,6 +96,56 @@ def graph(measured_at: str = "base", base: str = "flat", dtype: torch.dtype = F6
     return made.to(dtype)
 
 
+@pytest.mark.parametrize("exhaustive", [False, True])
+@pytest.mark.parametrize("reading", ["clip", "literal"])
+def test_patches_without_a_plane_are_not_met(
+    reading: str, exhaustive: bool, dtype: torch.dtype, device: torch.device
+) -> None:
+    """The highest patches of a ball collapse, or are not finite; rays from below and past them do not notice."""
+    mesh = ball()
+    patches = pd.FreeFormPatches.from_mesh(mesh, quadrics_on(mesh, 30), dtype=F64, thickness=0.02)
+    patches = patches.to(device=device, dtype=dtype)
+    top = int(patches.vertices[:, 2].argmax())
+    beside = next(int(v) for t in patches.triangles.tolist() if top in t for v in t if v != top)
+    bad = patches.vertices.expand(3, -1, -1).clone()
+    bad[0, top], bad[1, top], bad[2, top] = bad[0, beside], math.nan, math.inf
+    below = np.column_stack([np.random.default_rng(0).uniform(-0.6, 0.6, (50, 2)), np.full(50, -5.0)])
+    past = np.array([[5.0, 5.0, 5.0], [0.1, 3.0, 5.0]])
+    o = torch.tensor(np.concatenate([below, past])).to(patches.vertices)
+    d = torch.tensor([[0.0, 0.0, 1.0]]).to(o).repeat(52, 1)
+    d[-1] = -d[-1]
+    rays = pd.PatchRays(patches)
+    want, number = rays.cast_field(o, d, far=4.5, reading=reading, exhaustive=exhaustive)
+    assert float(want[0, :50].isfinite().double().mean()) > 0.3
+    assert not bool(want[0, 50:].isfinite().any())
+    found, numbers = rays.cast_field(o, d, far=4.5, reading=reading, exhaustive=exhaustive, positions=bad)
+    assert torch.equal(found, want.expand(3, -1))
+    assert torch.equal(numbers, number.expand(3, -1))
+
+
+def test_a_pose_that_is_not_finite_leaves_the_others_alone(dtype: torch.dtype, device: torch.device) -> None:
+    patches = patches_on(dtype=dtype, device=device)
+    rays, transport = pd.PatchRays(patches), central(patches)
+    positions = transport.rest_positions.expand(3, -1, -1).clone()
+    positions[1], positions[2] = math.nan, math.inf
+    o, d = (t.to(patches.vertices) for t in towards_ball(500))
+    depth, patch, b = rays.search(o, d, transport(positions))
+    alone = rays.search(o, d, transport(positions[:1]))
+    assert all(torch.equal(found[:1], want) for found, want in zip((depth, patch, b), alone, strict=True))
+    assert bool(depth[1:].isinf().all())
+    assert bool((patch[1:] == -1).all())
+
+
+@pytest.mark.parametrize("length", [1e-30, 1e-20, 1e20, 1e30])
+def test_directions_of_any_length(length: float, dtype: torch.dtype, device: torch.device) -> None:
+    patches = patches_on(dtype=dtype, device=device)
+    o, d = (t.to(patches.vertices) for t in towards_ball(200))
+    want, found = pd.PatchRays(patches).search(o, d)[0], pd.PatchRays(patches).search(o, length * d)[0]
+    assert torch.equal(found.isfinite(), want.isfinite())
+    hit = want.isfinite()
+    assert float((found - want)[hit].abs().max()) < 100 * torch.finfo(dtype).eps * 4.0
+
+
 def march_over_graph(measured_at: str, count: int, chosen: slice = slice(None)) -> int:
     patches = graph(measured_at)
     start, end = (ends[chosen] for ends in segments(count, 0.1))
@@ -130,7 +182,7 @@ def test_two_crossings_close_to_each_other() -> None:
     assert march_over_graph("base", 100_000, slice(19810, 19811)) == 0
 
 
-@pytest.mark.slow
+@LONG
 @pytest.mark.parametrize("measured_at", ["base", "surface"])
 def test_long_march_over_a_graph(measured_at: str) -> None:
     assert march_over_graph(measured_at, 100_000) == 0
@@ -171,7 +223,7 @@ def test_march_through_the_field(reading: str) -> None:
     assert march_through_field(reading, 10_000) == 0
 
 
-@pytest.mark.slow
+@LONG
 @pytest.mark.parametrize("reading", ["clip", "literal"])
 def test_long_march_through_the_field(reading: str) -> None:
     assert march_through_field(reading, 100_000) == 0

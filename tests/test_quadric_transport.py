@@ -53,7 +53,7 @@ def test_a_quadric_between_two_patches_goes_by_the_mean() -> None:
     apexes = torch.tensor([[0.3, 0, -1], [-0.3, 0, -1]], dtype=F64)
     transport = pd.PatchTransport(patches, apexes)
     rule = pd.QuadricTransport(transport, patches)
-    assert rule.weights[0].tolist() == pytest.approx([0.5, 0.5], abs=1e-15)
+    assert rule.weights.tolist() == pytest.approx([0.5, 0.5], abs=1e-15)
     positions = transport.rest_positions + 0.1 * torch.tensor(np.random.default_rng(0).standard_normal((6, 3)))
     G = transport.gradients(positions[None])[0]
     first = patches.triangles[:, 0].long()
@@ -76,7 +76,7 @@ def test_weights_are_integrals_of_the_bump() -> None:
     y, x = torch.meshgrid(*2 * [(torch.arange(400, dtype=F64) + 0.5) / 400], indexing="ij")
     bump = (quadric.values(torch.stack([x, y, torch.zeros_like(x)], dim=-1)) / 0.1)[..., 0]
     lower, upper = (bump * (y < x)).sum(), (bump * (y > x)).sum()  # the diagonal is of neither
-    found = pd.QuadricTransport(transport, patches).weights[0]
+    found = pd.QuadricTransport(transport, patches).weights
     assert float(lower / (lower + upper)) > 0.8
     torch.testing.assert_close(found, torch.stack([lower, upper]) / (lower + upper), rtol=0, atol=0.01)
 
@@ -139,15 +139,57 @@ def test_gradients() -> None:
 
 
 def test_quadrics_that_touch_nothing_and_none_at_all() -> None:
-    far = pd.Quadrics.from_radii(torch.tensor([0.1]), torch.tensor([[9.0, 0, 0]]), torch.tensor([0.2]))
-    patches = pd.FreeFormPatches.from_mesh(ball(), far)
+    """One far from all patches goes by the motion of the nearest."""
+    far = pd.Quadrics.from_radii(*(torch.tensor(a, dtype=F64) for a in ([0.1], [[9.0, 0.5, 0.2]], [0.2])))
+    patches = pd.FreeFormPatches.from_mesh(ball(), far, dtype=F64)
     transport = central(patches)
-    W = pd.QuadricTransport(transport, patches)(transport.rest_positions[None])
-    assert bool(W.isfinite().all())
-    bare = patches.with_quadrics(pd.Quadrics.none())
+    rule = pd.QuadricTransport(transport, patches)
+    middles = patches.vertices[patches.triangles.long()].mean(1)
+    nearest = int((middles - far.centres).norm(dim=1).argmin())
+    positions = transport.rest_positions.clone()
+    positions[patches.triangles[nearest].long()] *= 1.1
+    G = transport.gradients(positions[None])[0, nearest]
+    corner = int(patches.triangles[nearest, 0])
+    T = torch.eye(4, dtype=F64)
+    T[:3, :3] = G
+    T[:3, 3] = positions[corner] - G @ patches.vertices[corner]
+    back = torch.linalg.inv(T)
+    want = back.T @ far.normalized_matrices()[0] @ back
+    torch.testing.assert_close(rule(positions[None])[0, 0], want, rtol=0, atol=1e-9)  # numbers up to 2000
+    bare = patches.with_quadrics(pd.Quadrics.none(F64))
     assert pd.QuadricTransport(transport, bare)(transport.rest_positions[None]).shape == (1, 0, 4, 4)
 
 
-def test_patches_of_another_mesh_are_refused() -> None:
-    with pytest.raises(ValueError, match="must have the vertices and triangles of the transport"):
-        pd.QuadricTransport(central(patches_on(ball())), patches_on(ball(2)))
+def test_patches_that_turn_to_opposite_sides_leave_a_finite_quadric() -> None:
+    """Two patches that turn by a quarter, one against the other: their mean is flat, and clamped."""
+    mesh = pd.TriMesh([[0.0, -1, 0], [0, 1, 0], [1, 0, 0], [-1, 0, 0]], [[0, 2, 1], [0, 1, 3]])
+    quadric = pd.Quadrics.from_radii(*(torch.tensor(a, dtype=F64) for a in ([0.1], [[0.0, 0, 0]], [0.5])))
+    patches = pd.FreeFormPatches.from_mesh(mesh, quadric, dtype=F64)
+    transport = pd.PatchTransport(patches, torch.tensor([[0.3, 0, -1], [-0.3, 0, -1]], dtype=F64))
+    positions = transport.rest_positions.clone()
+    positions[2], positions[4] = torch.tensor([0.0, 0, 1]), torch.tensor([1.0, 0, 0.3])
+    positions[3], positions[5] = torch.tensor([0.0, 0, 1]), torch.tensor([-1.0, 0, 0.3])
+    mean = transport.gradients(positions[None])[0].mean(0)
+    assert float(torch.linalg.svdvals(mean)[-1]) < 0.2
+    W = pd.QuadricTransport(transport, patches)(positions[None])[0, 0]
+    # W = -M^T M there: radii of 0.5 m times singular values within the bounds of the transport
+    radii = torch.linalg.eigvalsh(-W[:3, :3]).rsqrt()
+    assert 0.3 - 1e-9 <= float(radii.min()) / 0.5 <= float(radii.max()) / 0.5 <= 3.0 + 1e-9
+
+
+def test_patches_of_another_kind_are_refused() -> None:
+    patches = patches_on(ball())
+    transport = central(patches)
+    want = "must have the rest vertices and triangles of the transport"
+    with pytest.raises(ValueError, match=want):
+        pd.QuadricTransport(transport, patches_on(ball(2)))
+    with pytest.raises(ValueError, match=want):
+        pd.QuadricTransport(transport, patches.with_shape(2 * patches.vertices, patches.directors))
+    with pytest.raises(TypeError, match=r"patches are torch\.float32 on cpu and the transport torch\.float64"):
+        pd.QuadricTransport(transport, patches.to(dtype=torch.float32))
+    with pytest.raises(TypeError, match="transport must be a PatchTransport, got FreeFormPatches"):
+        pd.QuadricTransport(patches, transport)  # type: ignore[arg-type]
+    rule = pd.QuadricTransport(transport, patches)
+    transport.float()
+    with pytest.raises(TypeError, match=r"make both, and this, of patches\.to"):
+        rule(transport.rest_positions[None])

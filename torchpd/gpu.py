@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 import torch
 
-from . import _C
-
 __all__ = ["LEAST_CAPABILITY", "Properties", "free_memory", "properties_of", "refuse_full_memory", "why_not"]
 
 LEAST_CAPABILITY = (8, 0)
@@ -32,6 +30,8 @@ def properties_of(device: torch.device) -> Properties:
 
 def _cluster_of(capability: tuple[int, int]) -> int:
     """Blocks of a cluster: 8 is what every device with clusters has, Hopper and the large Blackwells have more."""
+    from . import _C  # the doctor works without it
+
     if capability < (9, 0):
         return 1
     return _C.most_cluster_blocks if capability[0] in (9, 10) else 8

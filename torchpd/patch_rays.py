@@ -113,7 +113,8 @@ class PatchRays:
         near: float = 0.0,
         far: float = math.inf,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """What `cast` finds before it looks at the hits: nothing waits for the device, nothing has a gradient.
+        """What `cast` finds before it looks at the hits: nothing has a gradient, and nothing waits for the device
+        unless `patches` have triangles of their own, which are compared.
 
         Returns:
             Depth [B, R] in m, infinite for a miss; patch int32 [B, R], -1 for a miss; barycentrics [B, R, 3].
@@ -225,6 +226,8 @@ def _batched(name: str, rays: Tensor, surface: FreeFormPatches) -> Tensor:
 def _rays(origins: Tensor, directions: Tensor, surface: FreeFormPatches) -> tuple[Tensor, Tensor]:
     """With a batch, and of unit length."""
     o, d = _batched("origins", origins, surface), _batched("directions", directions, surface)
+    # first by the largest component, whose square alone might be beyond all numbers
+    d = d / d.detach().abs().amax(-1, keepdim=True)
     return o, torch.nn.functional.normalize(d, dim=-1, eps=0.0)
 
 

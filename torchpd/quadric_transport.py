@@ -37,15 +37,21 @@ class QuadricTransport:
     """
 
     def __init__(self, transport: PatchTransport, patches: FreeFormPatches) -> None:
-        tets = transport.tets
-        same = transport.vertices == len(patches.vertices) and len(tets) == len(patches.triangles)
-        if not same or not torch.equal(tets[:, :3], patches.triangles.to(tets)):
-            raise ValueError(
-                "QuadricTransport: patches must have the vertices and triangles of the transport "
-                f"({transport.vertices} and {len(tets)}), got {len(patches.vertices)} and {len(patches.triangles)}"
-            )
+        for name, given, want in (("transport", transport, PatchTransport), ("patches", patches, FreeFormPatches)):
+            if not isinstance(given, want):
+                raise TypeError(f"QuadricTransport: {name} must be a {want.__name__}, got {type(given).__name__}")
         self.transport, self.patches = transport, patches
-        self.table, self.weights = _shares(patches)
+        self._check_kind()
+        tets, rest = transport.tets, transport.rest_positions[: transport.vertices]
+        same = rest.shape == patches.vertices.shape and len(tets) == len(patches.triangles)
+        if not same or not (torch.equal(tets[:, :3], patches.triangles) and torch.equal(rest, patches.vertices)):
+            raise ValueError(
+                "QuadricTransport: patches must have the rest vertices and triangles of the transport "
+                f"({transport.vertices} and {len(tets)}), got {len(patches.vertices)} and {len(patches.triangles)} or "
+                "others; make the transport of these patches"
+            )
+        self._patch, self._quadric, self.weights = _shares(patches)
+        self._counts = torch.bincount(self._quadric, minlength=len(patches.quadrics))
         count = len(patches.quadrics)
         own = np.arange(4 * count, dtype=np.int64).reshape(count, 4)
         arrays = (own, *corner_lists(own, 4 * count))
@@ -59,19 +65,38 @@ class QuadricTransport:
             positions: of vertices and apexes, in this order, [B, V + K, 3] [m].
             fallback: see `PatchTransport.gradients`.
         """
-        patches, table = self.patches, self.table
-        q = patches.quadrics
-        first = patches.triangles[:, 0].long()
-        G = self.transport.gradients(positions, fallback)[:, table]  # [B, Q, m, 3, 3]
-        v, V = positions[:, first][:, table], patches.vertices[first][table]
-        moved = v + (G @ (q.centres[:, None] - V)[..., None])[..., 0]
-        centres = torch.einsum("qm,bqmi->bqi", self.weights, moved)
-        inverse = torch.linalg.inv(self._clamped(torch.einsum("qm,bqmij->bqij", self.weights, G)))
+        self._check_kind()
+        patches, q = self.patches, self.patches.quadrics
+        first = patches.triangles[:, 0].long()[self._patch]
+        G = self.transport.gradients(positions, fallback)[:, self._patch]  # [B, N, 3, 3] of every pair
+        offset = q.centres[self._quadric] - patches.vertices[first]
+        moved = positions[:, first] + (G @ offset[..., None])[..., 0]
+        mean = self._mean(torch.cat([G.flatten(2), moved], dim=2))
+        centres = mean[..., 9:]
+        inverse = torch.linalg.inv(self._clamped(mean[..., :9].unflatten(2, (3, 3))))
         # T^-1, which takes a point of the pose back: x -> A^-1 (x - c') + c
         back = torch.cat([inverse, (q.centres - (inverse @ centres[..., None])[..., 0])[..., None]], dim=3)
         last = back.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*back.shape[:2], 1, 4)
         back = torch.cat([back, last], dim=2)
         return back.mT @ q.normalized_matrices() @ back
+
+    def _mean(self, of_pairs: Tensor) -> Tensor:
+        """Weighted means over the pairs of every quadric, [B, N, C] to [B, Q, C], in the order of pairs."""
+        batch, _, width = of_pairs.shape
+        rows = (self.weights[:, None] * of_pairs).transpose(0, 1).flatten(1).contiguous()
+        if len(self._counts) == 0:
+            return of_pairs.new_empty((batch, 0, width))
+        sums: Tensor = torch.segment_reduce(rows, "sum", lengths=self._counts, axis=0)
+        means: Tensor = sums.unflatten(1, (batch, width)).transpose(0, 1)
+        return means
+
+    def _check_kind(self) -> None:
+        mine, theirs = self.patches.vertices, self.transport.rest_positions
+        if mine.dtype != theirs.dtype or mine.device != theirs.device:
+            raise TypeError(
+                f"QuadricTransport: patches are {mine.dtype} on {mine.device} and the transport {theirs.dtype} on "
+                f"{theirs.device}; make both, and this, of patches.to(...)"
+            )
 
     def _clamped(self, mean: Tensor) -> Tensor:
         """The mean of clamped gradients can still be flat: where patches turn to different sides."""
@@ -85,8 +110,8 @@ class QuadricTransport:
 
 
 @torch.no_grad()
-def _shares(patches: FreeFormPatches) -> tuple[Tensor, Tensor]:
-    """Patches of each quadric [Q, m], filled up with the first one, and their weights [Q, m], which sum to 1."""
+def _shares(patches: FreeFormPatches) -> tuple[Tensor, Tensor, Tensor]:
+    """Patch, quadric and weight of every pair [N], quadric by quadric; the weights of each sum to 1."""
     q = patches.quadrics
     corners = patches.vertices[patches.triangles.long()]
     edges = corners[:, 1:] - corners[:, :1]
@@ -107,10 +132,5 @@ def _shares(patches: FreeFormPatches) -> tuple[Tensor, Tensor]:
     bump = torch.cat([bump, areas[nearest]])
     order = torch.argsort(number, stable=True)
     patch, number, bump = patch[order], number[order], bump[order]
-    counts = torch.bincount(number, minlength=len(q))
-    rank = torch.arange(len(number), device=number.device) - (counts.cumsum(0) - counts)[number]
-    most = int(counts.max()) if len(q) else 0
-    table = torch.zeros((len(q), most), dtype=torch.int64, device=number.device)
-    weights = torch.zeros((len(q), most), dtype=bump.dtype, device=number.device)
-    table[number, rank], weights[number, rank] = patch, bump
-    return table, weights / weights.sum(1, keepdim=True)
+    total = torch.segment_reduce(bump, "sum", lengths=torch.bincount(number, minlength=len(q))) if len(q) else bump
+    return patch, number, bump / total[number]

@@ -275,7 +275,9 @@ PD_HD Box<double> field_box(const Solid<T>& s, Index pose, Index patch) {
   const double most = biggest<double>();
   Box<double> box = {{most, most, most}, {-most, -most, -most}};
   double risen = 0.0;
-  bool bounded = dot(normal, normal) > 0.5;
+  // without a plane, or not finite: no ray meets it
+  if (!(dot(normal, normal) > 0.5)) return box;
+  bool bounded = true;
   for (int32 e = s.lists.patch_start[patch]; e < s.lists.patch_start[patch + 1]; ++e) {
     const double a = double(s.amplitudes[s.lists.entry_quadric[e]]);
     if (a <= 0.0) continue;
@@ -285,6 +287,7 @@ PD_HD Box<double> field_box(const Solid<T>& s, Index pose, Index patch) {
     risen += a * (q.most * q.most * q.most);
     if (!s.clip) join(box, q.centre - q.half, q.centre + q.half);
   }
+  bounded = bounded && risen <= most;
   const double tau = double(s.thickness), up = s.clip ? tau + risen : tau;
   for (int k = 0; k < 3; ++k) {
     const Vec3<double> low = v[k] - tau * normal, high = v[k] + up * normal;
@@ -332,6 +335,9 @@ struct EnterPatch {
     const Index corner = pose * s.lists.vertices + s.lists.triangles[3 * patch];
     const T foot = dot(load3(s.positions, corner) - ray.o, ray.d);
     const Profile<T> p = profile_of(s, pose, patch, multiply_add(foot, ray.d, ray.o), ray.d);
+    T reach = T(0);
+    for (int k = 0; k < 5; ++k) reach = reach + absolute(p.line[k][0]) + absolute(p.line[k][1]);
+    if (!(reach <= biggest<T>())) return;  // collapsed, or not finite
     T at;
     if (!enter_patch(s, p, task.rays.near - foot, task.rays.far - foot, at)) return;
     const T t = at + foot;

@@ -262,9 +262,11 @@ PD_HD void meet_cell(const SurfaceRays<T>& t, Index pose, Index number, const Si
   }
   const T slack = c.slack[pose * c.tree.count + number] +
                   T(16) * epsilon<T>() * (largest(ray.o) + absolute(farthest));
-  if (nearest - slack > hit.depth || farthest + slack < t.rays.near) return;
+  // so that a cell that is not finite is left at once
+  if (!(nearest - slack <= hit.depth && farthest + slack >= t.rays.near)) return;
   for (int k = 0; k < 3; ++k) area[k] = turn(flat[(k + 1) % 3], flat[(k + 2) % 3]);
   const T whole = area[0] + area[1] + area[2], side = whole < T(0) ? T(-1) : T(1);
+  if (!(absolute(whole) <= biggest<T>())) return;
   T longest = T(0);
   for (int k = 0; k < 3; ++k) {
     const T* e = flat[(k + 1) % 3];

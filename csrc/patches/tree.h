@@ -135,7 +135,8 @@ PD_HD void enter_four(const T* boxes, const Sight<T>& ray, const T& near, const 
     entry[k] = greater(near, first * (T(1) - rounding));
     exit[k] = lesser(far, last * (T(1) + rounding));
   }
-  for (int k = 0; k < 4; ++k) in[k] = entry[k] <= exit[k];
+  // a box around nothing has its faces the wrong way round
+  for (int k = 0; k < 4; ++k) in[k] = entry[k] <= exit[k] && boxes[k] <= boxes[12 + k];
 }
 
 // Nodes still to be looked into, the nearest on top.
