@@ -38,7 +38,8 @@ class RigidPieces:
 
     A piece is a connected set of elements that are stiffer than the rest; one that hard pins hold is left to the
     solver. Worth it from contrasts of about a thousand, with `Multilevel`. Made for the material, time step, precision
-    and device of now: after a change of these a step is refused until `prepare`. Contacts are not known to these
+    and device of now: after a change of these a step is refused until `prepare` (writes through `.data` cannot be
+    seen). Contacts are not known to these
     motions: such scenes are refused. Results may depend on the batch by rounding. `Simulator.rollout`, `capture`,
     `tune`, `save` and `load` do not know of it: they take the simulator's own steps.
 
