@@ -97,3 +97,7 @@ def tumbled(transport: pd.PatchTransport, batch: int = 3, noise: float = 0.1, se
     rest = transport.rest_positions.detach().double().cpu().numpy()
     moved = rest @ np.swapaxes(motion, 1, 2) + rng.standard_normal((batch, 1, 3))
     return torch.tensor(moved + noise * rng.standard_normal(moved.shape)).to(transport.rest_positions)
+
+
+def unit(vectors: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(vectors, dim=-1)
