@@ -96,7 +96,7 @@ def measure_scene(scene: GpuScene, dtype: torch.dtype, machine: Device, options:
     row: Row = {
         "scene": scene.name,
         "dtype": str(dtype).removeprefix("torch."),
-        "irregular": scene.irregular,
+        "mesh": scene.mesh,
         "batch": scene.batch,
         "iterations": scene.iterations,
         **facts,

@@ -36,6 +36,22 @@ def regular_bar(cells: tuple[int, int, int]) -> pd.TetMesh:
     return pd.shapes.box(SIZE, cells)
 
 
+def five_tet_bar(cells: tuple[int, int, int]) -> pd.TetMesh:
+    """Five tetrahedra a cell: one on every other corner, and the four corners left; neighbours are mirrored."""
+    grid = regular_bar(cells)
+    i, j, k = np.meshgrid(*(np.arange(count) for count in cells), indexing="ij")
+    odd = ((i + j + k) % 2).reshape(-1, 1)
+    number = np.arange(len(grid.vertices)).reshape(cells[0] + 1, cells[1] + 1, cells[2] + 1)
+    corner = np.stack(
+        [number[i + a, j + b, k + c].ravel() for a in range(2) for b in range(2) for c in range(2)], axis=-1
+    )  # 4 a + 2 b + c
+    corner = np.where(odd, corner[:, [4, 5, 6, 7, 0, 1, 2, 3]], corner)
+    tets = corner[:, [[0, 3, 5, 6], [1, 0, 5, 3], [2, 0, 3, 6], [4, 0, 6, 5], [7, 3, 5, 6]]].reshape(-1, 4)
+    points = grid.vertices[tets]
+    volume = np.linalg.det(points[:, 1:] - points[:, :1])
+    return pd.TetMesh(grid.vertices, np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets))
+
+
 def irregular_bar(cells: tuple[int, int, int], *, seed: int = 0) -> pd.TetMesh:
     """Delaunay tetrahedra of the corners of the cells, each moved by up to 0.3 of a cell, without slivers.
 
@@ -55,6 +71,13 @@ def irregular_bar(cells: tuple[int, int, int], *, seed: int = 0) -> pd.TetMesh:
     return pd.TetMesh(points[used] / cells * SIZE, compact.reshape(-1, 4))
 
 
+MESHES = {"regular": regular_bar, "irregular": irregular_bar, "five": five_tet_bar}
+
+
+def _suffix(mesh: str) -> str:
+    return "" if mesh == "regular" else f"-{mesh}"
+
+
 @dataclass(frozen=True)
 class GpuScene:
     """Copies of a bar that is held at one end, swings, and bends by its weight."""
@@ -63,14 +86,14 @@ class GpuScene:
     cells: tuple[int, int, int]
     batch: int = 1
     kernel: str = "auto"
-    irregular: bool = False
+    mesh: str = "regular"
     iterations: int = ITERATIONS
     aims: tuple[Aim, ...] = ()
     heavy: bool = False  # minutes to prepare: only when asked for
 
     def build(self) -> pd.Scene:
         """The scene of one environment."""
-        mesh = irregular_bar(self.cells) if self.irregular else regular_bar(self.cells)
+        mesh = MESHES[self.mesh](self.cells)
         bar = pd.Solid(mesh, youngs=YOUNGS, density=DENSITY)
         return pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] < 1e-9), pd.Gravity((0.0, -9.81, 0.0)))
 
@@ -85,20 +108,15 @@ class GpuScene:
 SMALL = {64: (3, 3, 3), 256: (15, 3, 3), 400: (15, 4, 4), 1000: (9, 9, 9)}
 BATCHES = (1, 132, 1024, 8192)
 BATCH_AIM = Aim("tet_iterations_per_second", 65e9, 90e9)
-STEP_AIM = Aim("environment_steps_per_second", 1.5e6, 2.1e6)  # 256 vertices, 64 iterations
-
-
-def _small_aims(vertices: int, batch: int) -> tuple[Aim, ...]:
-    if batch < 1024:
-        return ()
-    return (BATCH_AIM, STEP_AIM) if (vertices, batch) == (256, 8192) else (BATCH_AIM,)
+STEP_AIM = Aim("environment_steps_per_second", 1.5e6, 2.1e6)  # 256 vertices, 675 tetrahedra, 64 iterations
+SMALL_AIM = Aim("step_microseconds", 80.0, 45.0)  # 1200 tetrahedra, 64 iterations
 
 
 def _pair(name: str, cells: tuple[int, int, int], kernel: str, aim: Aim, *, heavy: bool = False) -> list[GpuScene]:
     """The regular and the irregular mesh."""
     return [
-        GpuScene(name + suffix, cells, kernel=kernel, irregular=bool(suffix), aims=(aim,), heavy=heavy)
-        for suffix in ("", "-irregular")
+        GpuScene(name + _suffix(mesh), cells, kernel=kernel, mesh=mesh, aims=(aim,), heavy=heavy)
+        for mesh in ("regular", "irregular")
     ]
 
 
@@ -108,12 +126,16 @@ def _iteration(must: float, stretch: float) -> Aim:
 
 GPU_SCENES = (
     *(
-        GpuScene(f"{vertices}x{batch}{suffix}", cells, batch, irregular=bool(suffix), aims=_small_aims(vertices, batch))
-        for suffix in ("", "-irregular")
+        GpuScene(
+            f"{vertices}x{batch}{_suffix(mesh)}", cells, batch, mesh=mesh, aims=(BATCH_AIM,) if batch >= 1024 else ()
+        )
+        for mesh in ("regular", "irregular")
         for vertices, cells in SMALL.items()
         for batch in BATCHES
     ),
-    *_pair("one-1200-tets", (8, 5, 5), "grid", Aim("step_microseconds", 80.0, 45.0)),
+    GpuScene("256x8192-five", SMALL[256], 8192, mesh="five", aims=(BATCH_AIM, STEP_AIM)),
+    *_pair("one-1200-tets", (8, 5, 5), "grid", SMALL_AIM),
+    GpuScene("one-1200-tets-five", (15, 4, 4), kernel="grid", mesh="five", aims=(SMALL_AIM,)),
     *_pair("one-10k", (39, 15, 15), "grid", _iteration(3.0, 2.3)),
     *_pair("one-100k", (99, 31, 31), "auto", _iteration(14.0, 11.0)),
     *_pair("one-1M", (255, 63, 63), "stream", _iteration(130.0, 105.0)),
@@ -121,8 +143,8 @@ GPU_SCENES = (
 )
 
 QUICK_GPU_SCENES = tuple(
-    GpuScene(f"tiny-{kernel}{suffix}", (6, 2, 2), batch, kernel, bool(suffix), 4, (BATCH_AIM,))
-    for suffix in ("", "-irregular")
+    GpuScene(f"tiny-{kernel}{_suffix(mesh)}", (6, 2, 2), batch, kernel, mesh, 4, (BATCH_AIM,))
+    for mesh in MESHES
     for kernel, batch in (("block", 9), ("grid", 2), ("stream", 1))
 )
 
