@@ -6,6 +6,7 @@ import argparse
 import gc
 import statistics
 import time
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -197,23 +198,25 @@ def table(rows: list[Row]) -> str:
     return "\n".join("  ".join(c.rjust(width) for c, width in zip(line, widths, strict=True)) for line in lines)
 
 
-def run_on_gpu(options: argparse.Namespace) -> Row:
-    """Everything, printed; what is written besides the description of the machine."""
+def run_on_gpu(options: argparse.Namespace, result: Row, keep: Callable[[], None]) -> None:
+    """Everything, into the result and printed."""
     device = torch.device(options.device)
     with torch.no_grad(), torch.cuda.device(device):
         machine = describe_device(device)
-        result: Row = {
-            "device": {
-                **vars(machine),
-                "lane_instructions_per_second": machine.lane_instructions,
-                "cuda": torch.version.cuda,
-            },
-            "call_microseconds": measure_calls(options),
-            "paper": measure_paper(options) if "paper" in (options.only or ["paper"]) and not options.quick else [],
+        result["device"] = {
+            **vars(machine),
+            "lane_instructions_per_second": machine.lane_instructions,
+            "cuda": torch.version.cuda,
         }
+        result["call_microseconds"] = measure_calls(options)
+        with_paper = "paper" in (options.only or ["paper"]) and not options.quick
+        result["paper"] = measure_paper(options) if with_paper else []
         jobs = [(scene, getattr(torch, name)) for name in options.dtype for scene in options.scenes]
         bar = tqdm(jobs, desc="measuring", unit="scene", leave=False)
-        result["results"] = [measure_scene(scene, dtype, machine, options) for scene, dtype in bar]
+        result["results"] = []
+        for scene, dtype in bar:
+            result["results"].append(measure_scene(scene, dtype, machine, options))
+            keep()
     print(table(result["results"]))
     print("\nmicroseconds of a call (host, in a graph, kernels alone), one iteration on one tetrahedron:")
     for name, parts in result["call_microseconds"].items():
@@ -223,4 +226,3 @@ def run_on_gpu(options: argparse.Namespace) -> Row:
             f"  {row['scene']} ({row['tets']} tets, {row['kernel']}): {row['milliseconds']:.3f} ms a step, "
             f"the paper {row['milliseconds_of_the_paper']:.0f} ms"
         )
-    return result

@@ -8,6 +8,7 @@ import json
 import statistics
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -208,32 +209,38 @@ def parse(words: list[str]) -> argparse.Namespace:
     return options
 
 
-def run_on_cpu(options: argparse.Namespace) -> Row:
-    """Everything, printed; what is written besides the description of the machine."""
-    result: Row = {
-        "goals_hold_at": {
-            "multiply_adds_per_second_per_thread": GOAL_MULTIPLY_ADDS_PER_SECOND,
-            "threads": GOAL_THREADS,
-        },
-        "call_microseconds": measure_calls(options),
+def run_on_cpu(options: argparse.Namespace, result: Row, keep: Callable[[], None]) -> None:
+    """Everything, into the result and printed."""
+    result["goals_hold_at"] = {
+        "multiply_adds_per_second_per_thread": GOAL_MULTIPLY_ADDS_PER_SECOND,
+        "threads": GOAL_THREADS,
     }
+    result["call_microseconds"] = measure_calls(options)
     jobs = [(scene, getattr(torch, name)) for name in options.dtype for scene in options.scenes]
     bar = tqdm(jobs, desc="measuring", unit="scene", leave=False)
-    result["results"] = [measure_scene(scene, dtype, options) for scene, dtype in bar]
+    result["results"] = []
+    for scene, dtype in bar:
+        result["results"].append(measure_scene(scene, dtype, options))
+        keep()
     print(table(result["results"]))
     print("\nmicroseconds of a call, one iteration on one tetrahedron:")
     print("\n".join(f"  {name}: {value:.1f}" for name, value in result["call_microseconds"].items()))
-    return result
 
 
 def main(words: list[str]) -> None:
     options = parse(words)
     torch.set_num_threads(options.threads)
     result = {"schema": SCHEMA, **describe_run(torch.device(options.device), options.threads)}
-    result.update(run_on_gpu(options) if options.on_gpu else run_on_cpu(options))
+
+    def keep() -> None:
+        """Writes what there is so far: a run that is cut short has not been for nothing."""
+        if options.out:
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+            options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+    (run_on_gpu if options.on_gpu else run_on_cpu)(options, result, keep)
+    keep()
     if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(result, indent=1) + "\n")
         print(f"written: {options.out}")
 
 

@@ -225,9 +225,9 @@ PYBIND11_MODULE(_C, m) {
   m.def("device_sizes", &device_sizes, "Names of the numbers in a GPU plan's sizes.");
   m.def("material_table", &material_table,
         "Rows (name, width, rows, meaning) of the differentiable arrays, in op order.");
-  m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("slots"),
-        py::arg("entries"), py::arg("planes"), py::arg("balls"),
-        "Shared memory of a block of the kernels block and grid.");
+  m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("many"),
+        py::arg("slots"), py::arg("entries"), py::arg("planes"), py::arg("balls"),
+        "Shared memory of a block of the kernels block and (many patches) grid.");
   m.def("cluster_shared_bytes", &pd::cluster_shared_bytes, py::arg("real"), py::arg("fused_bytes"),
         py::arg("slots"), py::arg("seats"), py::arg("patches"),
         "The same of a block of the kernel grid whose blocks form a cluster.");

@@ -207,6 +207,24 @@ def test_irregular_bar_is_a_mesh_of_the_same_size(cells: tuple[int, int, int]) -
 
 
 @pytest.mark.usefixtures("on_path")
+def test_a_run_that_is_cut_short_leaves_its_rows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    run = importlib.import_module("run")
+    done = []
+
+    def measure(scene: Any, *_: object) -> dict[str, Any]:
+        if done:
+            raise KeyboardInterrupt
+        done.append(scene.name)
+        return {"scene": scene.name}
+
+    monkeypatch.setattr(run, "measure_scene", measure)
+    monkeypatch.setattr(run, "measure_calls", lambda _: {})
+    with pytest.raises(KeyboardInterrupt):
+        run.main(["--quick", "--threads", str(torch.get_num_threads()), "--out", str(tmp_path / "here" / "cut.json")])
+    assert [row["scene"] for row in json.loads((tmp_path / "here" / "cut.json").read_text())["results"]] == done
+
+
+@pytest.mark.usefixtures("on_path")
 def test_bar_of_five_tetrahedra_a_cell() -> None:
     mesh = importlib.import_module("gpu_scenes").five_tet_bar((15, 3, 3))
     corners = mesh.vertices[mesh.tets]

@@ -90,13 +90,23 @@ def test_a_kernel_that_does_not_fit_is_refused_with_numbers() -> None:
         choose_plan(values, torch.float32, H100, "team")
 
 
+def test_shared_memory_by_hand(dtype: torch.dtype) -> None:
+    """Many patches keep six numbers a slot (position, rest position) in place of eight, and both 1 KB for control."""
+    values, real = values_of((4, 4, 4)), torch.finfo(dtype).bits // 8
+    for kernel, numbers in (("block", 8), ("grid", 6)):
+        plan = choose_plan(values, dtype, H100._replace(cluster=1), kernel)
+        slots, entries = plan.size("most_slots"), plan.size("most_entries")
+        filled = -(-numbers * real * slots // 16) * 16
+        assert shared_bytes(plan, 2, 3) == 1024 + filled + real * (4 * entries + 5 * 2 + 8 * 3)
+
+
 def test_what_is_refused_unbuilt_does_not_fit_when_built() -> None:
     """The bound from the numbers of vertices and tetrahedra never exceeds what the plan then needs."""
     for cells in ((1, 1, 1), (5, 4, 3), (9, 9, 2)):
         values = values_of(cells, pd.Ground(), pd.Sphere((0, -3, 0), 1.0))
         for dtype, real in REAL.items():
             plan = choose_plan(values, dtype, Properties(2, 10**9), "block")
-            least = _C.fused_shared_bytes(real, len(values.rest_positions), 5 * len(values.tets) // 2, 1, 1)
+            least = _C.fused_shared_bytes(real, False, len(values.rest_positions), 5 * len(values.tets) // 2, 1, 1)
             assert least <= shared_bytes(plan, 1, 1)
 
 

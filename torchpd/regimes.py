@@ -50,7 +50,7 @@ def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
         return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.outer_static_bytes
     if plan.kernel == "stream":
         return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.pass_static_bytes
-    return _C.fused_shared_bytes(real, slots, entries, planes, balls)
+    return _C.fused_shared_bytes(real, plan.kernel == "grid", slots, entries, planes, balls)
 
 
 class _Scene(NamedTuple):
@@ -87,18 +87,19 @@ class _Scene(NamedTuple):
             if self.tets <= _LEVEL_ALONE:
                 return 1
             # 2.5 entries and at least a third of a slot a tetrahedron, see pass_shared_bytes
-            each = (4 * 2.5 + 8 / 3) * torch.finfo(self.dtype).bits / 8
+            each = (4 * 2.5 + 6 / 3) * torch.finfo(self.dtype).bits / 8
             least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes))
             rounds = -(-int(least) // gpu.multiprocessors)
             return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
         return -(-self.tets // _STREAM_TETS[self.dtype])
 
-    def least_shared_bytes(self, patches: int) -> int:
+    def least_shared_bytes(self, kernel: str, patches: int) -> int:
         """Of the kernels block and grid, without building the plan: two tetrahedra have at least five entries."""
         slots = len(self.values.rest_positions) if patches == 1 else 4
         entries = 5 * -(-self.tets // patches) // 2
         real = torch.finfo(self.dtype).bits // 8
-        return _C.fused_shared_bytes(real, slots, entries, len(self.values.planes), len(self.values.spheres))
+        planes, balls = len(self.values.planes), len(self.values.spheres)
+        return _C.fused_shared_bytes(real, kernel == "grid", slots, entries, planes, balls)
 
 
 def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | None, str]:
@@ -109,7 +110,7 @@ def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | Non
         if needed <= gpu.shared:
             return plan, f"{needed:,} B"
     patches = scene.patches(kernel, gpu)
-    least = scene.least_shared_bytes(patches)
+    least = scene.least_shared_bytes(kernel, patches)
     if least > gpu.shared:
         return None, f"at least {least:,} B"
     try:

@@ -5,6 +5,7 @@
 #include "cuda/launch.h"
 #include "cuda/patch.h"
 #include "cuda/runtime.h"
+#include "cuda/slots.h"
 #include "plan/shared_memory.h"
 
 #include <stdexcept>
@@ -55,26 +56,43 @@ template <int Fields, class T>
 struct PatchFields {
   std::int64_t environment;
   Patch<T> patch;
-  Quad<T>*position, *direction;  // by slot
-  Quad<T>* entries;              // behind them
+  Quad<T>* position;  // by slot, without directions
+  Slots<T> both;      // else
+  Quad<T>* entries;   // behind them
 
   __device__ PatchFields(const DeviceField<T>& field, std::byte* shared)
       : environment(blockIdx.x / field.plan.patches),
         patch(field.plan, int(blockIdx.x % field.plan.patches)),
         position(reinterpret_cast<Quad<T>*>(shared)),
-        direction(Fields == 2 ? position + field.plan.most_slots : nullptr),
-        entries(position + Fields * field.plan.most_slots) {
+        both(shared, field.plan.most_slots),
+        entries(reinterpret_cast<Quad<T>*>(shared +
+                                           slots_bytes(sizeof(T), field.plan.most_slots, Fields))) {
     const auto at = [&](const T* from, int slot) {
       const DevicePlan<T>& plan = field.plan;
       const std::int64_t row = environment * plan.vertices + plan.vertex_order[patch.vertex(slot)];
       return read3(from + 3 * row);
     };
     for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
-      position[s] = {};
-      if (field.positions) position[s] = quad(at(field.positions, s) - at(field.positions, 0));
-      if (direction) direction[s] = quad(at(field.direction, s));
+      Vec3<T> x = {T(0), T(0), T(0)};
+      if (field.positions) x = at(field.positions, s) - at(field.positions, 0);
+      if constexpr (Fields == 2) {
+        both.set(s, x, at(field.direction, s));
+      } else {
+        position[s] = quad(x);
+      }
     }
     __syncthreads();
+  }
+
+  // of a slot, for elements
+  __device__ void operator()(int slot, Vec3<T> (&vectors)[Fields]) const {
+    if constexpr (Fields == 2) {
+      const Quad<T> seen = both.look(slot);
+      vectors[0] = vec3(seen);
+      vectors[1] = both.second(slot, seen);
+    } else {
+      vectors[0] = vec3(position[slot]);
+    }
   }
 };
 
@@ -84,17 +102,15 @@ __global__ void __launch_bounds__(field_threads)
     field_vertices(const __grid_constant__ FieldWork<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
   const DevicePlan<T>& plan = work.field.plan;
-  const auto [environment, patch, position, direction, entries] =
-      PatchFields<Fields, T>(work.field, shared);
-  const Quad<T>* fields[Fields];
-  fields[0] = position;
-  if constexpr (Fields == 2) fields[1] = direction;
-  each_pair(patch, const_cast<const Quad<T>* const(&)[Fields]>(fields), rest_of<Computed>(patch),
-            work.weights_of(environment), entries, Element{});
+  const PatchFields<Fields, T> fields(work.field, shared);
+  const std::int64_t environment = fields.environment;
+  const Patch<T>& patch = fields.patch;
+  each_pair<Fields>(patch, fields, rest_of<Computed>(patch), work.weights_of(environment),
+                    fields.entries, Element{});
   __syncthreads();
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const int slot = patch.first_slot + s;
-    const Vec3<T> force = sum_entries(entries, plan.slot_row[slot]);
+    const Vec3<T> force = sum_entries(fields.entries, plan.slot_row[slot]);
     if (s < patch.interior) {
       write_vertex<Numbers>(work.field, environment, patch.first_vertex + s, force);
     } else {
@@ -123,8 +139,10 @@ __global__ void __launch_bounds__(field_threads)
     field_elements(const __grid_constant__ FieldWork<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
   const DevicePlan<T>& plan = work.field.plan;
-  const auto [environment, patch, position, direction, entries] =
-      PatchFields<Product ? 2 : 1, T>(work.field, shared);
+  constexpr int wanted = Product ? 2 : 1;
+  const PatchFields<wanted, T> fields(work.field, shared);
+  const std::int64_t environment = fields.environment;
+  const Patch<T>& patch = fields.patch;
   const T* weights = work.weights_of(environment);
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const PairPlace place = place_of(patch, number);
@@ -138,8 +156,10 @@ __global__ void __launch_bounds__(field_threads)
       Vec3<T> x[4], dx[4];
       for (int c = 0; c < 4; ++c) {
         const int at = pair.slot(c < 3 ? c : 3 + e);
-        x[c] = vec3(position[at]);
-        if constexpr (Product) dx[c] = vec3(direction[at]);
+        Vec3<T> vectors[wanted];
+        fields(at, vectors);
+        x[c] = vectors[0];
+        if constexpr (Product) dx[c] = vectors[1];
       }
       const T weight = pair.weight[e];
       T& out = work.field.out[environment * plan.tets + tet];

@@ -46,11 +46,17 @@ class FusedRunner {
         h_(T(call.step.settings.time_step)),
         theta_(T(call.step.settings.relaxation)),
         mail_(shared + mail_begin(call.step), plan_.most_shared, plan_.patches, index_) {
-    position_ = reinterpret_cast<Quad<T>*>(shared + fused_control_bytes);
-    Quad<T>* second = position_ + plan_.most_slots;
+    std::byte* slots = shared + fused_control_bytes;
+    if constexpr (Many) {
+      slots_ = Slots<T>(slots, plan_.most_slots);
+      entries_ = reinterpret_cast<Quad<T>*>(slots + slots_bytes(sizeof(T), plan_.most_slots, 2));
+    } else {
+      position_ = reinterpret_cast<Quad<T>*>(slots);
+      entries_ = position_ + 2 * plan_.most_slots;
+    }
     const FusedScratch<T>& m = call.scratch;
     v_ = {m.x + first_slot(), m.velocity + first_slot(), m.target + first_slot(),
-          Many ? m.u + first_slot() : second, m.before + first_slot()};
+          Many ? m.u + first_slot() : position_ + plan_.most_slots, m.before + first_slot()};
     origin_ = m.origin + first_slot();
     if constexpr (Kind == Blocks::cluster) {
       Quad<T>* own = reinterpret_cast<Quad<T>*>(shared + vertices_begin(call.step));
@@ -59,8 +65,6 @@ class FusedRunner {
         own += plan_.most_slots;
       }
     }
-    rest_ = reinterpret_cast<RestPoint<T>*>(second);
-    entries_ = position_ + 2 * plan_.most_slots;
     balls_ = reinterpret_cast<Ball<T>*>(entries_ + plan_.most_entries);
     planes_ = reinterpret_cast<Plane<T>*>(balls_ + call_.material.spheres_count);
     if (Many && int(threadIdx.x) < patch_.slots) row_ = patch_.row(slot_of_seat(threadIdx.x));
@@ -221,9 +225,18 @@ class FusedRunner {
     for (int s = threadIdx.x; s < patch_.slots; s += blockDim.x) visit(s);
   }
 
+  // for elements to see
+  PD_DEVICE void place(int s, const Vec3<T>& position) {
+    if constexpr (Many) {
+      slots_.set_first(s, position);
+    } else {
+      position_[s] = quad(position);
+    }
+  }
+
   PD_DEVICE void move(int s, const Vec3<T>& u) {
     v_.set(s, u);
-    position_[s] = quad(vec3(origin_[s]) + u);
+    place(s, vec3(origin_[s]) + u);
   }
 
   PD_DEVICE void update(const Seat& at, const Seen& seen, const Vec3<T>& force) {
@@ -235,20 +248,21 @@ class FusedRunner {
     }
     v_.set_before(at.slot, seen.u);
     v_.set(at.slot, next);
-    position_[at.slot] = quad(at.origin + next);
+    place(at.slot, at.origin + next);
   }
 
   template <class Element>
   PD_DEVICE T each_element(const Element& element) {
     if constexpr (Many) {
       // a cluster's patches are small: what they do not work out again they have registers for
-      const auto inverse_of = [&](const HalfNumbers<T>& numbers, bool first) {
-        return Kind == Blocks::cluster && first ? inverse_ : half_inverse(numbers, rest_);
+      const auto inverse_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4],
+                                  bool first) {
+        return Kind == Blocks::cluster && first ? inverse_ : half_inverse(numbers, slots_, seen);
       };
-      return each_half(patch_, position_, inverse_of, weights(), entries_, element, half_);
+      return each_half(patch_, slots_, inverse_of, weights(), entries_, element, half_);
     } else {
-      const Quad<T>* const fields[1] = {position_};
-      return each_pair(patch_, fields, rest_of<Many>(patch_), weights(), entries_, element);
+      const auto read = [&](int s, Vec3<T>(&x)[1]) { x[0] = vec3(position_[s]); };
+      return each_pair<1>(patch_, read, rest_of<Many>(patch_), weights(), entries_, element);
     }
   }
 
@@ -324,8 +338,12 @@ class FusedRunner {
     contacts_ = {planes_, balls_, call_.material.planes_count, call_.material.spheres_count};
     each_slot([&](int s) {
       v_.load(s, in_, patch_.vertex(s), h_);
-      position_[s] = {};
-      if constexpr (Many) rest_[s] = rest_of<true>(patch_).position[s];
+      const Vec3<T> none = {T(0), T(0), T(0)};
+      if constexpr (Many) {
+        slots_.set(s, none, rest_of<true>(patch_).position[s].bits());
+      } else {
+        position_[s] = quad(none);
+      }
     });
     __syncthreads();
   }
@@ -361,7 +379,11 @@ class FusedRunner {
     weigh_pairs(patch_, rest_of<Many>(patch_), stiffness, bounded, weights());
     __syncthreads();  // one lane has left the weights of two
     if constexpr (Many) half_ = read_half(patch_, weights(), threadIdx.x);
-    if constexpr (Kind == Blocks::cluster) inverse_ = half_inverse(half_, rest_);
+    if constexpr (Kind == Blocks::cluster) {
+      Quad<T> seen[4];
+      look(half_, slots_, seen);
+      inverse_ = half_inverse(half_, slots_, seen);
+    }
   }
 
   // ---- momentum: cuda/fused_momentum.h
@@ -396,9 +418,10 @@ class FusedRunner {
   const FusedScratch<T>& memory_;
   Control<T>& control_;
   TeamSums<Kind> sums_;
-  RestPoint<T>* rest_;  // with many patches: rest positions
-  Quad<T>*position_,
-      *entries_;  // where elements read vertices, from the patch's first; their forces
+  // where elements read vertices, from the patch's first; with many patches rest positions too
+  Quad<T>* position_;
+  Slots<T> slots_;
+  Quad<T>* entries_;  // forces of elements
   Vertices<T, Touching> v_;
   Quad<T>* origin_;  // start of the step, from the patch's first
   Plane<T>* planes_;

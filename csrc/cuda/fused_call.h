@@ -1,6 +1,7 @@
 // What the fused kernel is given, and what it keeps where.
 #pragma once
 #include "cuda/inputs.h"
+#include "cuda/launch.h"
 #include "cuda/mail.h"
 #include "cuda/team.h"
 #include "plan/shared_memory.h"
@@ -29,7 +30,8 @@ struct FusedCall {
 // Shared memory of a block, without a cluster's mail.
 template <class T>
 PD_HD std::size_t fused_shared_bytes(const DeviceStep<T>& step) {
-  return pd::fused_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries,
+  const bool many = step.plan.kernel != int(DeviceKernel::block);
+  return pd::fused_shared_bytes(sizeof(T), many, step.plan.most_slots, step.plan.most_entries,
                                 step.material.planes_count, step.material.spheres_count);
 }
 

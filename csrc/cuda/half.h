@@ -3,6 +3,7 @@
 #pragma once
 #include "cuda/collect.h"
 #include "cuda/patch.h"
+#include "cuda/slots.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -11,6 +12,8 @@ template <class T>
 struct HalfNumbers {
   unsigned corner[4];  // slot, plus 65536 times the entry
   T weight, factor;    // w V, pair_factor
+
+  PD_HD int slot(int c) const { return int(corner[c] & 0xffff); }
 };
 
 template <class T>
@@ -26,12 +29,18 @@ PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int 
   return numbers;
 }
 
-// Dm^-1 of a lane's tetrahedron, worked out from `rest`, where elements read rest positions.
+// Dm^-1 of a lane's tetrahedron, worked out from the rest positions of its slots, which were looked at.
 template <class T>
-PD_DEVICE Mat3<T> half_inverse(const HalfNumbers<T>& numbers, const RestPoint<T>* rest) {
+PD_DEVICE Mat3<T> half_inverse(const HalfNumbers<T>& numbers, const Slots<T>& slots,
+                               const Quad<T> (&seen)[4]) {
   RestPoint<T> point[4];
-  for (int c = 0; c < 4; ++c) point[c] = rest[numbers.corner[c] & 0xffff];
+  for (int c = 0; c < 4; ++c) point[c] = RestPoint<T>::of(slots.second(numbers.slot(c), seen[c]));
   return ComputedRest<T>::between(point, numbers.factor);
+}
+
+template <class T>
+PD_DEVICE void look(const HalfNumbers<T>& numbers, const Slots<T>& slots, Quad<T> (&seen)[4]) {
+  for (int c = 0; c < 4; ++c) seen[c] = slots.look(numbers.slot(c));
 }
 
 template <class T>
@@ -60,10 +69,11 @@ PD_DEVICE Vec3<T> add_partner(const Vec3<T>& a) {
           a.z + __shfl_xor_sync(whole_warp, a.z, 1)};
 }
 
-// Runs an effect on every pair; returns the sum of energies that this thread has met. `now`: what `read_half` gave for this
-// thread's first tetrahedron. `inverse_of(numbers, first)`: Dm^-1 of a tetrahedron, and whether it is the thread's first.
+// Runs an effect on every pair; returns the sum of energies that this thread has met. `slots`: position and rest position.
+// `now`: what `read_half` gave for this thread's first tetrahedron. `inverse_of(numbers, seen, first)`: Dm^-1 of a tetrahedron,
+// given what was seen of its slots, and whether it is the thread's first.
 template <class T, class Element, class InverseOf>
-PD_DEVICE T each_half(const Patch<T>& patch, const Quad<T>* position, const InverseOf& inverse_of,
+PD_DEVICE T each_half(const Patch<T>& patch, const Slots<T>& slots, const InverseOf& inverse_of,
                       const T* weights, Quad<T>* entries, const Element& element,
                       HalfNumbers<T> now) {
   T energy = T(0);
@@ -73,10 +83,12 @@ PD_DEVICE T each_half(const Patch<T>& patch, const Quad<T>* position, const Inve
     if (first + int(blockDim.x) < 2 * patch.pairs)
       next = read_half(patch, weights, first + int(blockDim.x) + lane);
     Vec3<T> x[4], force[4];
-    for (int c = 0; c < 4; ++c) x[c] = vec3(position[now.corner[c] & 0xffff]);
+    Quad<T> seen[4];
+    look(now, slots, seen);
+    for (int c = 0; c < 4; ++c) x[c] = vec3(seen[c]);
     T met = T(0);
     element.template run<1>(
-        HalfElement<T>{x, inverse_of(now, first < int(blockDim.x)), now.weight, force, met});
+        HalfElement<T>{x, inverse_of(now, seen, first < int(blockDim.x)), now.weight, force, met});
     for (int c = 0; c < 3; ++c) force[c] = add_partner(force[c]);
     const bool here = first + lane < 2 * patch.pairs, second = lane & 1;
     // the first writes corners 0 and 1, the second corner 2, each its own apex

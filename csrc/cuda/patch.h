@@ -140,6 +140,14 @@ struct alignas(16) RestPoint<float> {
   PD_HD friend Vec3<float> operator-(const RestPoint& a, const RestPoint& b) {
     return {float(a.x - b.x), float(a.y - b.y), float(a.z - b.z)};
   }
+
+  // the same bits where numbers are kept
+  PD_DEVICE Vec3<float> bits() const {
+    return {__int_as_float(x), __int_as_float(y), __int_as_float(z)};
+  }
+  PD_DEVICE static RestPoint of(const Vec3<float>& bits) {
+    return {__float_as_int(bits.x), __float_as_int(bits.y), __float_as_int(bits.z), 0};
+  }
 };
 
 template <>
@@ -149,6 +157,9 @@ struct alignas(16) RestPoint<double> {
   PD_HD friend Vec3<double> operator-(const RestPoint& a, const RestPoint& b) {
     return {a.x - b.x, a.y - b.y, a.z - b.z};
   }
+
+  PD_DEVICE Vec3<double> bits() const { return {x, y, z}; }
+  PD_DEVICE static RestPoint of(const Vec3<double>& bits) { return {bits.x, bits.y, bits.z, 0}; }
 };
 
 // Rest shapes worked out from rest positions: a quarter of the bytes.
@@ -217,10 +228,10 @@ struct PairElement {
 };
 
 // Runs an effect on every pair of a patch, a thread a pair; returns the sum of energies that this thread has met.
-template <class T, int Fields, class Rest, class Element>
-PD_DEVICE T each_pair(const Patch<T>& patch, const Quad<T>* const (&field)[Fields],
-                      const Rest& rest, const T* weights, Quad<T>* entries,
-                      const Element& element) {
+// `read(slot, vectors)`: those that elements want of a slot.
+template <int Fields, class T, class Read, class Rest, class Element>
+PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest, const T* weights,
+                      Quad<T>* entries, const Element& element) {
   using First = OneOf<T, 0>;
   using Second = OneOf<T, 1>;
   Pair<T, Fields> pair;
@@ -229,8 +240,10 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Quad<T>* const (&field)[Field
   if (int(threadIdx.x) < patch.pairs) now = read_pair(patch, weights, int(threadIdx.x));
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const typename Rest::Numbers shape = rest.read(place_of(patch, number), now);
-    for (int f = 0; f < Fields; ++f) {
-      for (int c = 0; c < 5; ++c) pair.corner[f][c] = vec3(field[f][now.slot(c)]);
+    for (int c = 0; c < 5; ++c) {
+      Vec3<T> vectors[Fields];
+      read(now.slot(c), vectors);
+      for (int f = 0; f < Fields; ++f) pair.corner[f][c] = vectors[f];
     }
     element.template run<1>(PairElement<T, Fields, First>{
         pair, shape.template shape<First>().inverse, now.weight[0], energy});

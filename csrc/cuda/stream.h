@@ -167,20 +167,19 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
                                  const Element& element, const Here& here) {
   const Patch<T> patch(w.plan, number);
   const HalfNumbers<T> first = read_half(patch, w.weights, int(threadIdx.x));
-  Quad<T>* position = reinterpret_cast<Quad<T>*>(shared);
+  const Slots<T> slots(shared, w.plan.most_slots);
   const RestPoint<T>* rest = rest_of<true>(patch).position;
-  auto* rest_position = reinterpret_cast<RestPoint<T>*>(position + w.plan.most_slots);
-  Quad<T>* entries = position + 2 * w.plan.most_slots;
+  auto* entries = reinterpret_cast<Quad<T>*>(shared + slots_bytes(sizeof(T), w.plan.most_slots, 2));
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
-    position[s] = quad(vec3(w.origin[patch.first_slot + s]) + vec3(w.v.u[patch.vertex(s)]));
-    rest_position[s] = rest[s];
+    const Vec3<T> position = vec3(w.origin[patch.first_slot + s]) + vec3(w.v.u[patch.vertex(s)]);
+    slots.set(s, position, rest[s].bits());
   }
   __syncthreads();
-  const auto inverse_of = [&](const HalfNumbers<T>& numbers, bool) {
-    return half_inverse(numbers, rest_position);
+  const auto inverse_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4], bool) {
+    return half_inverse(numbers, slots, seen);
   };
   const double energy =
-      double(each_half(patch, position, inverse_of, w.weights, entries, element, first));
+      double(each_half(patch, slots, inverse_of, w.weights, entries, element, first));
   __syncthreads();
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const int slot = patch.first_slot + s;

@@ -7,19 +7,27 @@ namespace pd {
 
 constexpr std::size_t fused_control_bytes = 1024;
 
-// position and u of every slot, an entry for every corner of a pair; planes and balls as numbers of five and eight
-constexpr std::size_t fused_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
-                                         std::size_t planes, std::size_t balls) {
-  return fused_control_bytes + real * (8 * slots + 4 * entries + 5 * planes + 8 * balls);
+// `bytes` and what fills them up to a multiple of 16
+constexpr std::size_t aligned(std::size_t bytes) { return (bytes + 15) / 16 * 16; }
+
+// one vector of every slot in four numbers, or two in six (cuda/slots.h)
+constexpr std::size_t slots_bytes(std::size_t real, std::size_t slots, std::size_t vectors) {
+  return vectors == 1 ? 4 * real * slots : aligned(6 * real * slots);
+}
+
+// With one patch position and u of every slot, with `many` position and rest position; an entry for every corner of a pair;
+// planes and balls as numbers of five and eight.
+constexpr std::size_t fused_shared_bytes(std::size_t real, bool many, std::size_t slots,
+                                         std::size_t entries, std::size_t planes,
+                                         std::size_t balls) {
+  return fused_control_bytes + (many ? slots_bytes(real, slots, 2) : 8 * real * slots) +
+         real * (4 * entries + 5 * planes + 8 * balls);
 }
 
 // A cluster of blocks: the most that one has, and what each keeps for sums (cuda/cluster_sums.h).
 constexpr std::size_t most_cluster_blocks = 16;
 constexpr std::size_t cluster_sums_bytes =
     2 * sizeof(std::uint64_t) + 2 * most_cluster_blocks * 3 * sizeof(double);
-
-// `bytes` and what fills them up to a multiple of 16
-constexpr std::size_t aligned(std::size_t bytes) { return (bytes + 15) / 16 * 16; }
 
 // what each keeps for letters (cuda/mail.h); `seats`: shared slots
 constexpr std::size_t mail_bytes(std::size_t real, std::size_t seats, std::size_t patches) {
@@ -41,10 +49,10 @@ constexpr std::size_t pass_static_bytes = 3 * 32 * sizeof(double);
 // the same with all that the iterations of the multilevel solver keep
 constexpr std::size_t outer_static_bytes = 7168;
 
-// `fields` vectors of every slot
+// `fields` vectors of every slot, one or two
 constexpr std::size_t pass_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
                                         std::size_t fields) {
-  return real * 4 * (fields * slots + entries);
+  return slots_bytes(real, slots, fields) + 4 * real * entries;
 }
 
 }  // namespace pd
