@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 import torchpd as pd
 from torchpd.scene import SceneValues
 
+SMALL_PAIRS = 512  # csrc/plan/device_build.cpp
+
 
 def test_patches_hold_their_interior_and_then_shared_vertices(lanes: Lanes, plan: Arrays, values: SceneValues) -> None:
     np.testing.assert_array_equal(np.sort(plan.vertex_order), np.arange(len(values.rest_positions)))
@@ -42,6 +44,27 @@ def test_patches_hold_their_interior_and_then_shared_vertices(lanes: Lanes, plan
 def test_the_first_patch_owns_a_vertex(plan: Arrays) -> None:
     first = np.unique(plan.slot_vertex, return_index=True)[1]
     np.testing.assert_array_equal(np.flatnonzero(plan.slot_row >= 0), np.sort(first))
+
+
+def test_vertices_of_the_same_patches_are_neighbours(plan: Arrays) -> None:
+    """A patch reads what another sends in runs then. Slots of a small one follow; those of a large one save padding."""
+    first_shared = plan.patch_vertex[-1]
+    patch = np.repeat(np.arange(len(plan.patch_slot) - 1), np.diff(plan.patch_slot))
+    owners = [patch[plan.slot_vertex == v].tolist() for v in range(first_shared, len(plan.vertex_order))]
+    assert owners == sorted(owners)
+    for p, (a, b) in enumerate(zip(plan.patch_slot[:-1], plan.patch_slot[1:], strict=True)):
+        mine, forces = plan.slot_vertex[a:b], plan.slot_row[a:b] >> 16 & 0x7FFF
+        shared = mine >= first_shared
+        assert (np.diff(forces[~shared]) <= 0).all()
+        assert (np.diff(mine[shared] if plan.patch_pairs[p] <= SMALL_PAIRS else -forces[shared]) >= 0).all()
+
+
+@pytest.mark.parametrize(("patches", "small"), [(20, True), (5, False)])
+def test_shared_slots_of_small_and_of_large_patches(patches: int, small: bool) -> None:
+    values = pd.Scene(pd.Solid(pd.shapes.box((1.0, 1.0, 1.0), (10, 10, 10)), youngs=1e5)).values()
+    plan = Arrays.of(values, patches)
+    assert (plan.patch_pairs <= SMALL_PAIRS).all() == small
+    test_vertices_of_the_same_patches_are_neighbours(plan)
 
 
 def sender_rows(plan: Arrays, number: int) -> list[int]:

@@ -18,6 +18,7 @@ namespace pd {
 namespace {
 
 constexpr int lanes = 32, slice = 8;
+constexpr int small_pairs = 512;      // of a patch
 constexpr std::int64_t none = 65535;  // slots and entries of a patch count up to one less
 
 struct Mesh {
@@ -45,13 +46,19 @@ struct Patch {
                               std::to_string(none - 1) + "; take more patches");
 }
 
-// Slots of a patch in an order that leaves little padding between entries: interior vertices first, most forces first.
-std::vector<std::int32_t> slots_of(const Patch& patch, const std::vector<std::uint8_t>& is_shared) {
+// Slots of a patch: interior vertices first, most forces first, which leaves little padding between entries. In a small patch,
+// which has room for padding and waits for others most of the time, shared ones come as they are numbered: all their patches
+// read and write them in runs then.
+std::vector<std::int32_t> slots_of(const Patch& patch, const Numbering& numbering) {
   std::vector<std::int32_t> order(patch.vertex.size()), slot(order.size());
   for (std::size_t v = 0; v < order.size(); ++v) order[v] = std::int32_t(v);
+  const bool small = std::ssize(patch.pairs) <= small_pairs;
   std::stable_sort(order.begin(), order.end(), [&](std::int32_t a, std::int32_t b) {
-    const bool shared = is_shared[patch.vertex[a]], other = is_shared[patch.vertex[b]];
-    return shared != other ? other : patch.forces[a] > patch.forces[b];
+    const std::int32_t one = patch.vertex[a], two = patch.vertex[b];
+    const bool shared = numbering.is_shared[one], other = numbering.is_shared[two];
+    if (shared != other) return other;
+    return shared && small ? numbering.internal[one] < numbering.internal[two]
+                           : patch.forces[a] > patch.forces[b];
   });
   for (std::size_t s = 0; s < order.size(); ++s) slot[order[s]] = std::int32_t(s);
   return slot;
@@ -97,7 +104,7 @@ Patch make_patch(const Mesh& mesh, std::span<const std::int32_t> tets,
   for (const Pair& pair : patch.pairs) {
     for (int c = 0; c < pair.corners(); ++c) ++patch.forces[pair.corner[c]];
   }
-  const std::vector<std::int32_t> slot = slots_of(patch, mesh.numbering.is_shared);
+  const std::vector<std::int32_t> slot = slots_of(patch, mesh.numbering);
   scatter(patch.vertex, slot);
   scatter(patch.forces, slot);
   for (Pair& pair : patch.pairs) {

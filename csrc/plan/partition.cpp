@@ -60,6 +60,27 @@ void divide(Partition& mesh, const std::vector<Point>& corners, std::int64_t beg
   divide(mesh, corners, middle, end, patches - left, grain);
 }
 
+// Shared vertices in an order that puts those of the same patches side by side: what one patch reads of another lies together
+// then. `shared` keeps its order otherwise.
+void gather_by_patches(const Partition& mesh, const std::int64_t* tets,
+                       const std::vector<std::uint8_t>& is_shared,
+                       std::vector<std::int64_t>& shared) {
+  std::vector<std::int32_t> number(is_shared.size(), -1);
+  for (std::size_t i = 0; i < shared.size(); ++i) number[shared[i]] = std::int32_t(i);
+  std::vector<std::vector<std::int32_t>> patches(shared.size());
+  for (int p = 0; p < mesh.patches(); ++p) {
+    for (const std::int32_t t : mesh.patch(p)) {
+      for (int k = 0; k < 4; ++k) {
+        const std::int32_t i = number[tets[4 * std::int64_t(t) + k]];
+        if (i >= 0 && (patches[i].empty() || patches[i].back() != p)) patches[i].push_back(p);
+      }
+    }
+  }
+  std::stable_sort(shared.begin(), shared.end(), [&](std::int64_t a, std::int64_t b) {
+    return patches[number[a]] < patches[number[b]];
+  });
+}
+
 }  // namespace
 
 Partition partition_mesh(const double* positions, const std::int64_t* tets, std::int64_t count,
@@ -92,14 +113,21 @@ Numbering number_vertices(const Partition& mesh, const std::int64_t* tets, std::
   }
   n.patch_vertex.assign(mesh.patches() + 1, 0);
   n.vertex_order.reserve(by_owner.size());
-  for (int shared = 0; shared < 2; ++shared) {
-    for (const std::int64_t v : by_owner) {
-      if (n.is_shared[v] != shared) continue;
-      n.internal[v] = std::int32_t(n.vertex_order.size());
-      n.vertex_order.push_back(std::int32_t(v));
-      if (!shared) ++n.patch_vertex[owner[v] + 1];
+  const auto append = [&](std::int64_t v) {
+    n.internal[v] = std::int32_t(n.vertex_order.size());
+    n.vertex_order.push_back(std::int32_t(v));
+  };
+  std::vector<std::int64_t> shared;
+  for (const std::int64_t v : by_owner) {
+    if (n.is_shared[v]) {
+      shared.push_back(v);
+    } else {
+      append(v);
+      ++n.patch_vertex[owner[v] + 1];
     }
   }
+  gather_by_patches(mesh, tets, n.is_shared, shared);
+  for (const std::int64_t v : shared) append(v);
   std::partial_sum(n.patch_vertex.begin(), n.patch_vertex.end(), n.patch_vertex.begin());
   return n;
 }
