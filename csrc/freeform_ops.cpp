@@ -1,6 +1,7 @@
 // The ops of free-form patches: schemas, and the CPU behind them.
 //
-// Compiled once, for any processor: the work is gathers and short scalar loops, which wider registers hardly speed up.
+// Compiled once, for any processor: the work is gathers and sums over a few quadrics, which registers of more than four
+// numbers hardly speed up.
 #if defined(__x86_64__)
 #define PD_NO_FMA  // x86-64 has it only since AVX2, and a call to the library would be slow
 #endif
@@ -61,10 +62,12 @@ TORCH_LIBRARY_FRAGMENT(torchpd, m) {
       "patch_frames_vjp(Tensor grad, Tensor frames, Tensor gradients, Tensor weights, Tensor[] "
       "lists) -> (Tensor, Tensor)");
   m.def(
-      "patch_surface_rays(Tensor origins, Tensor directions, Tensor points, Tensor cells, Tensor "
+      "patch_surface_rays(Tensor origins, Tensor directions, Tensor barycentrics, Tensor cells, "
+      "Tensor "
       "weights, Tensor places, Tensor positions, Tensor frames, Tensor vertices, Tensor directors, "
       "Tensor amplitudes, Tensor centres, Tensor factors, Tensor[] lists, *, int level, bool "
-      "on_surface, bool phong, float near, float far) -> (Tensor, Tensor, Tensor)");
+      "on_surface, bool phong, bool shape, float near, float far) -> (Tensor, Tensor, Tensor, "
+      "Tensor, Tensor)");
   m.def(
       "patch_field_rays(Tensor origins, Tensor directions, Tensor positions, Tensor amplitudes, "
       "Tensor matrices, Tensor order, Tensor[] lists, *, float thickness, bool clip, float near, "

@@ -1,6 +1,7 @@
 // Rays, on either device: checks, views, the tasks one after another.
 #pragma once
 #include "freeform_field_ops.h"
+#include "freeform_surface_ops.h"
 
 #include <algorithm>
 #include <limits>
@@ -26,7 +27,7 @@ struct RayTensors {
                         describe(t));
     }
     origins = real_argument(o, o, {o.size(0), count, 3}, "origins", "m");
-    directions = real_argument(d, o, {d.size(0), count, 3}, "directions", "of unit length");
+    directions = real_argument(d, o, {d.size(0), count, 3}, "directions", "of the rays");
   }
 
   template <class T>
@@ -68,21 +69,23 @@ void join_boxes(const Tree<T>& tree, std::int64_t batch, const Tensor& like) {
     Backend::run(JoinedBoxes<T>{tree, k}, batch << k, like);
 }
 
+using Five = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+
 template <class Backend>
-std::tuple<Tensor, Tensor, Tensor> surface_rays(
-    const Tensor& origins, const Tensor& directions, const Tensor& points, const Tensor& cells,
-    const Tensor& weights, const Tensor& places, const Tensor& positions, const Tensor& frames,
-    const Tensor& vertices, const Tensor& directors, const Tensor& amplitudes,
-    const Tensor& centres, const Tensor& factors, at::TensorList arrays, std::int64_t level,
-    bool on_surface, bool phong, double near, double far) {
-  check_batched(points, 3, "points", "[batch, grid, 3] (m)");
-  const Lists lists = lists_view(arrays, {points.device(), "points"});
-  const auto batch = points.size(0), q = lists.quadrics, v = lists.vertices;
+Five surface_rays(const Tensor& origins, const Tensor& directions, const Tensor& barycentrics,
+                  const Tensor& cells, const Tensor& weights, const Tensor& places,
+                  const Tensor& positions, const Tensor& frames, const Tensor& vertices,
+                  const Tensor& directors, const Tensor& amplitudes, const Tensor& centres,
+                  const Tensor& factors, at::TensorList arrays, std::int64_t level, bool on_surface,
+                  bool phong, bool shape, double near, double far) {
+  check_batched(positions, 3, "positions", "[batch, vertices, 3] (m)");
+  const Lists lists = lists_view(arrays, {positions.device(), "positions"});
+  const auto batch = positions.size(0), q = lists.quadrics, v = lists.vertices;
   const RayTensors rays(origins, directions, batch, near, far);
-  check_cells(cells, points, level);
+  check_cells(cells, positions, level);
   const auto real = [&](const Tensor& t, at::IntArrayRef sizes, const char* name,
                         const char* meaning) {
-    return real_argument(t, points, sizes, name, meaning);
+    return real_argument(t, positions, sizes, name, meaning);
   };
   const Tensor at_rest = real(vertices, {v, 3}, "vertices", "m"),
                n = real(directors, {v, 3}, "directors", "of unit length"),
@@ -91,42 +94,51 @@ std::tuple<Tensor, Tensor, Tensor> surface_rays(
                m = real(factors, {q, 6}, "factors", "1/m"),
                posed = real(positions, {batch, v, 3}, "positions", "m"),
                turned = real(frames, {batch, v, 3, 3}, "frames", "of the vertices"),
-               grid = real(points, points.sizes(), "points", "m"),
+               grid = real(barycentrics, {lists.samples, 3}, "barycentrics", "of the grid"),
                inner = real(weights, {check_points, 3}, "weights", "of the checks of a cell"),
                place =
                    real(places, {level * level, 9}, "places", "corners of the cells of a patch");
   real(rays.origins, rays.origins.sizes(), "origins", "m");
-  const int levels = levels_of(cells.size(0), 2);
-  const Tensor sheets = at::empty({batch, lists.patches, sheet_numbers}, points.options());
-  const Tensor slack = at::empty({batch, cells.size(0)}, points.options());
-  const Tensor boxes = empty_boxes(batch, levels, points);
-  const Tensor depth = at::empty({batch, rays.count}, points.options());
-  const Tensor patch = at::empty({batch, rays.count}, points.options().dtype(at::kInt));
-  const Tensor b = at::empty({batch, rays.count, 3}, points.options());
-  for_precision(points, [&](auto number) {
+  const int levels = levels_of(cells.size(0), 2);  // at most four cells a leaf, side by side
+  const auto empty = [&](at::IntArrayRef sizes) { return at::empty(sizes, positions.options()); };
+  const Tensor sheets = empty({batch, lists.patches, sheet_numbers});
+  const Tensor bumps = empty({lists.entries / 4 + lists.patches + 1, bump_numbers});
+  const Tensor heights = empty({lists.samples}), points = empty({batch, lists.samples, 3});
+  const Tensor fours = empty({batch, std::int64_t(1) << levels, cell_four_numbers});
+  const Tensor boxes = empty_boxes(batch, levels, positions);
+  const Tensor depth = empty({batch, rays.count}), b = empty({batch, rays.count, 3});
+  const Tensor patch = at::empty({batch, rays.count}, positions.options().dtype(at::kInt));
+  const auto shaped = shape ? rays.count : 0;
+  const Tensor hits = empty({batch, shaped, 3}), normals = empty({batch, shaped, 3});
+  for_precision(positions, [&](auto number) {
     using T = decltype(number);
-    const Tree<T> tree{write<T>(boxes), cells.size(0), levels};
-    const Cells<T> in{tree,          read<int32>(cells), read<T>(inner), read<T>(place),
-                      read<T>(grid), write<T>(slack),    points.size(1), T(1) / T(level)};
-    Backend::run(CellBoxes<T>{in}, batch << levels, points);
-    join_boxes<Backend>(tree, batch, points);
-    const Base<T> base{read<T>(at_rest), read<T>(n), phong ? T(0.75) : T(0)};
+    const Base<T> base{read<T>(at_rest), read<T>(n), phong ? phong_lift<T> : T(0)};
     const Ellipsoids<T> ellipsoids{read<T>(a), read<T>(c), read<T>(m)};
     Backend::run(PosedSheets<T>{lists, base, read<T>(posed), read<T>(turned), write<T>(sheets)},
-                 batch * lists.patches, points);
-    const SurfaceRays<T> task{lists,
-                              base,
-                              ellipsoids,
+                 batch * lists.patches, positions);
+    Backend::run(GatheredBumps<T>{lists, ellipsoids, write<T>(bumps)}, lists.patches, positions);
+    const Sheets<T> surface{lists, read<T>(sheets), read<T>(bumps), base.lift, on_surface};
+    Backend::run(GridHeights<T>{surface, read<T>(grid), write<T>(heights)}, lists.samples,
+                 positions);
+    Backend::run(GridPoints<T>{surface, read<T>(grid), read<T>(heights), write<T>(points)},
+                 batch * lists.samples, positions);
+    const Tree<T> tree{write<T>(boxes), cells.size(0), levels};
+    const Cells<T> in{tree,           read<int32>(cells), read<T>(inner),
+                      read<T>(place), read<T>(points),    write<T>(fours),
+                      lists.samples,  T(1) / T(level)};
+    Backend::run(CellBoxes<T>{in}, batch << levels, positions);
+    join_boxes<Backend>(tree, batch, positions);
+    const SurfaceRays<T> task{surface,
                               in,
                               rays.view<T>(),
-                              read<T>(sheets),
-                              on_surface,
                               write<T>(depth),
                               write<int32>(patch),
-                              write<T>(b)};
-    Backend::run(task, batch * rays.count, points);
+                              write<T>(b),
+                              shape ? write<T>(hits) : nullptr,
+                              shape ? write<T>(normals) : nullptr};
+    Backend::run(task, batch * rays.count, positions);
   });
-  return {depth, patch, b};
+  return {depth, patch, b, hits, normals};
 }
 
 template <class Backend>

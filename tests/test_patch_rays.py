@@ -275,17 +275,17 @@ def op_arguments(name: str, dtype: torch.dtype, device: torch.device) -> tuple[l
         options = {"thickness": 0.1, "clip": True, "exhaustive": False, **span}
         return [o, unit(d), v[None], q.amplitudes, q.normalized_matrices()[None], rays._order, lists], options
     eye = torch.eye(3, dtype=dtype, device=device).expand(1, len(v), 3, 3)
-    points = patches.surface(rays._samples).points[None]
     quadrics = [q.amplitudes, q.centres, q.entries()]
-    arrays = [rays._cells, rays._weights, rays._places, v[None], eye, v, patches.directors, *quadrics]
-    options = {"level": rays.level, "on_surface": False, "phong": False, **span}
-    return [o, unit(d), points, *arrays, [*patches.lists, *rays._samples.lists]], options
+    grid = [rays._samples.barycentrics, rays._cells, rays._weights, rays._places]
+    options = {"level": rays.level, "on_surface": False, "phong": False, "shape": name == "shape", **span}
+    arrays = [v[None], eye, v, patches.directors, *quadrics]
+    return [o, d, *grid, *arrays, [*patches.lists, *rays._samples.lists]], options
 
 
-@pytest.mark.parametrize("name", ["surface", "field"])
+@pytest.mark.parametrize("name", ["surface", "shape", "field"])
 def test_ops(name: str, dtype: torch.dtype, device: torch.device, poisoned: None) -> None:
     """opcheck; the same bits again; vmap over origins; no derivative of their own."""
-    op = getattr(torch.ops.torchpd, f"patch_{name}_rays")
+    op = torch.ops.torchpd.patch_field_rays if name == "field" else torch.ops.torchpd.patch_surface_rays
     args, options = op_arguments(name, dtype, device)
     assert set(torch.library.opcheck(op.default, tuple(args), options).values()) == {"SUCCESS"}
     once, again = op(*args, **options), op(*args, **options)

@@ -73,11 +73,21 @@ def render_patches(
     directions = torch.as_tensor(camera.rays(size)).to(like).reshape(-1, 3)
     origin = torch.tensor(camera.origin).to(like)
     hits = rays.cast(origin.expand_as(directions), directions, pose, patches=patches)
-    towards = -directions if light is None else torch.nn.functional.normalize(like.new_tensor(light), dim=0)
-    seen = torch.where((hits.normals * directions).sum(-1) > 0.0, -1.0, 1.0)
-    lit = (seen * (hits.normals * towards).sum(-1)).clamp_min(0.0)
-    shaded = (ambient + (1.0 - ambient) * lit)[..., None] * like.new_tensor(color)
-    shown = torch.where(hits.hit[..., None], shaded, like.new_tensor(background))
+    facing = _dot(hits.normals, directions)
+    if light is None:
+        lit = facing.abs()
+    else:
+        towards = torch.nn.functional.normalize(like.new_tensor(light), dim=0)
+        lit = (torch.where(facing > 0.0, -1.0, 1.0) * _dot(hits.normals, towards)).clamp_min(0.0)
+    share = torch.where(hits.hit, ambient + (1.0 - ambient) * lit, 0.0)
+    behind = (~hits.hit)[..., None] * like.new_tensor(background)
+    shown = torch.addcmul(behind, share[..., None], like.new_tensor(color))
     shape = (-1, height, width)
     flat = (hits.hit, hits.depth, hits.normals, hits.patch, hits.barycentrics, hits.points, shown)
     return PatchImage(*(t.reshape(*shape, *t.shape[2:]) for t in flat))
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Component by component: a sum over a dimension of three is slow."""
+    (x, y, z), (u, v, w) = a.unbind(-1), b.unbind(-1)
+    return x * u + y * v + z * w

@@ -96,9 +96,11 @@ def _(grad: Tensor, frames: Tensor, gradients: Tensor, weights: Tensor, lists: _
 
 
 @torch.library.register_fake("torchpd::patch_surface_rays")
-def _(origins: Tensor, directions: Tensor, points: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
-    shape = (points.shape[0], origins.shape[1])
-    return points.new_empty(shape), points.new_empty(shape, dtype=torch.int32), points.new_empty((*shape, 3))
+def _(origins: Tensor, directions: Tensor, *inputs: Any, shape: bool, **_: Any) -> tuple[Tensor, ...]:
+    positions, rays = inputs[4], origins.shape[1]
+    batch, shaped = positions.shape[0], rays if shape else 0
+    depth, patch = positions.new_empty((batch, rays)), positions.new_empty((batch, rays), dtype=torch.int32)
+    return depth, patch, *(positions.new_empty((batch, count, 3)) for count in (rays, shaped, shaped))
 
 
 @torch.library.register_fake("torchpd::patch_field_rays")

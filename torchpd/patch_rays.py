@@ -86,8 +86,8 @@ class PatchRays:
     ) -> PatchHits:
         """The first hit of every ray.
 
-        Hits are gathered, so this waits for the device. Gradients go to quadrics, pose, base, origins and directions;
-        that a ray hits or misses has none, nor does the outline of the surface.
+        Gradients go to quadrics, pose, base, origins and directions; that a ray hits or misses has none, nor does the
+        outline of the surface. Where they are wanted hits are gathered, and this waits for the device.
 
         Args:
             origins: [R, 3], or [B, R, 3] in B poses [m].
@@ -96,11 +96,16 @@ class PatchRays:
             patches: in place of those given at the start, with the same triangles.
             near, far: hits count between these distances along the ray [m].
         """
-        depth, patch, b = self.search(origins, directions, pose, patches=patches, near=near, far=far)
         surface = self.patches if patches is None else patches
-        o, d = _rays(origins, directions, surface)
-        rest = _at_rest(surface) if pose is None else pose
-        return _fill(surface, rest, depth, patch, b, o.expand(len(depth), -1, -1), d.expand(len(depth), -1, -1))
+        at = _at_rest(surface) if pose is None else pose
+        found = self._find(origins, directions, at, surface, near, far, shape=True)
+        hits = PatchHits(found[1] >= 0, *found)
+        q = surface.quadrics
+        inputs = (surface.vertices, surface.directors, q.amplitudes, q.centres, q.factors, *at, origins, directions)
+        if not (torch.is_grad_enabled() and any(t.requires_grad for t in inputs)):
+            return hits
+        o, d = (t.expand(len(hits.depth), -1, -1) for t in _rays(origins, directions, surface))
+        return _with_gradients(surface, at, hits, o, d)
 
     @torch.no_grad()
     def search(
@@ -120,22 +125,33 @@ class PatchRays:
             Depth [B, R] in m, infinite for a miss; patch int32 [B, R], -1 for a miss; barycentrics [B, R, 3].
         """
         surface = self.patches if patches is None else patches
-        self._check_patches(surface)
-        o, d = _rays(origins, directions, surface)
         at = _at_rest(surface) if pose is None else pose
-        h, slopes = surface.heights(self._samples)
-        points, _ = _ops.patch_surface(
-            *at, surface.vertices, surface.directors, h, slopes, self._samples.barycentrics,
-            [*surface.lists, *self._samples.lists], phong=surface.base == "phong",
-        )  # fmt: skip
-        q = surface.quadrics
-        depth, patch, b = _ops.patch_surface_rays(
-            o, d, points, self._cells, self._weights, self._places, *at, surface.vertices, surface.directors,
-            q.amplitudes, q.centres, q.entries(), [*surface.lists, *self._samples.lists],
-            level=self.level, on_surface=surface.measured_at == "surface", phong=surface.base == "phong",
-            near=near, far=far,
-        )  # fmt: skip
+        depth, patch, b, _, _ = self._find(origins, directions, at, surface, near, far, shape=False)
         return depth, patch, b
+
+    @torch.no_grad()
+    def _find(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        pose: PatchPose,
+        surface: FreeFormPatches,
+        near: float,
+        far: float,
+        *,
+        shape: bool,
+    ) -> tuple[Tensor, ...]:
+        """What `search` returns, and with `shape` the points and normals of the hits."""
+        self._check_patches(surface)
+        o, d = _batched("origins", origins, surface), _batched("directions", directions, surface)
+        q = surface.quadrics
+        found: tuple[Tensor, ...] = _ops.patch_surface_rays(
+            o, d, self._samples.barycentrics, self._cells, self._weights, self._places, *pose, surface.vertices,
+            surface.directors, q.amplitudes, q.centres, q.entries(), [*surface.lists, *self._samples.lists],
+            level=self.level, on_surface=surface.measured_at == "surface", phong=surface.base == "phong",
+            shape=shape, near=near, far=far,
+        )  # fmt: skip
+        return found
 
     def render(
         self,
@@ -316,30 +332,28 @@ def _in_poses(surface: FreeFormPatches, pose: PatchPose, number: Tensor, where: 
     return SurfacePoints(points[0], torch.nn.functional.normalize(normal, dim=-1, eps=0.0), tangents[0])
 
 
-def _fill(
-    surface: FreeFormPatches, pose: PatchPose, depth: Tensor, patch: Tensor, b: Tensor, o: Tensor, d: Tensor
-) -> PatchHits:
-    """Points and normals of the hits, and gradients where they are wanted."""
-    hit = patch >= 0
-    number, ray = hit.nonzero(as_tuple=True)
-    where = surface.samples(patch[hit], b[hit])
+def _with_gradients(surface: FreeFormPatches, pose: PatchPose, hits: PatchHits, o: Tensor, d: Tensor) -> PatchHits:
+    """The same numbers, with gradients by the implicit function theorem."""
+    number, ray = hits.hit.nonzero(as_tuple=True)
+    where = surface.samples(hits.patch[hits.hit], hits.barycentrics[hits.hit])
     at = _in_poses(surface, pose, number, where)
-    t = depth[hit]
-    if any(x.requires_grad for x in (at.points, o, d)):
-        # S(b) = o + t d: b and t move by the solution of a linear system whose matrix may be taken as constant
-        o, d = o[number, ray], d[number, ray]
-        left = at.points - (o + t[:, None] * d)
-        matrix = torch.cat([at.tangents.detach(), -d.detach()[:, None]], dim=1).mT
-        moved = torch.linalg.solve_ex(matrix, left[..., None])[0][..., 0]
-        moved = moved.detach() - moved  # of value zero
-        t = t + moved[:, 2]
-        changed = torch.cat([moved[:, :2], -moved[:, :1] - moved[:, 1:2]], dim=1)
-        at = _in_poses(surface, pose, number, where.at(where.barycentrics + changed))
-        b = b.index_put((number, ray), where.barycentrics + changed)
+    # S(b) = o + t d: b and t move by the solution of a linear system whose matrix may be taken as constant
+    o, d = o[number, ray], d[number, ray]
+    left = at.points - (o + hits.depth[hits.hit][:, None] * d)
+    matrix = torch.cat([at.tangents.detach(), -d.detach()[:, None]], dim=1).mT
+    moved = -torch.linalg.solve_ex(matrix, left[..., None])[0][..., 0]
+    moved = moved - moved.detach()  # of value zero
+    changed = torch.cat([moved[:, :2], -moved[:, :1] - moved[:, 1:2]], dim=1)
+    at = _in_poses(surface, pose, number, where.at(where.barycentrics + changed))
+
+    def traced(value: Tensor, change: Tensor) -> Tensor:
+        return value.index_put((number, ray), value[number, ray] + (change - change.detach()))
+
     return PatchHits(
-        hit,
-        depth.index_put((number, ray), t),
-        patch,
-        b,
-        *(torch.zeros_like(b).index_put((number, ray), x) for x in (at.points, at.normals)),
+        hits.hit,
+        traced(hits.depth, moved[:, 2]),
+        hits.patch,
+        traced(hits.barycentrics, changed),
+        traced(hits.points, at.points),
+        traced(hits.normals, at.normals),
     )

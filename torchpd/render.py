@@ -30,6 +30,7 @@ CORAL: Color = (0.72, 0.10, 0.04)
 _FLOOR: Color = (0.41, 0.53, 0.60)
 _KEY_LIGHT: Color = (12.0, 11.4, 10.6)  # radiance of the soft box, warm
 _SKY: Color = (0.61, 0.625, 0.66)  # radiance from everywhere, cool
+_ROWS = 16  # of a picture at a time, so that they stay in the cache
 _PAPER, _INK = (255, 255, 255), (62, 64, 70)
 
 
@@ -51,8 +52,15 @@ class Camera:
         slope = np.tan(np.radians(self.fov) / 2.0)
         x = (2.0 * (np.arange(width) + 0.5) / width - 1.0) * slope * width / height
         y = (1.0 - 2.0 * (np.arange(height) + 0.5) / height) * slope
-        rays = forward + x[None, :, None] * right + y[:, None, None] * np.cross(right, forward)
-        return np.asarray(rays / np.linalg.norm(rays, axis=2, keepdims=True))
+        across, upwards = forward + x[:, None] * right, y[:, None] * np.cross(right, forward)
+        rays = np.empty((height, width, 3))
+        for top in range(0, height, _ROWS):
+            rows = slice(top, top + _ROWS)
+            a, b, c = (across[:, k] + upwards[rows, k, None] for k in range(3))
+            length = np.sqrt(a * a + b * b + c * c)
+            for k, component in enumerate((a, b, c)):
+                np.divide(component, length, out=rays[rows, :, k])
+        return rays
 
 
 def _view_axes(azimuth: float, elevation: float) -> Array:

@@ -4,7 +4,7 @@
 // the boundary, where it ends. |dR/dr| is at most 96 / (25 sqrt 5) a over the radius.
 //   grad R = -6 a q^2 M^T y,   Hess R w = M^T (24 a q (y.z) y - 6 a q^2 z),   z = M w,   q = [Q]_+
 #pragma once
-#include "patches/views.h"
+#include "patches/fours.h"
 
 namespace pd::freeform::inline PD_TARGET {
 
@@ -65,6 +65,91 @@ PD_HD Field<T> bumps_at(const Ellipsoids<T>& of, const Lists& lists, Index patch
     add(sum.gradient, T(-6) * r.a * (q * q), transposed_times(r.m, y));
   }
   return sum;
+}
+
+// The bumps of a patch.
+template <class T>
+struct PatchBumps {
+  const Ellipsoids<T>& of;
+  const Lists& lists;
+  Index patch;
+};
+
+template <class T>
+PD_HD Field<T> bumps_at(const PatchBumps<T>& b, const Vec3<T>& x) {
+  return bumps_at(b.of, b.lists, b.patch, x);
+}
+
+template <class T>
+PD_HD void bounds_of(const PatchBumps<T>& b, T& low, T& high) {
+  for (int32 e = b.lists.patch_start[b.patch]; e < b.lists.patch_start[b.patch + 1]; ++e) {
+    const T a = b.of.amplitudes[b.lists.entry_quadric[e]];
+    (a > T(0) ? high : low) = (a > T(0) ? high : low) + a;
+  }
+}
+
+// The same by fours, number by number, so that a processor takes four at once; what is missing has no amplitude, and its Q > 0 far away.
+template <class T>
+struct BumpFours {
+  const T* numbers;  // [count, 10, 4]
+  int32 count;
+};
+
+constexpr int bump_numbers = 40;
+
+// Where the fours of a patch begin: they fit in before those of the next, with less than one to spare for each patch.
+PD_HD Index first_four(const Lists& lists, Index patch) {
+  return lists.patch_start[patch] / 4 + patch;
+}
+
+PD_HD int32 fours_of(const Lists& lists, Index patch) {
+  return (lists.patch_start[patch + 1] - lists.patch_start[patch] + 3) / 4;
+}
+
+template <class T>
+PD_HD void store_fours(T* fours, const Ellipsoids<T>& of, const Lists& lists, Index patch) {
+  T* to = fours + bump_numbers * first_four(lists, patch);
+  const int32 begin = lists.patch_start[patch], end = lists.patch_start[patch + 1];
+  for (int32 n = 0; n < 4 * fours_of(lists, patch); ++n) {
+    Bump<T> r = {T(0), {T(1e15), T(0), T(0)}, {T(1), T(1), T(1), T(0), T(0), T(0)}};
+    if (begin + n < end) r = load_bump(of, lists.entry_quadric[begin + n]);
+    const T numbers[10] = {r.a,    r.c.x,  r.c.y,  r.c.z,  r.m.xx,
+                           r.m.yy, r.m.zz, r.m.yx, r.m.zx, r.m.zy};
+    for (int k = 0; k < 10; ++k) to[bump_numbers * (n / 4) + 4 * k + n % 4] = numbers[k];
+  }
+}
+
+template <class T>
+PD_HD Field<T> bumps_at(const BumpFours<T>& b, const Vec3<T>& x) {
+  using L = Lanes<T>;
+  using R = Number<T>;
+  const Vec3<R> at = {R(x.x), R(x.y), R(x.z)};
+  R value = R(T(0));
+  Vec3<R> gradient = {R(T(0)), R(T(0)), R(T(0))};
+  for (int32 n = 0; n < b.count; ++n) {
+    for (int lane = 0; lane < 4; lane += L::width) {
+      const T* m = b.numbers + bump_numbers * Index(n) + lane;
+      const Vec3<R> c = {L::load(m + 4), L::load(m + 8), L::load(m + 12)};
+      const Factor<R> factor = {L::load(m + 16), L::load(m + 20), L::load(m + 24),
+                                L::load(m + 28), L::load(m + 32), L::load(m + 36)};
+      const Vec3<R> y = factor * (at - c);
+      const R q = R(T(1)) - dot(y, y);
+      if (bits_of(q > R(T(0))) == 0) continue;
+      const R inside = greater(R(T(0)), q), steep = L::load(m) * (inside * inside);
+      value = value + steep * inside;
+      gradient = gradient + steep * transposed_times(factor, y);
+    }
+  }
+  return {L::sum(value),
+          T(-6) * Vec3<T>{L::sum(gradient.x), L::sum(gradient.y), L::sum(gradient.z)}};
+}
+
+template <class T>
+PD_HD void bounds_of(const BumpFours<T>& b, T& low, T& high) {
+  for (int n = 0; n < 4 * b.count; ++n) {
+    const T a = b.numbers[bump_numbers * (n / 4) + n % 4];
+    (a > T(0) ? high : low) = (a > T(0) ? high : low) + a;
+  }
 }
 
 // Hess R w of the sum over the quadrics of a patch

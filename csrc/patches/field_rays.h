@@ -347,6 +347,16 @@ struct EnterPatch {
   }
 };
 
+template <class T>
+struct EnterLeaf {
+  const EnterPatch<T>& enter;
+
+  PD_HD void operator()(Index leaf) const {
+    const Tree<T>& t = enter.task.tree;
+    for (Index n = first_of(t, leaf); n < first_of(t, leaf + 1); ++n) enter(n);
+  }
+};
+
 // Item: a ray in a pose.
 template <class T>
 PD_HD void item(const FieldRays<T>& t, Index i) {
@@ -361,7 +371,7 @@ PD_HD void item(const FieldRays<T>& t, Index i) {
       for (Index n = 0; n < t.tree.count; ++n) enter(n);
     } else {
       visit(t.tree, pose, sight, t.rays.near, depth, T(64) * epsilon<T>() * largest(sight.o),
-            enter);
+            EnterLeaf<T>{enter});
     }
   }
   t.depth[i] = found < 0 ? T(HUGE_VAL) : depth;

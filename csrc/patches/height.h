@@ -60,17 +60,13 @@ struct HeightQuadrics {
 namespace pd::freeform::inline PD_TARGET {
 
 // Newton's method between bounds that hold a root, halving them where a step leaves them.
-template <class T>
-PD_HD T solve_height(const Ellipsoids<T>& of, const Lists& lists, Index patch, const Vec3<T>& p,
-                     const Vec3<T>& d) {
+template <class T, class Bumps>
+PD_HD T solve_height(const Bumps& bumps, const Vec3<T>& p, const Vec3<T>& d) {
   T low = T(0), high = T(0);
-  for (int32 e = lists.patch_start[patch]; e < lists.patch_start[patch + 1]; ++e) {
-    const T a = of.amplitudes[lists.entry_quadric[e]];
-    (a > T(0) ? high : low) = (a > T(0) ? high : low) + a;
-  }
-  T h = bumps_at(of, lists, patch, p).value;
+  bounds_of(bumps, low, high);
+  T h = bumps_at(bumps, p).value;
   for (int step = 0; step < 64; ++step) {
-    const Field<T> r = bumps_at(of, lists, patch, multiply_add(h, d, p));
+    const Field<T> r = bumps_at(bumps, multiply_add(h, d, p));
     const T excess = h - r.value;
     (excess > T(0) ? high : low) = h;
     T next = h - excess / (T(1) - dot(r.gradient, d));
@@ -91,7 +87,7 @@ PD_HD void item(const Height<T>& t, Index sample) {
   Field<T> r;
   if (t.on_surface) {
     const Vec3<T> d = director(s);
-    h = solve_height(t.quadrics, t.lists, patch, x, d);
+    h = solve_height(PatchBumps<T>{t.quadrics, t.lists, patch}, x, d);
     x = multiply_add(h, d, x);
     r = bumps_at(t.quadrics, t.lists, patch, x);
     scale = T(1) / (T(1) - dot(r.gradient, d));

@@ -13,7 +13,8 @@ namespace pd::freeform {
 
 constexpr int check_points = 12;
 constexpr int cell_numbers = 3 + check_points + 2;  // corners and checks in `points`, patch, place
-constexpr int sheet_numbers = 27;
+constexpr int sheet_numbers = 45;
+constexpr int cell_four_numbers = 4 * (9 + 1);  // corners and slack
 
 // Where the surface is, cell by cell.
 template <class T>
@@ -23,7 +24,7 @@ struct Cells {
   const T* weights;    // [12, 3] barycentric coordinates of the checks in their cell
   const T* places;     // [m^2, 9] barycentric coordinates of the corners of a cell in its patch
   const T* points;     // [B, N, 3] m
-  T* slack;            // [B, C] m
+  T* fours;  // [B, leaves, 10, 4] of up to four cells, number by number: corners and slack, NaN for none, m
   Index samples;
   T size;  // edge of a cell in barycentric coordinates, 1 / m
 };
@@ -35,27 +36,56 @@ struct CellBoxes {
 
 // The posed surface patch by patch, its frames multiplied out: with A_k, v_k, e_k and u_k of patches/surface.h,
 //   sum_k b_k (v_k + A_k u_k) = sum_k b_k v_k + sum_{k<j} b_k b_j (A_k - A_j)(V_j - V_k) / 2 + sum_k b_k (h + l_k) A_k N_k,
-// which takes half of the arithmetic at every further place on the patch.
+// which takes half of the arithmetic at every further place on the patch. V_k and N_k follow, and the bumps by fours.
 template <class T>
 struct PosedSheets {
   Lists lists;
   Base<T> base;
   const T *positions, *frames;  // [B, V, 3], [B, V, 3, 3]
-  T* sheets;                    // [B, P, 27]
+  T* sheets;                    // [B, P, 45]
+};
+
+// The bumps of every patch by fours.
+template <class T>
+struct GatheredBumps {
+  Lists lists;
+  Ellipsoids<T> quadrics;
+  T* fours;  // [entries / 4 + P + 1, 10, 4]
+};
+
+// What the surface is evaluated from.
+template <class T>
+struct Sheets {
+  Lists lists;
+  const T *sheets, *fours;  // of PosedSheets and GatheredBumps
+  T lift;                   // of Base
+  bool on_surface;
+};
+
+// The corners and checks of cells: heights at rest, then points in every pose.
+template <class T>
+struct GridHeights {
+  Sheets<T> sheets;
+  const T* barycentrics;  // [N, 3]
+  T* heights;             // [N] m
+};
+
+template <class T>
+struct GridPoints {
+  Sheets<T> sheets;
+  const T *barycentrics, *heights;
+  T* points;  // [B, N, 3] m
 };
 
 template <class T>
 struct SurfaceRays {
-  Lists lists;
-  Base<T> base;
-  Ellipsoids<T> quadrics;
+  Sheets<T> sheets;
   Cells<T> cells;
   Rays<T> rays;
-  const T* sheets;  // [B, P, 27]
-  bool on_surface;
-  T* depth;         // [B, R] m, infinite without a hit
-  int32* patch;     // [B, R], -1 without a hit
-  T* barycentrics;  // [B, R, 3]
+  T* depth;             // [B, R] m, infinite without a hit
+  int32* patch;         // [B, R], -1 without a hit
+  T* barycentrics;      // [B, R, 3]
+  T *points, *normals;  // [B, R, 3] m and of unit length, or null
 };
 
 }  // namespace pd::freeform
@@ -70,6 +100,8 @@ PD_HD void item(const CellBoxes<T>& t, Index i) {
   const T* points = c.points + 3 * pose * c.samples;
   const T most = biggest<T>();
   Box<T> box = {{most, most, most}, {-most, -most, -most}};
+  T* four = c.fours + cell_four_numbers * i;
+  for (int k = 0; k < cell_four_numbers; ++k) four[k] = T(NAN);
   for (Index n = first_of(c.tree, leaf); n < first_of(c.tree, leaf + 1); ++n) {
     const int32* cell = c.cells + cell_numbers * n;
     const Vec3<T> p[3] = {load3(points, cell[0]), load3(points, cell[1]), load3(points, cell[2])};
@@ -84,7 +116,10 @@ PD_HD void item(const CellBoxes<T>& t, Index i) {
     const T rounding = T(16) * epsilon<T>() * greater(largest(own.low), largest(own.high));
     // between the checks it is little more
     const T slack = T(1.5) * square_root(apart) + rounding;
-    c.slack[pose * c.tree.count + n] = slack;
+    T* to = four + n - first_of(c.tree, leaf);
+    const T numbers[10] = {p[0].x, p[0].y, p[0].z, p[1].x, p[1].y,
+                           p[1].z, p[2].x, p[2].y, p[2].z, slack};
+    for (int k = 0; k < 10; ++k) to[4 * k] = numbers[k];
     const Vec3<T> margin = {slack, slack, slack};
     join(box, own.low - margin, own.high + margin);
   }
@@ -103,6 +138,8 @@ PD_HD void item(const PosedSheets<T>& t, Index i) {
     a[k] = load9(t.frames, vertex);
     store3(to, k, load3(t.positions, vertex));
     store3(to, 6 + k, a[k] * load3(t.base.directors, corner[k]));
+    store3(to, 9 + k, load3(t.base.vertices, corner[k]));
+    store3(to, 12 + k, load3(t.base.directors, corner[k]));
   }
   for (int k = 0; k < 3; ++k) {
     const int next = (k + 1) % 3;
@@ -114,30 +151,63 @@ PD_HD void item(const PosedSheets<T>& t, Index i) {
   }
 }
 
+// Item: a patch.
+template <class T>
+PD_HD void item(const GatheredBumps<T>& t, Index patch) {
+  store_fours(t.fours, t.quadrics, t.lists, patch);
+}
+
 // One patch at rest and in a pose.
 template <class T>
 struct Sheet {
-  Index patch;
-  T lift;
-  Vec3<T> v[3], n[3];                      // at rest
   Vec3<T> posed[3], pair[3], director[3];  // of PosedSheets, pair k of corners k and k + 1
+  Vec3<T> v[3], n[3];                      // at rest
+  BumpFours<T> bumps;
 };
 
 template <class T>
-PD_HD Sheet<T> load_sheet(const SurfaceRays<T>& t, Index pose, Index patch) {
+PD_HD Sheet<T> load_sheet(const Sheets<T>& t, Index pose, Index patch) {
   Sheet<T> s;
-  s.patch = patch;
-  s.lift = t.base.lift;
   const T* from = t.sheets + sheet_numbers * (pose * t.lists.patches + patch);
   for (int k = 0; k < 3; ++k) {
-    const int32 corner = t.lists.triangles[3 * patch + k];
-    s.v[k] = load3(t.base.vertices, corner);
-    s.n[k] = load3(t.base.directors, corner);
     s.posed[k] = load3(from, k);
     s.pair[k] = load3(from, 3 + k);
     s.director[k] = load3(from, 6 + k);
+    s.v[k] = load3(from, 9 + k);
+    s.n[k] = load3(from, 12 + k);
   }
+  s.bumps = {t.fours + bump_numbers * first_four(t.lists, patch), fours_of(t.lists, patch)};
   return s;
+}
+
+template <class T>
+PD_HD void item(const GridHeights<T>& t, Index i) {
+  const Sheet<T> s = load_sheet(t.sheets, 0, t.sheets.lists.sample_patch[i]);
+  const T b[3] = {t.barycentrics[3 * i], t.barycentrics[3 * i + 1], t.barycentrics[3 * i + 2]};
+  const Vec3<T> flat = blend(b, s.v);
+  Vec3<T> x = flat;
+  if (t.sheets.lift != T(0)) {
+    for (int k = 0; k < 3; ++k)
+      add(x, b[k] * (-t.sheets.lift * dot(flat - s.v[k], s.n[k])), s.n[k]);
+  }
+  t.heights[i] =
+      t.sheets.on_surface ? solve_height(s.bumps, x, blend(b, s.n)) : bumps_at(s.bumps, x).value;
+}
+
+template <class T>
+PD_HD void item(const GridPoints<T>& t, Index i) {
+  const Index pose = i / t.sheets.lists.samples, sample = i % t.sheets.lists.samples;
+  const Sheet<T> s = load_sheet(t.sheets, pose, t.sheets.lists.sample_patch[sample]);
+  const T* from = t.barycentrics + 3 * sample;
+  const T b[3] = {from[0], from[1], from[2]}, h = t.heights[sample];
+  const Vec3<T> flat = blend(b, s.v);
+  Vec3<T> point = blend(b, s.posed);
+  for (int k = 0; k < 3; ++k) {
+    add(point, b[k] * b[(k + 1) % 3], s.pair[k]);
+    const T raised = t.sheets.lift != T(0) ? -t.sheets.lift * dot(flat - s.v[k], s.n[k]) : T(0);
+    add(point, b[k] * (h + raised), s.director[k]);
+  }
+  store3(t.points, i, point);
 }
 
 // The surface at one place: a point and its tangents along the chart.
@@ -147,52 +217,56 @@ struct SurfaceElement {
 };
 
 template <class T>
-PD_HD SurfaceElement<T> surface_at(const SurfaceRays<T>& t, const Sheet<T>& s, const T (&b)[3]) {
-  const Vec3<T> flat = blend(b, s.v);
-  Vec3<T> x = flat, d = zero3<T>(), along[2] = {s.v[0] - s.v[2], s.v[1] - s.v[2]};
-  T raised[3] = {T(0), T(0), T(0)}, raising[2][3] = {};
-  if (s.lift != T(0)) {
-    for (int k = 0; k < 3; ++k) {
-      raised[k] = -s.lift * dot(flat - s.v[k], s.n[k]);
-      for (int c = 0; c < 2; ++c) raising[c][k] = -s.lift * dot(s.v[c] - s.v[2], s.n[k]);
-      add(x, b[k] * raised[k], s.n[k]);
-    }
-    for (int c = 0; c < 2; ++c) {
-      add(along[c], raised[c], s.n[c]);
-      add(along[c], -raised[2], s.n[2]);
-      for (int k = 0; k < 3; ++k) add(along[c], b[k] * raising[c][k], s.n[k]);
-    }
-  }
-  T h = T(0), scale = T(1);
-  if (t.on_surface) {
-    d = blend(b, s.n);
-    h = solve_height(t.quadrics, t.lists, s.patch, x, d);
-    x = multiply_add(h, d, x);
-    for (int c = 0; c < 2; ++c) add(along[c], h, s.n[c] - s.n[2]);
-  }
-  const Field<T> r = bumps_at(t.quadrics, t.lists, s.patch, x);
-  if (t.on_surface) {
-    scale = T(1) / (T(1) - dot(r.gradient, d));
-  } else {
-    h = r.value;
-  }
+PD_HD SurfaceElement<T> surface_at(const Sheets<T>& t, const Sheet<T>& s, const T (&b)[3]) {
+  const Vec3<T> flat = blend(b, s.v), d = blend(b, s.director);
+  Vec3<T> x = flat, along[2] = {s.v[0] - s.v[2], s.v[1] - s.v[2]};
   SurfaceElement<T> e;
-  const T reach[3] = {h + raised[0], h + raised[1], h + raised[2]};
   e.point = blend(b, s.posed);
-  for (int k = 0; k < 3; ++k) {
-    add(e.point, b[k] * b[(k + 1) % 3], s.pair[k]);
-    add(e.point, b[k] * reach[k], s.director[k]);
-  }
+  for (int k = 0; k < 3; ++k) add(e.point, b[k] * b[(k + 1) % 3], s.pair[k]);
   for (int c = 0; c < 2; ++c) {
-    const T slope = dot(r.gradient, along[c]) * scale;
     Vec3<T> tangent = s.posed[c] - s.posed[2];
     // of the pairs, that without the third corner grows, that without c shrinks, and theirs does both
     add(tangent, b[1 - c], s.pair[0] - s.pair[1 + c]);
     add(tangent, b[2] - b[c], s.pair[2 - c]);
-    for (int k = 0; k < 3; ++k) add(tangent, b[k] * (slope + raising[c][k]), s.director[k]);
-    add(tangent, reach[c], s.director[c]);
-    add(tangent, -reach[2], s.director[2]);
     e.tangent[c] = tangent;
+  }
+  if (t.lift != T(0)) {
+    T raised[3];
+    for (int k = 0; k < 3; ++k) {
+      raised[k] = -t.lift * dot(flat - s.v[k], s.n[k]);
+      add(x, b[k] * raised[k], s.n[k]);
+      add(e.point, b[k] * raised[k], s.director[k]);
+    }
+    for (int c = 0; c < 2; ++c) {
+      const Vec3<T> edge = s.v[c] - s.v[2];
+      add(along[c], raised[c], s.n[c]);
+      add(along[c], -raised[2], s.n[2]);
+      add(e.tangent[c], raised[c], s.director[c]);
+      add(e.tangent[c], -raised[2], s.director[2]);
+      for (int k = 0; k < 3; ++k) {
+        const T raising = -t.lift * dot(edge, s.n[k]);
+        add(along[c], b[k] * raising, s.n[k]);
+        add(e.tangent[c], b[k] * raising, s.director[k]);
+      }
+    }
+  }
+  Field<T> r;
+  T scale = T(1);
+  if (t.on_surface) {
+    const Vec3<T> up = blend(b, s.n);
+    const T h = solve_height(s.bumps, x, up);
+    x = multiply_add(h, up, x);
+    for (int c = 0; c < 2; ++c) add(along[c], h, s.n[c] - s.n[2]);
+    r = bumps_at(s.bumps, x);
+    scale = T(1) / (T(1) - dot(r.gradient, up));
+    r.value = h;
+  } else {
+    r = bumps_at(s.bumps, x);
+  }
+  add(e.point, r.value, d);
+  for (int c = 0; c < 2; ++c) {
+    add(e.tangent[c], dot(r.gradient, along[c]) * scale, d);
+    add(e.tangent[c], r.value, s.director[c] - s.director[2]);
   }
   return e;
 }
@@ -204,15 +278,25 @@ struct Hit {
   T b[3];
 };
 
+// The largest difference between two places on a patch.
+template <class T>
+PD_HD T apart(const T (&a)[3], const T* b) {
+  return greater(greater(absolute(a[0] - b[0]), absolute(a[1] - b[1])), absolute(a[2] - b[2]));
+}
+
 enum class End { nowhere, beside, on_patch };
 
-// Newton's method from b, and where it ends.
+// Newton's method from b, and where it ends. A whole step leads to the ray but for the bend of the surface, of second order in the
+// step: what it did to the last step tells what it will do to the next, and where that is nothing nobody need look.
 template <class T>
-PD_HD End refine(const SurfaceRays<T>& t, const Sheet<T>& sheet, const Sight<T>& ray, T (&b)[3],
-                 T& depth) {
+PD_HD End refine(const SurfaceRays<T>& t, const Sheet<T>& sheet, const Sight<T>& ray,
+                 const T* known, T (&b)[3], T& depth) {
   const T most = t.cells.size;
+  T before = T(0);  // length of the step that led here, if it was a whole one
+  Vec3<T> aimed = zero3<T>();
+  int astray = 0;
   for (int step = 0; step < 24; ++step) {
-    const SurfaceElement<T> s = surface_at(t, sheet, b);
+    const SurfaceElement<T> s = surface_at(t.sheets, sheet, b);
     const Vec3<T> r = s.point - ray.o;
     const T x = dot(r, ray.u), y = dot(r, ray.v);
     const T xx = dot(s.tangent[0], ray.u), xy = dot(s.tangent[1], ray.u);
@@ -220,79 +304,115 @@ PD_HD End refine(const SurfaceRays<T>& t, const Sheet<T>& sheet, const Sight<T>&
     const T det = multiply_subtract(xx, yy, xy * yx);
     T p = xy * y - yy * x, q = yx * x - xx * y;
     const T rounding = T(32) * epsilon<T>() * (largest(s.point) + largest(ray.o));
-    const bool close = absolute(x) <= rounding && absolute(y) <= rounding;
+    bool close = absolute(x) <= rounding && absolute(y) <= rounding;
     // never by more than a cell
     const T bound = most * absolute(det), longest = greater(absolute(p), absolute(q));
-    const T scale = longest <= bound ? T(1) / det : most / longest * (det < T(0) ? T(-1) : T(1));
-    const bool flat = !(longest > T(0)) || (close && !(longest <= bound));
+    const bool whole = longest <= bound;
+    const T scale = whole ? T(1) / det : most / longest * (det < T(0) ? T(-1) : T(1));
+    const bool flat = !(longest > T(0)) || (close && !whole);
     p = flat ? T(0) : p * scale;
     q = flat ? T(0) : q * scale;
+    const T after = whole ? greater(absolute(p), absolute(q)) : T(0);
+    if (whole && before > T(0)) {
+      const T ratio = after / before;
+      close = close ||
+              (ratio < T(0.25) && largest(r - aimed) * (ratio * ratio) <= T(1) / T(64) * rounding);
+    }
     b[0] = b[0] + p;
     b[1] = b[1] + q;
     b[2] = T(1) - b[0] - b[1];
     const T outside = lesser(lesser(b[0], b[1]), b[2]);
+    aimed = multiply_add(p, s.tangent[0], multiply_add(q, s.tangent[1], r));
     if (close) {
-      depth = dot(multiply_add(p, s.tangent[0], multiply_add(q, s.tangent[1], r)), ray.d);
+      depth = dot(aimed, ray.d);
       return outside >= T(-512) * epsilon<T>() ? End::on_patch : End::beside;
     }
-    if (!(outside >= T(-2) * most)) break;
+    // on the way to the hit that is known
+    if (known != nullptr && apart(b, known) <= T(1) / T(64) * most) return End::beside;
+    // halved at every step even where the ray only touches the surface; where it passes, steps wander
+    astray += !(whole && T(4) * after < T(3) * before);
+    if (!(outside >= T(-2) * most) || astray > 5) break;
+    before = after;
   }
   return End::nowhere;
 }
 
-template <class T>
-PD_HD T turn(const T (&a)[2], const T (&b)[2]) {
-  return multiply_subtract(a[0], b[1], a[1] * b[0]);
+// Cells as seen along a ray.
+template <class T, class R>
+struct SeenCells {
+  R area[3], whole, slack, longest;
+  unsigned passed;  // bits: those that the ray passes within the slack
+};
+
+// Those from `lane` on, R at a time: T or Number<T>.
+template <class R, class T, class Load>
+PD_HD SeenCells<T, R> see_cells(const T* four, const Load& load, const Sight<T>& ray, const T& near,
+                                const T& far) {
+  const auto spread = [](const Vec3<T>& a) { return Vec3<R>{R(a.x), R(a.y), R(a.z)}; };
+  const Vec3<R> o = spread(ray.o), d = spread(ray.d), u = spread(ray.u), v = spread(ray.v);
+  SeenCells<T, R> s;
+  R flat[3][2], along[3];
+  for (int k = 0; k < 3; ++k) {
+    const T* p = four + 12 * k;
+    const Vec3<R> r = Vec3<R>{load(p), load(p + 4), load(p + 8)} - o;
+    flat[k][0] = dot(r, u);
+    flat[k][1] = dot(r, v);
+    along[k] = dot(r, d);
+  }
+  const R nearest = lesser(lesser(along[0], along[1]), along[2]);
+  const R farthest = greater(greater(along[0], along[1]), along[2]);
+  s.slack = load(four + 36) + R(T(16) * epsilon<T>()) * (R(largest(ray.o)) + absolute(farthest));
+  // so that a cell that is not finite is left at once
+  s.passed = bits_of(nearest - s.slack <= R(far)) & bits_of(R(near) <= farthest + s.slack);
+  for (int k = 0; k < 3; ++k) {
+    const R *e = flat[(k + 1) % 3], *f = flat[(k + 2) % 3];
+    s.area[k] = multiply_subtract(e[0], f[1], e[1] * f[0]);
+  }
+  s.whole = s.area[0] + s.area[1] + s.area[2];
+  s.passed &= bits_of(absolute(s.whole) <= R(biggest<T>()));
+  s.longest = R(T(0));
+  for (int k = 0; k < 3; ++k) {
+    const R *e = flat[(k + 1) % 3], *f = flat[(k + 2) % 3], x = e[0] - f[0], y = e[1] - f[1];
+    const R length = square_root(x * x + y * y);
+    // not beyond this edge, on either side of the cell
+    const R inside = select(s.whole < R(T(0)), -s.area[k], s.area[k]);
+    s.passed &= bits_of(-(s.slack * length) <= inside);
+    s.longest = greater(s.longest, length);
+  }
+  return s;
 }
 
 // The nearest hit so far, after one cell more.
 template <class T>
-PD_HD void meet_cell(const SurfaceRays<T>& t, Index pose, Index number, const Sight<T>& ray,
-                     Hit<T>& hit) {
-  const Cells<T>& c = t.cells;
-  const int32* cell = c.cells + cell_numbers * number;
-  T flat[3][2], along[3], area[3], nearest = biggest<T>(), farthest = -biggest<T>();
-  for (int k = 0; k < 3; ++k) {
-    const Vec3<T> r = load3(c.points, pose * c.samples + cell[k]) - ray.o;
-    flat[k][0] = dot(r, ray.u);
-    flat[k][1] = dot(r, ray.v);
-    along[k] = dot(r, ray.d);
-    nearest = lesser(nearest, along[k]);
-    farthest = greater(farthest, along[k]);
-  }
-  const T slack = c.slack[pose * c.tree.count + number] +
-                  T(16) * epsilon<T>() * (largest(ray.o) + absolute(farthest));
-  // so that a cell that is not finite is left at once
-  if (!(nearest - slack <= hit.depth && farthest + slack >= t.rays.near)) return;
-  for (int k = 0; k < 3; ++k) area[k] = turn(flat[(k + 1) % 3], flat[(k + 2) % 3]);
-  const T whole = area[0] + area[1] + area[2], side = whole < T(0) ? T(-1) : T(1);
-  if (!(absolute(whole) <= biggest<T>())) return;
-  T longest = T(0);
-  for (int k = 0; k < 3; ++k) {
-    const T* e = flat[(k + 1) % 3];
-    const T* f = flat[(k + 2) % 3];
-    const T square = (e[0] - f[0]) * (e[0] - f[0]) + (e[1] - f[1]) * (e[1] - f[1]);
-    const T inside = side * area[k];
-    if (inside < T(0) && inside < -slack * square_root(square)) return;  // beyond this edge
-    longest = greater(longest, square);
-  }
+PD_HD void meet_cell(const SurfaceRays<T>& t, Index pose, const int32* cell,
+                     const SeenCells<T, T>& seen, const Sight<T>& ray, Hit<T>& hit) {
   // seen so steeply that it may be met twice
-  const bool edge_on = absolute(whole) <= T(8) * slack * square_root(longest);
-  const T* place = c.places + 9 * cell[cell_numbers - 1];
-  const Sheet<T> sheet = load_sheet(t, pose, cell[cell_numbers - 2]);
+  const bool edge_on = absolute(seen.whole) <= T(8) * seen.slack * seen.longest;
+  const int32 patch = cell[cell_numbers - 2];
+  const T* place = t.cells.places + 9 * cell[cell_numbers - 1];
+  // beside the hit, on the same patch and met once: that is the one
+  if (!edge_on && hit.patch == patch) {
+    T b[3];
+    for (int k = 0; k < 3; ++k) {
+      b[k] = (seen.area[0] * place[k] + seen.area[1] * place[3 + k] + seen.area[2] * place[6 + k]) /
+             seen.whole;
+    }
+    if (apart(b, hit.b) <= T(0.25) * t.cells.size) return;
+  }
+  const Sheet<T> sheet = load_sheet(t.sheets, pose, patch);
   for (int start = 0; start < 4; ++start) {
     T inner[3], total = T(0), b[3], depth;
     for (int k = 0; k < 3; ++k) {
       inner[k] = start > 0 ? T(int(k == start - 1))
                  : edge_on ? T(1)
-                           : greater(T(0), area[k] / whole);
+                           : greater(T(0), seen.area[k] / seen.whole);
       total = total + inner[k];
     }
     for (int k = 0; k < 3; ++k)
       b[k] = (inner[0] * place[k] + inner[1] * place[3 + k] + inner[2] * place[6 + k]) / total;
-    const End end = refine(t, sheet, ray, b, depth);
+    const End end = refine(t, sheet, ray, hit.patch == patch ? hit.b : nullptr, b, depth);
     if (end == End::on_patch && depth >= t.rays.near && depth < hit.depth)
-      hit = {depth, cell[cell_numbers - 2], {b[0], b[1], b[2]}};
+      hit = {depth, patch, {b[0], b[1], b[2]}};
     if (end != End::nowhere && !edge_on) break;
   }
 }
@@ -305,15 +425,38 @@ struct MeetCells {
   const Sight<T>& ray;
   Hit<T>& hit;
 
-  PD_HD void operator()(Index number) const { meet_cell(task, pose, number, ray, hit); }
+  PD_HD void operator()(Index leaf) const {
+    const Cells<T>& c = task.cells;
+    const T* four = c.fours + cell_four_numbers * ((pose << c.tree.levels) + leaf);
+    const Index first = first_of(c.tree, leaf), count = first_of(c.tree, leaf + 1) - first;
+    const auto one = [](const T* from) { return *from; };
+    for (int lane = 0; lane < count; lane += Lanes<T>::width) {
+      const auto seen =
+          see_cells<Number<T>>(four + lane, Lanes<T>::load, ray, task.rays.near, hit.depth);
+      for (int k = 0; k < Lanes<T>::width; ++k) {
+        if (!(seen.passed >> k & 1)) continue;
+        const int32* cell = c.cells + cell_numbers * (first + lane + k);
+        if constexpr (Lanes<T>::width == 1) {
+          meet_cell(task, pose, cell, seen, ray, hit);
+        } else {
+          // those before it may have brought the hit nearer
+          const auto again = see_cells<T>(four + lane + k, one, ray, task.rays.near, hit.depth);
+          if (again.passed) meet_cell(task, pose, cell, again, ray, hit);
+        }
+      }
+    }
+  }
 };
 
 // Item: a ray in a pose.
 template <class T>
 PD_HD void item(const SurfaceRays<T>& t, Index i) {
   const Index pose = i / t.rays.count, ray = i % t.rays.count;
+  const Vec3<T> d = load3(t.rays.directions + pose * t.rays.direction_step, ray);
+  // first by the largest component, whose square alone might be beyond all numbers
+  const Vec3<T> scaled = (T(1) / largest(d)) * d;
   const Sight<T> sight = sight_along(load3(t.rays.origins + pose * t.rays.origin_step, ray),
-                                     load3(t.rays.directions + pose * t.rays.direction_step, ray));
+                                     (T(1) / square_root(dot(scaled, scaled))) * scaled);
   Hit<T> hit = {t.rays.far, -1, {T(0), T(0), T(0)}};
   // one that is not finite meets nothing
   if (dot(sight.o, sight.o) + dot(sight.d, sight.d) <= biggest<T>())
@@ -322,6 +465,17 @@ PD_HD void item(const SurfaceRays<T>& t, Index i) {
   t.depth[i] = hit.patch < 0 ? T(HUGE_VAL) : hit.depth;
   t.patch[i] = hit.patch;
   for (int k = 0; k < 3; ++k) t.barycentrics[3 * i + k] = hit.b[k];
+  if (t.points == nullptr) return;
+  Vec3<T> point = zero3<T>(), normal = zero3<T>();
+  if (hit.patch >= 0) {
+    const SurfaceElement<T> s =
+        surface_at(t.sheets, load_sheet(t.sheets, pose, Index(hit.patch)), hit.b);
+    point = s.point;
+    normal = cross(s.tangent[0], s.tangent[1]);
+    normal = (T(1) / square_root(dot(normal, normal))) * normal;
+  }
+  store3(t.points, i, point);
+  store3(t.normals, i, normal);
 }
 
 }  // namespace pd::freeform::inline PD_TARGET

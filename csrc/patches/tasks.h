@@ -32,6 +32,9 @@
   X(CellBoxes)               \
   X(JoinedBoxes)             \
   X(PosedSheets)             \
+  X(GatheredBumps)           \
+  X(GridHeights)             \
+  X(GridPoints)              \
   X(SurfaceRays)             \
   X(FieldBoxes)              \
   X(FieldRays)

@@ -1,6 +1,6 @@
 // A complete binary tree of boxes around things that a ray may meet, refitted in every pose.
 #pragma once
-#include "patches/views.h"
+#include "patches/fours.h"
 
 namespace pd::freeform {
 
@@ -19,7 +19,7 @@ struct JoinedBoxes {
 
 template <class T>
 struct Rays {
-  const T *origins, *directions;  // [1 or B, R, 3] m, and of unit length
+  const T *origins, *directions;  // [1 or B, R, 3] m, and of unit length for FieldRays
   Index count, origin_step,
       direction_step;  // from the rays of one pose to those of the next: 0 or 3 R
   T near, far;         // m
@@ -28,11 +28,6 @@ struct Rays {
 }  // namespace pd::freeform
 
 namespace pd::freeform::inline PD_TARGET {
-
-template <class T>
-PD_HD T greater(const T& a, const T& b) {
-  return b > a ? b : a;
-}
 
 template <class T>
 PD_HD T largest(const Vec3<T>& a) {
@@ -93,12 +88,6 @@ PD_HD void item(const JoinedBoxes<T>& t, Index i) {
   store_box(boxes, node, box);
 }
 
-// A ray and two directions across it (Duff et al. 2017): what meets it has no component along either.
-template <class T>
-struct Sight {
-  Vec3<T> o, d, u, v, inverse;  // of d, component by component
-};
-
 // Finite for 0 too, or 0 times it would be NaN. Only along the very face of a box is the answer then open, and the margin of the
 // boxes keeps the surface off their faces.
 template <class T>
@@ -106,6 +95,12 @@ PD_HD T inverse_of(const T& a) {
   constexpr T least = T(1) / biggest<T>() * T(4);
   return T(1) / (absolute(a) > least ? a : least);
 }
+
+// A ray and two directions across it (Duff et al. 2017): what meets it has no component along either.
+template <class T>
+struct Sight {
+  Vec3<T> o, d, u, v, inverse;  // of d, component by component
+};
 
 template <class T>
 PD_HD Sight<T> sight_along(const Vec3<T>& o, const Vec3<T>& d) {
@@ -117,26 +112,34 @@ PD_HD Sight<T> sight_along(const Vec3<T>& o, const Vec3<T>& d) {
           {inverse_of(d.x), inverse_of(d.y), inverse_of(d.z)}};
 }
 
-// Which of four boxes, larger by `margin`, a ray enters before `far`, and where: never later than that, for the rounding of six products.
+// Which of four boxes, larger by `margin`, a ray enters before `far`, as bits, and where: never later than that, for the rounding of
+// six products. A box around nothing has its faces the wrong way round, and no ray enters it.
 template <class T>
-PD_HD void enter_four(const T* boxes, const Sight<T>& ray, const T& near, const T& far,
-                      const T& margin, T (&entry)[4], bool (&in)[4]) {
+PD_HD unsigned enter_four(const T* boxes, const Sight<T>& ray, const T& near, const T& far,
+                          const T& margin, T (&entry)[4]) {
+  using L = Lanes<T>;
+  using R = Number<T>;
   constexpr T rounding = T(4) * epsilon<T>();
-  T exit[4];
-  for (int k = 0; k < 4; ++k) {  // in one vector
-    const T a[3] = {(boxes[k] - ray.o.x - margin) * ray.inverse.x,
-                    (boxes[4 + k] - ray.o.y - margin) * ray.inverse.y,
-                    (boxes[8 + k] - ray.o.z - margin) * ray.inverse.z};
-    const T b[3] = {(boxes[12 + k] - ray.o.x + margin) * ray.inverse.x,
-                    (boxes[16 + k] - ray.o.y + margin) * ray.inverse.y,
-                    (boxes[20 + k] - ray.o.z + margin) * ray.inverse.z};
-    const T first = greater(greater(lesser(a[0], b[0]), lesser(a[1], b[1])), lesser(a[2], b[2]));
-    const T last = lesser(lesser(greater(a[0], b[0]), greater(a[1], b[1])), greater(a[2], b[2]));
-    entry[k] = greater(near, first * (T(1) - rounding));
-    exit[k] = lesser(far, last * (T(1) + rounding));
+  const T o[3] = {ray.o.x, ray.o.y, ray.o.z};
+  const T inverse[3] = {ray.inverse.x, ray.inverse.y, ray.inverse.z};
+  unsigned in = 0;
+  for (int lane = 0; lane < 4; lane += L::width) {
+    R first[3], last[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      const bool upwards = inverse[axis] > T(0);
+      const T* low = boxes + 4 * axis + lane;
+      const T before = upwards ? o[axis] + margin : o[axis] - margin;
+      const T behind = upwards ? o[axis] - margin : o[axis] + margin;
+      first[axis] = (L::load(upwards ? low : low + 12) - R(before)) * R(inverse[axis]);
+      last[axis] = (L::load(upwards ? low + 12 : low) - R(behind)) * R(inverse[axis]);
+    }
+    const R enters =
+        greater(R(near), greater(greater(first[0], first[1]), first[2]) * R(T(1) - rounding));
+    const R leaves = lesser(R(far), lesser(lesser(last[0], last[1]), last[2]) * R(T(1) + rounding));
+    L::store(entry + lane, enters);
+    in |= bits_of(enters <= leaves) << lane;
   }
-  // a box around nothing has its faces the wrong way round
-  for (int k = 0; k < 4; ++k) in[k] = entry[k] <= exit[k] && boxes[k] <= boxes[12 + k];
+  return in;
 }
 
 // Nodes still to be looked into, the nearest on top.
@@ -158,8 +161,8 @@ PD_HD void put(Waiting<T>& w, int base, Index node, const T& entry) {
   w.entry[at] = entry;
 }
 
-// Calls `meet` with the numbers of the things whose boxes, larger by `margin`, a ray enters before `far`, which may shrink
-// meanwhile; about from near to far.
+// Calls `meet` with the leaves whose boxes, larger by `margin`, a ray enters before `far`, which may shrink meanwhile; about from
+// near to far.
 template <class T, class Meet>
 PD_HD void visit(const Tree<T>& t, Index pose, const Sight<T>& ray, const T& near, const T& far,
                  const T& margin, const Meet& meet) {
@@ -171,19 +174,33 @@ PD_HD void visit(const Tree<T>& t, Index pose, const Sight<T>& ray, const T& nea
   for (Index node = 1 + t.levels % 2; node <= 1 + 2 * (t.levels % 2); ++node)
     put(w, w.count, node, near);
   while (w.count > 0) {
-    const Index node = w.node[--w.count];
+    Index node = w.node[--w.count];
     if (w.entry[w.count] > far) continue;
-    if (node >= leaves) {
-      const Index leaf = node - leaves;
-      for (Index n = first_of(t, leaf); n < first_of(t, leaf + 1); ++n) meet(n);
-      continue;
+    while (node < leaves) {
+      T entry[4];
+      const unsigned in = enter_four(boxes + place_of(4 * node), ray, near, far, margin, entry);
+      // the nearest at once; there is no node 0
+      Index next = 0;
+      T nearest = T(0);
+      const int base = w.count;
+      for (int k = 0; k < 4; ++k) {
+        if (!(in >> k & 1)) continue;
+        const Index found = 4 * node + k;
+        if (next == 0) {
+          next = found;
+          nearest = entry[k];
+        } else if (entry[k] < nearest) {
+          put(w, base, next, nearest);
+          next = found;
+          nearest = entry[k];
+        } else {
+          put(w, base, found, entry[k]);
+        }
+      }
+      node = next;
+      if (node == 0) break;
     }
-    T entry[4];
-    bool in[4];
-    enter_four(boxes + place_of(4 * node), ray, near, far, margin, entry, in);
-    const int base = w.count;
-    for (int k = 0; k < 4; ++k)
-      if (in[k]) put(w, base, 4 * node + k, entry[k]);
+    if (node >= leaves) meet(node - leaves);
   }
 }
 

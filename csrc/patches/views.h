@@ -47,6 +47,11 @@ struct Ellipsoids {
 namespace pd::freeform::inline PD_TARGET {
 
 template <class T>
+PD_HD T greater(const T& a, const T& b) {
+  return b > a ? b : a;
+}
+
+template <class T>
 PD_HD Vec3<T> load3(const T* from, Index row) {
   return {from[3 * row], from[3 * row + 1], from[3 * row + 2]};
 }
