@@ -24,7 +24,7 @@ struct Cells {
   const T* places;     // [m^2, 9] barycentric coordinates of the corners of a cell in its patch
   const T* points;     // [B, N, 3] m
   T* slack;            // [B, C] m
-  Index samples;
+  Index samples, patches, cells_of_patch;
   T size;  // edge of a cell in barycentric coordinates, 1 / m
 };
 
@@ -62,6 +62,13 @@ struct SurfaceRays {
 
 namespace pd::freeform::inline PD_TARGET {
 
+// Whether the numbers of a cell point into the arrays.
+PD_HD bool is_cell(const int32* cell, Index samples, Index patches, Index places) {
+  bool is = is_below(cell[cell_numbers - 2], patches) && is_below(cell[cell_numbers - 1], places);
+  for (int k = 0; k < 3 + check_points; ++k) is = is && is_below(cell[k], samples);
+  return is;
+}
+
 // Item: a leaf of a pose.
 template <class T>
 PD_HD void item(const CellBoxes<T>& t, Index i) {
@@ -72,6 +79,10 @@ PD_HD void item(const CellBoxes<T>& t, Index i) {
   Box<T> box = {{most, most, most}, {-most, -most, -most}};
   for (Index n = first_of(c.tree, leaf); n < first_of(c.tree, leaf + 1); ++n) {
     const int32* cell = c.cells + cell_numbers * n;
+    if (!is_cell(cell, c.samples, c.patches, c.cells_of_patch)) {
+      c.slack[pose * c.tree.count + n] = T(NAN);  // never met
+      continue;
+    }
     const Vec3<T> p[3] = {load3(points, cell[0]), load3(points, cell[1]), load3(points, cell[2])};
     T apart = T(0);
     for (int k = 0; k < check_points; ++k) {
@@ -250,6 +261,8 @@ template <class T>
 PD_HD void meet_cell(const SurfaceRays<T>& t, Index pose, Index number, const Sight<T>& ray,
                      Hit<T>& hit) {
   const Cells<T>& c = t.cells;
+  const T bulge = c.slack[pose * c.tree.count + number];
+  if (!(bulge >= T(0))) return;  // not finite, or points outside the arrays
   const int32* cell = c.cells + cell_numbers * number;
   T flat[3][2], along[3], area[3], nearest = biggest<T>(), farthest = -biggest<T>();
   for (int k = 0; k < 3; ++k) {
@@ -260,8 +273,7 @@ PD_HD void meet_cell(const SurfaceRays<T>& t, Index pose, Index number, const Si
     nearest = lesser(nearest, along[k]);
     farthest = greater(farthest, along[k]);
   }
-  const T slack = c.slack[pose * c.tree.count + number] +
-                  T(16) * epsilon<T>() * (largest(ray.o) + absolute(farthest));
+  const T slack = bulge + T(16) * epsilon<T>() * (largest(ray.o) + absolute(farthest));
   // so that a cell that is not finite is left at once
   if (!(nearest - slack <= hit.depth && farthest + slack >= t.rays.near)) return;
   for (int k = 0; k < 3; ++k) area[k] = turn(flat[(k + 1) % 3], flat[(k + 2) % 3]);

@@ -46,6 +46,8 @@ struct Ellipsoids {
 
 namespace pd::freeform::inline PD_TARGET {
 
+PD_HD bool is_below(int32 index, Index count) { return index >= 0 && index < count; }
+
 template <class T>
 PD_HD Vec3<T> load3(const T* from, Index row) {
   return {from[3 * row], from[3 * row + 1], from[3 * row + 2]};
