@@ -118,7 +118,7 @@ def study(name: str, shape: Any, *, quick: bool) -> tuple[float, list[Row]]:
     # by the vertices of a base, which do not know the bounds of a function
     size = float(np.ptp(base_triangles(target, balls(1280))[0].bounds, axis=0).max()) if is_blob else target.size
     fits = (QUICK if quick else FITS)["blob" if is_blob else "other"]
-    counts = (80, 320) if quick else (80, 320, 1280) if is_blob else (100, 200, 400, 800, 1600, 3200)
+    counts = (80,) if quick else (80, 320, 1280) if is_blob else (100, 200, 400, 800, 1600, 3200)
     fine = target.mesh() if quick or not is_blob else base_triangles(target, balls(5120))[0]
     rows = []
     for count in tqdm(counts, desc=f"{name}: triangles", leave=False):
