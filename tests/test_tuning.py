@@ -208,12 +208,25 @@ def test_a_real_budget_is_near() -> None:
         ({"error": 0.0}, "error must lie in (0, 1)"),
         ({"error": 1.5}, "error must lie in (0, 1)"),
         ({"milliseconds": -1.0}, "milliseconds must be positive and finite"),
-        ({"error": 0.1, "most": 0}, "most must be at least one iteration"),
+        ({"error": 0.1, "most": 0}, "most must be a whole number >= 1, got 0"),
+        ({"error": 0.1, "most": 1.5}, "most must be a whole number >= 1, got 1.5"),
+        ({"error": math.nan}, "error must be finite, got nan"),
+        ({"error": 0.1, "candidates": []}, "candidates must hold at least one solver"),
     ],
 )
 def test_bad_requests_are_named(request_: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         bar().tune(**request_)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("candidates", ["auto", pd.Jacobi()])
+def test_candidates_are_a_sequence(candidates: object) -> None:
+    with pytest.raises(TypeError, match="candidates must be a sequence of solvers, got"):
+        bar().tune(error=0.1, candidates=candidates)  # type: ignore[arg-type]
+
+
+def test_numbers_of_a_request_may_be_tensors() -> None:
+    assert bar().tune(error=torch.tensor(0.125)).asked_error == 0.125  # type: ignore[arg-type]
 
 
 def test_states_that_are_not_finite_are_named() -> None:

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from . import patch_ops  # noqa: F401  (registers the ops)
 from .patch_mesh import grid, tessellate, weld
-from .patches import FreeFormPatches, PatchPose, PatchSamples, SurfacePoints
-from .quadrics import check_real_tensor
+from .patches import FreeFormPatches, PatchPose, PatchSamples, SurfacePoints, check_pose
+from .quadrics import dimensions
 
 if TYPE_CHECKING:
     from .patch_image import PatchImage
@@ -121,6 +121,8 @@ class PatchRays:
         """
         surface = self.patches if patches is None else patches
         self._check_patches(surface)
+        if pose is not None:
+            check_pose(pose)
         o, d = _rays(origins, directions, surface)
         at = _at_rest(surface) if pose is None else pose
         h, slopes = surface.heights(self._samples)
@@ -196,6 +198,8 @@ class PatchRays:
         return depth, patch
 
     def _check_patches(self, patches: FreeFormPatches) -> None:
+        if not isinstance(patches, FreeFormPatches):
+            raise TypeError(f"PatchRays: patches must be FreeFormPatches, got {type(patches).__name__}")
         mine, theirs = self.patches, patches
         same = theirs.triangles is mine.triangles or (
             theirs.triangles.device == mine.triangles.device and torch.equal(theirs.triangles, mine.triangles)
@@ -213,8 +217,11 @@ def _check_level(level: Any) -> None:
 
 
 def _batched(name: str, rays: Tensor, surface: FreeFormPatches) -> Tensor:
-    shape = (None, 3) if rays.dim() == 2 else (None, None, 3)
-    check_real_tensor(f"cast: {name}", rays, shape, "of rays")
+    wanted = f"cast: {name} must be a tensor [R, 3], or [B, R, 3] in B poses"
+    if dimensions(rays) < 0:
+        raise TypeError(f"{wanted}, got {type(rays).__name__}")
+    if rays.dim() not in (2, 3) or rays.shape[-1] != 3:
+        raise ValueError(f"{wanted}, got {list(rays.shape)}")
     like = surface.vertices
     if rays.dtype != like.dtype or rays.device != like.device:
         raise ValueError(
