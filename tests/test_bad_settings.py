@@ -166,6 +166,7 @@ def test_what_is_no_state_is_refused(state: Any, sim: pd.Simulator) -> None:
     calls: list[Callable[[], object]] = [
         lambda: sim(state),
         lambda: sim.step_(state),
+        lambda: sim.energy(3 if isinstance(state, torch.Tensor) else state),  # type: ignore[arg-type]
         lambda: sim.rollout(state, steps=2),
         lambda: sim.tune(state, error=0.1) if state is not None else sim(state),
     ]

@@ -179,6 +179,7 @@ SURFACE = patches_on(ball(0), count=5)
 PLACE = SURFACE.samples(torch.tensor([3]), torch.tensor([[0.2, 0.3, 0.5]], dtype=F64))
 BODY = pd.PatchBody(SURFACE, stiffness=1e4)
 RAYS = pd.PatchRays(SURFACE)
+APEX = torch.zeros(20, dtype=torch.int64)
 RAY = torch.tensor([[0.0, 0.0, 3.0]], dtype=F64)
 CAMERA = Camera((0.0, 0.0, 4.0), (0.0, 0.0, 0.0), 40.0)
 STATE = pd.State(*(torch.zeros(1, 13, 3, dtype=F64) for _ in range(2)))
@@ -218,6 +219,9 @@ STATE = pd.State(*(torch.zeros(1, 13, 3, dtype=F64) for _ in range(2)))
         (lambda: RAYS.render(CAMERA, 8), "size must be two whole numbers, width and height in pixels, got 8"),
         (lambda: BODY.pose(STATE), r"positions must be a tensor \[B, 13, 3\], got State; take state.positions"),
         (lambda: pd.PatchLoss(ball(0), ball(2)), "patches must be FreeFormPatches, got TriMesh"),
+        (lambda: pd.PatchLoss(SURFACE, ball(2))(SURFACE.to(dtype=torch.float32)), "must be torch.float64 on cpu like"),
+        (lambda: pd.PatchTransport(None, RAY), "PatchTransport: patches must be FreeFormPatches, got NoneType"),
+        (lambda: pd.PatchTransport(SURFACE, RAY, APEX, stretch="ab"), "stretch must hold real numbers, got <U2"),
         (lambda: pd.PatchLoss(SURFACE, ball(2))(ball(0)), "patches must be FreeFormPatches, got TriMesh"),
     ],
 )
@@ -232,6 +236,8 @@ def test_other_kinds_of_things(call: Any, message: str) -> None:
         (lambda: SURFACE.samples(torch.tensor([2**40]), RAY), "patch must lie in 0..19, got 1099511627776 to"),
         (lambda: SURFACE.samples(torch.tensor([True]), RAY), r"patch must be integers \[1\] .*, got torch.bool"),
         (lambda: SURFACE.field(RAY[0], torch.tensor([0])), r"field: points must be \[n, 3\]"),
+        (lambda: pd.PatchTransport(SURFACE, RAY, APEX, stretch=3), "stretch must be .*, got 3"),
+        (lambda: pd.PatchTransport(SURFACE, RAY, APEX + 0.5), r"apex must be integers \[20\]"),
         (lambda: RAYS.cast(RAY[0], RAY), r"origins must be a tensor \[R, 3\], or \[B, R, 3\] in B poses, got \[3\]"),
         (lambda: pd.PatchBody(SURFACE, stiffness=1e4, apex=RAY.numpy()), "apex must be skeleton or prism, got array"),
         (lambda: pd.fit_patches(ball(1), 1.5), "quadrics must be a whole number >= 1, got 1.5"),

@@ -88,7 +88,12 @@ class PatchLoss:
         """The means of the three terms: of distance over L, normal and crease, each squared."""
         _check_patches(patches)
         mine, theirs = self._triangles, patches.triangles
-        if theirs is not mine and not torch.equal(theirs, mine.to(theirs.device)):
+        if patches.vertices.dtype != self.targets.dtype or theirs.device != mine.device:
+            raise TypeError(
+                f"PatchLoss: patches must be {self.targets.dtype} on {mine.device} like those that the loss was made "
+                f"for, got {patches.vertices.dtype} on {theirs.device}"
+            )
+        if theirs is not mine and not torch.equal(theirs, mine):
             raise ValueError(
                 f"PatchLoss: patches must have the {len(mine)} triangles that the loss was made for, got {patches!r}"
             )

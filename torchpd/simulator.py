@@ -252,6 +252,8 @@ class Simulator(Model):
             state: a `State`, or positions [B, V, 3] alone.
             targets: of pins, as in `forward`.
         """
+        if not isinstance(state, Tensor):
+            self.check_state(state)
         positions = state if isinstance(state, Tensor) else state[0]
         refuse_tangents(positions)
         material = dict(zip(MATERIAL_ROWS, self.material_at(targets, positions.shape[0]), strict=True))
