@@ -207,6 +207,11 @@ STATE = pd.State(*(torch.zeros(1, 13, 3, dtype=F64) for _ in range(2)))
             lambda: SURFACE.field([[0.0, 0.0, 0.0]], torch.tensor([0])),
             "points must be a float32 or .*, got list",
         ),
+        (
+            lambda: SURFACE.field(RAY, APEX[:1], matrices=[1.0]),
+            r"must be a tensor W \[Q, 4, 4\], .*, got list",
+        ),
+        (lambda: RAYS.cast_field(RAY, RAY, far=1.0, matrices=RAY), r"matrices must be a tensor W .*, got \[1, 3\]"),
         (lambda: RAYS.cast(RAY, RAY, STATE), "pose must be PatchPose, got State; PatchBody.pose makes one"),
         (lambda: RAYS.cast(RAY, RAY, STATE.positions), "pose must be PatchPose, got Tensor"),
         (

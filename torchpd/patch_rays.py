@@ -17,7 +17,7 @@ from torch import Tensor
 from . import patch_ops  # noqa: F401  (registers the ops)
 from .patch_mesh import grid, tessellate, weld
 from .patches import FreeFormPatches, PatchPose, PatchSamples, SurfacePoints, check_pose
-from .quadrics import dimensions
+from .quadrics import dimensions, matrix_sets
 
 if TYPE_CHECKING:
     from .patch_image import PatchImage
@@ -190,7 +190,7 @@ class PatchRays:
         W = surface.quadrics.normalized_matrices() if matrices is None else matrices
         v = surface.vertices[None] if positions is None else positions
         nowhere = surface.samples(torch.empty(0, dtype=torch.int32), surface.vertices[:0])
-        arguments = (o, d, v, surface.quadrics.amplitudes, W if W.dim() == 4 else W[None])
+        arguments = (o, d, v, surface.quadrics.amplitudes, matrix_sets(W))
         depth, patch = _ops.patch_field_rays(
             *(t.detach() for t in arguments), self._order, [*surface.lists, *nowhere.lists],
             thickness=surface.thickness, clip=reading == "clip", near=near, far=far, exhaustive=exhaustive,

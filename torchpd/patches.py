@@ -20,7 +20,7 @@ from .mesh import TriMesh
 from .mesh_checks import store
 from .patch_checks import angle_weighted_normals, check_surface
 from .patch_lists import Touching, gather_lists, touching
-from .quadrics import Quadrics, check_real_tensor, dimensions
+from .quadrics import Quadrics, check_real_tensor, dimensions, matrix_sets
 
 if TYPE_CHECKING:
     from .patch_fit import PatchFit
@@ -333,7 +333,7 @@ class FreeFormPatches:
         W = self.quadrics.normalized_matrices() if matrices is None else matrices
         where = self.samples(patch, torch.zeros_like(x[0]))
         F: Tensor = _ops.patch_field(
-            x, v, self.quadrics.amplitudes, W if W.dim() == 4 else W[None], self._lists(where),
+            x, v, self.quadrics.amplitudes, matrix_sets(W), self._lists(where),
             thickness=self.thickness, clip=reading == "clip",
         )  # fmt: skip
         return F if batched else F[0]

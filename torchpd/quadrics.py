@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["Quadrics", "check_real_tensor", "dimensions"]
+__all__ = ["Quadrics", "check_real_tensor", "dimensions", "matrix_sets"]
 
 _LOWER = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))  # entries of M in the order of `factors`
 
@@ -29,6 +29,14 @@ def check_real_tensor(name: str, value: Any, shape: tuple[int | None, ...], mean
 def dimensions(value: Any) -> int:
     """Of a tensor; -1 of anything else, for a check that follows."""
     return value.dim() if isinstance(value, Tensor) else -1
+
+
+def matrix_sets(matrices: Tensor) -> Tensor:
+    """W [B or 1, Q, 4, 4] of what may be [Q, 4, 4]."""
+    if dimensions(matrices) not in (3, 4):
+        came = list(matrices.shape) if dimensions(matrices) >= 0 else type(matrices).__name__
+        raise TypeError(f"matrices must be a tensor W [Q, 4, 4], or [B, Q, 4, 4] in B poses, got {came}")
+    return matrices if matrices.dim() == 4 else matrices[None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
