@@ -118,7 +118,7 @@ def study(name: str, shape: Any, *, quick: bool) -> tuple[float, list[Row]]:
     # by the vertices of a base, which do not know the bounds of a function
     size = float(np.ptp(base_triangles(target, balls(1280))[0].bounds, axis=0).max()) if is_blob else target.size
     fits = (QUICK if quick else FITS)["blob" if is_blob else "other"]
-    counts = (80, 320) if quick else (80, 320, 1280) if is_blob else (100, 200, 400, 800, 1600, 3200)
+    counts = (80,) if quick else (80, 320, 1280) if is_blob else (100, 200, 400, 800, 1600, 3200)
     fine = target.mesh() if quick or not is_blob else base_triangles(target, balls(5120))[0]
     rows = []
     for count in tqdm(counts, desc=f"{name}: triangles", leave=False):
@@ -127,11 +127,12 @@ def study(name: str, shape: Any, *, quick: bool) -> tuple[float, list[Row]]:
         rows.append(triangle_row("triangles, vertices on the shape", target, mesh, flat_points, 3))
         rows.append(triangle_row("triangles, least quadric error", target, coarse, flat_points, 3))
         rows.append(triangle_row("PN triangles", target, mesh, pn_points, 5))
+    effort: dict[str, Any] = {"iterations": 5} if quick else {}
     settings = [(patches, count, base) for patches, some in fits for count in some for base in ("flat", "phong")]
     for patches, count, base in tqdm(settings, desc=f"{name}: fits", leave=False):
         over = balls(patches) if is_blob else patches
         try:
-            report = pd.FreeFormPatches.fit(shape, count, patches=over, base=base, **options).report
+            report = pd.FreeFormPatches.fit(shape, count, patches=over, base=base, **options, **effort).report
         except ValueError as error:  # a base too coarse for the shape: nothing to compare
             tqdm.write(f"{name}, {patches} patches, {count} quadrics, {base} base: {error}")
             continue
@@ -196,7 +197,7 @@ def main() -> None:
     parser.add_argument("meshes", nargs="*", type=Path, help="surfaces or tetrahedral meshes to study too")
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
     parser.add_argument("--picture", type=Path, help="file for the picture (PNG)")
-    parser.add_argument("--quick", action="store_true", help="few fits: only to see that it runs")
+    parser.add_argument("--quick", action="store_true", help="few and short fits: only to see that it runs")
     options = parser.parse_args()
     shapes: dict[str, Any] = {"blob": blob, "octopus": pd.shapes.octopus(cells=16 if options.quick else 24)}
     shapes |= {path.stem: pd.TriMesh.from_file(path) for path in options.meshes}

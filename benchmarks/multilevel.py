@@ -18,6 +18,7 @@ of the processor, one thread.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from typing import Literal
 
@@ -171,7 +172,7 @@ def setup_of(cells: int) -> None:
         print(f"    {solver}: {1e3 * best / sim.iterations:.2f} ms an iteration")
 
 
-def main() -> None:
+def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cells", type=int, nargs="+", default=[11], help="r of the boxes")
     parser.add_argument("--youngs", type=float, nargs="+", default=[1e6, 1e8], help="Young's moduli of the boxes [Pa]")
@@ -179,7 +180,7 @@ def main() -> None:
     parser.add_argument("--setup", type=int, nargs="+", default=[], help="r of boxes to set up in float32 instead")
     parser.add_argument("--blocks", type=int, nargs="+", default=[], help="even r, from 6, of boxes with stiff pieces")
     parser.add_argument("--contrasts", type=float, nargs="+", default=[1e2, 1e4, 1e6], help="of these pieces")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(words)
     for cells in arguments.blocks:
         torch.set_num_threads(1)
         for kind in ("slabs", "cubes"):
@@ -196,4 +197,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

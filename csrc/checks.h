@@ -48,14 +48,15 @@ constexpr int plan_arrays = 0
     ;
 #undef X
 
-// One array of a plan: [rows], or [rows, width] when that is more than 1.
+// One array of a table, of a plan unless `remedy` says where else it is from: [rows], or [rows, width] when that is more than 1.
 inline void check_array(const Tensor& t, at::ScalarType type, std::int64_t rows, std::int64_t width,
-                        const Place& place, const std::string& name, const char* meaning) {
+                        const Place& place, const std::string& name, const char* meaning,
+                        const char* remedy = "compile the scene again") {
   check_storage(t, type, place, name, meaning);
   std::vector<std::int64_t> shape{rows};
   if (width > 1) shape.push_back(width);
   TORCH_CHECK_VALUE(t.sizes() == at::IntArrayRef(shape), name, " must be ", at::IntArrayRef(shape),
-                    " (", meaning, "), got ", describe(t), "; compile the scene again");
+                    " (", meaning, "), got ", describe(t), "; ", remedy);
 }
 
 // The counts of a plan. They stay on the CPU, so that no op waits for another device.

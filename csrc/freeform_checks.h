@@ -31,8 +31,10 @@ constexpr int constraint_arrays = 0
 #undef X
 
 inline Lists lists_view(at::TensorList arrays, const Place& place) {
+  const char* remedy =
+      "take them from FreeFormPatches.lists, and from PatchSamples.lists after them";
   TORCH_CHECK_VALUE(arrays.size() == list_arrays, "lists must be ", list_arrays, " arrays, got ",
-                    arrays.size(), "; take them from FreeFormPatches.lists");
+                    arrays.size(), "; ", remedy);
   enum Array {
 #define X(name, width, rows, meaning) name,
 #include "patches/lists.def"
@@ -54,8 +56,8 @@ inline Lists lists_view(at::TensorList arrays, const Place& place) {
     std::int64_t patch, patch_end, entry, quadric_end, vertex_end, corner, sample;
   } const count{lists.patches,      lists.patches + 1, lists.entries, lists.quadrics + 1,
                 lists.vertices + 1, 3 * lists.patches, lists.samples};
-#define X(name, width, rows, meaning)                                                     \
-  check_array(arrays[name], at::kInt, count.rows, width, place, "lists." #name, meaning); \
+#define X(name, width, rows, meaning)                                                             \
+  check_array(arrays[name], at::kInt, count.rows, width, place, "lists." #name, meaning, remedy); \
   lists.name = arrays[name].const_data_ptr<int32>();
 #include "patches/lists.def"
 #undef X
@@ -63,8 +65,9 @@ inline Lists lists_view(at::TensorList arrays, const Place& place) {
 }
 
 inline Constraints constraints_view(at::TensorList arrays, const Place& place) {
+  const char* remedy = "take them from PatchTransport.constraints";
   TORCH_CHECK_VALUE(arrays.size() == constraint_arrays, "constraints must be ", constraint_arrays,
-                    " arrays, got ", arrays.size(), "; take them from PatchFrames.constraints");
+                    " arrays, got ", arrays.size(), "; ", remedy);
   enum Array {
 #define X(name, width, rows, meaning) name,
 #include "patches/constraints.def"
@@ -81,8 +84,9 @@ inline Constraints constraints_view(at::TensorList arrays, const Place& place) {
   struct {
     std::int64_t constraint, point_end, tet_corner;
   } const count{c.count, c.points + 1, 4 * c.count};
-#define X(name, width, rows, meaning)                                                           \
-  check_array(arrays[name], at::kInt, count.rows, width, place, "constraints." #name, meaning); \
+#define X(name, width, rows, meaning)                                                          \
+  check_array(arrays[name], at::kInt, count.rows, width, place, "constraints." #name, meaning, \
+              remedy);                                                                         \
   c.name = arrays[name].const_data_ptr<int32>();
 #include "patches/constraints.def"
 #undef X

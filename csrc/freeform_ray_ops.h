@@ -42,13 +42,44 @@ struct RayTensors {
   }
 };
 
+constexpr auto ray_arrays = "PatchRays makes it";
+
 // The checks of a cell are those of a grid of four segments.
-inline void check_cells(const Tensor& cells, const Tensor& points, std::int64_t level) {
+inline void check_cells(const Tensor& cells, const Tensor& like, std::int64_t samples,
+                        std::int64_t patches, std::int64_t level) {
   TORCH_CHECK_VALUE(level >= 1, "level must be at least 1, got ", level);
   TORCH_CHECK_VALUE(cells.dim() == 2 && cells.size(0) >= 1, "cells must be int32 [count > 0, ",
                     cell_numbers, "], got ", describe(cells));
-  check_array(cells, at::kInt, cells.size(0), cell_numbers, {points.device(), "points"}, "cells",
-              "corners, checks, patch and place of each");
+  check_array(cells, at::kInt, cells.size(0), cell_numbers, {like.device(), "positions"}, "cells",
+              "corners, checks, patch and place of each", ray_arrays);
+  // on a GPU, where no op may wait, the kernels leave out a cell that is none
+  if (!cells.is_cpu()) return;
+  const std::int64_t places = level * level;
+  const int32* first = cells.const_data_ptr<int32>();
+  for (std::int64_t n = 0; n < cells.size(0); ++n) {
+    const int32* cell = first + cell_numbers * n;
+    TORCH_CHECK_INDEX(is_cell(cell, samples, patches, places),
+                      "cells must hold corners and checks in 0..", samples - 1, ", patches in 0..",
+                      patches - 1, " and places in 0..", places - 1, ", got ",
+                      at::IntArrayRef(std::vector<std::int64_t>(cell, cell + cell_numbers)), " at ",
+                      n, "; ", ray_arrays);
+  }
+}
+
+// A permutation of the patches.
+inline void check_order(const Tensor& order, std::int64_t patches, const Place& place) {
+  check_array(order, at::kInt, patches, 1, place, "order",
+              "patches, in the order of the leaves of their tree", ray_arrays);
+  // on a GPU, where no op may wait, the kernels leave out a patch that is none
+  if (!order.is_cpu()) return;
+  const int32* patch = order.const_data_ptr<int32>();
+  std::vector<bool> seen(patches);
+  for (std::int64_t n = 0; n < patches; ++n) {
+    TORCH_CHECK_INDEX(is_below(patch[n], patches) && !seen[patch[n]],
+                      "order must hold each patch in 0..", patches - 1, " once, got ", patch[n],
+                      " at ", n, "; ", ray_arrays);
+    seen[patch[n]] = true;
+  }
 }
 
 // Levels of the tree with so many things a leaf or more, and less than twice as many.
@@ -82,7 +113,7 @@ Five surface_rays(const Tensor& origins, const Tensor& directions, const Tensor&
   const Lists lists = lists_view(arrays, {positions.device(), "positions"});
   const auto batch = positions.size(0), q = lists.quadrics, v = lists.vertices;
   const RayTensors rays(origins, directions, batch, near, far);
-  check_cells(cells, positions, level);
+  check_cells(cells, positions, lists.samples, lists.patches, level);
   const auto real = [&](const Tensor& t, at::IntArrayRef sizes, const char* name,
                         const char* meaning) {
     return real_argument(t, positions, sizes, name, meaning);
@@ -125,7 +156,8 @@ Five surface_rays(const Tensor& origins, const Tensor& directions, const Tensor&
     const Tree<T> tree{write<T>(boxes), cells.size(0), levels};
     const Cells<T> in{tree,           read<int32>(cells), read<T>(inner),
                       read<T>(place), read<T>(points),    write<T>(fours),
-                      lists.samples,  T(1) / T(level)};
+                      lists.samples,  lists.patches,      level * level,
+                      T(1) / T(level)};
     Backend::run(CellBoxes<T>{in}, batch << levels, positions);
     join_boxes<Backend>(tree, batch, positions);
     const SurfaceRays<T> task{surface,
@@ -155,8 +187,7 @@ std::tuple<Tensor, Tensor> field_rays(const Tensor& origins, const Tensor& direc
   const Tensor points = at::empty({positions.size(0), 0, 3}, positions.options());
   const SolidTensors in(points, positions, amplitudes, matrices, arrays);
   real_argument(rays.origins, positions, rays.origins.sizes(), "origins", "m");
-  check_array(order, at::kInt, in.lists.patches, 1, {positions.device(), "positions"}, "order",
-              "patches, in the order of the leaves of their tree");
+  check_order(order, in.lists.patches, {positions.device(), "positions"});
   const int levels = levels_of(in.lists.patches, 1);
   const Tensor boxes = empty_boxes(in.batch, levels, positions);
   const Tensor depth = in.empty({in.batch, rays.count});

@@ -108,7 +108,10 @@ def test_scenes_are_drawn_from_the_whole_range() -> None:
     assert all(1e-3 <= row["time_step"] <= 1 / 30 for row in drawn)
 
 
+@pytest.mark.usefixtures("on_path")
 def test_scenes_that_were_judged_are_kept(tmp_path: Path) -> None:
+    from tune import main
+
     out = tmp_path / "tune.json"
     run("tune.py", "--scenes", "1", "--out", str(out))
     first = json.loads(out.read_text())
@@ -116,7 +119,7 @@ def test_scenes_that_were_judged_are_kept(tmp_path: Path) -> None:
     assert first["command"] == f"python benchmarks/tune.py --scenes 1 --out {out}"
     first["rows"][0]["tuning_seconds"] = 123.0
     out.write_text(json.dumps(first))
-    run("tune.py", "--scenes", "1", "--out", str(out))
+    main(["--scenes", "1", "--out", str(out)])
     assert json.loads(out.read_text())["rows"][0]["tuning_seconds"] == 123.0
 
 
@@ -222,11 +225,18 @@ def test_forecasts_are_judged_by_what_was_needed() -> None:
     assert found["auto, no contacts"] == {"scenes": 2, "error 0.001 reached": 1, "Multilevel": 2}
 
 
+@pytest.mark.usefixtures("on_path")
 @pytest.mark.parametrize("option", ["--blocks", "--mesh", "--setup", "--cells", "--youngs", "--contrasts"])
-def test_multilevel_does_not_run_something_else_for_an_option_without_values(option: str) -> None:
-    with pytest.raises(subprocess.CalledProcessError) as refusal:
-        run("multilevel.py", option)
-    assert f"argument {option}: expected at least one argument" in refusal.value.stderr
+def test_multilevel_does_not_run_something_else_for_an_option_without_values(
+    option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from multilevel import main
+
+    with pytest.raises(SystemExit):
+        main([option])
+    said = capsys.readouterr()
+    assert f"argument {option}: expected at least one argument" in said.err
+    assert not said.out
 
 
 @pytest.mark.usefixtures("on_path")

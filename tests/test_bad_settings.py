@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,10 @@ def test_settings_of_a_simulator_are_checked() -> None:
         ({"time_step": math.inf}, ValueError, r"time_step must be positive and finite"),
         ({"iterations": -1}, ValueError, r"iterations must be a whole number >= 0, got -1"),
         ({"iterations": 2.5}, ValueError, r"iterations must be a whole number >= 0, got 2\.5"),
+        ({"time_step": "fast"}, ValueError, r"time_step must be positive and finite \[s\], got 'fast'"),
+        ({"time_step": None}, ValueError, r"time_step must be positive and finite \[s\], got None"),
+        ({"iterations": "many"}, ValueError, r"iterations must be a whole number >= 0, got 'many'"),
+        ({"iterations": math.nan}, ValueError, r"iterations must be a whole number >= 0, got nan"),
         ({"iterations": True}, ValueError, r"iterations must be a whole number >= 0, got True"),
         ({"tolerance": 1.0}, ValueError, r"tolerance must lie in \[0, 1\), got 1"),
         ({"tolerance": -0.1}, ValueError, r"tolerance must lie in \[0, 1\)"),
@@ -148,11 +153,35 @@ def test_solvers_are_checked() -> None:
         (lambda: pd.Chebyshev(relaxation=3.0), r"Chebyshev\.relaxation must lie in \(0, 2\)"),
         (lambda: pd.Chebyshev(delay=5), r'Chebyshev\.delay belongs to schedule="classic"'),
         (lambda: pd.Auto(batch=0), r"Auto\.batch must be a whole number >= 1, got 0"),
+        (lambda: pd.Auto(batch=None), r"Auto\.batch must be a whole number >= 1, got None"),
         (lambda: pd.Auto(batch=1.5), r"Auto\.batch must be a whole number >= 1, got 1.5"),
         (lambda: pd.Chebyshev(diagonal="plain"), r'Chebyshev\.diagonal must be "weighted" when guarded'),
     ):
         with pytest.raises(ValueError, match=message):
             make()  # type: ignore[no-untyped-call]
+
+
+@pytest.mark.parametrize("state", [None, 3, torch.zeros(2, 1, 27, 3), (torch.zeros(1, 27, 3),), ("x", "v")])
+def test_what_is_no_state_is_refused(state: Any, sim: pd.Simulator) -> None:
+    calls: list[Callable[[], object]] = [
+        lambda: sim(state),
+        lambda: sim.step_(state),
+        lambda: sim.energy(3 if isinstance(state, torch.Tensor) else state),  # type: ignore[arg-type]
+        lambda: sim.rollout(state, steps=2),
+        lambda: sim.tune(state, error=0.1) if state is not None else sim(state),
+    ]
+    for call in calls:
+        with pytest.raises(TypeError, match=r"state must be a State, positions and velocities \[B, 27, 3\], got"):
+            call()
+
+
+def test_what_is_no_material_is_refused(sim: pd.Simulator) -> None:
+    for value in ("soft", None, [[1.0], [1.0, 2.0]], {}):
+        with pytest.raises(TypeError, match="set_material: stiffness must be a number or a tensor, got"):
+            sim.set_material(stiffness=value)  # type: ignore[arg-type]
+    for loaded in (None, "file.pt", 3):
+        with pytest.raises(TypeError, match=r"load_state_dict: state_dict must be what state_dict\(\) gave, got"):
+            sim.load_state_dict(loaded)  # type: ignore[arg-type]
 
 
 def test_effects_are_checked() -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -170,7 +171,8 @@ def test_instruction_sets_agree() -> None:
     assert extension is not None, reason
     names = extension.build_info()["simd_available"]
     assert "portable" in names
-    results = {name: results_with(name) for name in names}
+    with ThreadPoolExecutor(len(names)) as together:
+        results = dict(zip(names, together.map(results_with, names), strict=True))
     assert [results[name]["simd"] for name in names] == names
     widest = results[names[0]]
     for name in names[1:]:

@@ -12,6 +12,7 @@ import trimesh
 from patch_cases import F64, ball, central, lump, patches_on, quadrics_on, triangle
 
 import torchpd as pd
+from torchpd.render import Camera
 
 CORNERS = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]
 
@@ -172,3 +173,93 @@ def test_printed() -> None:
     patches = pd.FreeFormPatches.from_mesh(triangle(), lump(), dtype=F64)
     assert repr(patches) == "FreeFormPatches(1 patches, 3 vertices, 1 quadrics, base='flat', measured_at='base')"
     assert len(quadrics_on(ball())) == 12
+
+
+SURFACE = patches_on(ball(0), count=5)
+PLACE = SURFACE.samples(torch.tensor([3]), torch.tensor([[0.2, 0.3, 0.5]], dtype=F64))
+BODY = pd.PatchBody(SURFACE, stiffness=1e4)
+RAYS = pd.PatchRays(SURFACE)
+APEX = torch.zeros(20, dtype=torch.int64)
+RAY = torch.tensor([[0.0, 0.0, 3.0]], dtype=F64)
+CAMERA = Camera((0.0, 0.0, 4.0), (0.0, 0.0, 0.0), 40.0)
+STATE = pd.State(*(torch.zeros(1, 13, 3, dtype=F64) for _ in range(2)))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: made(CORNERS[:3], [[0, 1, 2]], 3), "quadrics must be Quadrics, got int"),
+        (lambda: SURFACE.with_quadrics(None), "quadrics must be Quadrics, got NoneType"),
+        (
+            lambda: pd.Quadrics.from_radii(RAY[:, 0], RAY, 0.1),
+            "radii must be a float32 or .*, got float",
+        ),
+        (lambda: lump().values([[0.0, 0.0, 0.0]]), r"points must be torch.float64 \[..., 3\] \(m\), got list"),
+        (
+            lambda: lump().values(RAY.float()),
+            r"must be torch.float64 \[..., 3\] \(m\), got torch.float32 \[1, 3\]",
+        ),
+        (lambda: SURFACE.samples([0], RAY), "patch must be a tensor of integers, got list"),
+        (lambda: SURFACE.heights(RAY), "samples must be PatchSamples, got Tensor; FreeFormPatches.samples makes them"),
+        (lambda: SURFACE.surface(None), "samples must be PatchSamples, got NoneType"),
+        (lambda: SURFACE.surface(PLACE, STATE), "pose must be PatchPose, got State; PatchBody.pose makes one"),
+        (
+            lambda: SURFACE.field([[0.0, 0.0, 0.0]], torch.tensor([0])),
+            "points must be a float32 or .*, got list",
+        ),
+        (
+            lambda: SURFACE.field(RAY, APEX[:1], matrices=[1.0]),
+            r"must be a tensor W \[Q, 4, 4\], .*, got list",
+        ),
+        (lambda: RAYS.cast_field(RAY, RAY, far=1.0, matrices=RAY), r"matrices must be a tensor W .*, got \[1, 3\]"),
+        (lambda: RAYS.cast(RAY, RAY, STATE), "pose must be PatchPose, got State; PatchBody.pose makes one"),
+        (lambda: RAYS.cast(RAY, RAY, STATE.positions), "pose must be PatchPose, got Tensor"),
+        (
+            lambda: RAYS.cast(RAY.tolist(), RAY),
+            r"origins must be a tensor \[R, 3\], or \[B, R, 3\] .*, got list",
+        ),
+        (lambda: RAYS.cast(RAY, RAY, patches=3), "patches must be FreeFormPatches, got int"),
+        (lambda: RAYS.render(None, (8, 6)), "camera must be a torchpd.render.Camera, got NoneType"),
+        (lambda: RAYS.render(CAMERA, (8, 6.5)), r"size must be two whole numbers, .* got \(8, 6.5\)"),
+        (lambda: RAYS.render(CAMERA, 8), "size must be two whole numbers, width and height in pixels, got 8"),
+        (lambda: BODY.pose(STATE), r"positions must be a tensor \[B, 13, 3\], got State; take state.positions"),
+        (lambda: pd.PatchLoss(ball(0), ball(2)), "patches must be FreeFormPatches, got TriMesh"),
+        (lambda: pd.PatchLoss(SURFACE, ball(2))(SURFACE.to(dtype=torch.float32)), "must be torch.float64 on cpu like"),
+        (lambda: pd.PatchTransport(None, RAY), "PatchTransport: patches must be FreeFormPatches, got NoneType"),
+        (lambda: pd.PatchTransport(SURFACE, RAY, APEX, stretch="ab"), "stretch must hold real numbers, got <U2"),
+        (lambda: pd.PatchLoss(SURFACE, ball(2))(ball(0)), "patches must be FreeFormPatches, got TriMesh"),
+    ],
+)
+def test_other_kinds_of_things(call: Any, message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: SURFACE.samples(torch.tensor([2**40]), RAY), "patch must lie in 0..19, got 1099511627776 to"),
+        (lambda: SURFACE.samples(torch.tensor([True]), RAY), r"patch must be integers \[1\] .*, got torch.bool"),
+        (lambda: SURFACE.field(RAY[0], torch.tensor([0])), r"field: points must be \[n, 3\]"),
+        (lambda: pd.PatchTransport(SURFACE, RAY, APEX, stretch=3), "stretch must be .*, got 3"),
+        (lambda: pd.PatchTransport(SURFACE, RAY, APEX + 0.5), r"apex must be integers \[20\]"),
+        (lambda: RAYS.cast(RAY[0], RAY), r"origins must be a tensor \[R, 3\], or \[B, R, 3\] in B poses, got \[3\]"),
+        (lambda: pd.PatchBody(SURFACE, stiffness=1e4, apex=RAY.numpy()), "apex must be skeleton or prism, got array"),
+        (lambda: pd.fit_patches(ball(1), 1.5), "quadrics must be a whole number >= 1, got 1.5"),
+        (lambda: pd.fit_patches(ball(1), 2, patches=20.5), "patches must be a whole number >= 4, got 20.5"),
+        (
+            lambda: pd.fit_patches(ball(1), 2, patches="x"),
+            "patches must be a whole number >= 4, got 'x'",
+        ),
+        (lambda: pd.PatchLoss(SURFACE, ball(2), level=2.5), "level must be a whole number >= 2, got 2.5"),
+        (lambda: pd.PatchLoss(SURFACE, ball(2))(patches_on(ball(1))), "must have the 20 triangles that the loss was"),
+        (lambda: Camera((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 40.0), "origin and target must not lie above each other"),
+        (lambda: Camera((0.0, 3.0, 1.0), (0.0, 0.0, 1.0), 40.0), "origin and target must not lie above each other"),
+        (lambda: Camera((math.nan, 3.0, 1.0), (0.0, 0.0, 1.0), 40.0), "Camera.origin must be finite, got nan"),
+        (lambda: Camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), 180.0), "fov must lie between 0 and 180 degrees, got 180"),
+        (lambda: Camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), 0.0), "fov must lie between 0 and 180 degrees, got 0"),
+    ],
+)
+def test_values_out_of_range(call: Any, message: str) -> None:
+    with pytest.raises((ValueError, IndexError), match=message):
+        call()

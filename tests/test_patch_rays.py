@@ -355,3 +355,60 @@ def test_refusals() -> None:
         rays.cast_field(o, d, far=math.inf)
     with pytest.raises(ValueError, match="reading must be one of"):
         rays.cast_field(o, d, far=1.0, reading="other")  # type: ignore[arg-type]
+
+
+# of patch_surface_rays and patch_field_rays: an argument, a place in it, how many there are, the words
+OUTSIDE = {
+    "corner": ("surface", 3, (4, 1), 7842, r"cells must hold corners and checks in 0\.\.7841, .*got \[.*\] at 4"),
+    "check": ("surface", 3, (4, 14), 7842, r"cells must hold corners and checks in 0\.\.7841, .*got \[.*\] at 4"),
+    "patch": ("surface", 3, (4, 15), 20, r"patches in 0\.\.19 .*got \[.*\] at 4; PatchRays makes it"),
+    "place": ("surface", 3, (4, 16), 49, r"places in 0\.\.48, got \[.*\] at 4; PatchRays makes it"),
+    "order": ("field", 5, (4,), 20, r"order must hold each patch in 0\.\.19 once, got -?\d+ at 4; PatchRays makes it"),
+}
+
+
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize("value", [-1, 0, 2**31 - 1, -(2**31)])
+@pytest.mark.parametrize("which", OUTSIDE)
+def test_indices_out_of_range(which: str, value: int, device: torch.device) -> None:
+    """Refused on the CPU. On a GPU, where nothing may wait for values, what has such an index is not there."""
+    name, number, place, count, message = OUTSIDE[which]
+    op = getattr(torch.ops.torchpd, f"patch_{name}_rays")
+    args, options = op_arguments(name, F64, device)
+    fitting = args[number]
+    args[number] = fitting.clone()
+    args[number][place] = value if value else count
+    if device.type == "cpu":
+        with pytest.raises(IndexError, match=message):
+            op(*args, **options)
+        return
+    missing = int(fitting[4, 15] if name == "surface" else fitting[4])
+    for change in ({}, {"exhaustive": True}) if name == "field" else ({},):
+        depth, patch = op(*args, **{**options, **change})[:2]
+        whole, owner = op(*args[:number], fitting, *args[number + 1 :], **{**options, **change})[:2]
+        assert torch.equal(depth[owner != missing], whole[owner != missing])
+        assert bool((depth >= whole).all())
+        assert bool(((patch >= -1) & (patch < 20)).all())
+
+
+def test_every_patch_has_a_place_in_the_order() -> None:
+    """One that were left out would never be hit."""
+    args, options = op_arguments("field", F64, torch.device("cpu"))
+    args[5] = args[5].clone()
+    args[5][7] = args[5][3]
+    with pytest.raises(IndexError, match=r"order must hold each patch in 0\.\.19 once, got \d+ at 7"):
+        torch.ops.torchpd.patch_field_rays(*args, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "message"),
+    [
+        ("surface", 3, r"cells must be \[\d+, 17\] .*; PatchRays makes it$"),
+        ("field", 5, r"order must be \[20\] .*; PatchRays makes it$"),
+    ],
+)
+def test_the_way_out_is_not_that_of_a_plan(name: str, number: int, message: str) -> None:
+    args, options = op_arguments(name, F64, torch.device("cpu"))
+    args[number] = args[number][..., :5].contiguous()
+    with pytest.raises(ValueError, match=message):
+        getattr(torch.ops.torchpd, f"patch_{name}_rays")(*args, **options)

@@ -86,6 +86,14 @@ def test_nothing_is_left_unfinished() -> None:
     assert found == []
 
 
+@pytest.mark.parametrize("file", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md"])
+def test_prose_is_wrapped(file: str) -> None:
+    """At 120 columns, as code is; tables, and words longer than that, cannot be."""
+    prose = re.sub(r"```.*?```", "", (ROOT / file).read_text(encoding="utf-8"), flags=re.DOTALL).splitlines()
+    long = [line for line in prose if len(line) > 120 and not line.startswith("|") and " " in line.strip()[:120]]
+    assert [line[:60] for line in long if not re.match(r"!?\[", line)] == []
+
+
 def test_execution_headers_know_no_torch_and_no_cuda() -> None:
     foreign = re.compile(r'#include\s*[<"](torch|ATen|c10|cuda|cub|pybind11)')
     headers = [

@@ -364,3 +364,14 @@ def test_tetwild_meshes_are_checked_and_carry_the_surface(monkeypatch: pytest.Mo
     assert mesh.flipped == 0
     assert not list(tmp_path.iterdir())
     np.testing.assert_allclose(carried(mesh).apply(mesh.vertices), surface.vertices, atol=1e-12)
+
+
+def test_embedding_takes_a_surface_and_a_mesh() -> None:
+    box = shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    surface = TriMesh(box.vertices[:3], [[0, 1, 2]])
+    with pytest.raises(TypeError, match="embed: surface must be a TriMesh, got TetMesh"):
+        embed(box, surface)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="embed: mesh must be a TetMesh, got ndarray"):
+        embed(surface, box.vertices)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="apply: positions must be a tensor or an array, got NoneType"):
+        embed(surface, box).apply(None)  # type: ignore[call-overload]

@@ -13,7 +13,10 @@ import torch
 import torchpd as pd
 from torchpd import tuning
 from torchpd.accuracy import exact_steps, frictionless
+from torchpd.contenders import safe_solvers
 from torchpd.tuning import Promise, Trial, TuningWarning
+
+CANDIDATES = ["guarded Chebyshev", "damped Jacobi", "Multilevel"]  # of `tune`, in its order
 
 
 def bar(youngs: float = 1e5, time_step: float = 1 / 60, **options: object) -> pd.Simulator:
@@ -61,10 +64,29 @@ def test_a_promised_error_holds_in_another_motion(error: float, youngs: float) -
     assert worst_error(sim, swinging(sim)) > error
 
 
-def test_less_error_costs_more_iterations() -> None:
+# Each alone: which of them is chosen is for the clock to say, and another one may need fewer iterations for less error.
+@pytest.mark.parametrize("name", CANDIDATES)
+def test_less_error_costs_more_iterations(name: str) -> None:
     sim = bar()
-    counts = [sim.tune(swinging(sim), error=error).iterations for error in (1e-1, 1e-2, 1e-3)]
+    solver = safe_solvers(sim, swinging(sim))[name]
+    counts = [sim.tune(swinging(sim), error=error, candidates=[solver]).iterations for error in (1e-1, 1e-2, 1e-3)]
     assert counts == sorted(set(counts))
+
+
+@pytest.mark.parametrize("favoured", CANDIDATES)
+def test_less_error_takes_longer(favoured: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With all candidates, one of which has iterations a tenth as long: the time that is promised grows too."""
+    sim = bar()
+    candidates = safe_solvers(sim, swinging(sim))
+    assert list(candidates) == CANDIDATES
+    cheap = candidates[favoured]
+    monkeypatch.setattr(
+        tuning, "_milliseconds", lambda sim, start, trial: trial.iterations * (0.1 if trial.solver == cheap else 1.0)
+    )
+    promises = [sim.tune(swinging(sim), error=error) for error in (1e-1, 1e-2, 1e-3)]
+    assert all(promise.attained for promise in promises)
+    costs = [promise.milliseconds for promise in promises]
+    assert costs == sorted(set(costs))
 
 
 def test_the_promise_is_printed_and_goes_stale(tuned: tuple[pd.Simulator, Promise]) -> None:
@@ -133,8 +155,10 @@ def test_every_environment_counts() -> None:
     soft, mixed = bar(1e4), bar(1e4)
     # not the first, the middle or the last of the batch
     mixed.set_material(stiffness=mixed.stiffness * torch.tensor([1.0, 100.0, 1.0, 1.0, 1.0, 1.0, 1.0])[:, None])
-    few = soft.tune(swinging(soft), error=1e-2).iterations
-    many = mixed.tune(swinging(mixed, batch=7), error=1e-2).iterations
+    few, many = (
+        sim.tune(swinging(sim, batch=batch), error=1e-2, candidates=[pd.Chebyshev()]).iterations
+        for sim, batch in ((soft, 1), (mixed, 7))
+    )
     assert many > 2 * few
     assert mixed.stiffness.shape[0] == 7
 
@@ -184,12 +208,25 @@ def test_a_real_budget_is_near() -> None:
         ({"error": 0.0}, "error must lie in (0, 1)"),
         ({"error": 1.5}, "error must lie in (0, 1)"),
         ({"milliseconds": -1.0}, "milliseconds must be positive and finite"),
-        ({"error": 0.1, "most": 0}, "most must be at least one iteration"),
+        ({"error": 0.1, "most": 0}, "most must be a whole number >= 1, got 0"),
+        ({"error": 0.1, "most": 1.5}, "most must be a whole number >= 1, got 1.5"),
+        ({"error": math.nan}, "error must be finite, got nan"),
+        ({"error": 0.1, "candidates": []}, "candidates must hold at least one solver"),
     ],
 )
 def test_bad_requests_are_named(request_: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         bar().tune(**request_)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("candidates", ["auto", pd.Jacobi()])
+def test_candidates_are_a_sequence(candidates: object) -> None:
+    with pytest.raises(TypeError, match="candidates must be a sequence of solvers, got"):
+        bar().tune(error=0.1, candidates=candidates)  # type: ignore[arg-type]
+
+
+def test_numbers_of_a_request_may_be_tensors() -> None:
+    assert bar().tune(error=torch.tensor(0.125)).asked_error == 0.125  # type: ignore[arg-type]
 
 
 def test_states_that_are_not_finite_are_named() -> None:

@@ -71,8 +71,12 @@ def check_vector(name: str, value: Any) -> NDArray[np.float64]:
     return array
 
 
-def check_whole(name: str, value: int, *, minimum: int) -> int:
+def check_whole(name: str, value: Any, *, minimum: int) -> int:
     """One whole number, as an int."""
-    if isinstance(value, bool) or int(value) != value or value < minimum:
+    try:
+        number = int(value)
+    except (TypeError, ValueError, OverflowError):
+        number = minimum - 1
+    if isinstance(value, bool) or number < minimum or number != value:
         raise ValueError(f"{name} must be a whole number >= {minimum}, got {value!r}")
-    return int(value)
+    return number

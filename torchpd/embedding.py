@@ -55,6 +55,8 @@ class Embedding:
 
         Arrays and tensors keep their precision; tensors keep their device and are differentiated through.
         """
+        if not isinstance(positions, (np.ndarray, torch.Tensor)):
+            raise TypeError(f"Embedding.apply: positions must be a tensor or an array, got {type(positions).__name__}")
         if tuple(positions.shape[-2:]) != (self.vertex_count, 3):
             raise ValueError(
                 f"Embedding.apply: positions must be [..., {self.vertex_count}, 3] (the vertices of the mesh), "
@@ -104,6 +106,9 @@ def embed(surface: TriMesh, mesh: TetMesh) -> Embedding:
 
     A vertex outside of the mesh is extrapolated, with negative weights.
     """
+    for name, value, kind in (("surface", surface, TriMesh), ("mesh", mesh, TetMesh)):
+        if not isinstance(value, kind):
+            raise TypeError(f"embed: {name} must be a {kind.__name__}, got {type(value).__name__}")
     points, corners = surface.vertices, mesh.vertices[mesh.tets]
     gradients, _ = shape_gradients(mesh.vertices, mesh.tets)
     centres = corners.mean(axis=1)

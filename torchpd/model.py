@@ -193,7 +193,10 @@ class Model(nn.Module):
         if name not in MATERIAL_ROWS:
             raise TypeError(f"set_material: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}")
         own = getattr(self, name)
-        tensor = torch.as_tensor(value).detach()
+        try:
+            tensor = torch.as_tensor(value).detach()
+        except (TypeError, ValueError, RuntimeError):
+            raise TypeError(f"set_material: {name} must be a number or a tensor, got {value!r}") from None
         if tensor.is_complex() or tensor.dtype == torch.bool:
             raise TypeError(f"set_material: {name} must hold real numbers, got {tensor.dtype}")
         tensor = tensor.to(dtype=self.dtype, device=self.device)
@@ -211,6 +214,11 @@ class Model(nn.Module):
 
         As a part of another module the simulator is not asked whether names are missing; then torch's order holds.
         """
+        if not isinstance(state_dict, Mapping):
+            raise TypeError(
+                f"{type(self).__name__}.load_state_dict: state_dict must be what state_dict() gave, got "
+                f"{type(state_dict).__name__}"
+            )
         # a hook may give keys other names
         if strict and not self._load_state_dict_pre_hooks:
             wanted = self.state_dict()
@@ -232,7 +240,12 @@ class Model(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def check_state(self, state: State) -> None:
-        """Refuse a state of another precision or on another device."""
+        """Refuse what is no state, and one of another precision or on another device."""
+        if not _is_pair(state):
+            raise TypeError(
+                f"state must be a State, positions and velocities [B, {self.vertices}, 3], got "
+                f"{type(state).__name__}; rest_state() makes one"
+            )
         if state[0].dtype != self.dtype or state[0].device != self.device:
             raise TypeError(
                 f"state must be {self.dtype} on {self.device} like the simulator, got {state[0].dtype} on "
@@ -286,6 +299,11 @@ class Model(nn.Module):
         return self
 
 
+def _is_pair(state: Any) -> bool:
+    pair = isinstance(state, (tuple, list)) and len(state) == 2
+    return pair and isinstance(state[0], Tensor) and isinstance(state[1], Tensor)
+
+
 def _held_everywhere(pin_stiffness: Tensor) -> Tensor:
     """Whether each pin holds exactly in all environments [P]."""
     hard = pin_stiffness.isinf()
@@ -293,7 +311,10 @@ def _held_everywhere(pin_stiffness: Tensor) -> Tensor:
 
 
 def _positive(name: str, value: float, unit: str) -> float:
-    number = float(value)
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = 0.0
     if not 0.0 < number < float("inf"):
-        raise ValueError(f"{name} must be positive and finite [{unit}], got {value}")
+        raise ValueError(f"{name} must be positive and finite [{unit}], got {value!r}")
     return number

@@ -112,6 +112,11 @@ class PatchBody(Solid):
         """Vertices of the patches and their apexes, as `transport` takes them, from positions as for `pose`."""
         want = self.patches.vertices
         count = len(self.mesh.vertices)
+        if not isinstance(positions, Tensor):
+            raise TypeError(
+                f"PatchBody.pose: positions must be a tensor [B, {count}, 3], got {type(positions).__name__}; take "
+                "state.positions"
+            )
         if positions.dim() != 3 or tuple(positions.shape[1:]) != (count, 3):
             raise ValueError(
                 f"PatchBody.pose: positions must be [B, {count}, 3], the vertices of this body alone, got "
@@ -184,15 +189,15 @@ def _per_patch(stiffness: ArrayLike, count: int) -> NDArray[np.float64]:
     return array
 
 
-def _constraints(patches: FreeFormPatches, apex: ApexKind, thickness: float | None) -> Constraints:
+def _constraints(patches: FreeFormPatches, apex: Any, thickness: float | None) -> Constraints:
     vertices, directors = (t.detach().cpu().double().numpy() for t in (patches.vertices, patches.directors))
     triangles = patches.triangles.cpu().numpy().astype(np.int64)
+    if not isinstance(apex, str) or apex not in ("skeleton", "prism"):
+        raise ValueError(f"PatchBody.apex must be skeleton or prism, got {apex!r}")
     if apex == "skeleton":
         if thickness is not None:
             raise ValueError(f"PatchBody.thickness is for apex='prism', a skeleton has none, got {thickness}")
         return skeleton(vertices, triangles)
-    if apex != "prism":
-        raise ValueError(f"PatchBody.apex must be skeleton or prism, got {apex!r}")
     if thickness is None:
         sides = vertices[triangles] - vertices[np.roll(triangles, -1, axis=1)]
         thickness = 0.5 * float(np.linalg.norm(sides, axis=2).mean())

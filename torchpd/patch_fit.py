@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from .checks import check_scalar
+from .checks import check_scalar, check_whole
 from .fit_problem import HeightProblem, QuadricNumbers, levenberg_marquardt, ridge_amplitudes
 from .fit_targets import FitTarget, base_triangles, target_of
 from .mesh import TriMesh
@@ -105,29 +105,29 @@ def fit_patches(
         ValueError: a target that is not an oriented surface, that encloses nothing, or that folds over the base.
         ImportError: distances from a mesh need the package rtree.
     """
-    count = int(check_scalar("FreeFormPatches.fit: quadrics", quadrics, minimum=1))
+    count = check_whole("FreeFormPatches.fit: quadrics", quadrics, minimum=1)
     cap = check_scalar("FreeFormPatches.fit: radius_cap", radius_cap, minimum=0.1)
     if optimizer not in ("lm", "adam"):
         raise ValueError(f"FreeFormPatches.fit: optimizer must be lm or adam, got {optimizer!r}")
-    rounds = check_scalar(
+    rounds = check_whole(
         "FreeFormPatches.fit: iterations", (60 if optimizer == "lm" else 500) if iterations is None else iterations,
         minimum=1,
     )  # fmt: skip
     if not isinstance(patches, TriMesh):
-        patches = int(check_scalar("FreeFormPatches.fit: patches", patches, minimum=4))
+        patches = check_whole("FreeFormPatches.fit: patches", patches, minimum=4)
     surface = target_of(target, normals, bounds, patches if isinstance(patches, TriMesh) else None)
     empty = empty_patches(surface, patches, base)
     level = sampling_level(len(empty.triangles), count)
     samples = sample_target(empty, surface, level)
     stages = _Stages(empty, samples, cap, level)
     if optimizer == "lm":
-        total = (2 + _RESEEDS) * int(rounds)
+        total = (2 + _RESEEDS) * rounds
         with tqdm(total=total, desc="fitting patches", disable=not progress, leave=False) as bar:
-            numbers = stages.solve(count, int(rounds), bar.update)
+            numbers = stages.solve(count, rounds, bar.update)
     else:
         seeds = ridge_amplitudes(stages.problem, stages.seed(count, stages.problem.residuals(np.empty((0, 10)))))
         loss = PatchLoss.from_samples(empty, samples, level)
-        numbers = descend(loss, empty, seeds, iterations=int(rounds), least=stages.least, progress=progress)
+        numbers = descend(loss, empty, seeds, iterations=rounds, least=stages.least, progress=progress)
     fitted = empty.with_quadrics(numbers.quadrics()).to(dtype)
     fitted = fitted.with_quadrics(fitted.quadrics)  # lists of the rounded numbers
     return PatchFit(fitted, measure_fit(fitted, surface, samples.missed))

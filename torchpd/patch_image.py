@@ -8,16 +8,14 @@ has no gradient: outlines alone do not pull at the surface.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from .patch_rays import PatchRays
 from .patches import FreeFormPatches, PatchPose
-
-if TYPE_CHECKING:
-    from .render import Camera
+from .render import Camera
 
 __all__ = ["PatchImage", "render_patches"]
 
@@ -64,6 +62,7 @@ def render_patches(
         light: direction towards a distant light; where the camera stands when left out.
         ambient: share of the light that comes from everywhere, in 0..1.
     """
+    _check_kinds(camera, size)
     width, height = size
     if min(width, height) < 1:
         raise ValueError(f"render: size must be at least 1 x 1 pixel, got {width} x {height}")
@@ -91,3 +90,10 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
     """Component by component: a sum over a dimension of three is slow."""
     (x, y, z), (u, v, w) = a.unbind(-1), b.unbind(-1)
     return x * u + y * v + z * w
+
+
+def _check_kinds(camera: Any, size: Any) -> None:
+    if not isinstance(camera, Camera):
+        raise TypeError(f"render: camera must be a torchpd.render.Camera, got {type(camera).__name__}")
+    if not isinstance(size, (tuple, list)) or [type(n) for n in size] != [int, int]:
+        raise TypeError(f"render: size must be two whole numbers, width and height in pixels, got {size!r}")

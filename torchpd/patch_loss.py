@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .checks import check_scalar
+from .checks import check_scalar, check_whole
 from .fit_problem import QuadricNumbers, within_radii
 from .fit_targets import target_of
 from .patch_samples import FitSamples, edge_pairs, mean_edges, sample_target
@@ -55,7 +55,8 @@ class PatchLoss:
         normals: Any = None,
         bounds: Any = None,
     ) -> None:
-        level = int(check_scalar("PatchLoss: level", level, minimum=2))
+        _check_patches(patches)
+        level = check_whole("PatchLoss: level", level, minimum=2)
         exact = patches.to(device="cpu", dtype=torch.float64).with_quadrics(Quadrics.none(torch.float64))
         samples = sample_target(exact, target_of(target, normals, bounds), level)
         self._take(patches, samples, level, normal_weight, edge_weight)
@@ -72,6 +73,7 @@ class PatchLoss:
     ) -> None:
         self.normal_weight = check_scalar("PatchLoss: normal_weight", normal_weight, minimum=0.0)
         self.edge_weight = check_scalar("PatchLoss: edge_weight", edge_weight, minimum=0.0)
+        self._triangles = patches.triangles
         exact = patches.to(device="cpu", dtype=torch.float64)
         self.length = float(mean_edges(exact).mean())
         like = patches.vertices
@@ -84,6 +86,17 @@ class PatchLoss:
 
     def terms(self, patches: FreeFormPatches) -> tuple[Tensor, Tensor, Tensor]:
         """The means of the three terms: of distance over L, normal and crease, each squared."""
+        _check_patches(patches)
+        mine, theirs = self._triangles, patches.triangles
+        if patches.vertices.dtype != self.targets.dtype or theirs.device != mine.device:
+            raise TypeError(
+                f"PatchLoss: patches must be {self.targets.dtype} on {mine.device} like those that the loss was made "
+                f"for, got {patches.vertices.dtype} on {theirs.device}"
+            )
+        if theirs is not mine and not torch.equal(theirs, mine):
+            raise ValueError(
+                f"PatchLoss: patches must have the {len(mine)} triangles that the loss was made for, got {patches!r}"
+            )
         surface = patches.surface(self.places)
         distance = ((surface.points - self.targets) * self.wanted).sum(-1) / self.length
         turned = (surface.normals - self.wanted).square().sum(-1)
@@ -96,6 +109,11 @@ class PatchLoss:
         """The loss of patches over the same triangles: other quadrics, or another shape (`with_shape`)."""
         distance, normal, crease = self.terms(patches)
         return distance + self.normal_weight * normal + self.edge_weight * crease
+
+
+def _check_patches(patches: Any) -> None:
+    if not isinstance(patches, FreeFormPatches):
+        raise TypeError(f"PatchLoss: patches must be FreeFormPatches, got {type(patches).__name__}")
 
 
 def _moved(patches: FreeFormPatches, patch: Tensor, barycentrics: Tensor) -> PatchSamples:

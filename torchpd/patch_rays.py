@@ -16,8 +16,8 @@ from torch import Tensor
 
 from . import patch_ops  # noqa: F401  (registers the ops)
 from .patch_mesh import grid, tessellate, weld
-from .patches import FreeFormPatches, PatchPose, PatchSamples, SurfacePoints
-from .quadrics import check_real_tensor
+from .patches import FreeFormPatches, PatchPose, PatchSamples, SurfacePoints, check_pose
+from .quadrics import dimensions, matrix_sets
 
 if TYPE_CHECKING:
     from .patch_image import PatchImage
@@ -96,8 +96,8 @@ class PatchRays:
             patches: in place of those given at the start, with the same triangles.
             near, far: hits count between these distances along the ray [m].
         """
-        surface = self.patches if patches is None else patches
-        at = _at_rest(surface) if pose is None else pose
+        surface = self._surface(patches)
+        at = _posed(surface, pose)
         found = self._find(origins, directions, at, surface, near, far, shape=True)
         hits = PatchHits(found[1] >= 0, *found)
         q = surface.quadrics
@@ -124,8 +124,8 @@ class PatchRays:
         Returns:
             Depth [B, R] in m, infinite for a miss; patch int32 [B, R], -1 for a miss; barycentrics [B, R, 3].
         """
-        surface = self.patches if patches is None else patches
-        at = _at_rest(surface) if pose is None else pose
+        surface = self._surface(patches)
+        at = _posed(surface, pose)
         depth, patch, b, _, _ = self._find(origins, directions, at, surface, near, far, shape=False)
         return depth, patch, b
 
@@ -142,7 +142,6 @@ class PatchRays:
         shape: bool,
     ) -> tuple[Tensor, ...]:
         """What `search` returns, and with `shape` the points and normals of the hits."""
-        self._check_patches(surface)
         o, d = _batched("origins", origins, surface), _batched("directions", directions, surface)
         q = surface.quadrics
         found: tuple[Tensor, ...] = _ops.patch_surface_rays(
@@ -204,14 +203,18 @@ class PatchRays:
         W = surface.quadrics.normalized_matrices() if matrices is None else matrices
         v = surface.vertices[None] if positions is None else positions
         nowhere = surface.samples(torch.empty(0, dtype=torch.int32), surface.vertices[:0])
-        arguments = (o, d, v, surface.quadrics.amplitudes, W if W.dim() == 4 else W[None])
+        arguments = (o, d, v, surface.quadrics.amplitudes, matrix_sets(W))
         depth, patch = _ops.patch_field_rays(
             *(t.detach() for t in arguments), self._order, [*surface.lists, *nowhere.lists],
             thickness=surface.thickness, clip=reading == "clip", near=near, far=far, exhaustive=exhaustive,
         )  # fmt: skip
         return depth, patch
 
-    def _check_patches(self, patches: FreeFormPatches) -> None:
+    def _surface(self, patches: FreeFormPatches | None) -> FreeFormPatches:
+        if patches is None:
+            return self.patches
+        if not isinstance(patches, FreeFormPatches):
+            raise TypeError(f"PatchRays: patches must be FreeFormPatches, got {type(patches).__name__}")
         mine, theirs = self.patches, patches
         same = theirs.triangles is mine.triangles or (
             theirs.triangles.device == mine.triangles.device and torch.equal(theirs.triangles, mine.triangles)
@@ -221,6 +224,7 @@ class PatchRays:
                 f"PatchRays: patches must have the triangles of those given at the start, be {mine.vertices.dtype} and "
                 f"on {mine.vertices.device}, got {theirs!r} in {theirs.vertices.dtype} on {theirs.vertices.device}"
             )
+        return patches
 
 
 def _check_level(level: Any) -> None:
@@ -229,8 +233,11 @@ def _check_level(level: Any) -> None:
 
 
 def _batched(name: str, rays: Tensor, surface: FreeFormPatches) -> Tensor:
-    shape = (None, 3) if rays.dim() == 2 else (None, None, 3)
-    check_real_tensor(f"cast: {name}", rays, shape, "of rays")
+    wanted = f"cast: {name} must be a tensor [R, 3], or [B, R, 3] in B poses"
+    if dimensions(rays) < 0:
+        raise TypeError(f"{wanted}, got {type(rays).__name__}")
+    if rays.dim() not in (2, 3) or rays.shape[-1] != 3:
+        raise ValueError(f"{wanted}, got {list(rays.shape)}")
     like = surface.vertices
     if rays.dtype != like.dtype or rays.device != like.device:
         raise ValueError(
@@ -247,7 +254,10 @@ def _rays(origins: Tensor, directions: Tensor, surface: FreeFormPatches) -> tupl
     return o, torch.nn.functional.normalize(d, dim=-1, eps=0.0)
 
 
-def _at_rest(surface: FreeFormPatches) -> PatchPose:
+def _posed(surface: FreeFormPatches, pose: PatchPose | None) -> PatchPose:
+    if pose is not None:
+        check_pose(pose)
+        return pose
     eye = torch.eye(3, dtype=surface.vertices.dtype, device=surface.vertices.device)
     return PatchPose(surface.vertices[None], eye.expand(1, len(surface.vertices), 3, 3))
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from . import patch_ops  # noqa: F401  (registers the ops)
+from .checks import as_array
 from .ops import nearest_rotation
 from .patch_lists import corner_lists
 from .patches import FreeFormPatches, PatchPose
@@ -62,10 +63,13 @@ class PatchTransport(nn.Module):
         super().__init__()
         if mode not in ("transport", "rotation"):
             raise ValueError(f"PatchTransport.mode must be transport or rotation, got {mode!r}")
-        if not 0.0 < stretch[0] <= 1.0 <= stretch[1]:
+        if not isinstance(patches, FreeFormPatches):
+            raise TypeError(f"PatchTransport: patches must be FreeFormPatches, got {type(patches).__name__}")
+        bounds = as_array("PatchTransport.stretch", stretch, np.float64)
+        if bounds.shape != (2,) or not 0.0 < bounds[0] <= 1.0 <= bounds[1]:
             raise ValueError(f"PatchTransport.stretch must be (in (0, 1], at least 1), got {stretch}")
         check_real_tensor("PatchTransport.apexes", apexes, (None, 3), "points at rest [m]")
-        self.mode, self.stretch = mode, (float(stretch[0]), float(stretch[1]))
+        self.mode, self.stretch = mode, (float(bounds[0]), float(bounds[1]))
         self.vertices = len(patches.vertices)
         rest = torch.cat([patches.vertices.detach(), apexes.detach().to(patches.vertices)])
         tets = _tets(patches, apex, len(apexes))
@@ -115,7 +119,7 @@ class PatchTransport(nn.Module):
 
 def _tets(patches: FreeFormPatches, apex: Tensor | None, apexes: int) -> Index:
     triangles = patches.triangles.cpu().numpy().astype(np.int64)
-    number = np.arange(len(triangles)) if apex is None else apex.cpu().numpy()
+    number = np.arange(len(triangles)) if apex is None else as_array("PatchTransport.apex", apex)
     if number.shape != (len(triangles),) or number.dtype.kind not in "iu":
         raise ValueError(
             f"PatchTransport.apex must be integers [{len(triangles)}], one for each patch, got {list(number.shape)}"

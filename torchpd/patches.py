@@ -20,7 +20,7 @@ from .mesh import TriMesh
 from .mesh_checks import store
 from .patch_checks import angle_weighted_normals, check_surface
 from .patch_lists import Touching, gather_lists, touching
-from .quadrics import Quadrics, check_real_tensor
+from .quadrics import Quadrics, check_real_tensor, dimensions, matrix_sets
 
 if TYPE_CHECKING:
     from .patch_fit import PatchFit
@@ -245,23 +245,26 @@ class FreeFormPatches:
             barycentrics: coordinates of each sample [S, 3], which add up to one.
         """
         check_real_tensor("samples: barycentrics", barycentrics, (None, 3), "barycentric coordinates")
-        if patch.dim() != 1 or patch.dtype.is_floating_point or len(patch) != len(barycentrics):
+        if not isinstance(patch, Tensor):
+            raise TypeError(f"samples: patch must be a tensor of integers, got {type(patch).__name__}")
+        counts = not (patch.dtype.is_floating_point or patch.dtype.is_complex or patch.dtype == torch.bool)
+        if patch.dim() != 1 or not counts or len(patch) != len(barycentrics):
             raise ValueError(
                 f"samples: patch must be integers [{len(barycentrics)}] like barycentrics, "
                 f"got {patch.dtype} {list(patch.shape)}"
             )
         count = len(self.triangles)
+        # before they are narrowed to 32 bits
+        if len(patch) and not (int(patch.min()) >= 0 and int(patch.max()) < count):
+            raise IndexError(f"samples: patch must lie in 0..{count - 1}, got {int(patch.min())} to {int(patch.max())}")
         number = patch.detach().to(device=self.vertices.device, dtype=torch.int32)
-        if len(number) and not (int(number.min()) >= 0 and int(number.max()) < count):
-            raise IndexError(
-                f"samples: patch must lie in 0..{count - 1}, got {int(number.min())} to {int(number.max())}"
-            )
         ordered, order = torch.sort(number, stable=True)
         starts = torch.searchsorted(ordered, torch.arange(count + 1, dtype=torch.int32, device=number.device))
         return PatchSamples(number, barycentrics, (number, starts.to(torch.int32), order.to(torch.int32)))
 
     def heights(self, samples: PatchSamples) -> tuple[Tensor, Tensor]:
         """Heights h [S] over the base [m], and their derivatives [S, 2] along b_1 and b_2 (b_3 gives way)."""
+        _check_kind("samples", samples, PatchSamples, "FreeFormPatches.samples makes them")
         q = self.quadrics
         h, slopes = _ops.patch_height(
             self.vertices, self.directors, q.amplitudes, q.centres, q.entries(), samples.barycentrics,
@@ -281,7 +284,10 @@ class FreeFormPatches:
             pose: of B environments; at rest when left out.
             heights: what `heights(samples)` gave, if it is known.
         """
+        _check_kind("samples", samples, PatchSamples, "FreeFormPatches.samples makes them")
         h, slopes = self.heights(samples) if heights is None else heights
+        if pose is not None:
+            check_pose(pose)
         if pose is None:
             eye = torch.eye(3, dtype=self.vertices.dtype, device=self.vertices.device)
             rest = PatchPose(self.vertices[None], eye.expand(1, len(self.vertices), 3, 3))
@@ -320,15 +326,17 @@ class FreeFormPatches:
             F' [S] or [B, S] in m.
         """
         _choose("reading", reading, ("clip", "literal"))
-        x = points if points.dim() == 3 else points[None]
+        batched = dimensions(points) == 3
+        check_real_tensor("field: points", points, (None, None, 3) if batched else (None, 3), "x [m]")
+        x = points if batched else points[None]
         v = self.vertices.expand(len(x), -1, -1) if positions is None else positions
         W = self.quadrics.normalized_matrices() if matrices is None else matrices
         where = self.samples(patch, torch.zeros_like(x[0]))
         F: Tensor = _ops.patch_field(
-            x, v, self.quadrics.amplitudes, W if W.dim() == 4 else W[None], self._lists(where),
+            x, v, self.quadrics.amplitudes, matrix_sets(W), self._lists(where),
             thickness=self.thickness, clip=reading == "clip",
         )  # fmt: skip
-        return F if points.dim() == 3 else F[0]
+        return F if batched else F[0]
 
     def tessellate(self, level: int) -> Tessellation:
         """A triangle mesh with `level` segments along every edge, to be evaluated in any pose."""
@@ -386,7 +394,18 @@ def _check_directors(directors: Tensor, vertices: Tensor) -> None:
         )
 
 
+def _check_kind(name: str, value: Any, kind: type, source: str) -> None:
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be {kind.__name__}, got {type(value).__name__}; {source}")
+
+
+def check_pose(pose: Any) -> None:
+    """Refuse what is no pose: a state, say, or its positions."""
+    _check_kind("pose", pose, PatchPose, "PatchBody.pose makes one of the positions of a state")
+
+
 def _check_quadrics(quadrics: Quadrics, vertices: Tensor) -> None:
+    _check_kind("FreeFormPatches.quadrics", quadrics, Quadrics, "Quadrics.none(...) for none")
     if quadrics.amplitudes.dtype != vertices.dtype or quadrics.amplitudes.device != vertices.device:
         raise ValueError(
             f"FreeFormPatches.quadrics must be {vertices.dtype} on {vertices.device} like vertices, "

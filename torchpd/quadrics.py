@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["Quadrics", "check_real_tensor"]
+__all__ = ["Quadrics", "check_real_tensor", "dimensions", "matrix_sets"]
 
 _LOWER = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))  # entries of M in the order of `factors`
 
@@ -24,6 +24,19 @@ def check_real_tensor(name: str, value: Any, shape: tuple[int | None, ...], mean
     if not matches:
         want = ", ".join("n" if length is None else str(length) for length in shape)
         raise ValueError(f"{name} must be [{want}] ({meaning}), got {list(value.shape)}")
+
+
+def dimensions(value: Any) -> int:
+    """Of a tensor; -1 of anything else, for a check that follows."""
+    return value.dim() if isinstance(value, Tensor) else -1
+
+
+def matrix_sets(matrices: Tensor) -> Tensor:
+    """W [B or 1, Q, 4, 4] of what may be [Q, 4, 4]."""
+    if dimensions(matrices) not in (3, 4):
+        came = list(matrices.shape) if dimensions(matrices) >= 0 else type(matrices).__name__
+        raise TypeError(f"matrices must be a tensor W [Q, 4, 4], or [B, Q, 4, 4] in B poses, got {came}")
+    return matrices if matrices.dim() == 4 else matrices[None]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,7 +79,8 @@ class Quadrics:
     def from_radii(cls, amplitudes: Tensor, centres: Tensor, radii: Tensor) -> Quadrics:
         """Balls of radii [Q], or ellipsoids along the axes with radii [Q, 3] [m]."""
         check_real_tensor("Quadrics.from_radii: centres", centres, (None, 3), "centres [m]")
-        check_real_tensor("Quadrics.from_radii: radii", radii, (len(centres), 3)[: max(radii.dim(), 1)], "radii [m]")
+        shape = (len(centres), 3) if dimensions(radii) == 2 else (len(centres),)
+        check_real_tensor("Quadrics.from_radii: radii", radii, shape, "radii [m]")
         if not bool((radii > 0).all()):
             raise ValueError(f"Quadrics.from_radii: radii must be positive [m], got {float(radii.min())}")
         rates = -torch.log(radii if radii.dim() == 2 else radii[:, None].expand(-1, 3))
@@ -140,6 +154,7 @@ class Quadrics:
 
     def values(self, points: Tensor) -> Tensor:
         """R_i [..., Q] of each quadric at points [..., 3], in plain torch."""
+        _check_points(points, self.centres.dtype)
         y = torch.einsum("qij,...qj->...qi", self.triangular(), points[..., None, :] - self.centres)
         return self.amplitudes * (1.0 - y.square().sum(-1)).clamp_min(0.0) ** 3
 
@@ -152,6 +167,12 @@ class Quadrics:
 
     def __repr__(self) -> str:
         return f"Quadrics({len(self)}, {str(self.amplitudes.dtype).removeprefix('torch.')}, {self.amplitudes.device})"
+
+
+def _check_points(points: Any, dtype: torch.dtype) -> None:
+    if not isinstance(points, Tensor) or points.dtype != dtype or points.shape[-1:] != (3,):
+        came = f"{points.dtype} {list(points.shape)}" if isinstance(points, Tensor) else type(points).__name__
+        raise TypeError(f"Quadrics.values: points must be {dtype} [..., 3] (m), got {came}")
 
 
 def _refuse_rows(contract: str, bad: Tensor) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import as_array, check_finite, check_scalar, check_shape
+from .checks import as_array, check_finite, check_scalar, check_shape, check_vector
 from .denoise import denoise
 from .shading import SmoothSurface
 
@@ -41,6 +41,16 @@ class Camera:
     origin: Color  # m
     target: Color  # m, in the middle of the picture
     fov: float  # vertical opening, degrees
+
+    def __post_init__(self) -> None:
+        forward = check_vector("Camera.target", self.target) - check_vector("Camera.origin", self.origin)
+        if not float(np.hypot(forward[0], forward[2])) > 1e-9 * float(np.linalg.norm(forward)):
+            raise ValueError(
+                f"Camera: origin and target must not lie above each other, nor at the same place, got {self.origin} "
+                f"and {self.target}; a camera stands upright, so move one of them a little"
+            )
+        if not 0.0 < check_scalar("Camera.fov", self.fov) < 180.0:
+            raise ValueError(f"Camera.fov must lie between 0 and 180 degrees, got {self.fov}")
 
     def rays(self, size: tuple[int, int]) -> Array:
         """Unit directions [H, W, 3] through the middles of the pixels."""

@@ -52,6 +52,7 @@ class Rollout:
 
 def roll(sim: Simulator, call: Rollout, *, progress: bool) -> Track:
     """The recorded states."""
+    sim.check_state(call.state)
     varies = callable(call.forces) or callable(call.targets)
     # the op has a derivative where it records every state
     one_by_one = varies or (call.every > 1 and call.tracks_gradient(sim.material()))
@@ -66,7 +67,6 @@ def _constant_material(sim: Simulator, call: Rollout) -> list[Tensor]:
 
 
 def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
-    sim.check_state(call.state)
     refuse_tangents(*call.state, call.forces if isinstance(call.forces, Tensor) else None, *material)
     positions, velocities, rows = torch.ops.torchpd.rollout(
         call.state[0],

@@ -91,6 +91,7 @@ class Simulator(Model):
             The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
             error follows the residual). Forward mode and `torch.func.grad` are not provided.
         """
+        self.check_state(state)
         material = self.material_at(targets, state[0].shape[0])
         after, rows = self.advance(state, forces, material, start, report=return_info)
         return (after, Info.from_rows(rows)) if return_info else after
@@ -98,8 +99,8 @@ class Simulator(Model):
     def advance(
         self, state: State, forces: Tensor | None, material: list[Tensor], start: str | Tensor, *, report: bool
     ) -> tuple[State, Tensor]:
-        """One step with a given material, see `material_at`: the next state, and rows for `Info.from_rows`."""
-        self.check_state(state)
+        """One step of a checked state with a given material, see `material_at`: the next state, and rows for
+        `Info.from_rows`."""
         given, inertial = _first_iterate(start)
         refuse_tangents(*state, forces, *material)
         positions, velocities, rows = _ops.step(
@@ -129,11 +130,11 @@ class Simulator(Model):
         Args:
             info: rows [B, 6] float64 to fill in, see `Info.from_rows`; None leaves out residual and energy.
         """
+        self.check_state(state)
         if state[0].requires_grad or state[1].requires_grad:
             raise ValueError(
                 "step_ overwrites the state, so it must not require gradients; detach it or call the simulator"
             )
-        self.check_state(state)
         given, inertial = _first_iterate(start)
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(
@@ -251,6 +252,8 @@ class Simulator(Model):
             state: a `State`, or positions [B, V, 3] alone.
             targets: of pins, as in `forward`.
         """
+        if not isinstance(state, Tensor):
+            self.check_state(state)
         positions = state if isinstance(state, Tensor) else state[0]
         refuse_tangents(positions)
         material = dict(zip(MATERIAL_ROWS, self.material_at(targets, positions.shape[0]), strict=True))

@@ -6,7 +6,6 @@ pieces' own elements is least. Only the extension is dense; it is solved for in 
 
 from __future__ import annotations
 
-import os
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from .gpu import free_memory
+from .memory import host_memory
 from .scene import SceneValues
 
 __all__ = ["StiffPieces", "find_pieces"]
@@ -130,10 +130,8 @@ def _refuse_full_memory(vertices: int, pieces: int, dtype: torch.dtype, device: 
 
 
 def _memory(device: torch.device) -> int:
-    """Bytes: all of the host's, and what is free on a GPU."""
-    if device.type == "cuda":
-        return free_memory(device)
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """Bytes: all that the host may give to this process, and what is free on a GPU."""
+    return free_memory(device) if device.type == "cuda" else host_memory()
 
 
 def _matrix(values: SceneValues, stiffness: Array, inertia: Array) -> csr_array:

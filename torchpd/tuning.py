@@ -23,6 +23,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .accuracy import ExactStep, exact_steps, frictionless
+from .checks import check_scalar, check_whole
 from .contenders import safe_solvers
 from .diagonal import step_diagonal
 from .material import MATERIAL_ROWS
@@ -165,7 +166,12 @@ def tune(
     progress: bool = False,
 ) -> Promise:
     """See `Simulator.tune`."""
-    _check_request(error, milliseconds, most)
+    error = None if error is None else check_scalar("tune: error", error)
+    milliseconds = None if milliseconds is None else check_scalar("tune: milliseconds", milliseconds)
+    most = check_whole("tune: most", most, minimum=1)
+    _check_request(error, milliseconds)
+    if isinstance(candidates, (str, Solver)):
+        raise TypeError(f"tune: candidates must be a sequence of solvers, got {candidates!r}; write [{candidates!r}]")
     start = sim.rest_state() if state is None else state
     _check_start(sim, start)
     study = _prepare(sim, start)
@@ -191,7 +197,7 @@ def tune(
 # ---- what is refused
 
 
-def _check_request(error: float | None, milliseconds: float | None, most: int) -> None:
+def _check_request(error: float | None, milliseconds: float | None) -> None:
     if (error is None) == (milliseconds is None):
         raise ValueError(
             f"tune takes one of error and milliseconds, got error={error} and milliseconds={milliseconds}; "
@@ -201,8 +207,6 @@ def _check_request(error: float | None, milliseconds: float | None, most: int) -
         raise ValueError(f"tune: error must lie in (0, 1), 1 being the first iterate; got {error}")
     if milliseconds is not None and not 0.0 < milliseconds < math.inf:
         raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
-    if most < 1:
-        raise ValueError(f"tune: most must be at least one iteration, got {most}")
 
 
 def _check_start(sim: Simulator, state: State) -> None:

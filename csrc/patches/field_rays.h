@@ -314,6 +314,7 @@ PD_HD void item(const FieldBoxes<T>& t, Index i) {
   const double most = double(biggest<T>());
   Box<double> box = {{most, most, most}, {-most, -most, -most}};
   for (Index n = first_of(t.tree, leaf); n < first_of(t.tree, leaf + 1); ++n) {
+    if (!is_below(t.order[n], t.tree.count)) continue;  // no patch
     const Box<double> own = field_box(t.solid, pose, t.order[n]);
     join(box, own.low, own.high);
   }
@@ -332,6 +333,7 @@ struct EnterPatch {
   PD_HD void operator()(Index number) const {
     const Solid<T>& s = task.solid;
     const int32 patch = task.order[number];
+    if (!is_below(patch, task.tree.count)) return;
     const Index corner = pose * s.lists.vertices + s.lists.triangles[3 * patch];
     const T foot = dot(load3(s.positions, corner) - ray.o, ray.d);
     const Profile<T> p = profile_of(s, pose, patch, multiply_add(foot, ray.d, ray.o), ray.d);

@@ -25,7 +25,7 @@ struct Cells {
   const T* places;     // [m^2, 9] barycentric coordinates of the corners of a cell in its patch
   const T* points;     // [B, N, 3] m
   T* fours;  // [B, leaves, 10, 4] of up to four cells, number by number: corners and slack, NaN for none, m
-  Index samples;
+  Index samples, patches, cells_of_patch;
   T size;  // edge of a cell in barycentric coordinates, 1 / m
 };
 
@@ -92,6 +92,13 @@ struct SurfaceRays {
 
 namespace pd::freeform::inline PD_TARGET {
 
+// Whether the numbers of a cell point into the arrays.
+PD_HD bool is_cell(const int32* cell, Index samples, Index patches, Index places) {
+  bool is = is_below(cell[cell_numbers - 2], patches) && is_below(cell[cell_numbers - 1], places);
+  for (int k = 0; k < 3 + check_points; ++k) is = is && is_below(cell[k], samples);
+  return is;
+}
+
 // Item: a leaf of a pose.
 template <class T>
 PD_HD void item(const CellBoxes<T>& t, Index i) {
@@ -104,6 +111,7 @@ PD_HD void item(const CellBoxes<T>& t, Index i) {
   for (int k = 0; k < cell_four_numbers; ++k) four[k] = T(NAN);
   for (Index n = first_of(c.tree, leaf); n < first_of(c.tree, leaf + 1); ++n) {
     const int32* cell = c.cells + cell_numbers * n;
+    if (!is_cell(cell, c.samples, c.patches, c.cells_of_patch)) continue;  // left out, like none
     const Vec3<T> p[3] = {load3(points, cell[0]), load3(points, cell[1]), load3(points, cell[2])};
     T apart = T(0);
     for (int k = 0; k < check_points; ++k) {

@@ -46,6 +46,8 @@ struct Ellipsoids {
 
 namespace pd::freeform::inline PD_TARGET {
 
+PD_HD bool is_below(int32 index, Index count) { return index >= 0 && index < count; }
+
 template <class T>
 PD_HD T greater(const T& a, const T& b) {
   return b > a ? b : a;

@@ -1,0 +1,51 @@
+"""How much memory a process may have: the machine's, or what its container is limited to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+__all__ = ["host_memory"]
+
+
+def host_memory(root: Path = Path("/")) -> int:
+    """Bytes: all of the machine's, or the least limit of the control groups (versions 1 and 2) around this process.
+
+    Args:
+        root: of the file system that tells the limits.
+    """
+    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return min([there, *_limits(root)])
+
+
+def _limits(root: Path) -> Iterator[int]:
+    """Those of the group and of all around it: inside a container its own may be what is mounted as the root."""
+    for controllers, path in _groups(root):
+        if controllers == "":  # version 2: one hierarchy
+            top, name = root / "sys/fs/cgroup", "memory.max"
+        elif "memory" in controllers.split(","):
+            top, name = root / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
+        else:
+            continue
+        parts = [part for part in PurePosixPath(path).parts if part not in ("/", "..")]
+        for depth in range(len(parts) + 1):
+            limit = _read(top.joinpath(*parts[:depth], name)).strip()
+            if limit.isdecimal():  # else "max"
+                yield int(limit)
+
+
+def _groups(root: Path) -> Iterator[tuple[str, str]]:
+    """Controllers and path of each hierarchy, from lines like 4:memory:/path."""
+    for line in _read(root / "proc/self/cgroup").splitlines():
+        number, _, rest = line.partition(":")
+        controllers, colon, path = rest.partition(":")
+        if number and colon:
+            yield controllers, path
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError):
+        return ""
