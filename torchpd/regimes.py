@@ -31,7 +31,9 @@ _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than th
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 200
 # with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block
 _LEVEL_TETS, _LEVEL_ALONE = 384, 1152
-_STREAM_TETS = {torch.float32: 2000, torch.float64: 960}  # a patch, so that two share a multiprocessor of an H100
+# a patch at most, and how many of them share a multiprocessor of an H100 (csrc/cuda/stream.h): six rounds of its threads
+_STREAM_TETS = {torch.float32: 2280, torch.float64: 960}
+_STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
 _MOST_FIELDS = 2  # of a pass: the products with a second derivative
 
 
@@ -91,7 +93,10 @@ class _Scene(NamedTuple):
             least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes))
             rounds = -(-int(least) // gpu.multiprocessors)
             return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
-        return -(-self.tets // _STREAM_TETS[self.dtype])
+        patches = -(-self.tets // _STREAM_TETS[self.dtype])
+        # what does not run at once runs in whole waves, of which the last is full too
+        wave = _STREAM_TOGETHER[self.dtype] * gpu.multiprocessors
+        return patches if patches <= wave else -(-patches // wave) * wave
 
     def least_shared_bytes(self, kernel: str, patches: int) -> int:
         """Of the kernels block and grid, without building the plan: two tetrahedra have at least five entries."""
