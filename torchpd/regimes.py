@@ -31,7 +31,7 @@ _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than th
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 200
 # with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block
 _LEVEL_TETS, _LEVEL_ALONE = 384, 1152
-# a patch at most, and how many of them share a multiprocessor of an H100 (csrc/cuda/stream.h): six rounds of its threads
+# a patch at most, six rounds of its threads, and how many share a multiprocessor of an H100 (csrc/cuda/stream.h)
 _STREAM_TETS = {torch.float32: 2280, torch.float64: 960}
 _STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
 _MOST_FIELDS = 2  # of a pass: the products with a second derivative
