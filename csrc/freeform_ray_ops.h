@@ -141,6 +141,7 @@ Five surface_rays(const Tensor& origins, const Tensor& directions, const Tensor&
   const Tensor patch = at::empty({batch, rays.count}, positions.options().dtype(at::kInt));
   const auto shaped = shape ? rays.count : 0;
   const Tensor hits = empty({batch, shaped, 3}), normals = empty({batch, shaped, 3});
+  if (depth.numel() == 0) return {depth, patch, b, hits, normals};
   for_precision(positions, [&](auto number) {
     using T = decltype(number);
     const Base<T> base{read<T>(at_rest), read<T>(n), phong ? phong_lift<T> : T(0)};

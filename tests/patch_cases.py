@@ -43,6 +43,15 @@ def sheet(cells: int = 3) -> pd.TriMesh:
     )
 
 
+def level_sheet(cells: int = 3) -> pd.TriMesh:
+    """A square in the plane z = 0: over it a surface of patches is the graph of a function."""
+    n = cells + 1
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij"))
+    corner = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]))
+    return pd.TriMesh(np.stack([x, y, 0 * x], axis=1), np.concatenate([np.stack(t, 1) for t in ((a, b, c), (a, c, d))]))
+
+
 def torus() -> pd.TriMesh:
     return pd.TriMesh.from_trimesh(trimesh.creation.torus(1.0, 0.4, major_sections=8, minor_sections=6))
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
-from patch_cases import F64, quadrics_on, triangle
+from patch_cases import F64, level_sheet, quadrics_on, triangle
 from torch import Tensor
 
 import torchpd as pd
@@ -22,15 +22,6 @@ NEVER = STEPS
 pytestmark = pytest.mark.usefixtures("one_thread")
 READINGS = ["clip", "literal"]
 TOUCH = 1e-9  # m: how near to the surface a ray must come for a hit that no march sees
-
-
-def level_sheet(cells: int = 3) -> pd.TriMesh:
-    """A square in the plane z = 0: over it a surface of patches is the graph of a function."""
-    n = cells + 1
-    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij"))
-    corner = np.arange(n * n).reshape(n, n)
-    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]))
-    return pd.TriMesh(np.stack([x, y, 0 * x], axis=1), np.concatenate([np.stack(t, 1) for t in ((a, b, c), (a, c, d))]))
 
 
 def segments(count: int, height: float, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -177,6 +168,33 @@ def test_march_over_a_graph(measured_at: str) -> None:
 def test_two_crossings_close_to_each_other() -> None:
     """A ray that enters and leaves a bump near its outline, which cells as long as the quadrics' radii miss."""
     assert march_over_graph("base", 100_000, slice(19810, 19811)) == 0
+
+
+def test_bumps_as_narrow_as_the_finest_cells() -> None:
+    """Patches of a metre and bumps of 2 to 4 cm, up to 20 times as high as wide: no level is fine enough, and cells are
+    as long as radii. Less than one in a hundred of the rays that are aimed at them may be missed."""
+    rng, pairs = np.random.default_rng(1), 6
+    mesh = level_sheet(2)
+    centres = np.zeros((2 * pairs, 3))
+    centres[::2, :2] = rng.uniform(-0.8, 0.8, (pairs, 2))
+    centres[1::2, :2] = centres[::2, :2] + rng.uniform(-0.06, 0.06, (pairs, 2))
+    radii, heights = 0.04 * rng.uniform(0.5, 1.0, 2 * pairs), 0.4 * rng.uniform(0.3, 1.0, 2 * pairs)
+    quadrics = pd.Quadrics.from_radii(*(torch.tensor(a) for a in (heights, centres, radii)))
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=F64).expand(len(mesh.vertices), 3)
+    patches = pd.FreeFormPatches.from_mesh(mesh, quadrics, dtype=F64, directors=up)
+    which = rng.integers(0, 2 * pairs, 20_000)
+    aim = centres[which] + rng.uniform([-1, -1, 0], [1, 1, 1], (20_000, 3)) * np.stack(
+        [radii[which], radii[which], heights[which]], axis=1
+    )
+    d = rng.standard_normal((20_000, 3)) * [1.0, 1.0, 0.1]
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    inside = (np.abs(aim) + 0.5 * np.abs(d))[:, :2].max(axis=1) < 0.99
+    start, end = torch.tensor((aim - 0.5 * d)[inside]), torch.tensor((aim + 0.5 * d)[inside])
+    rays = pd.PatchRays(patches)
+    assert rays.level == 32
+    depth = rays.search(start, end - start, far=1.0)[0][0]
+    wrong = compare_with_march(profiles_of_graph(patches, start, end), torch.ones(len(depth), dtype=F64), depth)
+    assert 100 * wrong <= len(depth)
 
 
 def field_case(reading: str, count: int) -> tuple[Profiles, pd.FreeFormPatches, Tensor, Tensor, Tensor]:

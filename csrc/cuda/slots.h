@@ -34,7 +34,8 @@ class Slots {
   }
   // the second vector stays
   PD_DEVICE void set_first(int slot, const Vec3<T>& first) const {
-    *reinterpret_cast<Two*>(first_ + slot) = {first.x, first.y};
+    const Two two = {first.x, first.y};
+    __builtin_memcpy(first_ + slot, &two, sizeof(two));
     first_[slot].z = first.z;
   }
 

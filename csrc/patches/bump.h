@@ -88,7 +88,7 @@ PD_HD void bounds_of(const PatchBumps<T>& b, T& low, T& high) {
   }
 }
 
-// The same by fours, number by number, so that a processor takes four at once; what is missing has no amplitude, and its Q > 0 far away.
+// The same by fours, number by number, so that a processor takes four at once; what is missing lies far away.
 template <class T>
 struct BumpFours {
   const T* numbers;  // [count, 10, 4]
@@ -133,11 +133,15 @@ PD_HD Field<T> bumps_at(const BumpFours<T>& b, const Vec3<T>& x) {
       const Factor<R> factor = {L::load(m + 16), L::load(m + 20), L::load(m + 24),
                                 L::load(m + 28), L::load(m + 32), L::load(m + 36)};
       const Vec3<R> y = factor * (at - c);
-      const R q = R(T(1)) - dot(y, y);
-      if (bits_of(q > R(T(0))) == 0) continue;
-      const R inside = greater(R(T(0)), q), steep = L::load(m) * (inside * inside);
-      value = value + steep * inside;
-      gradient = gradient + steep * transposed_times(factor, y);
+      const R none = R(T(0)), q = R(T(1)) - dot(y, y);
+      const auto inside = q > none;
+      if (bits_of(inside) == 0) continue;
+      // what is not finite counts only where it reaches
+      const R steep = L::load(m) * (q * q);
+      const Vec3<R> slope = steep * transposed_times(factor, y);
+      value = value + select(inside, steep * q, none);
+      gradient = gradient + Vec3<R>{select(inside, slope.x, none), select(inside, slope.y, none),
+                                    select(inside, slope.z, none)};
     }
   }
   return {L::sum(value),

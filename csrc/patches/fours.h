@@ -1,7 +1,7 @@
-// Four numbers of each kind side by side in memory: a processor takes as many of them at once as one short vector holds, a GPU, whose
-// threads are its lanes, one after another.
+// Four numbers of each kind side by side in memory: a processor takes as many of them at once as one short vector holds, a
+// GPU, whose threads are its lanes, one after another.
 //
-//   for (int lane = 0; lane < 4; lane += Lanes<T>::width) { Number<T> a = take<T>(from + lane); ... }
+//   for (int lane = 0; lane < 4; lane += Lanes<T>::width) { Number<T> a = Lanes<T>::load(from + lane); ... }
 #pragma once
 #include "patches/views.h"
 

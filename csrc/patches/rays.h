@@ -1,9 +1,13 @@
 // The first point of the posed surface on each ray.
 //
-// Every patch is cut into cells, triangles of its barycentric grid. The surface over a cell lies within `slack` of the triangle of
-// its corners, which 12 points inside the cell tell; the cells lie in a tree of boxes. Seen along a ray, the triangle is flat: the ray can meet the surface only if it passes within the slack of it. Then
-// Newton's method finds S(b) = o + t d from where the ray meets the triangle, and where the cell is seen edge-on, so that it may
-// be met twice, from its corners too. A patch counts as far as its edges, so neighbours leave no gap between them.
+// Every patch is cut into cells, triangles of its barycentric grid. The surface over a cell lies within `slack` of the triangle
+// of its corners, which 12 points inside the cell tell; the cells lie in a tree of boxes. Seen along a ray, the triangle is
+// flat: the ray can meet the surface only if it passes within the slack of it. Then Newton's method finds S(b) = o + t d from
+// where the ray meets the triangle, and where the cell is seen edge-on, so that it may be met twice, from its corners too. A
+// patch counts as far as its edges and the rounding of positions beyond, so neighbours leave no gap between them.
+//
+// Newton's method stops early where it closes in on the hit that is known, and a cell right beside that hit is left out unless
+// it is seen edge-on. Both rely on cells that are no longer than the quadrics are wide.
 #pragma once
 #include "patches/height.h"
 #include "patches/surface.h"
@@ -302,7 +306,6 @@ PD_HD End refine(const SurfaceRays<T>& t, const Sheet<T>& sheet, const Sight<T>&
   const T most = t.cells.size;
   T before = T(0);  // length of the step that led here, if it was a whole one
   Vec3<T> aimed = zero3<T>();
-  int astray = 0;
   for (int step = 0; step < 24; ++step) {
     const SurfaceElement<T> s = surface_at(t.sheets, sheet, b);
     const Vec3<T> r = s.point - ray.o;
@@ -333,13 +336,14 @@ PD_HD End refine(const SurfaceRays<T>& t, const Sheet<T>& sheet, const Sight<T>&
     aimed = multiply_add(p, s.tangent[0], multiply_add(q, s.tangent[1], r));
     if (close) {
       depth = dot(aimed, ray.d);
-      return outside >= T(-512) * epsilon<T>() ? End::on_patch : End::beside;
+      // as far as positions are known, in barycentric coordinates
+      const T edge = greater(largest(s.tangent[0]), largest(s.tangent[1]));
+      const T margin = greater(T(512) * epsilon<T>(), lesser(rounding / edge, most));
+      return outside >= -margin ? End::on_patch : End::beside;
     }
     // on the way to the hit that is known
     if (known != nullptr && apart(b, known) <= T(1) / T(64) * most) return End::beside;
-    // halved at every step even where the ray only touches the surface; where it passes, steps wander
-    astray += !(whole && T(4) * after < T(3) * before);
-    if (!(outside >= T(-2) * most) || astray > 5) break;
+    if (!(outside >= T(-2) * most)) break;
     before = after;
   }
   return End::nowhere;

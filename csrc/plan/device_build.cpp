@@ -48,7 +48,7 @@ struct Patch {
 
 // Slots of a patch: interior vertices first, most forces first, which leaves little padding between entries. In a small patch,
 // which has room for padding and waits for others most of the time, shared ones come as they are numbered: all their patches
-// read and write them in runs then.
+// read and write them in runs then. Padding can grow to several times the forces where a few vertices have many.
 std::vector<std::int32_t> slots_of(const Patch& patch, const Numbering& numbering) {
   std::vector<std::int32_t> order(patch.vertex.size()), slot(order.size());
   for (std::size_t v = 0; v < order.size(); ++v) order[v] = std::int32_t(v);
