@@ -9,16 +9,14 @@
 // Newton's method stops early where it closes in on the hit that is known, and a cell right beside that hit is left out unless
 // it is seen edge-on. Both rely on cells that are no longer than the quadrics are wide.
 #pragma once
-#include "patches/height.h"
-#include "patches/surface.h"
+#include "patches/sheets.h"
 #include "patches/tree.h"
 
 namespace pd::freeform {
 
 constexpr int check_points = 12;
 constexpr int cell_numbers = 3 + check_points + 2;  // corners and checks in `points`, patch, place
-constexpr int sheet_numbers = 45;
-constexpr int cell_four_numbers = 4 * (9 + 1);  // corners and slack
+constexpr int cell_four_numbers = 4 * (9 + 1);      // corners and slack
 
 // Where the surface is, cell by cell.
 template <class T>
@@ -36,49 +34,6 @@ struct Cells {
 template <class T>
 struct CellBoxes {
   Cells<T> cells;
-};
-
-// The posed surface patch by patch, its frames multiplied out: with A_k, v_k, e_k and u_k of patches/surface.h,
-//   sum_k b_k (v_k + A_k u_k) = sum_k b_k v_k + sum_{k<j} b_k b_j (A_k - A_j)(V_j - V_k) / 2 + sum_k b_k (h + l_k) A_k N_k,
-// which takes half of the arithmetic at every further place on the patch. V_k and N_k follow, and the bumps by fours.
-template <class T>
-struct PosedSheets {
-  Lists lists;
-  Base<T> base;
-  const T *positions, *frames;  // [B, V, 3], [B, V, 3, 3]
-  T* sheets;                    // [B, P, 45]
-};
-
-// The bumps of every patch by fours.
-template <class T>
-struct GatheredBumps {
-  Lists lists;
-  Ellipsoids<T> quadrics;
-  T* fours;  // [entries / 4 + P + 1, 10, 4]
-};
-
-// What the surface is evaluated from.
-template <class T>
-struct Sheets {
-  Lists lists;
-  const T *sheets, *fours;  // of PosedSheets and GatheredBumps
-  T lift;                   // of Base
-  bool on_surface;
-};
-
-// The corners and checks of cells: heights at rest, then points in every pose.
-template <class T>
-struct GridHeights {
-  Sheets<T> sheets;
-  const T* barycentrics;  // [N, 3]
-  T* heights;             // [N] m
-};
-
-template <class T>
-struct GridPoints {
-  Sheets<T> sheets;
-  const T *barycentrics, *heights;
-  T* points;  // [B, N, 3] m
 };
 
 template <class T>
@@ -136,151 +91,6 @@ PD_HD void item(const CellBoxes<T>& t, Index i) {
     join(box, own.low - margin, own.high + margin);
   }
   store_leaf(c.tree, pose, leaf, box);
-}
-
-// Item: a patch of a pose.
-template <class T>
-PD_HD void item(const PosedSheets<T>& t, Index i) {
-  const Index pose = i / t.lists.patches;
-  const int32* corner = t.lists.triangles + 3 * (i % t.lists.patches);
-  Mat3<T> a[3];
-  T* to = t.sheets + sheet_numbers * i;
-  for (int k = 0; k < 3; ++k) {
-    const Index vertex = pose * t.lists.vertices + corner[k];
-    a[k] = load9(t.frames, vertex);
-    store3(to, k, load3(t.positions, vertex));
-    store3(to, 6 + k, a[k] * load3(t.base.directors, corner[k]));
-    store3(to, 9 + k, load3(t.base.vertices, corner[k]));
-    store3(to, 12 + k, load3(t.base.directors, corner[k]));
-  }
-  for (int k = 0; k < 3; ++k) {
-    const int next = (k + 1) % 3;
-    const Vec3<T> half =
-        T(0.5) * (load3(t.base.vertices, corner[next]) - load3(t.base.vertices, corner[k]));
-    const Mat3<T> apart = {
-        {a[k].row[0] - a[next].row[0], a[k].row[1] - a[next].row[1], a[k].row[2] - a[next].row[2]}};
-    store3(to, 3 + k, apart * half);
-  }
-}
-
-// Item: a patch.
-template <class T>
-PD_HD void item(const GatheredBumps<T>& t, Index patch) {
-  store_fours(t.fours, t.quadrics, t.lists, patch);
-}
-
-// One patch at rest and in a pose.
-template <class T>
-struct Sheet {
-  Vec3<T> posed[3], pair[3], director[3];  // of PosedSheets, pair k of corners k and k + 1
-  Vec3<T> v[3], n[3];                      // at rest
-  BumpFours<T> bumps;
-};
-
-template <class T>
-PD_HD Sheet<T> load_sheet(const Sheets<T>& t, Index pose, Index patch) {
-  Sheet<T> s;
-  const T* from = t.sheets + sheet_numbers * (pose * t.lists.patches + patch);
-  for (int k = 0; k < 3; ++k) {
-    s.posed[k] = load3(from, k);
-    s.pair[k] = load3(from, 3 + k);
-    s.director[k] = load3(from, 6 + k);
-    s.v[k] = load3(from, 9 + k);
-    s.n[k] = load3(from, 12 + k);
-  }
-  s.bumps = {t.fours + bump_numbers * first_four(t.lists, patch), fours_of(t.lists, patch)};
-  return s;
-}
-
-template <class T>
-PD_HD void item(const GridHeights<T>& t, Index i) {
-  const Sheet<T> s = load_sheet(t.sheets, 0, t.sheets.lists.sample_patch[i]);
-  const T b[3] = {t.barycentrics[3 * i], t.barycentrics[3 * i + 1], t.barycentrics[3 * i + 2]};
-  const Vec3<T> flat = blend(b, s.v);
-  Vec3<T> x = flat;
-  if (t.sheets.lift != T(0)) {
-    for (int k = 0; k < 3; ++k)
-      add(x, b[k] * (-t.sheets.lift * dot(flat - s.v[k], s.n[k])), s.n[k]);
-  }
-  t.heights[i] =
-      t.sheets.on_surface ? solve_height(s.bumps, x, blend(b, s.n)) : bumps_at(s.bumps, x).value;
-}
-
-template <class T>
-PD_HD void item(const GridPoints<T>& t, Index i) {
-  const Index pose = i / t.sheets.lists.samples, sample = i % t.sheets.lists.samples;
-  const Sheet<T> s = load_sheet(t.sheets, pose, t.sheets.lists.sample_patch[sample]);
-  const T* from = t.barycentrics + 3 * sample;
-  const T b[3] = {from[0], from[1], from[2]}, h = t.heights[sample];
-  const Vec3<T> flat = blend(b, s.v);
-  Vec3<T> point = blend(b, s.posed);
-  for (int k = 0; k < 3; ++k) {
-    add(point, b[k] * b[(k + 1) % 3], s.pair[k]);
-    const T raised = t.sheets.lift != T(0) ? -t.sheets.lift * dot(flat - s.v[k], s.n[k]) : T(0);
-    add(point, b[k] * (h + raised), s.director[k]);
-  }
-  store3(t.points, i, point);
-}
-
-// The surface at one place: a point and its tangents along the chart.
-template <class T>
-struct SurfaceElement {
-  Vec3<T> point, tangent[2];
-};
-
-template <class T>
-PD_HD SurfaceElement<T> surface_at(const Sheets<T>& t, const Sheet<T>& s, const T (&b)[3]) {
-  const Vec3<T> flat = blend(b, s.v), d = blend(b, s.director);
-  Vec3<T> x = flat, along[2] = {s.v[0] - s.v[2], s.v[1] - s.v[2]};
-  SurfaceElement<T> e;
-  e.point = blend(b, s.posed);
-  for (int k = 0; k < 3; ++k) add(e.point, b[k] * b[(k + 1) % 3], s.pair[k]);
-  for (int c = 0; c < 2; ++c) {
-    Vec3<T> tangent = s.posed[c] - s.posed[2];
-    // of the pairs, that without the third corner grows, that without c shrinks, and theirs does both
-    add(tangent, b[1 - c], s.pair[0] - s.pair[1 + c]);
-    add(tangent, b[2] - b[c], s.pair[2 - c]);
-    e.tangent[c] = tangent;
-  }
-  if (t.lift != T(0)) {
-    T raised[3];
-    for (int k = 0; k < 3; ++k) {
-      raised[k] = -t.lift * dot(flat - s.v[k], s.n[k]);
-      add(x, b[k] * raised[k], s.n[k]);
-      add(e.point, b[k] * raised[k], s.director[k]);
-    }
-    for (int c = 0; c < 2; ++c) {
-      const Vec3<T> edge = s.v[c] - s.v[2];
-      add(along[c], raised[c], s.n[c]);
-      add(along[c], -raised[2], s.n[2]);
-      add(e.tangent[c], raised[c], s.director[c]);
-      add(e.tangent[c], -raised[2], s.director[2]);
-      for (int k = 0; k < 3; ++k) {
-        const T raising = -t.lift * dot(edge, s.n[k]);
-        add(along[c], b[k] * raising, s.n[k]);
-        add(e.tangent[c], b[k] * raising, s.director[k]);
-      }
-    }
-  }
-  Field<T> r;
-  T scale = T(1);
-  if (t.on_surface) {
-    const Vec3<T> up = blend(b, s.n);
-    const T h = solve_height(s.bumps, x, up);
-    x = multiply_add(h, up, x);
-    for (int c = 0; c < 2; ++c) add(along[c], h, s.n[c] - s.n[2]);
-    r = bumps_at(s.bumps, x);
-    scale = T(1) / (T(1) - dot(r.gradient, up));
-    r.value = h;
-  } else {
-    r = bumps_at(s.bumps, x);
-  }
-  add(e.point, r.value, d);
-  for (int c = 0; c < 2; ++c) {
-    add(e.tangent[c], dot(r.gradient, along[c]) * scale, d);
-    add(e.tangent[c], r.value, s.director[c] - s.director[2]);
-  }
-  return e;
 }
 
 template <class T>
