@@ -52,6 +52,15 @@ def level_sheet(cells: int = 3) -> pd.TriMesh:
     return pd.TriMesh(np.stack([x, y, 0 * x], axis=1), np.concatenate([np.stack(t, 1) for t in ((a, b, c), (a, c, d))]))
 
 
+def towards_ball(count: int, seed: int = 1) -> tuple[Tensor, Tensor]:
+    """Origins 3 m from a ball of 1 m, and directions to places in it and past it."""
+    rng = np.random.default_rng(seed)
+    o, target = rng.standard_normal((2, count, 3))
+    o *= 3.0 / np.linalg.norm(o, axis=1, keepdims=True)
+    target *= rng.uniform(0, 1.3, (count, 1)) / np.linalg.norm(target, axis=1, keepdims=True)
+    return torch.tensor(o), torch.tensor(target - o)
+
+
 def torus() -> pd.TriMesh:
     return pd.TriMesh.from_trimesh(trimesh.creation.torus(1.0, 0.4, major_sections=8, minor_sections=6))
 

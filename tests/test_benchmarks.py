@@ -72,12 +72,10 @@ def assert_schema(value: Any, schema: Any, where: str) -> None:
         assert isinstance(value, schema), where
 
 
-def run(*words: str) -> subprocess.CompletedProcess[str]:
+def run(*words: str, script: str = "run.py") -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    script = ROOT / "benchmarks" / "run.py"
-    return subprocess.run(
-        [sys.executable, script, *words], env=environment, capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, ROOT / "benchmarks" / script, *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -269,6 +267,9 @@ def test_a_gpu_that_is_missing_is_refused() -> None:
     if torch.cuda.is_available():
         pytest.skip("there is a GPU, but no kernels")
     ended = run("--device", "cuda", "--quick")
+    assert ended.returncode == 2
+    assert "torch finds no CUDA device" in ended.stderr
+    ended = run(script="few_environments.py")
     assert ended.returncode == 2
     assert "torch finds no CUDA device" in ended.stderr
 
