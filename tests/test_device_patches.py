@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from cases import box
 from device_plans import (  # noqa: F401  (fixtures)
+    LANES,
     SENDERS,
     SIZES,
     Arrays,
@@ -59,11 +60,28 @@ def test_vertices_of_the_same_patches_are_neighbours(plan: Arrays) -> None:
         assert (np.diff(mine[shared] if plan.patch_pairs[p] <= SMALL_PAIRS else -forces[shared]) >= 0).all()
 
 
+def test_outer_pairs_come_first(plan: Arrays) -> None:
+    """Forces on shared vertices are complete after them. Small patches, of a round or two, have no order."""
+    for p, pairs in enumerate(plan.patch_pairs):
+        outer = plan.patch_outer[p]
+        if pairs <= SMALL_PAIRS:
+            assert outer == pairs
+            continue
+        interior = plan.patch_vertex[p + 1] - plan.patch_vertex[p]
+        corners = plan.pair_corner[plan.patch_block[p] : plan.patch_block[p + 1]].reshape(-1, 5, LANES)
+        slots = (corners & 0xFFFF).transpose(0, 2, 1).reshape(-1, 5)[:pairs]
+        touches = (slots >= interior).any(axis=1)
+        assert not touches[outer:].any()
+        assert outer == min(-(-touches.sum() // LANES) * LANES, pairs)
+
+
 @pytest.mark.parametrize(("patches", "small"), [(20, True), (5, False)])
 def test_shared_slots_of_small_and_of_large_patches(patches: int, small: bool) -> None:
     values = pd.Scene(pd.Solid(pd.shapes.box((1.0, 1.0, 1.0), (10, 10, 10)), youngs=1e5)).values()
     plan = Arrays.of(values, patches)
     assert (plan.patch_pairs <= SMALL_PAIRS).all() == small
+    assert (plan.patch_outer < plan.patch_pairs).any() != small
+    test_outer_pairs_come_first(plan)
     test_vertices_of_the_same_patches_are_neighbours(plan)
 
 

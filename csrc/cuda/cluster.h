@@ -12,6 +12,14 @@
 #define PD_HAS_CLUSTERS 0
 #endif
 
+#if __CUDACC_VER_MAJOR__ * 100 + __CUDACC_VER_MINOR__ >= 1208
+#define PD_SHARED_WAIT "relaxed"
+#define PD_SHARED_FENCE "fence.acquire.sync_restrict::shared::cluster.cluster;"
+#else
+#define PD_SHARED_WAIT "acquire"
+#define PD_SHARED_FENCE ""
+#endif
+
 namespace pd::inline PD_TARGET {
 
 // What any thread of the cluster wrote before can be read after.
@@ -62,19 +70,19 @@ class ByteBarrier {
 #endif
   }
 
-  // `parity`: of the number of rounds before this one. Empties the first level of cache, in which nothing of the iterations
-  // is to lie therefore.
+  // `parity`: of the number of rounds before this one. What other blocks sent to shared memory can be read after; the first
+  // level of cache stays, which an acquire of all memory would empty (PTX ISA 8.6 can tell them apart).
   PD_DEVICE void wait(unsigned parity) const {
 #if PD_HAS_CLUSTERS
     unsigned through;
     do {
-      asm volatile(
-          "{.reg .pred p; mbarrier.try_wait.parity.acquire.cluster.shared::cta.b64 p, [%1], %2; "
-          "selp.u32 %0, 1, 0, p;}"
-          : "=r"(through)
-          : "r"(at_), "r"(parity)
-          : "memory");
+      asm volatile("{.reg .pred p; mbarrier.try_wait.parity." PD_SHARED_WAIT
+                   ".cluster.shared::cta.b64 p, [%1], %2; selp.u32 %0, 1, 0, p;}"
+                   : "=r"(through)
+                   : "r"(at_), "r"(parity)
+                   : "memory");
     } while (!through);
+    asm volatile(PD_SHARED_FENCE ::: "memory");
 #endif
   }
 

@@ -51,12 +51,15 @@ PD_DEVICE void post(Word* to, Word word) {
       : "memory");
 }
 
-PD_DEVICE Word look(const Word* from) {
+// The word, where that is `wanted`, else zeros. There is no branch, so several that follow each other are under way at once.
+PD_DEVICE Word look(const Word* from, bool wanted) {
   Word word;
-  asm volatile("{.reg .b128 t; ld.relaxed.gpu.global.b128 t, [%2]; mov.b128 {%0, %1}, t;}"
-               : "=l"(word.value), "=l"(word.tag)
-               : "l"(from)
-               : "memory");
+  asm volatile(
+      "{.reg .b128 t; .reg .b64 none; .reg .pred p; setp.ne.b32 p, %3, 0; mov.b64 none, 0; "
+      "mov.b128 t, {none, none}; @p ld.relaxed.gpu.global.b128 t, [%2]; mov.b128 {%0, %1}, t;}"
+      : "=l"(word.value), "=l"(word.tag)
+      : "l"(from), "r"(int(wanted))
+      : "memory");
   return word;
 }
 
@@ -73,7 +76,7 @@ struct Letter<float> {
     const auto bits = [](float f) { return std::uint64_t(__float_as_uint(f)); };
     pd::post(to, {bits(a.x) | bits(a.y) << 32, bits(a.z) | std::uint64_t(tag) << 32});
   }
-  PD_DEVICE void look(const Word* from) { word = pd::look(from); }
+  PD_DEVICE void look(const Word* from, bool wanted) { word = pd::look(from, wanted); }
   PD_DEVICE bool arrived(unsigned tag) const { return unsigned(word.tag >> 32) == tag; }
   PD_DEVICE Vec3<float> vector() const {
     return {__uint_as_float(unsigned(word.value)), __uint_as_float(unsigned(word.value >> 32)),
@@ -91,8 +94,8 @@ struct Letter<double> {
     for (int c = 0; c < 3; ++c)
       pd::post(to + c, {std::uint64_t(__double_as_longlong(numbers[c])), tag});
   }
-  PD_DEVICE void look(const Word* from) {
-    for (int c = 0; c < 3; ++c) word[c] = pd::look(from + c);
+  PD_DEVICE void look(const Word* from, bool wanted) {
+    for (int c = 0; c < 3; ++c) word[c] = pd::look(from + c, wanted);
   }
   PD_DEVICE bool arrived(unsigned tag) const {
     return word[0].tag == tag && word[1].tag == tag && word[2].tag == tag;

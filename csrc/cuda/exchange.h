@@ -25,32 +25,20 @@ PD_DEVICE Vec3<T> read_letters(const Word* box, const Senders* rows, int row, bo
   do {
     Senders senders = {{-1, -1, -1, -1, -1, -1, -1}, 0};
     if (goes_on) senders = rows[row];
-    int count = 0;
-#pragma unroll
-    for (int j = 0; j < Senders::together; ++j) count += senders.slot[j] >= 0;
-    count = __reduce_max_sync(whole_warp, count);
+    // all letters again where one is missing: kept ones would have to be waited for one by one
     Letter<T> letter[Senders::together];
-    bool waits = true;
-    for (bool again = false; waits; again = true) {
+    bool waits;
+    do {
+#pragma unroll
+      for (int j = 0; j < Senders::together; ++j)
+        letter[j].look(box + senders.slot[j] * Letter<T>::words, senders.slot[j] >= 0);
       waits = false;
 #pragma unroll
-      for (int j = 0; j < Senders::together; ++j) {
-        if (j >= count) break;
-        if (senders.slot[j] < 0 || (again && letter[j].arrived(round))) continue;
-        letter[j].look(box + std::int64_t(senders.slot[j]) * Letter<T>::words);
-      }
+      for (int j = 0; j < Senders::together; ++j)
+        waits |= senders.slot[j] >= 0 & !letter[j].arrived(round);
+    } while (__any_sync(whole_warp, waits));
 #pragma unroll
-      for (int j = 0; j < Senders::together; ++j) {
-        if (j >= count) break;
-        waits = waits || (senders.slot[j] >= 0 && !letter[j].arrived(round));
-      }
-      waits = __any_sync(whole_warp, waits);
-    }
-#pragma unroll
-    for (int j = 0; j < Senders::together; ++j) {
-      if (j >= count) break;
-      if (senders.slot[j] >= 0) sum = sum + letter[j].vector();
-    }
+    for (int j = 0; j < Senders::together; ++j) sum = sum + letter[j].vector();
     row = senders.more;
     goes_on = row > 0;
   } while (__any_sync(whole_warp, goes_on));
@@ -64,27 +52,20 @@ PD_DEVICE double over_patches(const Word* box, int patches, unsigned round) {
   const Op op;
   double sum = Op::none;
   for (int first = 0; first < patches; first += together * warp_size) {
+    const auto patch = [&](int j) { return first + j * warp_size + int(threadIdx.x) % warp_size; };
     Word word[together];
-    bool waits = true;
-    for (bool again = false; waits; again = true) {
+    bool waits;
+    do {
+#pragma unroll
+      for (int j = 0; j < together; ++j)
+        word[j] = look(box + patch(j) * sums_count, patch(j) < patches);
       waits = false;
 #pragma unroll
-      for (int j = 0; j < together; ++j) {
-        const int patch = first + j * warp_size + int(threadIdx.x) % warp_size;
-        if (patch >= patches || (again && word[j].tag == round)) continue;
-        word[j] = look(box + patch * sums_count);
-      }
-#pragma unroll
-      for (int j = 0; j < together; ++j) {
-        const int patch = first + j * warp_size + int(threadIdx.x) % warp_size;
-        waits = waits || (patch < patches && word[j].tag != round);
-      }
-      waits = __any_sync(whole_warp, waits);
-    }
+      for (int j = 0; j < together; ++j) waits |= patch(j) < patches & word[j].tag != round;
+    } while (__any_sync(whole_warp, waits));
 #pragma unroll
     for (int j = 0; j < together; ++j) {
-      const int patch = first + j * warp_size + int(threadIdx.x) % warp_size;
-      if (patch < patches) sum = op(sum, __longlong_as_double((long long)word[j].value));
+      if (patch(j) < patches) sum = op(sum, __longlong_as_double((long long)word[j].value));
     }
   }
   return sum;

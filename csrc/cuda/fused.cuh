@@ -17,52 +17,54 @@ static_assert(sizeof(Control<double>) <= fused_control_bytes);
 static_assert(sizeof(Plane<float>) == 5 * sizeof(float) &&
               sizeof(Ball<float>) == 8 * sizeof(float));
 
-template <class T, bool Touching, Blocks Kind, int Threads, int Together>
+// Threads of a block that has a multiprocessor to itself: the most, and those that have registers to look ahead.
+template <class T>
+constexpr int most_grid_threads = sizeof(T) == 4 ? 512 : 256;
+template <class T>
+constexpr int far_threads = sizeof(T) == 4 ? 384 : 192;
+
+template <class T, bool Touching, Blocks Kind, bool Near, int Threads, int Together>
 __global__ void __launch_bounds__(Threads, Together)
     fused_step(const __grid_constant__ FusedCall<T> call) {
   extern __shared__ __align__(16) std::byte shared[];
-  FusedRunner<T, Touching, Kind> runner(call, shared);
+  FusedRunner<T, Touching, Kind, Near> runner(call, shared);
   const int team = Kind != Blocks::one ? int(blockIdx.x) / call.step.plan.patches : int(blockIdx.x);
   for (std::int64_t e = team; e < call.step.batch; e += call.teams) runner.roll(e);
   // nobody leaves while others may still write to its shared memory
   if constexpr (Kind == Blocks::cluster) cluster_barrier();
 }
 
-// of a block that has a multiprocessor to itself
-template <class T>
-constexpr int most_grid_threads = sizeof(T) == 4 ? 512 : 256;
-
 template <class T>
 using FusedKernel = void (*)(FusedCall<T>);
 
 // One environment a multiprocessor has its registers to itself; several small ones share them.
 template <class T, bool Touching>
-FusedKernel<T> fused_kernel_for(Blocks kind, int threads) {
+FusedKernel<T> fused_kernel_for(Blocks kind, bool near, int threads) {
   constexpr int most = most_grid_threads<T>;
   if (kind == Blocks::cluster) {
-    if (threads <= 256) return fused_step<T, Touching, Blocks::cluster, 256, 1>;
-    return fused_step<T, Touching, Blocks::cluster, most, 1>;
+    if (threads <= 256) return fused_step<T, Touching, Blocks::cluster, true, 256, 1>;
+    return fused_step<T, Touching, Blocks::cluster, true, most, 1>;
   }
   if (kind == Blocks::grid) {
-    if (threads <= 256) return fused_step<T, Touching, Blocks::grid, 256, 1>;
-    return fused_step<T, Touching, Blocks::grid, most, 1>;
+    if (near) return fused_step<T, Touching, Blocks::grid, true, most, 1>;
+    return fused_step<T, Touching, Blocks::grid, false, far_threads<T>, 1>;
   }
   if constexpr (sizeof(T) == 8) {
-    if (threads <= 128) return fused_step<T, Touching, Blocks::one, 128, 2>;
-    return fused_step<T, Touching, Blocks::one, 256, 1>;
+    if (threads <= 128) return fused_step<T, Touching, Blocks::one, true, 128, 2>;
+    return fused_step<T, Touching, Blocks::one, true, 256, 1>;
   } else {
-    if (threads <= 128) return fused_step<T, Touching, Blocks::one, 128, 5>;
-    if (threads <= 192) return fused_step<T, Touching, Blocks::one, 192, 3>;
-    if (threads <= 320) return fused_step<T, Touching, Blocks::one, 320, 2>;
-    return fused_step<T, Touching, Blocks::one, most_threads, 1>;
+    if (threads <= 128) return fused_step<T, Touching, Blocks::one, true, 128, 5>;
+    if (threads <= 192) return fused_step<T, Touching, Blocks::one, true, 192, 3>;
+    if (threads <= 320) return fused_step<T, Touching, Blocks::one, true, 320, 2>;
+    return fused_step<T, Touching, Blocks::one, true, most_threads, 1>;
   }
 }
 
 template <class T>
-FusedKernel<T> fused_kernel(const DeviceStep<T>& step, Blocks kind, int threads) {
+FusedKernel<T> fused_kernel(const DeviceStep<T>& step, Blocks kind, bool near, int threads) {
   const bool touching = step.material.planes_count + step.material.spheres_count > 0;
-  return touching ? fused_kernel_for<T, true>(kind, threads)
-                  : fused_kernel_for<T, false>(kind, threads);
+  return touching ? fused_kernel_for<T, true>(kind, near, threads)
+                  : fused_kernel_for<T, false>(kind, near, threads);
 }
 
 // How a call is launched.
@@ -71,6 +73,7 @@ struct FusedLaunch {
   Blocks kind;
   FusedKernel<T> kernel;
   int threads, teams, patches;
+  int kept = 0;  // vertex arrays in shared memory
   std::size_t shared;
 
   explicit FusedLaunch(const DeviceStep<T>& step);
@@ -79,6 +82,7 @@ struct FusedLaunch {
 
  private:
   bool form_clusters(const DeviceStep<T>& step);
+  void keep_vertices(const DeviceStep<T>& step);
 };
 
 // A multiprocessor has registers for some 640 threads of float32: they are dealt out to as many environments as its shared
@@ -100,6 +104,12 @@ int patch_threads(const DevicePlan<T>& plan) {
   return std::clamp((wanted + warp_size - 1) / warp_size * warp_size, 64, most_grid_threads<T>);
 }
 
+// so few that FusedRunner calls them near
+template <class T>
+bool near_with(const DevicePlan<T>& plan, int threads) {
+  return plan.most_slots <= threads && (!near_once<T> || 2 * plan.most_pairs <= threads);
+}
+
 template <class T>
 FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
     : kind(step.plan.kernel == int(DeviceKernel::grid) ? Blocks::grid : Blocks::one),
@@ -107,7 +117,10 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
   if (kind == Blocks::grid && form_clusters(step)) return;
   shared = fused_shared_bytes(step);
   threads = kind == Blocks::grid ? patch_threads(step.plan) : block_threads(sizeof(T), shared);
-  kernel = fused_kernel(step, kind, threads);
+  if (kind == Blocks::grid) keep_vertices(step);
+  const bool near = kept == vertex_arrays && near_with(step.plan, threads);
+  if (kind == Blocks::grid && !near) threads = far_threads<T>;
+  kernel = fused_kernel(step, kind, near, threads);
   const int resident = resident_blocks(function(), threads, shared);
   if (resident < patches)
     throw std::runtime_error(
@@ -123,28 +136,40 @@ bool FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
   if (patches > int(most_cluster_blocks)) return false;
   shared = cluster_shared_bytes(step);
   threads = patch_threads(step.plan);
-  if (step.plan.most_slots > threads) return false;
-  kernel = fused_kernel(step, Blocks::cluster, threads);
+  if (!near_with(step.plan, threads)) return false;
+  kernel = fused_kernel(step, Blocks::cluster, true, threads);
   if (resident_blocks(function(), threads, shared) == 0) return false;
   const int clusters = resident_clusters(function(), threads, shared, patches);
   if (clusters == 0) return false;
   kind = Blocks::cluster;
+  kept = vertex_arrays;
   teams = int(std::min<std::int64_t>(step.batch, clusters));
   return true;
+}
+
+// As many as fit: a multiprocessor has one block.
+template <class T>
+void FusedLaunch<T>::keep_vertices(const DeviceStep<T>& step) {
+  const std::size_t each = sizeof(Quad<T>) * step.plan.most_slots;
+  const std::size_t begin = vertices_begin(step, false), most = shared_memory_per_block();
+  if (begin >= most || each == 0) return;
+  kept = int(std::min<std::size_t>((most - begin) / each, vertex_arrays));
+  if (kept > 0) shared = begin + kept * each;
 }
 
 template <class T>
 FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaunch<T>& launch) {
   const DevicePlan<T>& plan = step.plan;
-  const bool many = launch.kind != Blocks::one, grid = launch.kind == Blocks::grid;
+  const bool grid = launch.kind == Blocks::grid;
   const std::int64_t teams = launch.teams;
   FusedScratch<T> s;
   // what must start as zero comes first
   arena.place(s.letters, grid ? teams * 2 * plan.slots * Letter<T>::words : 0);
   arena.place(s.sums, grid ? teams * 2 * plan.patches * sums_count : 0);
-  for (Quad<T>** array : {&s.x, &s.velocity, &s.target, &s.origin, &s.before})
-    arena.place(*array, teams * plan.slots);
-  arena.place(s.u, many ? teams * plan.slots : 0);
+  for (int a = 0; a < vertex_arrays; ++a) {
+    const bool shared = a < launch.kept || (a == array_u && launch.kind == Blocks::one);
+    arena.place(s.vertex[a], shared ? 0 : teams * plan.slots);
+  }
   arena.place(s.weights, teams * plan.blocks * 2 * pair_lanes);
   arena.place(s.shift, teams * launch.patches * plan.pieces);
   arena.place(s.part_sum, teams * plan.parts * 4);
@@ -163,7 +188,7 @@ void run_fused(const DeviceStep<T>& step, void* memory, Stream to) {
   const auto stream = static_cast<cudaStream_t>(to);
   const FusedLaunch<T> launch(step);
   Arena arena(memory);
-  FusedCall<T> call{step, arrange(arena, step, launch), launch.teams};
+  FusedCall<T> call{step, arrange(arena, step, launch), launch.teams, launch.kept};
   void* arguments[] = {&call};
   const unsigned blocks = unsigned(launch.teams) * unsigned(launch.patches);
   if (launch.kind == Blocks::one) {
@@ -172,7 +197,7 @@ void run_fused(const DeviceStep<T>& step, void* memory, Stream to) {
     return;
   }
   const auto* begin = reinterpret_cast<const std::byte*>(call.scratch.letters);
-  const auto* end = reinterpret_cast<const std::byte*>(call.scratch.x);
+  const auto* end = reinterpret_cast<const std::byte*>(call.scratch.vertex[0]);
   if (begin != end) check(cudaMemsetAsync(call.scratch.letters, 0, end - begin, stream));
   pd::launch(launch.function(), blocks, launch.threads, arguments, launch.shared,
              launch.kind == Blocks::cluster ? launch.patches : 0, stream);

@@ -14,19 +14,24 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: the scene has contacts.
-template <class T, bool Touching, Blocks Kind>
+// `Touching`: the scene has contacts. `Near`: its patches are so small that vertex arrays fit shared memory
+// and that no thread has more than one slot, nor in float32 more than one tetrahedron. Those of a cluster always are.
+template <class T, bool Touching, Blocks Kind, bool Near>
 class FusedRunner {
   static constexpr bool Many = Kind != Blocks::one;  // patches an environment
+  static constexpr bool Once = Near && near_once<T>;
+  // whether threads have registers for it; a near grid has its vertices at hand
+  static constexpr bool looks_ahead = Kind == Blocks::cluster || (Kind == Blocks::grid && !Near);
   using Lanes = Thread<T>;
   using Letter = pd::Letter<T>;
   using Seen = typename Vertices<T, Touching>::Seen;
 
-  // A slot as a pass visits it; `owned`: by this patch.
+  // A slot as a pass visits it.
   struct Seat {
-    int slot;
-    bool owned;
+    int slot, row;
     Vec3<T> origin;
+
+    PD_DEVICE bool owned() const { return row >= 0; }
   };
 
  public:
@@ -37,6 +42,7 @@ class FusedRunner {
         set_(call.step.settings),
         index_(Many ? int(blockIdx.x) % call.step.plan.patches : 0),
         patch_(call.step.plan, index_),
+        soon_(2 * patch_.pairs),
         team_(Many ? int(blockIdx.x) / call.step.plan.patches : int(blockIdx.x)),
         memory_(call.scratch),
         control_(*reinterpret_cast<Control<T>*>(shared)),
@@ -54,19 +60,23 @@ class FusedRunner {
       position_ = reinterpret_cast<Quad<T>*>(slots);
       entries_ = position_ + 2 * plan_.most_slots;
     }
-    const FusedScratch<T>& m = call.scratch;
-    v_ = {m.x + first_slot(), m.velocity + first_slot(), m.target + first_slot(),
-          Many ? m.u + first_slot() : position_ + plan_.most_slots, m.before + first_slot()};
-    origin_ = m.origin + first_slot();
-    if constexpr (Kind == Blocks::cluster) {
-      Quad<T>* own = reinterpret_cast<Quad<T>*>(shared + vertices_begin(call.step));
-      for (Quad<T>** array : {&v_.x, &v_.velocity, &v_.target, &v_.u, &v_.before, &origin_}) {
-        *array = own;
-        own += plan_.most_slots;
-      }
-    }
+    const auto array = [&](VertexArray a) {
+      Quad<T>* const kept =
+          reinterpret_cast<Quad<T>*>(shared + vertices_begin(call.step, Kind == Blocks::cluster));
+      Quad<T>* const far = call.scratch.vertex[a] + first_slot();
+      if constexpr (Kind == Blocks::one) return a == array_u ? position_ + plan_.most_slots : far;
+      if constexpr (Near) return kept + a * plan_.most_slots;
+      return a < call.kept ? kept + a * plan_.most_slots : far;
+    };
+    v_ = {array(array_x), array(array_velocity), array(array_target), array(array_u),
+          array(array_before)};
+    origin_ = array(array_origin);
     balls_ = reinterpret_cast<Ball<T>*>(entries_ + plan_.most_entries);
     planes_ = reinterpret_cast<Plane<T>*>(balls_ + call_.material.spheres_count);
+    if constexpr (!Near) {
+      const int threads = blockDim.x;
+      soon_ = min((2 * patch_.outer + threads - 1) / threads * threads, soon_);
+    }
     if (Many && int(threadIdx.x) < patch_.slots) row_ = patch_.row(slot_of_seat(threadIdx.x));
     if constexpr (Kind == Blocks::cluster) {
       mail_.open(patch_, reinterpret_cast<const Senders*>(plan_.slot_sender), earlier_shared());
@@ -110,6 +120,7 @@ class FusedRunner {
       control_.progress.done = false;
     }
     finished_ = pending_ = false;
+    afresh_ = true;
     started_ = false;
     __syncthreads();
   }
@@ -140,14 +151,16 @@ class FusedRunner {
     const auto lead = [&] {
       conclude();
       if (!is_leader()) return;
-      control_.omega = T(control_.progress.schedule.next(k));
+      if (!Many || afresh_) coming_ = T(control_.progress.schedule.next(k));
+      afresh_ = false;
+      control_.omega = coming_;
       if (!control_.progress.done) ++control_.progress.used;
     };
     if constexpr (Many) {
       // one copy of the code, which several patches have to hold in the cache
       pass<true>(SolidGradient<true>{}, lead,
                  [&](const Seat& at, const Seen& seen, const Vec3<T>& force) {
-                   if (guard && at.owned) energy_ += seen.energy();
+                   if (guard && at.owned()) energy_ += seen.energy();
                    update(at, seen, force);
                  });
     } else if (guard) {
@@ -168,6 +181,8 @@ class FusedRunner {
       pending_ = true;
     }
     guarding_ = guard;
+    // while the others are still busy: the weight that holds if the energy has not risen
+    if (Many && is_leader()) coming_ = T(control_.progress.schedule.next(k + 1));
     __syncthreads();
   }
 
@@ -187,7 +202,7 @@ class FusedRunner {
     pass<false>(
         SolidGradient<true>{}, [] {},
         [&](const Seat& at, const Seen& seen, const Vec3<T>& force) {
-          if (!at.owned) return;
+          if (!at.owned()) return;
           energy_ += seen.energy();
           first_ += seen.residual(contacts_, force);
         });
@@ -241,7 +256,7 @@ class FusedRunner {
 
   PD_DEVICE void update(const Seat& at, const Seen& seen, const Vec3<T>& force) {
     const Vec3<T> next = seen.next(contacts_, force, theta_, omega_);
-    if (set_.tolerance > 0 && at.owned) {
+    if (set_.tolerance > 0 && at.owned()) {
       const Vec3<T> change = next - seen.u;
       first_ += double(dot(change, change));
       second_ += double(dot(next, next));
@@ -254,12 +269,22 @@ class FusedRunner {
   template <class Element>
   PD_DEVICE T each_element(const Element& element) {
     if constexpr (Many) {
-      // a cluster's patches are small: what they do not work out again they have registers for
+      // what small patches do not work out again they have registers for
       const auto inverse_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4],
                                   bool first) {
-        return Kind == Blocks::cluster && first ? inverse_ : half_inverse(numbers, slots_, seen);
+        return Near && (Once || first) ? inverse_ : half_inverse(numbers, slots_, seen);
       };
-      return each_half(patch_, slots_, inverse_of, weights(), entries_, element, half_);
+      HalfNumbers<T> now = half_;
+      T energy = T(0);
+      const int all = 2 * patch_.pairs;
+#pragma unroll 1
+      for (int begin = 0, end = soon_;; begin = end, end = all) {
+        energy += each_half<Once>(patch_, slots_, inverse_of, weights(), entries_, element, now,
+                                  begin, end);
+        if (Near || end == all) return energy;
+        __syncthreads();
+        post_shared();
+      }
     } else {
       const auto read = [&](int s, Vec3<T>(&x)[1]) { x[0] = vec3(position_[s]); };
       return each_pair<1>(patch_, read, rest_of<Many>(patch_), weights(), entries_, element);
@@ -272,22 +297,41 @@ class FusedRunner {
   PD_DEVICE void pass(const Element& element, const Lead& lead, const Visit& visit) {
     energy_ = double(each_element(element));
     first_ = second_ = 0;
-    if (leads()) lead();
+    late_ = Many && MayStop && pending_;
+    if (!late_ && leads()) lead();
+    if constexpr (looks_ahead) see_first();
     __syncthreads();
-    finished_ = MayStop && control_.progress.done;
+    if (!late_) {
+      heed<MayStop>();
+    } else if (leads()) {
+      lead();
+    }
     if (finished_) return;
-    omega_ = control_.omega;
-    if constexpr (Kind == Blocks::cluster) {
-      visit_seat(visit);
+    if constexpr (Many && Near) {
+      visit_seat<MayStop>(visit);
     } else if constexpr (Many) {
-      visit_patch(visit);
+      visit_patch<MayStop>(visit);
     } else {
       each_slot([&](int s) {
         const Seen seen = v_.see(s);
-        const Seat at = {s, true, vec3(origin_[s])};
+        const Seat at = {s, 0, vec3(origin_[s])};
         visit(at, seen, sum_entries(entries_, plan_.slot_row[s]));
       });
     }
+  }
+
+  // What the leading warp has decided.
+  template <bool MayStop>
+  PD_DEVICE void heed() {
+    finished_ = MayStop && control_.progress.done;
+    omega_ = control_.omega;
+  }
+  // With several patches it may have waited for the sums of the others meanwhile.
+  template <bool MayStop>
+  PD_DEVICE void heed_late() {
+    if (!late_) return;
+    __syncthreads();
+    heed<MayStop>();
   }
 
   // Shared slots have the first seats.
@@ -298,14 +342,35 @@ class FusedRunner {
   PD_DEVICE int row_of_seat(int seat) const {
     return seat == int(threadIdx.x) ? row_ : patch_.row(slot_of_seat(seat));
   }
+  // rounds of this warp's threads for so many seats
+  PD_DEVICE int rounds(int seats) const {
+    const int threads = blockDim.x;
+    return max(0, (seats - (int(threadIdx.x) - lane()) + threads - 1) / threads);
+  }
+  // In a visit the rounds without shared seats come first: letters are on the way meanwhile.
+  PD_DEVICE int seat_of_visit(int visit) const {
+    const int waiting = rounds(patch_.shared()), all = rounds(patch_.slots);
+    const int round = visit + waiting < all ? visit + waiting : visit + waiting - all;
+    return int(threadIdx.x) + round * int(blockDim.x);
+  }
+  PD_DEVICE void see(int seat) {
+    if (seat >= patch_.slots) return;
+    const int slot = slot_of_seat(seat);
+    seen_ = v_.see(slot);
+    at_ = {slot, row_of_seat(seat), vec3(origin_[slot])};
+  }
 
   // shared slots of earlier patches
   PD_DEVICE int earlier_shared() const { return patch_.first_slot - patch_.first_vertex; }
 
   // cuda/fused_visit.h
-  template <class Visit>
+  PD_DEVICE void post(int seat, const Vec3<T>& force) const;
+  PD_DEVICE void post_shared();
+  PD_DEVICE Vec3<T> read(int seat) const;
+  template <bool MayStop, class Visit>
   PD_DEVICE void visit_patch(const Visit& visit);
-  template <class Visit>
+  PD_DEVICE void see_first();
+  template <bool MayStop, class Visit>
   PD_DEVICE void visit_seat(const Visit& visit);
 
   // Leading warp: what follows from the sums of the last iteration.
@@ -313,7 +378,7 @@ class FusedRunner {
     if (!pending_) return;
     sums_.receive(Add{});
     if (lane() == 0) {
-      if (guarding_) control_.progress.schedule.check(sums_.total(0));
+      if (guarding_ && control_.progress.schedule.check(sums_.total(0))) afresh_ = true;
       const double limit = set_.tolerance * set_.tolerance * sums_.total(2);
       if (set_.tolerance > 0 && sums_.total(1) <= limit) control_.progress.done = true;
     }
@@ -379,7 +444,7 @@ class FusedRunner {
     weigh_pairs(patch_, rest_of<Many>(patch_), stiffness, bounded, weights());
     __syncthreads();  // one lane has left the weights of two
     if constexpr (Many) half_ = read_half(patch_, weights(), threadIdx.x);
-    if constexpr (Kind == Blocks::cluster) {
+    if constexpr (Many && Near) {
       Quad<T> seen[4];
       look(half_, slots_, seen);
       inverse_ = half_inverse(half_, slots_, seen);
@@ -414,6 +479,7 @@ class FusedRunner {
   const Settings& set_;
   int index_;  // of the patch
   Patch<T> patch_;
+  int soon_;  // of a grid: tetrahedra after which forces on shared vertices are complete, a multiple of the threads, or all
   int team_;
   const FusedScratch<T>& memory_;
   Control<T>& control_;
@@ -432,10 +498,15 @@ class FusedRunner {
   HalfNumbers<T> half_;  // with many patches: this thread's first tetrahedron
   Mat3<T> inverse_;      // in a cluster: its Dm^-1
   int row_ = 0;          // with many patches: slot_row of this thread's first seat
+  Seat at_;              // the seat that comes next,
+  Seen seen_;            // with what a pass knows of its vertex
   T h_, theta_, omega_ = T(1);
   double energy_ = 0, first_ = 0, second_ = 0;  // this thread's part of the sums
   unsigned round_ = 0;                          // exchanges of letters so far
-  bool finished_ = false, pending_ = false, guarding_ = false, started_ = false;
+  bool finished_ = false, pending_ = false, guarding_ = false, started_ = false, late_ = false;
+  // of the leader: the next omega, which is to be worked out again where the schedule starts afresh
+  T coming_ = T(1);
+  bool afresh_ = true;
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -8,16 +8,24 @@
 
 namespace pd::inline PD_TARGET {
 
+// What a team knows of every slot, and no element asks for: those that most is asked of first. A block that has one of several
+// patches keeps the first few in its shared memory, a cluster's all.
+enum VertexArray { array_u, array_before, array_target, array_origin, array_x, array_velocity };
+constexpr int vertex_arrays = 6;
+
+// Whether no thread of a small patch has a second tetrahedron. There are too few threads of float64.
+template <class T>
+constexpr bool near_once = sizeof(T) == 4;
+
 // Device memory of the teams.
 template <class T>
 struct FusedScratch {
-  Quad<T>*x, *velocity, *target, *origin, *before;  // [teams, slots]
-  Quad<T>* u;                                       // the same, with several patches
-  T* weights;                                       // [teams, blocks, 2, 32] w V
-  Quad<T>* shift;                                   // [teams, patches, pieces]
-  double* part_sum;  // [teams, parts, 4] of the vertices that a patch owns of a piece
-  Word* letters;     // of a grid: [teams, 2, slots, words] forces on shared vertices
-  Word* sums;        // of a grid: [teams, 2, patches, sums_count]
+  Quad<T>* vertex[vertex_arrays];  // [teams, slots] those that are not in shared memory
+  T* weights;                      // [teams, blocks, 2, 32] w V
+  Quad<T>* shift;                  // [teams, patches, pieces]
+  double* part_sum;                // [teams, parts, 4] of the vertices that a patch owns of a piece
+  Word* letters;                   // of a grid: [teams, 2, slots, words] forces on shared vertices
+  Word* sums;                      // of a grid: [teams, 2, patches, sums_count]
 };
 
 template <class T>
@@ -25,6 +33,7 @@ struct FusedCall {
   DeviceStep<T> step;
   FusedScratch<T> scratch;
   int teams;
+  int kept;  // vertex arrays in shared memory
 };
 
 // Shared memory of a block, without a cluster's mail.
@@ -44,8 +53,10 @@ template <class T>
 PD_HD std::size_t mail_begin(const DeviceStep<T>& step) {
   return sums_begin(step) + cluster_sums_bytes;
 }
+// `cluster`: behind the mail
 template <class T>
-PD_HD std::size_t vertices_begin(const DeviceStep<T>& step) {
+PD_HD std::size_t vertices_begin(const DeviceStep<T>& step, bool cluster) {
+  if (!cluster) return aligned(fused_shared_bytes(step));
   return mail_begin(step) + mail_bytes(sizeof(T), step.plan.most_shared, step.plan.patches);
 }
 template <class T>

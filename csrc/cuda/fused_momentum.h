@@ -6,24 +6,24 @@
 namespace pd::inline PD_TARGET {
 
 // a warp for each
-template <class T, bool Touching, Blocks Kind>
+template <class T, bool Touching, Blocks Kind, bool Near>
 template <class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Kind>::each_part(const Visit& visit) const {
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::each_part(const Visit& visit) const {
   const int warps = blockDim.x / warp_size;
   for (int part = plan_.patch_part[index_] + int(threadIdx.x) / warp_size;
        part < plan_.patch_part[index_ + 1]; part += warps)
     visit(part, plan_.part_start[part], plan_.part_start[part + 1]);
 }
 
-template <class T, bool Touching, Blocks Kind>
+template <class T, bool Touching, Blocks Kind, bool Near>
 template <class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Kind>::each_piece(const Visit& visit) const {
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::each_piece(const Visit& visit) const {
   const int warps = blockDim.x / warp_size;
   for (int piece = int(threadIdx.x) / warp_size; piece < plan_.pieces; piece += warps) visit(piece);
 }
 
-template <class T, bool Touching, Blocks Kind>
-PD_DEVICE void FusedRunner<T, Touching, Kind>::find_shifts() {
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::find_shifts() {
   if constexpr (Many) sums_.meet();  // everyone has read the sums of the last time
   each_part([&](int part, int begin, int end) {
     double sum[4];
@@ -42,8 +42,8 @@ PD_DEVICE void FusedRunner<T, Touching, Kind>::find_shifts() {
 }
 
 // a piece that the shift would leave touching a contact gets none
-template <class T, bool Touching, Blocks Kind>
-PD_DEVICE void FusedRunner<T, Touching, Kind>::drop_touching_shifts() {
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::drop_touching_shifts() {
   sums_.meet();  // everyone has read the sums
   each_part([&](int part, int begin, int end) {
     const Vec3<T> moved = vec3(shift(plan_.slot_piece[plan_.part_slot[begin]]));

@@ -4,62 +4,91 @@
 
 namespace pd::inline PD_TARGET {
 
-// All slots a first time: forces on shared vertices are sent, others visited. Then the shared ones again, whose forces
-// have come meanwhile. One loop, for one copy of the code. What a vertex knows of itself is asked for before the wait.
-template <class T, bool Touching, Blocks Kind>
-template <class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Kind>::visit_patch(const Visit& visit) {
+// Of a grid: the force on a shared vertex goes to the other patches.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::post(int seat, const Vec3<T>& force) const {
+  const std::int64_t slot = patch_.first_slot + slot_of_seat(seat);
+  Letter::post(letter_box() + slot * Letter::words, force, round_);
+}
+
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::post_shared() {
   ++round_;
-  Word* box = letter_box();
+  for (int seat = threadIdx.x; seat < patch_.shared(); seat += blockDim.x)
+    post(seat, sum_entries_soon(entries_, row_of_seat(seat)));
+  __syncwarp();
+}
+
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE Vec3<T> FusedRunner<T, Touching, Kind, Near>::read(int seat) const {
   const auto* senders = reinterpret_cast<const Senders*>(plan_.slot_sender);
-  const int begin = int(threadIdx.x) - lane(), step = blockDim.x, shared = patch_.shared();
-  bool again = false;
-  for (int from = begin; from < (again ? shared : patch_.slots);) {
-    const int seat = from + lane();
-    const bool sends = seat < shared, mine = again ? sends : !sends && seat < patch_.slots;
-    const int slot = slot_of_seat(seat < patch_.slots ? seat : 0);
-    const int row = row_of_seat(seat < patch_.slots ? seat : 0);
-    const Seen seen = v_.see(slot);
-    const Seat at = {slot, row >= 0, vec3(origin_[slot])};
-    Vec3<T> force;
-    if (again) {
-      force = read_letters<T>(box, senders, earlier_shared() + seat, sends, round_);
-    } else {
-      force = sum_entries(entries_, row);
-      if (sends)
-        Letter::post(box + std::int64_t(patch_.first_slot + slot) * Letter::words, force, round_);
+  return read_letters<T>(letter_box(), senders, earlier_shared() + seat, seat < patch_.shared(),
+                         round_);
+}
+
+// What the first visited vertex knows of itself: asked for before the barrier, as the next one's before a visit.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::see_first() {
+  see(Near ? int(threadIdx.x) : seat_of_visit(0));
+}
+
+// A warp's rounds of seats without shared ones, then those whose letters have come meanwhile.
+template <class T, bool Touching, Blocks Kind, bool Near>
+template <bool MayStop, class Visit>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_patch(const Visit& visit) {
+  if (soon_ == 2 * patch_.pairs) post_shared();
+  heed_late<MayStop>();
+  if (finished_) return;
+  const int shared = patch_.shared(), all = rounds(patch_.slots);
+#pragma unroll 1
+  for (int i = 0; i < all; ++i) {
+    const int seat = seat_of_visit(i);
+    const Seen seen = seen_;
+    const Seat at = at_;
+    if (i + 1 < all) see(seat_of_visit(i + 1));
+    const bool here = seat < patch_.slots, sends = seat < shared;
+    Vec3<T> force = sum_entries_soon(entries_, here && !sends ? at.row : 0);
+    if (seat - lane() < shared) {
+      const Vec3<T> sum = read(seat);
+      if (sends) force = sum;
     }
-    if (mine) visit(at, seen, force);
+    if (here) visit(at, seen, force);
     __syncwarp();
-    from += step;
-    if (!again && from >= patch_.slots) {
-      again = true;
-      from = begin;
-    }
   }
 }
 
-// The same in a cluster, where each thread has the one seat of its number, and keeps what it has read while it waits.
-template <class T, bool Touching, Blocks Kind>
-template <class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Kind>::visit_seat(const Visit& visit) {
+// The same where each thread has the one seat of its number. Warps wait as one, else lanes would go on one after another.
+template <class T, bool Touching, Blocks Kind, bool Near>
+template <bool MayStop, class Visit>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_seat(const Visit& visit) {
   ++round_;
   const int seat = threadIdx.x, shared = patch_.shared();
-  if (seat == 0) mail_.expect(round_);
-  const bool here = seat < patch_.slots, sends = seat < shared;
-  Seen seen;
-  Seat at;
-  if (here) {
-    const int slot = slot_of_seat(seat);
-    seen = v_.see(slot);
-    at = {slot, row_ >= 0, vec3(origin_[slot])};
-  }
-  Vec3<T> force = sum_entries(entries_, row_);
+  const bool sends = seat < shared, waits = seat - lane() < shared;
+  if (Kind == Blocks::cluster && seat == 0) mail_.expect(round_);
+  Vec3<T> force = sum_entries_soon(entries_, row_);
   if (sends) {
-    mail_.send(force, round_);
-    force = mail_.receive(round_);
+    if constexpr (Kind == Blocks::cluster) {
+      mail_.send(force, round_);
+    } else {
+      post(seat, force);
+    }
   }
-  if (here) visit(at, seen, force);
+  __syncwarp();
+  if (Kind == Blocks::cluster && waits) mail_.wait(round_);
+  heed_late<MayStop>();
+  if (finished_) return;
+  if (waits) {
+    Vec3<T> sum;
+    if constexpr (Kind == Blocks::cluster) {
+      if (sends) sum = mail_.receive(round_);
+    } else {
+      sum = read(seat);
+    }
+    if (sends) force = sum;
+  }
+  if constexpr (!looks_ahead) see(seat);
+  __syncwarp();
+  if (seat < patch_.slots) visit(at_, seen_, force);
   __syncwarp();
 }
 

@@ -69,18 +69,19 @@ PD_DEVICE Vec3<T> add_partner(const Vec3<T>& a) {
           a.z + __shfl_xor_sync(whole_warp, a.z, 1)};
 }
 
-// Runs an effect on every pair; returns the sum of energies that this thread has met. `slots`: position and rest position.
-// `now`: what `read_half` gave for this thread's first tetrahedron. `inverse_of(numbers, seen, first)`: Dm^-1 of a tetrahedron,
-// given what was seen of its slots, and whether it is the thread's first.
-template <class T, class Element, class InverseOf>
+// Runs an effect on the tetrahedra [begin, end) of all pairs; returns the sum of energies that this thread has met. `begin` and
+// an `end` before the last are multiples of the threads. `slots`: position and rest position. `now`: what `read_half` gave for
+// this thread's first tetrahedron from `begin` on; after it from `end` on. `inverse_of(numbers, seen, first)`: Dm^-1 of a
+// tetrahedron, given what was seen of its slots, and whether it is the thread's first of all. `Once`: no thread has a second.
+template <bool Once, class T, class Element, class InverseOf>
 PD_DEVICE T each_half(const Patch<T>& patch, const Slots<T>& slots, const InverseOf& inverse_of,
                       const T* weights, Quad<T>* entries, const Element& element,
-                      HalfNumbers<T> now) {
+                      HalfNumbers<T>& now, int begin, int end) {
   T energy = T(0);
   const int lane = int(threadIdx.x) % warp_size;
-  for (int first = int(threadIdx.x) - lane; first < 2 * patch.pairs; first += blockDim.x) {
+  for (int first = begin + int(threadIdx.x) - lane; first < end; first += blockDim.x) {
     HalfNumbers<T> next = now;
-    if (first + int(blockDim.x) < 2 * patch.pairs)
+    if (!Once && first + int(blockDim.x) < 2 * patch.pairs)
       next = read_half(patch, weights, first + int(blockDim.x) + lane);
     Vec3<T> x[4], force[4];
     Quad<T> seen[4];
@@ -103,6 +104,7 @@ PD_DEVICE T each_half(const Patch<T>& patch, const Slots<T>& slots, const Invers
       if (!second) entries[now.corner[1] >> 16] = quad(force[1]);
       if (apex != no_entry) entries[apex] = quad(force[3]);
     }
+    if (Once) break;
     now = next;
   }
   return energy;

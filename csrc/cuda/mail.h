@@ -37,6 +37,17 @@ class ClusterMail {
       }
       more = names.more;
     }
+    unsigned from = sharers_, to = sharers_ & ~(1u << own_);
+#pragma unroll
+    for (int j = 0; j < most_near; ++j, from &= from - 1) {
+      column_[j] = (__ffs(int(from)) - 1) * seats_ + seat;
+    }
+#pragma unroll
+    for (int j = 0; j < most_near - 1; ++j, to &= to - 1) {
+      const int p = to ? __ffs(int(to)) - 1 : own_;
+      to_[j] = at_block(shared_address(letters_ + own_ * seats_ + seat_[p * seats_ + seat]), p);
+      meets_[j] = at_block(barrier(0).address(), p);
+    }
     int letters = 0;
     const int others = sharers_ ? __popc(sharers_) - 1 : 0;
     for (int bit = 0; bit < 4; ++bit) letters += __syncthreads_count(others >> bit & 1) << bit;
@@ -54,30 +65,51 @@ class ClusterMail {
   // A thread with a seat that is shared.
   PD_DEVICE void send(const Vec3<T>& force, unsigned round) const {
     const Quad<T> letter = quad(force);
-    const int seat = threadIdx.x;
+    const int seat = threadIdx.x, sharers = __popc(sharers_);
     Quad<T>* const here = place(round);
     here[own_ * seats_ + seat] = letter;
+    const int second = (round & 1) * patches_ * seats_ * int(sizeof(Quad<T>));
+    const int second_barrier = (round & 1) * int(sizeof(std::uint64_t));
+#pragma unroll
+    for (int j = 0; j < most_near - 1; ++j) {
+      if (j < sharers - 1) pd::send(to_[j] + second, meets_[j] + second_barrier, letter);
+    }
+    if (sharers <= most_near) return;
     const SharedAddress row = shared_address(here + own_ * seats_);
     const SharedAddress meets = barrier(round).address();
+    int near = 0;
     for (unsigned left = sharers_ & ~(1u << own_); left; left &= left - 1) {
+      if (++near < most_near) continue;
       const int p = __ffs(int(left)) - 1;
       const SharedAddress to = row + seat_[p * seats_ + seat] * int(sizeof(Quad<T>));
       pd::send(at_block(to, p), at_block(meets, p), letter);
     }
   }
 
-  // The same thread: the sum of what all patches sent.
+  // until all letters are there
+  PD_DEVICE void wait(unsigned round) const { barrier(round).wait((round - 1) >> 1 & 1); }
+
+  // The thread that sent, after the wait: the sum of what all patches sent.
   PD_DEVICE Vec3<T> receive(unsigned round) const {
-    barrier(round).wait((round - 1) >> 1 & 1);
     Vec3<T> sum = {T(0), T(0), T(0)};
-    const Quad<T>* const column = place(round) + threadIdx.x;
-    for (unsigned left = sharers_; left; left &= left - 1)
-      sum = sum + vec3(column[(__ffs(int(left)) - 1) * seats_]);
+    const Quad<T>* const letters = place(round);
+    const int sharers = __popc(sharers_);
+#pragma unroll
+    for (int j = 0; j < most_near; ++j) {
+      if (j < sharers) sum = sum + vec3(letters[column_[j]]);
+    }
+    if (sharers <= most_near) return sum;
+    int near = 0;
+    for (unsigned left = sharers_; left; left &= left - 1) {
+      if (++near <= most_near) continue;
+      sum = sum + vec3(letters[(__ffs(int(left)) - 1) * seats_ + int(threadIdx.x)]);
+    }
     return sum;
   }
 
  private:
   static constexpr int barriers_bytes = 16;
+  static constexpr int most_near = 4;  // patches of a vertex whose places are known beforehand
 
   PD_DEVICE ByteBarrier barrier(unsigned round) const {
     return ByteBarrier(barrier_ + (round & 1));
@@ -90,6 +122,10 @@ class ClusterMail {
   Quad<T>* letters_;
   std::uint16_t* seat_;
   int seats_, patches_, own_;
+  // of the first patches that have the vertex of this thread's seat: where letters from there lie, and in order without
+  // this one where letters to there go and which barrier counts them
+  int column_[most_near];
+  SharedAddress to_[most_near - 1], meets_[most_near - 1];
   unsigned sharers_ = 0;  // a bit for each patch that has the vertex of this thread's seat
   int expected_ =
       0;  // bytes a round: at most 512 seats of 15 letters, and a barrier counts to 2^20

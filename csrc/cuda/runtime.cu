@@ -108,11 +108,19 @@ void launch(const void* kernel, unsigned blocks, int threads, void** arguments,
   check(cudaLaunchKernelExC(&how.config, kernel, arguments));
 }
 
-std::size_t shared_memory_per_multiprocessor() {
+static std::size_t shared_memory(cudaDeviceAttr which) {
   int device = 0, bytes = 0;
   check(cudaGetDevice(&device));
-  check(cudaDeviceGetAttribute(&bytes, cudaDevAttrMaxSharedMemoryPerMultiprocessor, device));
+  check(cudaDeviceGetAttribute(&bytes, which, device));
   return std::size_t(bytes);
+}
+
+std::size_t shared_memory_per_multiprocessor() {
+  return shared_memory(cudaDevAttrMaxSharedMemoryPerMultiprocessor);
+}
+
+std::size_t shared_memory_per_block() {
+  return shared_memory(cudaDevAttrMaxSharedMemoryPerBlockOptin);
 }
 
 unsigned blocks_of(std::int64_t count) {

@@ -21,6 +21,7 @@ void launch(const void* kernel, unsigned blocks, int threads, void** arguments,
             std::size_t shared_bytes, int cluster, cudaStream_t stream);
 
 std::size_t shared_memory_per_multiprocessor();
+std::size_t shared_memory_per_block();  // the most that one may ask for
 
 // A number of blocks, refused when one launch cannot have so many.
 unsigned blocks_of(std::int64_t count);

@@ -166,7 +166,7 @@ template <class T, bool Touching, class Element, class Here>
 PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, std::byte* shared,
                                  const Element& element, const Here& here) {
   const Patch<T> patch(w.plan, number);
-  const HalfNumbers<T> first = read_half(patch, w.weights, int(threadIdx.x));
+  HalfNumbers<T> first = read_half(patch, w.weights, int(threadIdx.x));
   const Slots<T> slots(shared, w.plan.most_slots);
   const RestPoint<T>* rest = rest_of<true>(patch).position;
   auto* entries = reinterpret_cast<Quad<T>*>(shared + slots_bytes(sizeof(T), w.plan.most_slots, 2));
@@ -178,8 +178,8 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
   const auto inverse_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4], bool) {
     return half_inverse(numbers, slots, seen);
   };
-  const double energy =
-      double(each_half(patch, slots, inverse_of, w.weights, entries, element, first));
+  const double energy = double(each_half<false>(patch, slots, inverse_of, w.weights, entries,
+                                                element, first, 0, 2 * patch.pairs));
   __syncthreads();
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const int slot = patch.first_slot + s;

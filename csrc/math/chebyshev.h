@@ -55,12 +55,15 @@ struct Schedule {
     return kind == ScheduleKind::guarded && k % guard_period == 0;
   }
 
-  PD_HD void check(double energy) {
-    if (energy > last_energy + slack * absolute(last_energy)) {
+  // Whether it starts afresh.
+  PD_HD bool check(double energy) {
+    const bool rose = energy > last_energy + slack * absolute(last_energy);
+    if (rose) {
       momentum = 0;
       ++restarts;
     }
     last_energy = energy;
+    return rose;
   }
 };
 

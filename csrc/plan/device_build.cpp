@@ -34,6 +34,7 @@ struct Patch {
   std::vector<std::int32_t> first;   // entry of each slot
   std::vector<std::int32_t> forces;  // corners of pairs that each slot adds up
   std::vector<Pair> pairs;           // user's tetrahedra, corners are slots
+  std::int64_t outer = 0;            // pairs past which none touches a shared vertex
   std::int64_t entries = 0;
 
   std::int64_t blocks() const { return (std::ssize(pairs) + lanes - 1) / lanes; }
@@ -82,6 +83,24 @@ void count_entries(Patch& patch) {
   }
 }
 
+// As few as can be meet in a bank. In a patch that is not small those that touch shared vertices come in the first blocks.
+void order_pairs(Patch& patch, const Numbering& numbering) {
+  patch.outer = std::ssize(patch.pairs);
+  if (patch.outer <= small_pairs) return spread_banks(patch.pairs);
+  const auto is_outer = [&](const Pair& pair) {
+    return std::any_of(pair.corner.begin(), pair.corner.end(),
+                       [&](std::int32_t s) { return numbering.is_shared[patch.vertex[s]] != 0; });
+  };
+  const auto inner = std::stable_partition(patch.pairs.begin(), patch.pairs.end(), is_outer);
+  // whole blocks, whose lanes are ordered together
+  patch.outer = std::min((inner - patch.pairs.begin() + lanes - 1) / lanes * lanes, patch.outer);
+  std::vector<Pair> rest(patch.pairs.begin() + patch.outer, patch.pairs.end());
+  patch.pairs.resize(patch.outer);
+  spread_banks(patch.pairs);
+  spread_banks(rest);
+  patch.pairs.insert(patch.pairs.end(), rest.begin(), rest.end());
+}
+
 // `number` [vertices] is -1 before and after.
 Patch make_patch(const Mesh& mesh, std::span<const std::int32_t> tets,
                  std::vector<std::int32_t>& number) {
@@ -111,7 +130,7 @@ Patch make_patch(const Mesh& mesh, std::span<const std::int32_t> tets,
     for (std::int32_t& corner : pair.corner) corner = slot[corner];
     for (std::int32_t& tet : pair.tet) tet = tet < 0 ? -1 : tets[tet];
   }
-  spread_banks(patch.pairs);
+  order_pairs(patch, mesh.numbering);
   count_entries(patch);
   return patch;
 }
@@ -142,6 +161,7 @@ void number_patches(DeviceMeshPlan& plan, const std::vector<Patch>& patches, boo
   plan.patch_block = plan.patch_slot = {0};
   for (const Patch& patch : patches) {
     plan.patch_pairs.push_back(std::int32_t(patch.pairs.size()));
+    plan.patch_outer.push_back(std::int32_t(patch.outer));
     plan.patch_block.push_back(plan.patch_block.back() + std::int32_t(patch.blocks()));
     plan.patch_slot.push_back(plan.patch_slot.back() + std::int32_t(patch.vertex.size()));
   }
