@@ -20,6 +20,7 @@ from torchpd.scene import SceneValues
 from torchpd.tables import DEVICE_PLAN_TABLE
 
 LANES, SLICE, NONE, SENDERS = 32, 8, 65535, 7
+SLOT_STEP = 8  # slots in pair_corner
 KERNELS = BLOCK, GRID, STREAM = range(3)
 BOTH = [[0, 1, 2, 3], [0, 1, 2, 4]]  # the corners of both tetrahedra of a pair
 SIZES = ["kernel", "vertices", "tets", "pins", "pieces", "blocks", "patches", "slots", "shared", "parts", "senders"]
@@ -108,7 +109,7 @@ class Lanes:
         patch = np.repeat(np.arange(len(blocks)), blocks * LANES)
         number = np.arange(len(patch)) - plan.patch_block[patch] * LANES
         packed = plan.pair_corner.view(np.uint32).reshape(-1, 5, LANES).transpose(0, 2, 1).reshape(-1, 5)
-        slot, entry = (packed & 65535).astype(np.int64), (packed >> 16).astype(np.int64)
+        slot, entry = (packed & 65535).astype(np.int64) // SLOT_STEP, (packed >> 16).astype(np.int64)
         return cls(
             number < plan.patch_pairs[patch],
             patch,

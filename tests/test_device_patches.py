@@ -9,6 +9,7 @@ from device_plans import (  # noqa: F401  (fixtures)
     LANES,
     SENDERS,
     SIZES,
+    SLOT_STEP,
     Arrays,
     Lanes,
     fixture_case,
@@ -69,7 +70,7 @@ def test_outer_pairs_come_first(plan: Arrays) -> None:
             continue
         interior = plan.patch_vertex[p + 1] - plan.patch_vertex[p]
         corners = plan.pair_corner[plan.patch_block[p] : plan.patch_block[p + 1]].reshape(-1, 5, LANES)
-        slots = (corners & 0xFFFF).transpose(0, 2, 1).reshape(-1, 5)[:pairs]
+        slots = (corners & 0xFFFF).transpose(0, 2, 1).reshape(-1, 5)[:pairs] // SLOT_STEP
         touches = (slots >= interior).any(axis=1)
         assert not touches[outer:].any()
         assert outer == min(-(-touches.sum() // LANES) * LANES, pairs)

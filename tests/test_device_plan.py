@@ -303,6 +303,20 @@ def test_too_few_patches_are_refused() -> None:
         assert plan["sizes"][SIZES.index("patches")] == 2
 
 
+def test_too_many_slots_are_refused() -> None:
+    """Single tetrahedra have few entries, and more slots than pair_corner counts."""
+    count = 2049
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    vertices = (corners + 2.0 * np.arange(count)[:, None, None] * [1, 0, 0]).reshape(-1, 3)
+    tets, piece = np.arange(4 * count).reshape(-1, 4), np.zeros(4 * count, dtype=np.int32)
+    refusal = "patches = 1 is too few: one of them would have at least 8196 slots, and 16 bits count up to 8192; take"
+    with pytest.raises(ValueError, match=refusal):
+        _C.build_device_plan(vertices, tets, 1, STREAM, False, piece, lambda done: None)
+    most = _C.build_device_plan(vertices[:-4], tets[:-1], 1, STREAM, False, piece[:-4], lambda done: None)
+    assert most["sizes"][SIZES.index("most_slots")] == 8192
+    assert (most["pair_corner"].view(np.uint32) & 65535).max() == 8 * 8191
+
+
 def test_bad_arguments_are_refused() -> None:
     values = values_of("one tet")
     x, tets, piece = values.rest_positions, values.tets, np.zeros(4, dtype=np.int32)

@@ -127,6 +127,15 @@ def test_a_patch_with_a_busy_vertex_is_split_until_it_fits() -> None:
     assert shared_bytes(plan, 0, 0) <= SMALL.shared
 
 
+def test_a_patch_with_more_slots_than_can_be_counted_is_split() -> None:
+    count = 2200  # of them 2280 go in a patch otherwise
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    vertices = (corners + 2.0 * np.arange(count)[:, None, None] * [1, 0, 0]).reshape(-1, 3)
+    mesh = pd.TetMesh(vertices, np.arange(4 * count).reshape(-1, 4))
+    values = pd.Scene(pd.Solid(mesh, youngs=1e5)).values()
+    assert choose_plan(values, torch.float32, Properties(132, 10**9), "stream").patches == 2
+
+
 @pytest.mark.parametrize("gpu", [Properties(1, 232_448), Properties(20, 101_376)])
 def test_patches_of_a_multilevel_solver_fit(gpu: Properties, dtype: torch.dtype) -> None:
     """As many for every multiprocessor as fit, also where 16 bits would not count the entries of fewer."""

@@ -129,11 +129,16 @@ def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | Non
 def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
     """More patches where many tetrahedra share a vertex, whose forces one patch sums."""
     patches = scene.patches("stream", gpu)
-    plan = scene.plan("stream", patches)
-    while scene.shared_bytes(plan) > gpu.shared and patches < scene.tets:
+    while True:
+        try:
+            plan = scene.plan("stream", patches)
+        except ValueError:  # more in a patch than can be counted
+            if patches == scene.tets:
+                raise
+        else:
+            if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
+                return plan
         patches = min(2 * patches, scene.tets)
-        plan = scene.plan("stream", patches)
-    return plan
 
 
 def _level_plan(scene: _Scene, gpu: Properties) -> Plan:

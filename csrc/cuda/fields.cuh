@@ -87,9 +87,9 @@ struct PatchFields {
   // of a slot, for elements
   __device__ void operator()(int slot, Vec3<T> (&vectors)[Fields]) const {
     if constexpr (Fields == 2) {
-      const Quad<T> seen = both.look(slot);
+      const Quad<T> seen = both.look(8 * slot);
       vectors[0] = vec3(seen);
-      vectors[1] = both.second(slot, seen);
+      vectors[1] = both.second(8 * slot, seen);
     } else {
       vectors[0] = vec3(position[slot]);
     }

@@ -158,7 +158,7 @@ class FusedRunner {
     };
     if constexpr (Many) {
       // one copy of the code, which several patches have to hold in the cache
-      pass<true>(SolidGradient<true>{}, lead,
+      pass<true>(SolidGradient<true>{guard}, lead,
                  [&](const Seat& at, const Seen& seen, const Vec3<T>& force) {
                    if (guard && at.owned()) energy_ += seen.energy();
                    update(at, seen, force);

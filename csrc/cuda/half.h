@@ -10,10 +10,10 @@ namespace pd::inline PD_TARGET {
 // What the plan and an environment say of a lane's tetrahedron: the even lane has the first of the pair.
 template <class T>
 struct HalfNumbers {
-  unsigned corner[4];  // slot, plus 65536 times the entry
+  unsigned corner[4];  // 8 times the slot, plus 65536 times the entry
   T weight, factor;    // w V, pair_factor
 
-  PD_HD int slot(int c) const { return int(corner[c] & 0xffff); }
+  PD_HD unsigned slot_times_8(int c) const { return corner[c] & 0xffff; }
 };
 
 template <class T>
@@ -34,13 +34,13 @@ template <class T>
 PD_DEVICE Mat3<T> half_inverse(const HalfNumbers<T>& numbers, const Slots<T>& slots,
                                const Quad<T> (&seen)[4]) {
   RestPoint<T> point[4];
-  for (int c = 0; c < 4; ++c) point[c] = RestPoint<T>::of(slots.second(numbers.slot(c), seen[c]));
+  for (int c = 0; c < 4; ++c) point[c] = RestPoint<T>::of(slots.second(numbers.slot_times_8(c), seen[c]));
   return ComputedRest<T>::between(point, numbers.factor);
 }
 
 template <class T>
 PD_DEVICE void look(const HalfNumbers<T>& numbers, const Slots<T>& slots, Quad<T> (&seen)[4]) {
-  for (int c = 0; c < 4; ++c) seen[c] = slots.look(numbers.slot(c));
+  for (int c = 0; c < 4; ++c) seen[c] = slots.look(numbers.slot_times_8(c));
 }
 
 template <class T>

@@ -86,7 +86,7 @@ struct PairNumbers {
   unsigned corner[5];
   T weight[2];
 
-  PD_HD int slot(int c) const { return int(corner[c] & 0xffff); }
+  PD_HD int slot(int c) const { return int(corner[c] & 0xffff) / 8; }
   PD_HD int entry(int c) const { return int(corner[c] >> 16); }
 };
 

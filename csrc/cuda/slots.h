@@ -21,11 +21,12 @@ class Slots {
       : first_(reinterpret_cast<Quad<T>*>(memory)),
         behind_(reinterpret_cast<Two*>(first_ + count)) {}
 
-  // as much of a slot as one load brings
-  PD_DEVICE Quad<T> look(int slot) const { return first_[slot]; }
+  // As much of a slot as one load brings.
+  PD_DEVICE Quad<T> look(unsigned slot_times_8) const { return *at(first_, slot_times_8); }
   // the second vector of a slot that was looked at
-  PD_DEVICE Vec3<T> second(int slot, const Quad<T>& seen) const {
-    return {seen.w, behind_[slot].a, behind_[slot].b};
+  PD_DEVICE Vec3<T> second(unsigned slot_times_8, const Quad<T>& seen) const {
+    const Two two = *at(behind_, slot_times_8);
+    return {seen.w, two.a, two.b};
   }
 
   PD_DEVICE void set(int slot, const Vec3<T>& first, const Vec3<T>& second) const {
@@ -40,6 +41,13 @@ class Slots {
   }
 
  private:
+  // as pair_corner has slots, for the fewest instructions
+  template <class Item>
+  PD_DEVICE static const Item* at(const Item* array, unsigned slot_times_8) {
+    const auto* bytes = reinterpret_cast<const std::byte*>(array);
+    return reinterpret_cast<const Item*>(bytes + slot_times_8 * (unsigned(sizeof(Item)) / 8));
+  }
+
   Quad<T>* first_;
   Two* behind_;
 };

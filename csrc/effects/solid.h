@@ -43,11 +43,12 @@ PD_HD Mat3<R> strain(const Vec3<R> (&x)[4], const Mat3<R>& rest_inverse) {
   return f - nearest_rotation(f);
 }
 
-// Gradient on the four corners of every element, and with `Energy` the energy. Phase by phase over N packs of elements,
+// Gradient on the four corners of every element, and with `Energy` the energy where it is wanted. Phase by phase over N packs of elements,
 // so that their chains of dependent operations overlap.
 template <bool Energy>
 struct SolidGradient {
   static constexpr int strip = 4;
+  bool wanted = true;
 
   template <int N, class Elements>
   PD_HD void run(const Elements& elements) const {
@@ -65,7 +66,7 @@ struct SolidGradient {
     for (int s = 0; s < N; ++s) {
       const R weight = elements.weight(s);
       const Mat3<R> d = f[s] - finish_rotation(f[s], i[s], root[s]);
-      if constexpr (Energy) {
+      if (Energy && wanted) {
         elements.sum(s) =
             multiply_add(R(scalar_of<R>(0.5)) * weight, frobenius(d, d), elements.sum(s));
       }

@@ -19,7 +19,8 @@ namespace {
 
 constexpr int lanes = 32, slice = 8;
 constexpr int small_pairs = 512;      // of a patch
-constexpr std::int64_t none = 65535;  // slots and entries of a patch count up to one less
+constexpr std::int64_t none = 65535;                     // entries of a patch count up to one less
+constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
 
 struct Mesh {
   const double* positions;
@@ -40,11 +41,11 @@ struct Patch {
   std::int64_t blocks() const { return (std::ssize(pairs) + lanes - 1) / lanes; }
 };
 
-[[noreturn]] void refuse(int patches, std::int64_t entries) {
+[[noreturn]] void refuse(int patches, std::int64_t count, const char* what, std::int64_t most) {
   throw std::invalid_argument("patches = " + std::to_string(patches) +
                               " is too few: one of them would have at least " +
-                              std::to_string(entries) + " entries, and 16 bits count up to " +
-                              std::to_string(none - 1) + "; take more patches");
+                              std::to_string(count) + " " + what + ", and 16 bits count up to " +
+                              std::to_string(most) + "; take more patches");
 }
 
 // Slots of a patch: interior vertices first, most forces first, which leaves little padding between entries. In a small patch,
@@ -141,16 +142,17 @@ std::vector<Patch> make_patches(const Mesh& mesh, std::int64_t vertices) {
   for (int p = 0; p < partition.patches(); ++p)
     most_tets = std::max(most_tets, std::ssize(partition.patch(p)));
   // five entries for two tetrahedra are the fewest
-  if (5 * most_tets / 2 >= none) refuse(partition.patches(), 5 * most_tets / 2);
+  if (5 * most_tets / 2 >= none) refuse(partition.patches(), 5 * most_tets / 2, "entries", none - 1);
   std::vector<Patch> patches(partition.patches());
   run_team(most_threads(), [&](const Team& team) {
     std::vector<std::int32_t> number(vertices, -1);
     for (std::int64_t p = team.begin(std::ssize(patches)); p < team.end(std::ssize(patches)); ++p)
       patches[p] = make_patch(mesh, partition.patch(int(p)), number);
   });
-  // every slot has an entry: their number bounds that of slots
   for (const Patch& patch : patches) {
-    if (patch.entries >= none) refuse(partition.patches(), patch.entries);
+    if (patch.entries >= none) refuse(partition.patches(), patch.entries, "entries", none - 1);
+    if (std::ssize(patch.vertex) > most_slots)
+      refuse(partition.patches(), std::ssize(patch.vertex), "slots", most_slots);
   }
   return patches;
 }
@@ -219,7 +221,7 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, dou
     for (int c = 0; c < 5; ++c) {
       const std::int32_t slot = pair.corner[c];
       plan.pair_corner[(5 * block + c) * lanes + lane] =
-          packed(slot, c < forces ? entry[slot] : none);
+          packed(slot_step * slot, c < forces ? entry[slot] : none);
       if (c < forces) entry[slot] += slice;
     }
   }
