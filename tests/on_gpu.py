@@ -22,7 +22,7 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def on_gpu(case: Case, dtype: torch.dtype, kernel: str, **options: Any) -> pd.Simulator:
-    """The scene of a case, compiled for one of the kernels."""
+    """The scene of a case, compiled for one of the kernels or "far"."""
     with compiled_for(kernel) as name:
         return with_kernel(simulator(case, dtype, GPU, kernel=name, **options), name)
 
@@ -42,10 +42,13 @@ def small_on_gpu(dtype: torch.dtype, kernel: str, batch: int = 3) -> tuple[pd.Si
 
 @contextmanager
 def compiled_for(kernel: str) -> Iterator[str]:
-    """The name that a simulator knows one of KERNELS by; a "grid" gets many patches of two tetrahedra and more."""
-    if kernel == "grid":
-        with mock.patch.multiple(regimes, _CLUSTER_TETS=0, _GRID_TETS=2):
-            yield kernel
+    """The name that a simulator knows one of KERNELS by; a "grid" gets many patches of two tetrahedra and more.
+
+    "far": a grid of a few patches that are too large for a cluster, of meshes that have 2400 tetrahedra or more.
+    """
+    if kernel in ("grid", "far"):
+        with mock.patch.multiple(regimes, _CLUSTER_TETS=0, _GRID_TETS=2 if kernel == "grid" else 1200):
+            yield "grid"
     else:
         yield "grid" if kernel == "cluster" else kernel
 

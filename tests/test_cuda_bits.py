@@ -49,7 +49,7 @@ def test_runs_and_batches_do_not_matter(kernel: str, tolerance: float, precision
     assert_same_bits(run(sim, state, forces, some), [t[some] for t in together])
 
 
-@pytest.mark.parametrize("kernel", ["cluster", "grid", "stream"])
+@pytest.mark.parametrize("kernel", ["cluster", "grid", "far", "stream"])
 def test_many_patches_many_times(kernel: str, precision: str) -> None:
     """What blocks of a grid say to each other arrives in any order; a hundred runs are the same."""
     case = bar((24, 5, 5), pd.Gravity(), pd.Ground(-0.02, friction=0.4), pinned=False)

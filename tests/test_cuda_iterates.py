@@ -135,6 +135,33 @@ def test_iterates_are_those_of_the_reference(name: str, kernel: str, precision: 
 
 
 @pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("name", LARGE)
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_iterates_of_large_patches(name: str, solver: str, precision: str) -> None:
+    """A thread has several of their elements; forces that others wait for go out before the last of them."""
+    case, _, _ = problem_of(name, DTYPES[precision])
+    sim = on_gpu(case, DTYPES[precision], "far", solver=SOLVERS[solver])
+    assert (sim.plan.patch_pairs > 512).all()
+    if name != "cones":
+        assert (sim.plan.patch_outer < 300).any()  # less than what threads there are have in one round
+    check(sim, name, solver)
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+def test_large_patches_stop_as_the_cpu_does(precision: str) -> None:
+    dtype = DTYPES[precision]
+    case = CASES["several patches, ground and pieces"]()
+    sim = on_gpu(case, dtype, "far", iterations=40, tolerance=2.05e-2)
+    plain = simulator(case, torch.float64, iterations=40, tolerance=2.05e-2)
+    state = state_of(case, sim, 3)
+    after, info = sim(state, return_info=True)
+    expected, facts = plain(moved(state, "cpu", torch.float64), return_info=True)
+    assert 1 < int(info.iterations[0]) < 40
+    assert torch.equal(info.iterations.cpu(), facts.iterations)
+    assert relative(after.velocities, expected.velocities) <= 2 * TOLERANCE[dtype]
+
+
+@pytest.mark.parametrize("precision", DTYPES)
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("solver", sorted(set(SOLVERS) - {"guarded"}))
 @pytest.mark.parametrize("name", ["pins, inertial start", "given start", "corner"])

@@ -39,7 +39,8 @@ from torchpd.plan import Plan
 from torchpd.render import Camera
 from torchpd.tables import DEVICE_PLAN_TABLE
 
-KERNELS = ("block", "cluster", "grid", "stream")  # for few patches the kernel "grid" forms clusters
+# for few patches the kernel "grid" forms clusters; "far" is a grid of patches that are too large for that
+KERNELS = ("block", "cluster", "grid", "far", "stream")
 RUNS = (*KERNELS, "levels", "patches")  # and what the multilevel solver runs with, and the ops of free-form patches
 SOLVERS = (pd.Chebyshev(), pd.Jacobi(), pd.Chebyshev("classic", rho=0.9, delay=1))
 ops = torch.ops.torchpd
@@ -47,13 +48,15 @@ ops = torch.ops.torchpd
 
 FEW_PATCHES = {"_CLUSTER_TETS": 8000, "_CLUSTER_EACH": 40}
 MANY_PATCHES = {"_CLUSTER_TETS": 0, "_GRID_TETS": 8}
+LARGE_PATCHES = {"_CLUSTER_TETS": 0, "_GRID_TETS": 1200}
+CELLS = {"far": (13, 5, 4)}  # of a bar
 
 
 def compiled_for(kernel: str) -> str:
     """The name that a simulator knows one of KERNELS by, from now on: a "grid" gets more patches than a cluster has."""
-    for name, value in (MANY_PATCHES if kernel == "grid" else FEW_PATCHES).items():
+    for name, value in {"grid": MANY_PATCHES, "far": LARGE_PATCHES}.get(kernel, FEW_PATCHES).items():
         setattr(regimes, name, value)
-    return "grid" if kernel == "cluster" else kernel
+    return "grid" if kernel in ("cluster", "far") else kernel
 
 
 def scene(*, contacts: bool, pieces: bool, pins: bool, cells: tuple[int, int, int] = (6, 2, 2)) -> pd.Scene:
@@ -182,17 +185,18 @@ def run(kernels: Sequence[str]) -> int:
         if kernel == "patches":
             count += free_form(dtype)
             continue
-        name = compiled_for(kernel)
+        name, cells = compiled_for(kernel), CELLS.get(kernel, (6, 2, 2))
         for number, (contacts, pieces) in enumerate(flags):
             solver, tolerance = SOLVERS[number % len(SOLVERS)], 1e-2 if number % 2 else 0.0
             options = {"solver": solver, "tolerance": tolerance, "dtype": dtype, "kernel": name, "progress": False}
-            built = scene(contacts=contacts, pieces=pieces, pins=True)
+            built = scene(contacts=contacts, pieces=pieces, pins=True, cells=cells)
             sim = pd.Simulator(built, 1 / 60, 5, **options).to("cuda")  # type: ignore[arg-type]
             step_all_ways(sim, 3)
             count += 1
         fields(sim, 3)
         options = {"dtype": dtype, "kernel": name, "progress": False}
-        free = pd.Simulator(scene(contacts=True, pieces=True, pins=False), 1 / 60, 5, **options)  # type: ignore[arg-type]
+        built = scene(contacts=True, pieces=True, pins=False, cells=cells)
+        free = pd.Simulator(built, 1 / 60, 5, **options)  # type: ignore[arg-type]
         step_all_ways(free.to("cuda"), 2)
         count += 1
         if kernel == "grid":
