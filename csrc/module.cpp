@@ -228,6 +228,12 @@ PYBIND11_MODULE(_C, m) {
   m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("many"),
         py::arg("slots"), py::arg("entries"), py::arg("planes"), py::arg("balls"),
         "Shared memory of a block of the kernels block and (many patches) grid.");
+  m.def(
+      "fits_cluster",
+      [](std::size_t real, std::size_t slots, std::size_t pairs) {
+        return pd::is_near(real, slots, pairs, pd::most_patch_threads(real));
+      },
+      py::arg("real"), py::arg("slots"), py::arg("pairs"));
   m.def("cluster_shared_bytes", &pd::cluster_shared_bytes, py::arg("real"), py::arg("fused_bytes"),
         py::arg("slots"), py::arg("seats"), py::arg("patches"),
         "The same of a block of the kernel grid whose blocks form a cluster.");

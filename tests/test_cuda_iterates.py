@@ -139,6 +139,8 @@ def test_iterates_are_those_of_the_reference(name: str, kernel: str, precision: 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_iterates_of_large_patches(name: str, solver: str, precision: str) -> None:
     """A thread has several of their elements; forces that others wait for go out before the last of them."""
+    if name == "cones" and precision == "float64":
+        pytest.skip("more than the shared memory of a block")
     case, _, _ = problem_of(name, DTYPES[precision])
     sim = on_gpu(case, DTYPES[precision], "far", solver=SOLVERS[solver])
     assert (sim.plan.patch_pairs > 512).all()

@@ -60,6 +60,14 @@ def test_small_meshes_are_cut_for_a_cluster_where_there_is_one() -> None:
     assert choose_plan(small, torch.float32, Properties(132, needed - 16, 16), "grid").patches == alone
 
 
+def test_patches_too_large_for_a_cluster_go_to_a_grid() -> None:
+    """Eight patches of 4116 tetrahedra want more than a thread each: then there are as many as multiprocessors take."""
+    values = values_of((14, 7, 7))
+    assert choose_plan(values, torch.float32, Properties(170, 101_376, 8), "grid").patches == 4116 // 150
+    assert choose_plan(values, torch.float32, Properties(170, 232_448, 16), "grid").patches == 16
+    assert choose_plan(values_of((13, 7, 7)), torch.float32, Properties(170, 101_376, 8), "grid").patches == 8
+
+
 def test_number_of_patches() -> None:
     """As many for a grid as leave each its least number of tetrahedra, as few for a stream as leave none too many."""
     small, large = values_of((6, 6, 6)), values_of((10, 10, 10))
@@ -134,6 +142,7 @@ def test_a_patch_with_more_slots_than_can_be_counted_is_split() -> None:
     mesh = pd.TetMesh(vertices, np.arange(4 * count).reshape(-1, 4))
     values = pd.Scene(pd.Solid(mesh, youngs=1e5)).values()
     assert choose_plan(values, torch.float32, Properties(132, 10**9), "stream").patches == 2
+    assert choose_plan(values, torch.float32, Properties(1, 10**9), levels=True).patches > 1
 
 
 @pytest.mark.parametrize("gpu", [Properties(1, 232_448), Properties(20, 101_376)])

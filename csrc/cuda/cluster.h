@@ -12,6 +12,7 @@
 #define PD_HAS_CLUSTERS 0
 #endif
 
+// What waits for other blocks, see ByteBarrier::wait.
 #if __CUDACC_VER_MAJOR__ * 100 + __CUDACC_VER_MINOR__ >= 1208
 #define PD_SHARED_WAIT "relaxed"
 #define PD_SHARED_FENCE "fence.acquire.sync_restrict::shared::cluster.cluster;"

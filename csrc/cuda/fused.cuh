@@ -19,7 +19,7 @@ static_assert(sizeof(Plane<float>) == 5 * sizeof(float) &&
 
 // Threads of a block that has a multiprocessor to itself: the most, and those that have registers to look ahead.
 template <class T>
-constexpr int most_grid_threads = sizeof(T) == 4 ? 512 : 256;
+constexpr int most_grid_threads = int(most_patch_threads(sizeof(T)));
 template <class T>
 constexpr int far_threads = sizeof(T) == 4 ? 384 : 192;
 
@@ -104,10 +104,9 @@ int patch_threads(const DevicePlan<T>& plan) {
   return std::clamp((wanted + warp_size - 1) / warp_size * warp_size, 64, most_grid_threads<T>);
 }
 
-// so few that FusedRunner calls them near
 template <class T>
 bool near_with(const DevicePlan<T>& plan, int threads) {
-  return plan.most_slots <= threads && (!near_once<T> || 2 * plan.most_pairs <= threads);
+  return is_near(sizeof(T), plan.most_slots, plan.most_pairs, threads);
 }
 
 template <class T>
@@ -147,7 +146,7 @@ bool FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
   return true;
 }
 
-// As many as fit: a multiprocessor has one block.
+// As many as fit a block that has a multiprocessor to itself.
 template <class T>
 void FusedLaunch<T>::keep_vertices(const DeviceStep<T>& step) {
   const std::size_t each = sizeof(Quad<T>) * step.plan.most_slots;

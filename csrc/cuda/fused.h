@@ -14,7 +14,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: the scene has contacts. `Near`: its patches are so small that vertex arrays fit shared memory
+// `Touching`: the scene has contacts. `Near`: of several patches, which are so small that vertex arrays fit shared memory
 // and that no thread has more than one slot, nor in float32 more than one tetrahedron. Those of a cluster always are.
 template <class T, bool Touching, Blocks Kind, bool Near>
 class FusedRunner {
@@ -306,6 +306,7 @@ class FusedRunner {
     } else if (leads()) {
       lead();
     }
+    // of several patches only late, when what others wait for has been sent
     if (finished_) return;
     if constexpr (Many && Near) {
       visit_seat<MayStop>(visit);
@@ -496,7 +497,7 @@ class FusedRunner {
   Contacts<T> contacts_;
   ClusterMail<T> mail_;  // of a cluster
   HalfNumbers<T> half_;  // with many patches: this thread's first tetrahedron
-  Mat3<T> inverse_;      // in a cluster: its Dm^-1
+  Mat3<T> inverse_;      // where they are near: its Dm^-1
   int row_ = 0;          // with many patches: slot_row of this thread's first seat
   Seat at_;              // the seat that comes next,
   Seen seen_;            // with what a pass knows of its vertex

@@ -8,8 +8,8 @@
 
 namespace pd::inline PD_TARGET {
 
-// What a team knows of every slot, and no element asks for: those that most is asked of first. A block that has one of several
-// patches keeps the first few in its shared memory, a cluster's all.
+// What a team knows of every slot and elements do not need, in the order of how often iterations ask for it. A block that has
+// one of several patches keeps as many as fit in its shared memory, a cluster's all.
 enum VertexArray { array_u, array_before, array_target, array_origin, array_x, array_velocity };
 constexpr int vertex_arrays = 6;
 

@@ -34,7 +34,8 @@ template <class T>
 PD_DEVICE Mat3<T> half_inverse(const HalfNumbers<T>& numbers, const Slots<T>& slots,
                                const Quad<T> (&seen)[4]) {
   RestPoint<T> point[4];
-  for (int c = 0; c < 4; ++c) point[c] = RestPoint<T>::of(slots.second(numbers.slot_times_8(c), seen[c]));
+  for (int c = 0; c < 4; ++c)
+    point[c] = RestPoint<T>::of(slots.second(numbers.slot_times_8(c), seen[c]));
   return ComputedRest<T>::between(point, numbers.factor);
 }
 

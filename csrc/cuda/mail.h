@@ -45,7 +45,8 @@ class ClusterMail {
 #pragma unroll
     for (int j = 0; j < most_near - 1; ++j, to &= to - 1) {
       const int p = to ? __ffs(int(to)) - 1 : own_;
-      to_[j] = at_block(shared_address(letters_ + own_ * seats_ + seat_[p * seats_ + seat]), p);
+      const int there = to ? seat_[p * seats_ + seat] : 0;
+      to_[j] = at_block(shared_address(letters_ + own_ * seats_ + there), p);
       meets_[j] = at_block(barrier(0).address(), p);
     }
     int letters = 0;

@@ -166,7 +166,7 @@ template <class T, bool Touching, class Element, class Here>
 PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, std::byte* shared,
                                  const Element& element, const Here& here) {
   const Patch<T> patch(w.plan, number);
-  HalfNumbers<T> first = read_half(patch, w.weights, int(threadIdx.x));
+  HalfNumbers<T> now = read_half(patch, w.weights, int(threadIdx.x));
   const Slots<T> slots(shared, w.plan.most_slots);
   const RestPoint<T>* rest = rest_of<true>(patch).position;
   auto* entries = reinterpret_cast<Quad<T>*>(shared + slots_bytes(sizeof(T), w.plan.most_slots, 2));
@@ -179,7 +179,7 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
     return half_inverse(numbers, slots, seen);
   };
   const double energy = double(each_half<false>(patch, slots, inverse_of, w.weights, entries,
-                                                element, first, 0, 2 * patch.pairs));
+                                                element, now, 0, 2 * patch.pairs));
   __syncthreads();
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const int slot = patch.first_slot + s;

@@ -43,8 +43,8 @@ PD_HD Mat3<R> strain(const Vec3<R> (&x)[4], const Mat3<R>& rest_inverse) {
   return f - nearest_rotation(f);
 }
 
-// Gradient on the four corners of every element, and with `Energy` the energy where it is wanted. Phase by phase over N packs of elements,
-// so that their chains of dependent operations overlap.
+// Gradient on the four corners of every element, and with `Energy` the energy, where it is `wanted`. Phase by phase over N
+// packs of elements, so that their chains of dependent operations overlap.
 template <bool Energy>
 struct SolidGradient {
   static constexpr int strip = 4;

@@ -18,8 +18,8 @@ namespace pd {
 namespace {
 
 constexpr int lanes = 32, slice = 8;
-constexpr int small_pairs = 512;      // of a patch
-constexpr std::int64_t none = 65535;                     // entries of a patch count up to one less
+constexpr int small_pairs = 512;                          // of a patch
+constexpr std::int64_t none = 65535;                      // entries of a patch count up to one less
 constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
 
 struct Mesh {
@@ -142,7 +142,8 @@ std::vector<Patch> make_patches(const Mesh& mesh, std::int64_t vertices) {
   for (int p = 0; p < partition.patches(); ++p)
     most_tets = std::max(most_tets, std::ssize(partition.patch(p)));
   // five entries for two tetrahedra are the fewest
-  if (5 * most_tets / 2 >= none) refuse(partition.patches(), 5 * most_tets / 2, "entries", none - 1);
+  if (5 * most_tets / 2 >= none)
+    refuse(partition.patches(), 5 * most_tets / 2, "entries", none - 1);
   std::vector<Patch> patches(partition.patches());
   run_team(most_threads(), [&](const Team& team) {
     std::vector<std::int32_t> number(vertices, -1);

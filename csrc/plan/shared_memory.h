@@ -43,6 +43,14 @@ constexpr std::size_t cluster_shared_bytes(std::size_t real, std::size_t fused_b
          6 * 4 * real * slots;
 }
 
+// Threads of a block that has one of several patches, and whether the patch is so small that each thread has one slot at
+// most, and in float32 one tetrahedron; of float64 there are too few threads for that. Blocks of a cluster have such patches.
+constexpr std::size_t most_patch_threads(std::size_t real) { return real == 4 ? 512 : 256; }
+constexpr bool is_near(std::size_t real, std::size_t slots, std::size_t pairs,
+                       std::size_t threads) {
+  return slots <= threads && (real == 8 || 2 * pairs <= threads);
+}
+
 // what a pass keeps beside: three sums of up to 32 warps
 constexpr std::size_t pass_static_bytes = 3 * 32 * sizeof(double);
 
