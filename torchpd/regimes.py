@@ -12,6 +12,7 @@ The batch does not enter: an environment gives the same bits alone and in any ba
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -133,33 +134,32 @@ def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | Non
 
 def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
     """More patches where many tetrahedra share a vertex, whose forces one patch sums."""
-    patches = scene.patches("stream", gpu)
-    while True:
-        try:
-            plan = scene.plan("stream", patches)
-        except ValueError:  # more in a patch than can be counted
-            if patches == scene.tets:
-                raise
-        else:
-            if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
-                return plan
-        patches = min(2 * patches, scene.tets)
+    return _plan_that_fits(scene, gpu, "stream", lambda patches: 2 * patches)
 
 
 def _level_plan(scene: _Scene, gpu: Properties) -> Plan:
     """For a multilevel solver: as many patches for every multiprocessor, where one each is not enough."""
-    patches = min(scene.patches("levels", gpu), scene.tets)
+
+    def more(patches: int) -> int:
+        rounds = -(-patches // gpu.multiprocessors)
+        return (rounds + 1 + rounds // 4) * gpu.multiprocessors
+
+    return _plan_that_fits(scene, gpu, "levels", more)
+
+
+def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
+    """For "stream" or "levels"; `more`: the patches to try after so many, whose slots or forces are too many."""
+    patches = min(scene.patches(name, gpu), scene.tets)
     while True:
         try:
-            plan = replace(scene.plan("stream", patches), for_levels=True)
+            plan = replace(scene.plan("stream", patches), for_levels=name == "levels")
         except ValueError:  # more in a patch than can be counted
             if patches == scene.tets:
                 raise
         else:
             if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
                 return plan
-        rounds = -(-patches // gpu.multiprocessors)
-        patches = min((rounds + 1 + rounds // 4) * gpu.multiprocessors, scene.tets)
+        patches = min(more(patches), scene.tets)
 
 
 def choose_plan(

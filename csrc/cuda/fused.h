@@ -19,7 +19,7 @@ namespace pd::inline PD_TARGET {
 template <class T, bool Touching, Blocks Kind, bool Near>
 class FusedRunner {
   static constexpr bool Many = Kind != Blocks::one;  // patches an environment
-  static constexpr bool Once = Near && near_once<T>;
+  static constexpr bool Once = Near && near_once(sizeof(T));
   // whether threads have registers for it; a near grid has its vertices at hand
   static constexpr bool looks_ahead = Kind == Blocks::cluster || (Kind == Blocks::grid && !Near);
   using Lanes = Thread<T>;

@@ -13,10 +13,6 @@ namespace pd::inline PD_TARGET {
 enum VertexArray { array_u, array_before, array_target, array_origin, array_x, array_velocity };
 constexpr int vertex_arrays = 6;
 
-// Whether no thread of a small patch has a second tetrahedron. There are too few threads of float64.
-template <class T>
-constexpr bool near_once = sizeof(T) == 4;
-
 // Device memory of the teams.
 template <class T>
 struct FusedScratch {

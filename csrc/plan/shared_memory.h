@@ -46,9 +46,10 @@ constexpr std::size_t cluster_shared_bytes(std::size_t real, std::size_t fused_b
 // Threads of a block that has one of several patches, and whether the patch is so small that each thread has one slot at
 // most, and in float32 one tetrahedron; of float64 there are too few threads for that. Blocks of a cluster have such patches.
 constexpr std::size_t most_patch_threads(std::size_t real) { return real == 4 ? 512 : 256; }
+constexpr bool near_once(std::size_t real) { return real == 4; }
 constexpr bool is_near(std::size_t real, std::size_t slots, std::size_t pairs,
                        std::size_t threads) {
-  return slots <= threads && (real == 8 || 2 * pairs <= threads);
+  return slots <= threads && (!near_once(real) || 2 * pairs <= threads);
 }
 
 // what a pass keeps beside: three sums of up to 32 warps
