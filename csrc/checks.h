@@ -93,8 +93,9 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   levels.vertices = vertices;
   levels.fine_nodes = size[level_fine_nodes];
   levels.middle_nodes = size[level_middle_nodes];
+  levels.direct = size[level_direct] != 0;
   const bool middle = levels.has_middle();
-  const std::int64_t coarse = 4 * std::int64_t(levels.coarse_nodes());
+  const std::int64_t coarse = levels.coarse_unknowns();
   LevelRows count{};
   count.level_size = level_size_count;
   count.tet = tets;

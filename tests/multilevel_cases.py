@@ -12,6 +12,7 @@ from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
 import torchpd as pd
+from torchpd.multilevel import precondition_plan, reference_of_levels
 from torchpd.plan import Plan
 
 
@@ -75,15 +76,17 @@ class Tables:
 
     def __init__(self, plan: Plan) -> None:
         t = {row.name: array.numpy() for row, array in zip(plan.table, plan.arrays, strict=True)}
-        count, (_, _, nodes, _, _, below) = len(t["vertex_order"]), t["level_sizes"].tolist()
+        count, (_, _, nodes, _, _, below, direct) = len(t["vertex_order"]), t["level_sizes"].tolist()
         self.order = t["vertex_order"]
-        self.levels = [
-            (
-                csr_array((t["fine_value"], t["fine_column"], t["fine_start"]), shape=(count, count)),
-                t["fine_inverse"].reshape(-1, 1),
-                self._blocks(t, "fine_lift", 1, (count, 4 * nodes)),
+        self.levels = []
+        if not direct:
+            self.levels.append(
+                (
+                    csr_array((t["fine_value"], t["fine_column"], t["fine_start"]), shape=(count, count)),
+                    t["fine_inverse"].reshape(-1, 1),
+                    self._blocks(t, "fine_lift", 1, (count, 4 * nodes)),
+                )
             )
-        ]
         if below:
             shape = (4 * nodes, 4 * nodes)
             value = t["middle_value"].reshape(-1, 4, 4)
@@ -94,7 +97,7 @@ class Tables:
                     self._blocks(t, "middle_lift", 4, (4 * nodes, 4 * below)),
                 )
             )
-        size = 4 * (below or nodes)
+        size = count if direct else 4 * (below or nodes)
         self.factor = np.zeros((size, size))
         self.factor[np.tril_indices(size)] = t["coarse_factor"]
 
@@ -127,6 +130,12 @@ class Tables:
         result = np.empty_like(field)
         result[self.order] = self._cycle(0, field[self.order])
         return result
+
+
+def solved_directly(sim: pd.Simulator, most: int = 1024) -> pd.Simulator:
+    """The simulator with M = A^-1 where it has up to so many vertices, as on a GPU."""
+    sim.plan = precondition_plan(sim.plan, sim.scene.values(), *reference_of_levels(sim.plan.arrays), most_direct=most)
+    return sim
 
 
 def precondition(sim: pd.Simulator, field: Array) -> Array:

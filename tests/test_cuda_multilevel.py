@@ -17,6 +17,8 @@ from runs import arguments_of, noise, same_bits, simulator, small, state_of
 from scipy.sparse import csr_array
 
 import torchpd as pd
+from torchpd import multilevel
+from torchpd.multilevel import precondition_plan, reference_of_levels
 from torchpd.tables import MULTILEVEL_TABLE
 
 require_gpu()
@@ -35,6 +37,12 @@ CASES: dict[str, Callable[[], Case]] = {
     "sphere": lambda: on_sphere(0.3),
     "sliding": lambda: contact_block(pd.Ground(friction=0.5), velocity=(1.0, -1.0, 0.0), youngs=1e6, cells=4),
 }
+
+
+@pytest.fixture(params=[1024, 0], ids=["direct", "levels"])
+def most_direct(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small meshes as they are solved on a GPU, and by the levels that larger ones have."""
+    monkeypatch.setattr(multilevel, "MOST_DIRECT", request.param)
 
 
 def reordered(levels: dict[str, np.ndarray], place: np.ndarray) -> dict[str, np.ndarray]:
@@ -72,7 +80,11 @@ def pair(case: Case, dtype: torch.dtype, solver: pd.Multilevel, **options: objec
 
 
 def share(gpu: pd.Simulator, cpu: pd.Simulator) -> None:
-    """Gives a simulator on the CPU the preconditioner of one on a GPU."""
+    """Gives a simulator on the CPU the preconditioner of one on a GPU; a direct one is made anew, as its rows are."""
+    if int(gpu.plan.level_sizes[6]):
+        reference = (array.cpu() for array in reference_of_levels(gpu.plan.arrays))
+        cpu.plan = precondition_plan(cpu.plan, cpu.scene.values(), *reference, most_direct=multilevel.MOST_DIRECT)
+        return
     levels = {row.name: getattr(gpu.plan, row.name).cpu().numpy() for row in MULTILEVEL_TABLE}
     internal = np.argsort(cpu.plan.vertex_order.numpy())
     arrays = reordered(levels, internal[gpu.plan.vertex_order.cpu().numpy()])
@@ -82,6 +94,7 @@ def share(gpu: pd.Simulator, cpu: pd.Simulator) -> None:
     cpu.plan = replace(cpu.plan, arrays=(*kept, *new))
 
 
+@pytest.mark.usefixtures("most_direct")
 @pytest.mark.parametrize("name", ["slivers", "beam", "box", "bodies"])
 def test_preconditioner_is_that_of_the_cpu(name: str, dtype: torch.dtype) -> None:
     cpu, gpu = pair(CASES[name](), dtype, SOLVERS["lbfgs"])
@@ -93,6 +106,7 @@ def test_preconditioner_is_that_of_the_cpu(name: str, dtype: torch.dtype) -> Non
     assert torch.equal(-2.0 * found[0], found[1])
 
 
+@pytest.mark.usefixtures("most_direct")
 @pytest.mark.parametrize("outer", SOLVERS)
 @pytest.mark.parametrize("name", CASES)
 def test_iterates_are_those_of_the_cpu(name: str, outer: str) -> None:
@@ -108,6 +122,7 @@ def test_iterates_are_those_of_the_cpu(name: str, outer: str) -> None:
     assert relative(info.rho, expected.rho) <= 1e-9
 
 
+@pytest.mark.usefixtures("most_direct")
 @pytest.mark.parametrize("outer", SOLVERS)
 @pytest.mark.parametrize("name", ["beam", "octopus", "ground"])
 def test_float32_comes_as_near_as_on_the_cpu(name: str, outer: str) -> None:
@@ -124,6 +139,7 @@ def test_float32_comes_as_near_as_on_the_cpu(name: str, outer: str) -> None:
     assert errors[0] <= 1e-3
 
 
+@pytest.mark.usefixtures("most_direct")
 @pytest.mark.parametrize("outer", SOLVERS)
 def test_material_that_it_was_not_made_for(outer: str) -> None:
     """Stiffness of each environment, springs that it takes for strangers, and pins that came since."""
@@ -144,6 +160,7 @@ def test_material_that_it_was_not_made_for(outer: str) -> None:
     assert relative(rho[1], rho[0]) <= 1e-9
 
 
+@pytest.mark.usefixtures("most_direct")
 @pytest.mark.parametrize("outer", SOLVERS)
 @pytest.mark.parametrize("name", ["slivers", "beam", "ground"])
 def test_an_environment_does_not_know_of_the_others(name: str, outer: str, dtype: torch.dtype) -> None:
@@ -159,6 +176,20 @@ def test_an_environment_does_not_know_of_the_others(name: str, outer: str, dtype
         few = sim(pd.State(state.positions[first:last], state.velocities[first:last]))
         assert same_bits(few, pd.State(together.positions[first:last], together.velocities[first:last]))
     assert not torch.equal(together.velocities[0], together.velocities[1])
+
+
+@pytest.mark.parametrize("cells", [13, 17])
+def test_large_meshes_have_the_same_bits_alone_and_in_a_batch(cells: int) -> None:
+    """With a middle level; 17 cells have so many vertices that warps add up theirs together."""
+    case = swing(cells, 1e6)
+    sim = simulator(case, torch.float32, GPU, solver=pd.Multilevel(), iterations=4)
+    assert int(sim.plan.level_sizes[5]) > 0
+    assert (sim.vertices > 640 * 32) == (cells == 17)
+    state = state_of(case, sim, 3)
+    together = sim(state)
+    assert same_bits(together, sim(state))
+    alone = sim(pd.State(state.positions[1:2], state.velocities[1:2]))
+    assert same_bits(alone, pd.State(together.positions[1:2], together.velocities[1:2]))
 
 
 def test_rollout_is_its_steps_and_a_recording_too() -> None:
@@ -207,6 +238,7 @@ def test_solvers_can_be_exchanged() -> None:
         torch.ops.torchpd.step(*start, None, None, block.material(), [*block.plan.arrays, *levels], **numbers)
 
 
+@pytest.mark.usefixtures("most_direct")
 def test_gradients_are_those_of_the_cpu() -> None:
     case = contact_block(pd.Ground(), velocity=(0.3, -1.0, 0.0))
     found = []

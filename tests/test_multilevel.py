@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cases import Case, beam, box, slivers
-from multilevel_cases import Tables, many_bodies, precondition, spectrum_of, swing
+from multilevel_cases import Tables, many_bodies, precondition, solved_directly, spectrum_of, swing
 from runs import ULP, noise, simulator
 from scipy.sparse import csr_array
 
@@ -34,11 +34,12 @@ def test_eigenvalues_on_uniform_boxes(cells: int, youngs: float) -> None:
     assert low >= 0.3
 
 
-@pytest.mark.parametrize("name", ["beam", "slivers", "bodies"])
+@pytest.mark.parametrize("name", ["beam", "slivers", "bodies", "direct"])
 def test_op_is_the_cycle_of_its_tables(name: str, dtype: torch.dtype) -> None:
-    case = {"beam": lambda: beam(1e6), "slivers": slivers, "bodies": many_bodies}[name]()
-    sim = prepared(case, dtype)
-    exact = simulator(case, torch.float64, solver=pd.Multilevel())
+    case = {"beam": lambda: beam(1e6), "slivers": slivers, "bodies": many_bodies, "direct": slivers}[name]()
+    sim, exact = prepared(case, dtype), prepared(case)
+    if name == "direct":
+        sim, exact = solved_directly(sim), solved_directly(exact)
     field = noise(sim.rest_positions).double().numpy()
     expected = Tables(exact.plan)(field)
     found = precondition(sim, field)
@@ -47,6 +48,34 @@ def test_op_is_the_cycle_of_its_tables(name: str, dtype: torch.dtype) -> None:
     assert error <= (1e-9 if dtype == torch.float64 else 1e-2) * np.linalg.norm(expected)
     held = ~case.problem().free
     assert not found[held].any()
+
+
+def test_a_direct_one_is_the_inverse(dtype: torch.dtype) -> None:
+    """On the free vertices; what is held stays at zero, and a larger mesh keeps its levels."""
+    case = beam(1e6)
+    sim = solved_directly(prepared(case, dtype), 936)
+    assert sim.vertices == 936
+    assert sim.plan.level_sizes.tolist()[1:] == [0, 0, 0, 0, 0, 1]
+    assert "preconditioner: 936 vertices, solved directly;" in str(sim)
+    problem = case.problem()
+    field = noise(sim.rest_positions).double().numpy() * problem.free[:, None]
+    image = precondition(sim, problem.matrix @ field)
+    assert not image[~problem.free].any()
+    # the condition of A, 3.2e3, times the rounding of the factor and what is added to the diagonal
+    assert np.linalg.norm(image - field) <= 3.2e3 * (ULP[dtype] + 1e-12) * np.linalg.norm(field)
+    assert int(solved_directly(prepared(case, dtype), 935).plan.level_sizes[2]) > 0
+
+
+@pytest.mark.parametrize("direct", [False, True])
+def test_what_is_held_has_no_part(direct: bool, dtype: torch.dtype) -> None:
+    """Whatever the field says there, the other vertices do not hear of it."""
+    case = slivers()
+    sim = solved_directly(prepared(case, dtype)) if direct else prepared(case, dtype)
+    held = ~case.problem().free
+    field = noise(sim.rest_positions).double().numpy()
+    expected = precondition(sim, field * ~held[:, None])
+    field[held] = np.nan
+    np.testing.assert_array_equal(precondition(sim, field)[~held], expected[~held])
 
 
 def test_matrix_is_that_of_the_reference() -> None:
@@ -117,13 +146,19 @@ def test_many_bodies_have_functions_of_their_own() -> None:
 
 
 @pytest.mark.usefixtures("two_threads")
-def test_tables_and_products_have_the_same_bits_on_any_number_of_threads(dtype: torch.dtype) -> None:
-    case = swing(6, 1e6)
-    two = prepared(case, dtype)
+@pytest.mark.parametrize("direct", [False, True])
+def test_tables_and_products_have_the_same_bits_on_any_number_of_threads(dtype: torch.dtype, direct: bool) -> None:
+    case = swing(5 if direct else 6, 1e6)
+
+    def made() -> pd.Simulator:
+        sim = prepared(case, dtype)
+        return solved_directly(sim) if direct else sim
+
+    two = made()
     field = noise(two.rest_positions)[None].repeat(3, 1, 1) * torch.tensor([1.0, 2.0, -1.0]).to(dtype)[:, None, None]
     product = ops.precondition(field, list(two.plan.arrays))
     torch.set_num_threads(1)
-    one = prepared(case, dtype)
+    one = made()
     assert all(torch.equal(a, b) for a, b in zip(one.plan.arrays, two.plan.arrays, strict=True))
     assert torch.equal(ops.precondition(field, list(one.plan.arrays)), product)
     assert torch.equal(product[1], 2.0 * product[0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from cases import Array, Case, beam, contact_block, hard_start, slivers
-from multilevel_cases import Tables, converged, irregular, swing, twist
+from multilevel_cases import Tables, converged, irregular, solved_directly, swing, twist
 from runs import arguments_of, displacement, simulator, state_of
 
 import torchpd as pd
@@ -151,15 +151,24 @@ def test_free_body_keeps_its_momentum(dtype: torch.dtype, device: torch.device) 
 
 @pytest.mark.parametrize("outer", OUTERS)
 @pytest.mark.parametrize("batch", [1, 9])
-def test_tolerance_stops_each_environment_by_itself(outer: str, batch: int, device: torch.device) -> None:
+@pytest.mark.parametrize("direct", [False, True])
+def test_tolerance_stops_each_environment_by_itself(outer: str, batch: int, direct: bool, device: torch.device) -> None:
+    """Where its error is of the size of the tolerance: less than ten times as large."""
     case = beam(1e5)
-    sim = simulator(case, torch.float64, device, solver=pd.Multilevel(outer), tolerance=1e-4, iterations=100)  # type: ignore[arg-type]
+    solver = pd.Multilevel(outer)  # type: ignore[arg-type]
+    sim = simulator(case, torch.float64, device, solver=solver, tolerance=1e-4, iterations=100)
+    if direct:
+        solved_directly(sim)
     state = state_of(case, sim, batch)
     state = pd.State(state.positions, state.velocities * torch.linspace(3.0, 0.0, batch, device=device)[:, None, None])
-    _, info = sim(state, return_info=True)
+    after, info = sim(state, return_info=True)
     assert bool(info.converged.all())
     assert int(info.iterations.max()) < 60
-    assert float(info.residual.max()) <= 1e-3
+    sim.tolerance, sim.iterations = 0.0, 300
+    exact, beyond = sim(state, return_info=True)
+    assert float(beyond.residual.max()) <= 1e-8
+    moved = (exact.positions - state.positions).flatten(1).norm(dim=1)
+    assert bool(((after.positions - exact.positions).flatten(1).norm(dim=1) <= 1e-3 * moved).all())
     if batch > 1:
         assert len(info.iterations.unique()) > 1
 

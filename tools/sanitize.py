@@ -32,7 +32,7 @@ import trimesh
 from torch import Tensor
 
 import torchpd as pd
-from torchpd import regimes
+from torchpd import multilevel, regimes
 from torchpd.device_plan import compile_device_plan
 from torchpd.plan import KERNELS as PLAN_KERNELS
 from torchpd.plan import Plan
@@ -127,16 +127,28 @@ def in_many_patches(sim: pd.Simulator) -> Plan:
 
 
 def levels(dtype: torch.dtype) -> int:
-    """The multilevel solver: one block an environment, several, and several environments one after another."""
+    """The multilevel solver: one block an environment, several, and several environments one after another.
+
+    By levels, then directly.
+    """
     small, large = (6, 2, 2), (14, 4, 4)
-    ways = (("lbfgs", False, small, 3), ("lbfgs", True, large, 2), ("momentum", True, small, 2))
-    for outer, contacts, cells, batch in ways:
+    ways = (
+        ("lbfgs", False, small, 3, 0),
+        ("lbfgs", True, large, 2, 0),
+        ("momentum", True, small, 2, 0),
+        ("lbfgs", True, small, 3, 1024),
+        ("lbfgs", False, large, 2, 1024),
+    )
+    usual = multilevel.MOST_DIRECT
+    for outer, contacts, cells, batch, most_direct in ways:
+        multilevel.MOST_DIRECT = most_direct
         built = scene(contacts=contacts, pieces=contacts, pins=True, cells=cells)
         solver = pd.Multilevel(outer)  # type: ignore[arg-type]
         options: dict[str, Any] = {"solver": solver, "tolerance": 1e-2 * contacts, "dtype": dtype}
         sim = pd.Simulator(built, 1 / 60, 3, progress=False, **options).to("cuda")
         step_all_ways(sim, batch)
         ops.precondition(sim.rest_state(batch).positions, list(sim.plan.arrays))
+    multilevel.MOST_DIRECT = usual
     many = pd.Simulator(scene(contacts=False, pieces=False, pins=True), 1 / 60, 1, solver=pd.Multilevel(), dtype=dtype)
     many.to("cuda")(many.rest_state(300))
     torch.cuda.synchronize()

@@ -24,6 +24,7 @@ def build_multilevel(
     vertex_order: NDArray[int32],
     stiffness: NDArray[float64],
     inertia: NDArray[float64],
+    most_direct: int,
     threads: int,
     progress: Callable[[float], None],
 ) -> dict[str, NDArray[Any]]: ...

@@ -53,7 +53,7 @@ class Costs(NamedTuple):
 # "stream": without `more` the choice for a batch is that for one environment.
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 190.0)),
-    "block": Costs(Cost(2.6, 5.0, 0.05), Cost(34.0, 14.0, 1.04)),
+    "block": Costs(Cost(2.6, 5.0, 0.05), Cost(32.0, 3.0, 0.9)),
     "grid": Costs(Cost(1.2, 0.13), Cost(40.0, 2.0)),
     "stream": Costs(Cost(6.0, 0.18), Cost(40.0, 2.0)),
 }

@@ -19,6 +19,9 @@ from .tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE
 
 __all__ = ["has_levels", "precondition_plan", "reference_of", "reference_of_levels", "without_levels"]
 
+# Two dense products there take less time than the many short phases of a cycle: each of those waits for all blocks.
+MOST_DIRECT = 1024
+
 Reference = tuple[Tensor, Tensor]  # stiffness [E] Pa, and inertia a [V] N/m in the user's order, inf where held
 
 
@@ -60,7 +63,13 @@ def reference_of(plan: Plan, material: Sequence[Tensor], time_step: float) -> Re
 
 
 def precondition_plan(
-    plan: Plan, values: SceneValues, stiffness: Tensor, inertia: Tensor, *, progress: bool = False
+    plan: Plan,
+    values: SceneValues,
+    stiffness: Tensor,
+    inertia: Tensor,
+    *,
+    most_direct: int | None = None,
+    progress: bool = False,
 ) -> Plan:
     """The plan with a multilevel approximation of A^-1 for a material, see csrc/plan/multilevel_build.h.
 
@@ -69,10 +78,13 @@ def precondition_plan(
         values: of the scene that the plan was compiled from.
         stiffness: [E] Pa.
         inertia: a of each vertex [V] N/m in the user's order, inf where held.
+        most_direct: up to so many vertices M is A^-1, without levels. None: `MOST_DIRECT` on a GPU, 0 on a CPU.
         progress: show a bar when the mesh is large.
     """
     plan = without_levels(plan)
     order = plan.vertex_order.cpu().numpy()
+    if most_direct is None:
+        most_direct = MOST_DIRECT if plan.kernel is not None else 0
 
     def rounded(values: Tensor) -> NDArray[np.float64]:
         """In the plan's precision, which the arrays will have: it decides the bits."""
@@ -81,7 +93,7 @@ def precondition_plan(
     with compiling(len(values.tets), progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_multilevel(
             values.rest_positions, values.tets, order, rounded(stiffness), rounded(inertia),
-            torch.get_num_threads(), advance,
+            most_direct, torch.get_num_threads(), advance,
         )  # fmt: skip
     if plan.kernel is not None:
         arrays["coarse_columns"] = _by_columns(arrays["coarse_factor"])

@@ -62,10 +62,11 @@ def _preconditioner_lines(sim: Simulator) -> list[str]:
     plan = sim.plan
     if not isinstance(sim.solver, Multilevel):
         return []
-    nodes, below = int(plan.level_sizes[2]), int(plan.level_sizes[5])
-    steps = [f"{plan.vertices} vertices", f"{nodes} nodes", *([f"{below} nodes"] if below else [])]
+    _, _, nodes, _, _, below, direct = plan.level_sizes.tolist()
+    steps = [f"{plan.vertices} vertices", *(f"{count} nodes" for count in (nodes, below) if count)]
+    solved = "solved directly" if direct else "the last solved directly"
     own = sum(array.numel() * array.element_size() for array in plan.arrays[-len(MULTILEVEL_TABLE) :])
-    return [f"preconditioner: {' > '.join(steps)}, the last solved directly; {own:,} B of the plan"]
+    return [f"preconditioner: {' > '.join(steps)}, {solved}; {own:,} B of the plan"]
 
 
 def _effect_lines(sim: Simulator) -> list[str]:

@@ -1,4 +1,4 @@
-// The preconditioner M of solver/multilevel.h on the CPU: one V-cycle by a team of threads, in a fixed order of sums.
+// The preconditioner M of solver/multilevel.h on the CPU: one V-cycle, or a direct solve, by a team of threads, in a fixed order of sums.
 #pragma once
 #include "cpu/team.h"
 #include "cpu/workspace.h"
@@ -18,7 +18,7 @@ class Cycle {
   };
 
  public:
-  explicit Cycle(const Levels<T>& levels) : levels_(levels), coarse_(4 * levels.coarse_nodes()) {
+  explicit Cycle(const Levels<T>& levels) : levels_(levels), coarse_(levels.coarse_unknowns()) {
     const std::int64_t middle = levels.has_middle() ? 4 * std::int64_t(levels.fine_nodes) : 0;
     const std::int64_t count = 4 * (levels.vertices + middle) + 3 * std::int64_t(coarse_);
     storage_ = allocate_zeroed(std::size_t(count) * sizeof(Value));
@@ -28,9 +28,9 @@ class Cycle {
       const std::int64_t size = level == &fine_ ? levels.vertices : middle;
       *level = {take(size), take(size), take(size), take(size)};
     }
-    coarse_in_ = take(coarse_);
+    coarse_in_ = levels.direct ? fine_.in : take(coarse_);
     coarse_half_ = take(coarse_);
-    coarse_out_ = take(coarse_);
+    coarse_out_ = levels.direct ? fine_.z : take(coarse_);
   }
 
   Value* input() const { return fine_.in; }
@@ -38,7 +38,13 @@ class Cycle {
 
   // result = M input. All of the team; the input has to be complete, the result is when this returns.
   void run(const Team& team) const {
-    if (levels_.has_middle()) {
+    if (levels_.direct) {
+      // what is held has no part in a product, be it NaN
+      each_row(team, fine_level(levels_), [&](int row, std::int64_t) {
+        if (!(levels_.fine_inverse[row] > T(0))) fine_.in[row] = {};
+      });
+      solve_coarse(team);
+    } else if (levels_.has_middle()) {
       const auto below = [&] {
         descend(team, middle_level(levels_), middle_, coarse_in_, coarse_out_,
                 [&] { solve_coarse(team); });

@@ -16,16 +16,24 @@ struct HalfNumbers {
   PD_HD unsigned slot_times_8(int c) const { return corner[c] & 0xffff; }
 };
 
+// `number`: of the tetrahedron. 32 bits count the numbers of all pairs, of which there are fewer than 2^29.
 template <class T>
 PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int number) {
   HalfNumbers<T> numbers;
   // lanes past the end repeat the last pair
-  const int pair = number / 2 < patch.pairs ? number / 2 : patch.pairs - 1, which = number & 1;
-  const PairPlace place = place_of(patch, pair);
-  for (int c = 0; c < 3; ++c) numbers.corner[c] = unsigned(patch.plan.pair_corner[place.in(5, c)]);
-  numbers.corner[3] = unsigned(patch.plan.pair_corner[place.in(5, 3 + which)]);
-  numbers.weight = weights[place.in(2, which)];
-  numbers.factor = patch.plan.pair_factor[place.in(2, which)];
+  const unsigned pair = unsigned(min(number / 2, patch.pairs - 1)), which = unsigned(number) & 1;
+  // places of width 5 and 2, see PairPlace
+  const unsigned before = pair & ~unsigned(pair_lanes - 1);
+  const unsigned of_five = unsigned(patch.first_block) * (5 * pair_lanes) + pair + 4 * before;
+  const unsigned of_two = unsigned(patch.first_block) * (2 * pair_lanes) + pair + before;
+  const auto corner = [&](unsigned c) {
+    return unsigned(patch.plan.pair_corner[of_five + c * pair_lanes]);
+  };
+  for (unsigned c = 0; c < 3; ++c) numbers.corner[c] = corner(c);
+  numbers.corner[3] = corner(3 + which);
+  const unsigned own = of_two + which * pair_lanes;
+  numbers.weight = weights[own];
+  numbers.factor = patch.plan.pair_factor[own];
   return numbers;
 }
 

@@ -18,17 +18,19 @@ static_assert(sizeof(OuterControl) + pass_static_bytes <= outer_static_bytes);
 template <class T>
 PD_HD void arrange(Arena& arena, const Levels<T>& levels, int teams, CycleMemory<T>& m) {
   const std::int64_t middle = levels.has_middle() ? 4 * std::int64_t(levels.fine_nodes) : 0;
+  const std::int64_t coarse = levels.coarse_unknowns(), below = levels.direct ? 0 : 1;
   const auto place = [&](LevelFields<T>& f, std::int64_t size) {
-    for (Quad<T>** array : {&f.in, &f.z, &f.rest, &f.part}) arena.place(*array, teams * size);
+    for (Quad<T>** array : {&f.in, &f.z}) arena.place(*array, teams * size);
+    for (Quad<T>** array : {&f.rest, &f.part}) arena.place(*array, teams * size * below);
   };
   place(m.fine, levels.vertices);
   place(m.middle, middle);
-  for (Quad<T>** array : {&m.coarse_in, &m.coarse_half, &m.coarse_out})
-    arena.place(*array, teams * 4 * std::int64_t(levels.coarse_nodes()));
+  arena.place(m.coarse_half, teams * coarse);
+  for (Quad<T>** array : {&m.coarse_in, &m.coarse_out}) arena.place(*array, teams * coarse * below);
 }
 
-template <class T, bool Touching>
-__global__ void __launch_bounds__(outer_threads)
+template <class T, bool Touching, int Threads>
+__global__ void __launch_bounds__(Threads, Threads == outer_threads ? 1 : small_outer_blocks)
     outer_iterations(const __grid_constant__ OuterCall<T> call) {
   extern __shared__ __align__(16) std::byte shared[];
   __shared__ __align__(16) std::byte control[sizeof(OuterControl)];
@@ -40,8 +42,8 @@ __global__ void __launch_bounds__(outer_threads)
     arrange(arena, call.plan().levels, 1, memory.cycle);
   }
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
-    MultilevelRunner<T, Touching> runner(call, memory, e, team,
-                                         *reinterpret_cast<OuterControl*>(control), shared);
+    MultilevelRunner<T, Touching, Threads> runner(
+        call, memory, e, team, *reinterpret_cast<OuterControl*>(control), shared);
     multilevel_iterations(runner, call.stream.step.settings);
   }
 }
@@ -97,6 +99,7 @@ struct Teams {
 
 template <class T>
 int useful_blocks(const Levels<T>& levels) {
+  if (levels.direct) return (levels.vertices + outer_warps - 1) / outer_warps;
   constexpr int alone =
       4 * outer_threads;  // vertices with which one block is done before several have met
   return levels.vertices <= alone ? 1 : (levels.vertices + outer_threads - 1) / outer_threads;
@@ -108,11 +111,13 @@ using OuterKernel = void (*)(OuterCall<T>);
 template <class T>
 struct OuterLaunch {
   OuterKernel<T> kernel;
+  int threads;
   std::size_t shared, shared_cycle = 0;
   int resident;
 
   explicit OuterLaunch(const DeviceStep<T>& step)
-      : kernel(touching(step) ? outer_iterations<T, true> : outer_iterations<T, false>),
+      : kernel(kernel_of(step)),
+        threads(is_small(step) ? small_outer_threads : outer_threads),
         shared(pass_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries, 2)),
         resident(blocks_with(shared)) {
     keep_cycle(step);
@@ -123,8 +128,8 @@ struct OuterLaunch {
   }
 
   int blocks_with(std::size_t bytes) const {
-    const auto of = [](const void* any, std::size_t shared_bytes) {
-      return resident_blocks(any, outer_threads, shared_bytes);
+    const auto of = [&](const void* any, std::size_t shared_bytes) {
+      return resident_blocks(any, threads, shared_bytes);
     };
     // the material is compared by the same teams
     return std::min(of(reinterpret_cast<const void*>(kernel), bytes),
@@ -140,10 +145,21 @@ struct OuterLaunch {
     arrange(arena, step.plan.levels, 1, fields);
     const std::size_t begin = (shared + 255) / 256 * 256, all = begin + std::size_t(arena.size());
     const int blocks = blocks_with(all);
-    if (blocks < (one ? 1 : resident)) return;
+    if (blocks < (one ? std::min<std::int64_t>(step.batch, resident) : resident)) return;
     shared_cycle = begin;
     shared = all;
     resident = blocks;
+  }
+
+  static bool is_small(const DeviceStep<T>& step) { return step.plan.patches == 1; }
+
+  static OuterKernel<T> kernel_of(const DeviceStep<T>& step) {
+    const auto of = [&]<int Threads>() {
+      return touching(step) ? outer_iterations<T, true, Threads>
+                            : outer_iterations<T, false, Threads>;
+    };
+    return is_small(step) ? of.template operator()<small_outer_threads>()
+                          : of.template operator()<outer_threads>();
   }
 
   static bool touching(const DeviceStep<T>& step) {
@@ -152,7 +168,9 @@ struct OuterLaunch {
 
   OuterCall<T> call(const StreamCall<T>& stream) const {
     const DevicePlan<T>& plan = stream.step.plan;
-    const Teams teams(stream.step.batch, resident, plan.patches);
+    const bool spread = plan.levels.direct && !is_small(stream.step);
+    const int useful = std::max(plan.patches, spread ? useful_blocks(plan.levels) : 1);
+    const Teams teams(stream.step.batch, resident, useful);
     return {stream, {}, teams.count, teams.blocks, shared_cycle};
   }
 };
@@ -187,11 +205,11 @@ std::int64_t outer_bytes(const DeviceStep<T>& step) {
 
 // All blocks at once, since they wait for each other.
 template <class Call>
-void launch_teams(const void* kernel, Call& call, unsigned* counter, std::size_t shared,
-                  cudaStream_t stream) {
+void launch_teams(const void* kernel, Call& call, unsigned* counter, int threads,
+                  std::size_t shared, cudaStream_t stream) {
   void* arguments[] = {&call};
   check(cudaMemsetAsync(counter, 0, call.teams * sizeof(unsigned), stream));
-  check(cudaLaunchCooperativeKernel(kernel, dim3(call.teams * call.blocks), dim3(outer_threads),
+  check(cudaLaunchCooperativeKernel(kernel, dim3(call.teams * call.blocks), dim3(threads),
                                     arguments, shared, stream));
 }
 
@@ -205,9 +223,10 @@ OuterCall<T> outer_call(const StreamCall<T>& stream, const OuterLaunch<T>& launc
 
 template <class T>
 void run_comparison(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
-  OuterCall<T> call = outer_call(stream, OuterLaunch<T>(stream.step), memory);
-  launch_teams(reinterpret_cast<const void*>(compare_material<T>), call, call.memory.counter, 0,
-               to);
+  const OuterLaunch<T> launch(stream.step);
+  OuterCall<T> call = outer_call(stream, launch, memory);
+  launch_teams(reinterpret_cast<const void*>(compare_material<T>), call, call.memory.counter,
+               launch.threads, 0, to);
 }
 
 template <class T>
@@ -215,7 +234,7 @@ void run_outer(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
   const OuterLaunch<T> launch(stream.step);
   OuterCall<T> call = outer_call(stream, launch, memory);
   launch_teams(reinterpret_cast<const void*>(launch.kernel), call, call.memory.counter,
-               launch.shared, to);
+               launch.threads, launch.shared, to);
 }
 
 template <class T>
@@ -241,8 +260,8 @@ template <class T>
 void run_precondition(const PreconditionCall<T>& op, void* memory, Stream stream) {
   std::int64_t bytes = 0;
   CycleCall<T> call = cycle_call(op, memory, &bytes);
-  launch_teams(reinterpret_cast<const void*>(precondition_fields<T>), call, call.counter, 0,
-               static_cast<cudaStream_t>(stream));
+  launch_teams(reinterpret_cast<const void*>(precondition_fields<T>), call, call.counter,
+               outer_threads, 0, static_cast<cudaStream_t>(stream));
 }
 
 }  // namespace pd

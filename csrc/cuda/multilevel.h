@@ -10,7 +10,10 @@ namespace pd::inline PD_TARGET {
 constexpr int outer_dots = 2 * history + 3;  // sums that one pass over the vertices may make
 constexpr int ranges_count = 2;              // that a round of Ranges compares
 constexpr int most_chunks = 640;             // of vertices, whose sums every block adds up
-constexpr int outer_threads = 768;           // of a block, a multiprocessor each
+// Threads of a block: a multiprocessor each, but for meshes of one patch, of which two share it. Few enough that each has the
+// registers for what it asks of memory at once.
+constexpr int outer_threads = 512, small_outer_threads = 256;
+constexpr int small_outer_blocks = 2;
 constexpr int outer_warps = outer_threads / warp_size;
 
 // Device memory of the teams.
@@ -36,10 +39,11 @@ struct OuterCall {
   std::size_t shared_cycle;  // where the cycle's fields stand in shared memory; 0: in device memory
 
   PD_HD const DevicePlan<T>& plan() const { return stream.step.plan; }
-  // Warps whose vertices are added up together, a divisor of those of a block. The plan alone decides, so that an
-  // environment gives the same bits whatever the number of blocks.
+  // Warps whose vertices are added up together, a divisor of those of a block: one where the block is small, since a patch
+  // has fewer slots than most_chunks warps have lanes. The plan alone decides, so that an environment gives the same bits
+  // whatever the number of blocks.
   PD_HD int warps_of_chunk() const {
-    for (int warps : {1, 2, 3, 4, 6, 8, 12}) {
+    for (int warps : {1, 2, 4, 8}) {
       if (chunks_of(plan().vertices, warps) <= most_chunks) return warps;
     }
     return outer_warps;
@@ -77,8 +81,10 @@ PD_DEVICE OuterMemory<T> of_team(const OuterCall<T>& call, int team) {
   return m;
 }
 
-template <class T, bool Touching>
+template <class T, bool Touching, int Threads>
 class MultilevelRunner {
+  static constexpr int warps = Threads / warp_size;
+
  public:
   PD_DEVICE MultilevelRunner(const OuterCall<T>& call, const OuterMemory<T>& memory,
                              std::int64_t environment, BlockTeam& team, OuterControl& control,
@@ -116,16 +122,21 @@ class MultilevelRunner {
 #pragma unroll 1
     for (int patch = team_.rank(); patch < w_.plan.patches; patch += team_.blocks()) {
       ThreadSums sums = {{0, 0, 0}};
-      sums.value[0] +=
-          pass_over_patch(w_, patch, shared_, SolidGradient<true>{},
-                          [&](int i, const Vec3<T>& force) { look_at(i, force, sums); });
+      sums.value[0] += pass_over_patch(
+          w_, patch, shared_, SolidGradient<true>{}, [&](int i) { return w_.v.see(i); },
+          [&](int i, const auto& seen, const Vec3<T>& force) { look_at(i, seen, force, sums); });
       write_sums<Visit::measure>(sums, m_.patch_sums + patch * sums_count);
     }
     team_.barrier();
+    if (w_.plan.shared == 0) {
+      if (threadIdx.x == 0) c_.total[0] = c_.total[1] = 0;
+      return;
+    }
     const int first = w_.plan.patch_vertex[w_.plan.patches];
     add_up<2>(w_.plan.shared, [&](int i, double (&sum)[2]) {
       ThreadSums sums = {{0, 0, 0}};
-      look_at(first + i, shared_force(w_, i), sums);
+      const auto seen = w_.v.see(first + i);
+      look_at(first + i, seen, shared_force(w_, i), sums);
       sum[0] = sums.value[0];
       sum[1] = sums.value[1];
     });
@@ -146,7 +157,7 @@ class MultilevelRunner {
     }
     __syncthreads();
     if (warp == 0) {
-      for (int n = 0; n < 2; ++n) sum[n] = lane < outer_warps ? c_.warp_dot[lane][n] : 0;
+      for (int n = 0; n < 2; ++n) sum[n] = lane < warps ? c_.warp_dot[lane][n] : 0;
       add_across_warp(sum);
     }
     if (threadIdx.x == 0) {
@@ -183,10 +194,12 @@ class MultilevelRunner {
       m_.s[newest_ * vertices() + i] = quad(s);
       m_.y[newest_ * vertices() + i] = quad(y);
       const Vec3<T> g = let_through(i, left);
+      Vec3<T> ways[history];
+      see_pairs(m_.s, i, ways);
 #pragma unroll
       for (int j = 0; j < history; ++j) {
         if (j != newest_ && !c_.pairs.valid[j]) continue;
-        const Vec3<T> way = j == newest_ ? s : vec3(m_.s[j * vertices() + i]);
+        const Vec3<T> way = j == newest_ ? s : ways[j];
         sum[j] += double(dot(way, y));
         sum[history + j] += double(dot(way, g));
       }
@@ -209,10 +222,11 @@ class MultilevelRunner {
     each_vertex([&](int i) {
       Vec3<T> q = let_through(i, vec3(m_.pull[i]));
       if (lbfgs_) {
+        Vec3<T> y[history];
+        see_pairs(m_.y, i, y);
 #pragma unroll
         for (int j = 0; j < history; ++j) {
-          if (c_.pairs.valid[j])
-            q = subtract_product(q, T(c_.pairs.alpha[j]), vec3(m_.y[j * vertices() + i]));
+          if (c_.pairs.valid[j]) q = subtract_product(q, T(c_.pairs.alpha[j]), y[j]);
         }
         q = let_through(i, q);
       }
@@ -261,8 +275,8 @@ class MultilevelRunner {
   PD_DEVICE std::int64_t vertices() const { return w_.plan.vertices; }
   PD_DEVICE static Vec3<T> none() { return {T(0), T(0), T(0)}; }
 
-  PD_DEVICE void look_at(int i, const Vec3<T>& force, ThreadSums& sums) const {
-    const auto seen = w_.v.see(i);
+  PD_DEVICE void look_at(int i, const typename Vertices<T, Touching>::Seen& seen,
+                         const Vec3<T>& force, ThreadSums& sums) const {
     const auto& v = seen.vertex;
     sums.value[0] += seen.energy();
     m_.fresh[i] = quad(v.unbalanced(w_.contacts, seen.u, force));
@@ -293,7 +307,7 @@ class MultilevelRunner {
   template <int Count, class Visit>
   PD_DEVICE void add_up(int count, const Visit& visit) {
     const int together = call_.warps_of_chunk(), chunks = call_.chunks_of(count, together);
-    const int groups = outer_warps / together;  // chunks that a block works on at a time
+    const int groups = warps / together;  // chunks that a block works on at a time
     const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
     // nobody overwrites what others may still read
     parity_ = !parity_;
@@ -308,12 +322,8 @@ class MultilevelRunner {
       const int from = (chunk_of(round, warp / together) * together + warp % together) * warp_size;
       if (from < count) {
         if (from + lane < count) visit(from + lane, sum);
-        add_across_warp(sum);
       }
-#pragma unroll
-      for (int d = 0; d < Count; ++d) {
-        if (lane == 0) c_.warp_dot[warp][d] = sum[d];
-      }
+      write_warp_sums(sum, c_.warp_dot[warp]);
       __syncthreads();
       const int group = threadIdx.x / Count, d = threadIdx.x % Count;
       if (group < groups && chunk_of(round, group) < chunks) {
@@ -324,12 +334,18 @@ class MultilevelRunner {
       __syncthreads();
     }
     team_.barrier();
+    constexpr int each = (Count + warps - 1) / warps;  // sums of a warp
+    double sum[each] = {};
 #pragma unroll 1
-    for (int d = warp; d < Count; d += outer_warps) {
-      double sum[1] = {0};
-      for (int chunk = lane; chunk < chunks; chunk += warp_size) sum[0] += dots[d * chunks + chunk];
-      add_across_warp(sum);
-      if (lane == 0) c_.total[d] = sum[0];
+    for (int chunk = lane; chunk < chunks; chunk += warp_size) {
+#pragma unroll
+      for (int n = 0; n < each; ++n)
+        sum[n] += dots[min(warp + n * warps, Count - 1) * chunks + chunk];
+    }
+    add_across_warp(sum);
+#pragma unroll
+    for (int n = 0; n < each; ++n) {
+      if (lane == 0 && warp + n * warps < Count) c_.total[warp + n * warps] = sum[n];
     }
     __syncthreads();
   }
@@ -356,9 +372,11 @@ class MultilevelRunner {
   PD_DEVICE void correct() {
     pass<history + 1>([&](int i, double (&sum)[history + 1]) {
       const Vec3<T> z = cycle_.result(i);
+      Vec3<T> y[history];
+      see_pairs(m_.y, i, y);
 #pragma unroll
       for (int j = 0; j < history; ++j) {
-        if (c_.pairs.valid[j]) sum[j] += double(dot(vec3(m_.y[j * vertices() + i]), z));
+        if (c_.pairs.valid[j]) sum[j] += double(dot(y[j], z));
       }
       sum[history] += double(dot(vec3(m_.pull[i]), way(i, z)));
     });
@@ -379,11 +397,22 @@ class MultilevelRunner {
   PD_DEVICE Vec3<T> direction(int i) const {
     Vec3<T> d = cycle_.result(i);
     if (!lbfgs_) return d;
+    Vec3<T> s[history];
+    see_pairs(m_.s, i, s);
 #pragma unroll
     for (int j = 0; j < history; ++j) {
-      if (c_.pairs.valid[j]) d = multiply_add(T(c_.factor[j]), vec3(m_.s[j * vertices() + i]), d);
+      if (c_.pairs.valid[j]) d = multiply_add(T(c_.factor[j]), s[j], d);
     }
     return d;
+  }
+
+  // A field of the pairs at a vertex, all asked for at once: in place of one that is not valid the newest, which is there.
+  PD_DEVICE void see_pairs(const Quad<T>* field, int i, Vec3<T> (&seen)[history]) const {
+#pragma unroll
+    for (int j = 0; j < history; ++j) {
+      const int pair = c_.pairs.valid[j] ? j : newest_;
+      seen[j] = vec3(field[pair * vertices() + i]);
+    }
   }
 
   // whether M knows nothing of a vertex

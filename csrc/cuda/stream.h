@@ -99,18 +99,24 @@ struct ThreadSums {
   double value[sums_count];
 };
 
+// What a visit goes by beside the force; nothing before there is a state.
 template <Visit What, class T, bool Touching>
-PD_DEVICE void visit(const StreamWork<T, Touching>& w, int i, const Vec3<T>& force, int k,
+PD_DEVICE typename Vertices<T, Touching>::Seen see(const StreamWork<T, Touching>& w, int i) {
+  if constexpr (What == Visit::weigh) return {};
+  return w.v.see(i);
+}
+
+template <Visit What, class T, bool Touching>
+PD_DEVICE void visit(const StreamWork<T, Touching>& w, int i,
+                     const typename Vertices<T, Touching>::Seen& seen, const Vec3<T>& force, int k,
                      ThreadSums& sums) {
   double (&sum)[sums_count] = sums.value;
   if constexpr (What == Visit::weigh) {
     sum[0] = Least{}(sum[0], w.v.weigh(i, force.x));
   } else if constexpr (What == Visit::measure) {
-    const auto seen = w.v.see(i);
     sum[0] += seen.energy();
     sum[1] += seen.residual(w.contacts, force);
   } else {
-    const auto seen = w.v.see(i);
     if constexpr (What == Visit::update_guarded) sum[0] += seen.energy();
     const Vec3<T> next = seen.next(w.contacts, force, T(w.settings().relaxation), w.omega(k));
     if (w.settings().tolerance > 0) {
@@ -160,11 +166,11 @@ PD_DEVICE bool skips(const StreamWork<T, Touching>& w) {
   return updates && w.settings().tolerance > 0 && w.progress.done;
 }
 
-// Elements of a patch: here(vertex, force) for every vertex inside it; the forces on those that it shares stay behind.
-// Returns what this thread has met of their energy. `shared`: pass_shared_bytes.
-template <class T, bool Touching, class Element, class Here>
+// Elements of a patch: here(vertex, see(vertex), force) for every vertex inside it; the forces on those that it shares stay
+// behind. Returns what this thread has met of their energy. `shared`: pass_shared_bytes.
+template <class T, bool Touching, class Element, class See, class Here>
 PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, std::byte* shared,
-                                 const Element& element, const Here& here) {
+                                 const Element& element, const See& see, const Here& here) {
   const Patch<T> patch(w.plan, number);
   HalfNumbers<T> now = read_half(patch, w.weights, int(threadIdx.x));
   const Slots<T> slots(shared, w.plan.most_slots);
@@ -180,15 +186,25 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
   };
   const double energy = double(each_half<false>(patch, slots, inverse_of, w.weights, entries,
                                                 element, now, 0, 2 * patch.pairs));
+  // on the way while the block meets
+  int s = threadIdx.x, row = 0;
+  decltype(see(0)) seen{};
+  const auto look_at_slot = [&] {
+    if (s < patch.slots) row = patch.row(s);
+    if (s < patch.interior) seen = see(patch.first_vertex + s);
+  };
+  look_at_slot();
   __syncthreads();
-  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
-    const int slot = patch.first_slot + s;
-    const Vec3<T> force = sum_entries(entries, w.plan.slot_row[slot]);
+#pragma unroll 1
+  while (s < patch.slots) {
+    const Vec3<T> force = sum_entries(entries, row);
     if (s < patch.interior) {
-      here(patch.first_vertex + s, force);
+      here(patch.first_vertex + s, seen, force);
     } else {
-      w.shared_force[slot] = quad(force);
+      w.shared_force[patch.first_slot + s] = quad(force);
     }
+    s += blockDim.x;
+    look_at_slot();
   }
   return energy;
 }
@@ -202,9 +218,11 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   const StreamWork<T, Touching> w(call, blockIdx.x / call.step.plan.patches);
   if (skips<What>(w)) return;
   ThreadSums sums = no_sums<What>();
-  const double energy =
-      pass_over_patch(w, number, shared, typename ElementOf<What>::type{},
-                      [&](int i, const Vec3<T>& force) { visit<What>(w, i, force, k, sums); });
+  const double energy = pass_over_patch(
+      w, number, shared, typename ElementOf<What>::type{}, [&](int i) { return see<What>(w, i); },
+      [&](int i, const auto& seen, const Vec3<T>& force) {
+        visit<What>(w, i, seen, force, k, sums);
+      });
   if constexpr (What != Visit::weigh) sums.value[0] += energy;
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));
 }
@@ -227,8 +245,11 @@ __global__ void __launch_bounds__(vertex_threads)
   if (skips<What>(w)) return;
   ThreadSums sums = no_sums<What>();
   const int i = number * vertex_threads + int(threadIdx.x);
-  if (i < w.plan.shared)
-    visit<What>(w, w.plan.patch_vertex[w.plan.patches] + i, shared_force(w, i), k, sums);
+  if (i < w.plan.shared) {
+    const int vertex = w.plan.patch_vertex[w.plan.patches] + i;
+    const auto seen = see<What>(w, vertex);
+    visit<What>(w, vertex, seen, shared_force(w, i), k, sums);
+  }
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(w.plan.patches + number));
 }
 

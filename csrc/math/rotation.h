@@ -44,15 +44,15 @@ PD_HD constexpr T newton_tolerance() {
   return sizeof(T) == 4 ? T(4e-4) : T(12e-9);
 }
 
-// Three steps serve strains up to 0.3; lanes that need more go on alone, so that no lane depends on its neighbours.
+// Two steps serve strains up to 0.11 in float32; lanes that need more go on alone, so that no lane depends on its neighbours.
 template <class R>
 PD_HD Root<R> largest_root(const Invariants<R>& i) {
   using T = scalar_of<R>;
-  constexpr int first = sizeof(T) == 4 ? 3 : 4;
+  constexpr int first = sizeof(T) == 4 ? 2 : 4;
   Root<R> root = {rough_square_root(R(3) * i.norm2), R(0), R(0)};
   for (int step = 0; step < first; ++step) root = newton(i, root.value);
   auto far = root.change > R(newton_tolerance<T>()) * root.value;
-  for (int step = 0; step < 8 && any(far); ++step) {
+  for (int step = 0; step < 9 && any(far); ++step) {
     const Root<R> next = newton(i, root.value);
     root = {select(far, next.value, root.value), select(far, next.slope, root.slope),
             select(far, next.change, root.change)};

@@ -178,7 +178,8 @@ Aggregates limited(Aggregates groups, std::int32_t most) {
   return groups;
 }
 
-std::vector<double> coarse_factor(const BlockMatrix& a, int threads) {
+// L^-1 of a matrix L L^T, row by row up to the diagonal; nothing in the rows of what is held.
+std::vector<double> coarse_factor(const BlockMatrix& a, const Mask& held, int threads) {
   const int n = a.rows * a.height;
   std::vector<double> dense(std::size_t(n) * n, 0.0);
   for (std::int32_t row = 0; row < a.rows; ++row) {
@@ -194,7 +195,11 @@ std::vector<double> coarse_factor(const BlockMatrix& a, int threads) {
     double& d = dense[std::size_t(i) * n + i];
     d = d > 0 ? d * (1 + coarse_shift) : 1;
   }
-  return inverse_cholesky_factor(std::move(dense), n, threads);
+  std::vector<double> factor = inverse_cholesky_factor(std::move(dense), n, threads);
+  for (std::int64_t i = 0; i < std::ssize(held); ++i) {
+    if (held[i]) std::fill_n(factor.begin() + i * (i + 1) / 2, i + 1, 0.0);
+  }
+  return factor;
 }
 
 BlockMatrix galerkin(const BlockMatrix& a, const BlockMatrix& lift, const Transposed& transposed,
@@ -290,6 +295,21 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
   MultilevelTables t;
   FineMatrix fine = assemble(scene, threads);
   progress(0.2);
+  for (const double bound : fine.bound) t.fine_inverse.push_back(bound > 0 ? 1 / bound : 0);
+  t.reference_stiffness.assign(scene.stiffness, scene.stiffness + scene.count);
+  for (std::int64_t i = 0; i < scene.vertices; ++i)
+    t.reference_inertia.push_back(scene.inertia[scene.vertex_order[i]]);
+  t.level_sizes.assign(level_size_count, 0);
+  t.level_sizes[level_fine_entries] = fine.matrix.start.back();
+  if (scene.vertices <= scene.most_direct) {
+    t.level_sizes[level_direct] = 1;
+    t.coarse_factor = coarse_factor(fine.matrix, fine.held, threads);
+    t.fine_lift_start.assign(std::size_t(scene.vertices) + 1, 0);
+    t.fine_node_start = {0};
+    store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
+    progress(1.0);
+    return t;
+  }
   const Affine rest = affine(scene);
   const Graph graph = coupling_graph(
       fine.matrix.rows, couplings(fine.matrix, diagonal(fine.matrix), rest.position, 0));
@@ -301,11 +321,8 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
       aggregate(graph, fine.held, middle ? nodes : std::min(nodes, most_coarse_nodes));
   progress(0.5);
 
-  for (const double bound : fine.bound) t.fine_inverse.push_back(bound > 0 ? 1 / bound : 0);
   const Tentative first = tentative(rest.candidates, 1, groups);
   Step step = coarsen(fine.matrix, t.fine_inverse, fine_smoothing, first.lift, threads);
-  t.level_sizes.assign(level_size_count, 0);
-  t.level_sizes[level_fine_entries] = fine.matrix.start.back();
   t.level_sizes[level_fine_lifts] = step.lift.start.back();
   t.level_sizes[level_fine_nodes] = groups.count;
   store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
@@ -328,10 +345,7 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
     coarse = std::move(step.coarse);
   }
   progress(0.8);
-  t.coarse_factor = coarse_factor(coarse, threads);
-  t.reference_stiffness.assign(scene.stiffness, scene.stiffness + scene.count);
-  for (std::int64_t i = 0; i < scene.vertices; ++i)
-    t.reference_inertia.push_back(scene.inertia[scene.vertex_order[i]]);
+  t.coarse_factor = coarse_factor(coarse, {}, threads);
   progress(1.0);
   return t;
 }

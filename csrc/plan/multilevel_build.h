@@ -21,6 +21,7 @@ struct MultilevelScene {
   const std::int32_t* vertex_order;  // [vertices]
   const double* stiffness;           // [count] Pa
   const double* inertia;             // [vertices] a, inf where a pin holds the vertex exactly [N/m]
+  std::int64_t most_direct;          // vertices of a mesh that needs no levels: M is A^-1 itself
 };
 
 // The table as vectors.

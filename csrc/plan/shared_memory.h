@@ -56,7 +56,7 @@ constexpr bool is_near(std::size_t real, std::size_t slots, std::size_t pairs,
 constexpr std::size_t pass_static_bytes = 3 * 32 * sizeof(double);
 
 // the same with all that the iterations of the multilevel solver keep
-constexpr std::size_t outer_static_bytes = 7168;
+constexpr std::size_t outer_static_bytes = 4608;
 
 // `fields` vectors of every slot, one or two
 constexpr std::size_t pass_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,

@@ -32,6 +32,7 @@ enum LevelSize : int {
   level_middle_entries,
   level_middle_lifts,
   level_middle_nodes,  // below the middle level
+  level_direct,        // 1: no levels, A itself is solved directly
   level_size_count
 };
 
@@ -43,10 +44,13 @@ struct Levels {
 #include "plan/multilevel.def"
 #undef X
   int vertices = 0, fine_nodes = 0, middle_nodes = 0;
+  bool direct = false;
 
   PD_HD bool there() const { return fine_start != nullptr; }
   PD_HD bool has_middle() const { return middle_nodes > 0; }
-  PD_HD int coarse_nodes() const { return has_middle() ? middle_nodes : fine_nodes; }
+  PD_HD int coarse_unknowns() const {
+    return direct ? vertices : 4 * (has_middle() ? middle_nodes : fine_nodes);
+  }
 };
 
 template <class T>

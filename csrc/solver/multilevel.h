@@ -50,7 +50,7 @@ PD_HD void multilevel_iterations(Runner& run, const Settings& settings) {
   run.settle();  // on the last trial that was better
 }
 
-// ---- M: a symmetric V-cycle
+// ---- M: a symmetric V-cycle, or A^-1 where the plan says so (Levels::direct)
 
 // Chebyshev's polynomial of degree 2 for eigenvalues of D^-1 A in [1/4, 1], from zero (Saad 2003, algorithm 12.1):
 //   w = first / D r,   z = keep w + second / D (r - A w)
