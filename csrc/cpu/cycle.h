@@ -1,5 +1,6 @@
 // The preconditioner M of solver/multilevel.h on the CPU: one V-cycle, or a direct solve, by a team of threads, in a fixed order of sums.
 #pragma once
+#include "cpu/dense.h"
 #include "cpu/team.h"
 #include "cpu/workspace.h"
 #include "solver/multilevel.h"
@@ -132,38 +133,8 @@ class Cycle {
     team.barrier();
   }
 
-  static std::int64_t row_of_factor(std::int64_t i) { return i * (i + 1) / 2; }
-
-  // L^-T (L^-1 r): symmetric and positive in any precision. Rows differ in length, so threads take them in turn.
   void solve_coarse(const Team& team) const {
-    constexpr int chains = 4;
-    for (int i = team.rank; i < coarse_; i += team.size) {
-      const T* row = levels_.coarse_factor + row_of_factor(i);
-      Value sum[chains] = {};
-      int j = 0;
-      for (; j + chains <= i + 1; j += chains) {
-        for (int c = 0; c < chains; ++c)
-          sum[c] = multiply_add(Real(row[j + c]), coarse_in_[j + c], sum[c]);
-      }
-      for (int c = 0; j + c <= i; ++c)
-        sum[c] = multiply_add(Real(row[j + c]), coarse_in_[j + c], sum[c]);
-      coarse_half_[i] = (sum[0] + sum[1]) + (sum[2] + sum[3]);
-    }
-    team.barrier();
-    constexpr int strip = 8;
-    for (int first = team.rank * strip; first < coarse_; first += team.size * strip) {
-      const int columns = coarse_ - first < strip ? coarse_ - first : strip;
-      Value sum[strip] = {};
-      const auto add = [&](int i, int filled) {
-        const T* row = levels_.coarse_factor + row_of_factor(i) + first;
-        for (int j = 0; j < filled; ++j)
-          sum[j] = multiply_add(Real(row[j]), coarse_half_[i], sum[j]);
-      };
-      for (int i = first; i < first + columns; ++i) add(i, i - first + 1);
-      for (int i = first + columns; i < coarse_; ++i) add(i, strip);
-      for (int j = 0; j < columns; ++j) coarse_out_[first + j] = sum[j];
-    }
-    team.barrier();
+    Dense<Lanes>(levels_.coarse_factor, coarse_).solve(team, coarse_in_, coarse_half_, coarse_out_);
   }
 
   const Levels<T>& levels_;
