@@ -150,7 +150,7 @@ def test_hard_first_iterates(kind: str, batch: int, dtype: torch.dtype, device: 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_energy_never_rises_at_a_restart_on_slivers(seed: int, dtype: torch.dtype, device: torch.device) -> None:
-    """The check at u_k acts on the step from u_{k+1} to u_{k+2}, which is then plain descent; rounding of E apart."""
+    """The check at u_k acts on the step from u_{k+2} to u_{k+3}, which is then plain descent; rounding of E apart."""
     assert longest_spread(sliver_mesh(seed=seed)) > 3.95
     case = slivers(seed=seed)
     sim = simulator(case, dtype, device)
@@ -172,4 +172,4 @@ def test_energy_never_rises_at_a_restart_on_slivers(seed: int, dtype: torch.dtyp
     # E is a sum of squares, so its relative rounding is that of a square and of a sum, here of some 200 terms a lane
     slack = 1.0 + 200 * torch.finfo(dtype).eps
     for k in restarted:
-        assert look(k + 2)[0] <= look(k + 1)[0] * slack
+        assert look(k + 3)[0] <= look(k + 2)[0] * slack

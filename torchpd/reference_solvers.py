@@ -107,12 +107,13 @@ def _iterate(
     """u_{k+1} = P(u_{k-1} + omega_k (u_k - theta g / D - u_{k-1})), u_{-1} = u_0."""
     result = Iterates(first, 1.0, 0)
     previous = current = first
+    coming = schedule.omega(0)
     for k in range(iterations):
         energy, gradient = problem.evaluate(current)
-        omega = schedule.omega(k)
+        omega, coming = coming, schedule.omega(k + 1)
         if k % 4 == 0:
             result.energies.append((k, energy))
-            # the check acts on the next omega: element and vertex work of an iteration are one pass
+            # acts on the omega after the next: the sums of one iteration are worked out during the next
             if schedule.check(energy):
                 result.restarts.append(k)
         step = current - relaxation * gradient / diagonal[:, None]

@@ -71,6 +71,7 @@ class Stepper {
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
       schedule_[lane] = Schedule(set_, least_[lane], Lanes::lane(friction, lane) > 0);
+      coming_[lane] = schedule_[lane].next(0);
       used_[lane] = 0;
       done_[lane] = false;
     }
@@ -96,7 +97,7 @@ class Stepper {
 
   void iterate(int k) {
     for (int lane = 0; lane < width; ++lane) {
-      Lanes::set_lane(omega_, lane, T(schedule_[lane].next(k)));
+      Lanes::set_lane(omega_, lane, T(coming_[lane]));
       Lanes::set_lane(active_, lane, T(done_[lane] ? 0 : 1));
     }
     const bool guard = schedule_[0].wants_energy(k);
@@ -272,7 +273,10 @@ class Stepper {
   // every thread adds up the same parts in the same order, so all come to the same decisions
   void conclude(int k, bool guard) {
     const bool soft = set_.tolerance > 0;
-    for (int lane = 0; lane < width; ++lane) used_[lane] += done_[lane] ? 0 : 1;
+    for (int lane = 0; lane < width; ++lane) {
+      used_[lane] += done_[lane] ? 0 : 1;
+      coming_[lane] = schedule_[lane].next(k + 1);
+    }
     if (!guard && !soft) return;
     const auto sum = total(k & 1);
     for (int lane = 0; lane < width; ++lane) {
@@ -329,6 +333,7 @@ class Stepper {
   Wide energy_ = Wide(0.0), residual_ = Wide(0.0);
   double least_[width] = {}, course_[width] = {};
   Schedule schedule_[width];
+  double coming_[width] = {};  // the next omega
   int used_[width] = {};
   bool done_[width] = {};
 };

@@ -22,7 +22,7 @@ struct Least {
 // The same bits in all lanes, since both partners of an exchange combine the same two numbers.
 template <class Op>
 PD_DEVICE double across_warp(double value, Op op) {
-#pragma unroll 1
+#pragma unroll
   for (int distance = warp_size / 2; distance > 0; distance /= 2) {
     value = op(value, __shfl_xor_sync(whole_warp, value, distance));
   }

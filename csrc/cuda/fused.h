@@ -20,8 +20,8 @@ template <class T, bool Touching, Blocks Kind, bool Near>
 class FusedRunner {
   static constexpr bool Many = Kind != Blocks::one;  // patches an environment
   static constexpr bool Once = Near && near_once(sizeof(T));
-  // whether threads have registers for it; a near grid has its vertices at hand
-  static constexpr bool looks_ahead = Kind == Blocks::cluster || (Kind == Blocks::grid && !Near);
+  // near patches have their vertices at hand
+  static constexpr bool looks_ahead = Kind == Blocks::grid && !Near;
   using Lanes = Thread<T>;
   using Letter = pd::Letter<T>;
   using Seen = typename Vertices<T, Touching>::Seen;
@@ -120,7 +120,6 @@ class FusedRunner {
       control_.progress.done = false;
     }
     finished_ = pending_ = false;
-    afresh_ = true;
     started_ = false;
     __syncthreads();
   }
@@ -147,42 +146,54 @@ class FusedRunner {
 
   PD_DEVICE void iterate(int k) {
     const bool guard = set_.schedule == ScheduleKind::guarded && k % guard_period == 0;
-    if (pending_ && leads()) sums_.send(Add{});
+    const bool stops = set_.tolerance > 0, early = guard && leaves_early();
+    if (pending_ && !leaves_early() && leads()) sums_.send(Add{});
     const auto lead = [&] {
-      conclude();
-      if (!is_leader()) return;
-      if (!Many || afresh_) coming_ = T(control_.progress.schedule.next(k));
-      afresh_ = false;
-      control_.omega = coming_;
-      if (!control_.progress.done) ++control_.progress.used;
+      if (is_leader()) {
+        if (!Many || k == 0) coming_ = T(control_.progress.schedule.next(k));
+        control_.omega = coming_;
+      }
+      if (pending_ && (stops || !Many)) conclude();
+      if (is_leader() && !control_.progress.done) ++control_.progress.used;
     };
     if constexpr (Many) {
       // one copy of the code, which several patches have to hold in the cache
-      pass<true>(SolidGradient<true>{guard}, lead,
+      pass<true>(SolidGradient<true>{guard}, lead, early,
                  [&](const Seat& at, const Seen& seen, const Vec3<T>& force) {
-                   if (guard && at.owned()) energy_ += seen.energy();
+                   if (guard && !early && at.owned()) energy_ += seen.energy();
                    update(at, seen, force);
                  });
     } else if (guard) {
-      pass<true>(SolidGradient<true>{}, lead,
+      pass<true>(SolidGradient<true>{}, lead, false,
                  [&](const Seat& at, const Seen& seen, const Vec3<T>& force) {
                    energy_ += seen.energy();
                    update(at, seen, force);
                  });
     } else {
       pass<true>(
-          SolidGradient<false>{}, lead,
+          SolidGradient<false>{}, lead, false,
           [&](const Seat& at, const Seen& seen, const Vec3<T>& force) { update(at, seen, force); });
     }
-    pending_ = false;
-    if (finished_) return;
-    if (guard || set_.tolerance > 0) {
-      sums_.leave({energy_, first_, second_}, set_.tolerance > 0 ? sums_count : 1, Add{});
-      pending_ = true;
+    if (finished_) {
+      pending_ = false;
+      return;
+    }
+    if ((guard && !early) || stops)
+      sums_.leave({energy_, first_, second_}, stops ? sums_count : 1, Add{});
+    if constexpr (Many) {
+      // while others are still busy
+      if (leads()) {
+        if (early) {
+          sums_.gather();
+          sums_.send(Add{});
+        } else if (pending_ && !stops) {
+          conclude();
+        }
+        if (is_leader()) coming_ = T(control_.progress.schedule.next(k + 1));
+      }
     }
     guarding_ = guard;
-    // while the others are still busy: the weight that holds if the energy has not risen
-    if (Many && is_leader()) coming_ = T(control_.progress.schedule.next(k + 1));
+    pending_ = guard || stops;
     __syncthreads();
   }
 
@@ -200,7 +211,7 @@ class FusedRunner {
     settle();
     __syncthreads();
     pass<false>(
-        SolidGradient<true>{}, [] {},
+        SolidGradient<true>{}, [] {}, false,
         [&](const Seat& at, const Seen& seen, const Vec3<T>& force) {
           if (!at.owned()) return;
           energy_ += seen.energy();
@@ -292,12 +303,12 @@ class FusedRunner {
   }
 
   // Elements, then every slot once with the force on its vertex. `lead` is for the leading warp, before the slots; where it
-  // `MayStop`, an environment that is done is not visited any more.
+  // `MayStop`, an environment that is done is not visited any more. `early`: the energy is left to the leading warp before.
   template <bool MayStop, class Element, class Lead, class Visit>
-  PD_DEVICE void pass(const Element& element, const Lead& lead, const Visit& visit) {
+  PD_DEVICE void pass(const Element& element, const Lead& lead, bool early, const Visit& visit) {
     energy_ = double(each_element(element));
     first_ = second_ = 0;
-    late_ = Many && MayStop && pending_;
+    late_ = Many && MayStop && pending_ && set_.tolerance > 0;
     if (!late_ && leads()) lead();
     if constexpr (looks_ahead) see_first();
     __syncthreads();
@@ -309,7 +320,7 @@ class FusedRunner {
     // of several patches only late, when what others wait for has been sent
     if (finished_) return;
     if constexpr (Many && Near) {
-      visit_seat<MayStop>(visit);
+      visit_seat<MayStop>(early, visit);
     } else if constexpr (Many) {
       visit_patch<MayStop>(visit);
     } else {
@@ -372,14 +383,17 @@ class FusedRunner {
   PD_DEVICE void visit_patch(const Visit& visit);
   PD_DEVICE void see_first();
   template <bool MayStop, class Visit>
-  PD_DEVICE void visit_seat(const Visit& visit);
+  PD_DEVICE void visit_seat(bool early, const Visit& visit);
+  PD_DEVICE void leave_energy();
+
+  // Whether energies are left and sent while letters are on their way.
+  PD_DEVICE bool leaves_early() const { return Many && Near && !(set_.tolerance > 0); }
 
   // Leading warp: what follows from the sums of the last iteration.
   PD_DEVICE void conclude() {
-    if (!pending_) return;
     sums_.receive(Add{});
     if (lane() == 0) {
-      if (guarding_ && control_.progress.schedule.check(sums_.total(0))) afresh_ = true;
+      if (guarding_) control_.progress.schedule.check(sums_.total(0));
       const double limit = set_.tolerance * set_.tolerance * sums_.total(2);
       if (set_.tolerance > 0 && sums_.total(1) <= limit) control_.progress.done = true;
     }
@@ -390,7 +404,7 @@ class FusedRunner {
   PD_DEVICE void settle() {
     if (!pending_) return;
     if (leads()) {
-      sums_.send(Add{});
+      if (!leaves_early()) sums_.send(Add{});
       conclude();
     }
     pending_ = false;
@@ -431,7 +445,7 @@ class FusedRunner {
     __syncthreads();
     double least = HUGE_VAL;
     pass<false>(
-        SolidDiagonal{}, [] {},
+        SolidDiagonal{}, [] {}, false,
         [&](const Seat& at, const Seen&, const Vec3<T>& elastic) {
           least = Least{}(least, v_.weigh(at.slot, elastic.x));
         });
@@ -505,9 +519,7 @@ class FusedRunner {
   double energy_ = 0, first_ = 0, second_ = 0;  // this thread's part of the sums
   unsigned round_ = 0;                          // exchanges of letters so far
   bool finished_ = false, pending_ = false, guarding_ = false, started_ = false, late_ = false;
-  // of the leader: the next omega, which is to be worked out again where the schedule starts afresh
-  T coming_ = T(1);
-  bool afresh_ = true;
+  T coming_ = T(1);  // of the leader: the next omega
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -57,37 +57,48 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_patch(const Visit& vi
   }
 }
 
+// What the guard wants to know of this iterate, before it is moved.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::leave_energy() {
+  if (int(threadIdx.x) < patch_.slots && at_.owned()) energy_ += seen_.energy();
+  sums_.leave_early({energy_, 0, 0}, 1, Add{});
+}
+
 // The same where each thread has the one seat of its number. Warps wait as one, else lanes would go on one after another.
 template <class T, bool Touching, Blocks Kind, bool Near>
 template <bool MayStop, class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_seat(const Visit& visit) {
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_seat(bool early, const Visit& visit) {
   ++round_;
   const int seat = threadIdx.x, shared = patch_.shared();
-  const bool sends = seat < shared, waits = seat - lane() < shared;
+  // of the warp: any slots, any shared ones
+  const bool here = seat - lane() < patch_.slots, waits = seat - lane() < shared;
+  const bool sends = seat < shared;
   if (Kind == Blocks::cluster && seat == 0) mail_.expect(round_);
-  Vec3<T> force = sum_entries_soon(entries_, row_);
-  if (sends) {
+  Vec3<T> force = {T(0), T(0), T(0)};
+  if (here) {
+    force = sum_entries_soon(entries_, row_);
     if constexpr (Kind == Blocks::cluster) {
-      mail_.send(force, round_);
+      if (waits) mail_.send(force, round_);
     } else {
-      post(seat, force);
+      if (sends) post(seat, force);
     }
+    see(seat);
   }
+  if (early) leave_energy();
   __syncwarp();
   if (Kind == Blocks::cluster && waits) mail_.wait(round_);
   heed_late<MayStop>();
-  if (finished_) return;
+  if (finished_ || !here) return;
   if (waits) {
     Vec3<T> sum;
     if constexpr (Kind == Blocks::cluster) {
-      if (sends) sum = mail_.receive(round_);
+      sum = mail_.receive(round_);
     } else {
       sum = read(seat);
     }
     if (sends) force = sum;
+    __syncwarp();
   }
-  if constexpr (!looks_ahead) see(seat);
-  __syncwarp();
   if (seat < patch_.slots) visit(at_, seen_, force);
   __syncwarp();
 }

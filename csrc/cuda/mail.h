@@ -37,20 +37,17 @@ class ClusterMail {
       }
       more = names.more;
     }
-    unsigned from = sharers_, to = sharers_ & ~(1u << own_);
+    unsigned left = sharers_;
 #pragma unroll
-    for (int j = 0; j < most_near; ++j, from &= from - 1) {
-      column_[j] = (__ffs(int(from)) - 1) * seats_ + seat;
+    for (int j = 0; j < most_near; ++j, left &= left - 1) {
+      const int p = left ? __ffs(int(left)) - 1 : own_;
+      near_[j / 2] |= unsigned(p << seat_bits | (left ? seat_[p * seats_ + seat] : 0))
+                      << 16 * (j % 2);
     }
-#pragma unroll
-    for (int j = 0; j < most_near - 1; ++j, to &= to - 1) {
-      const int p = to ? __ffs(int(to)) - 1 : own_;
-      const int there = to ? seat_[p * seats_ + seat] : 0;
-      to_[j] = at_block(shared_address(letters_ + own_ * seats_ + there), p);
-      meets_[j] = at_block(barrier(0).address(), p);
-    }
+    const int sharers = __popc(sharers_);
+    most_ = __reduce_max_sync(whole_warp, sharers);
     int letters = 0;
-    const int others = sharers_ ? __popc(sharers_) - 1 : 0;
+    const int others = sharers > 0 ? sharers - 1 : 0;
     for (int bit = 0; bit < 4; ++bit) letters += __syncthreads_count(others >> bit & 1) << bit;
     expected_ = letters * int(sizeof(Quad<T>));
     if (threadIdx.x == 0) {
@@ -63,54 +60,70 @@ class ClusterMail {
     if (expected_ > 0) barrier(round).expect(expected_);
   }
 
-  // A thread with a seat that is shared.
+  // Whole warps; threads whose seat is not shared send nothing.
   PD_DEVICE void send(const Vec3<T>& force, unsigned round) const {
     const Quad<T> letter = quad(force);
-    const int seat = threadIdx.x, sharers = __popc(sharers_);
-    Quad<T>* const here = place(round);
-    here[own_ * seats_ + seat] = letter;
-    const int second = (round & 1) * patches_ * seats_ * int(sizeof(Quad<T>));
-    const int second_barrier = (round & 1) * int(sizeof(std::uint64_t));
+    const int seat = threadIdx.x;
+    Quad<T>* const row = place(round) + own_ * seats_;
+    if (sharers_) row[seat] = letter;
+    const SharedAddress to = shared_address(row), meets = barrier(round).address();
+    const auto post = [&](int p, int there, bool wanted) {
+      pd::send(at_block(to + there * int(sizeof(Quad<T>)), p), at_block(meets, p), letter, wanted);
+    };
+    const int sharers = __popc(sharers_);
 #pragma unroll
-    for (int j = 0; j < most_near - 1; ++j) {
-      if (j < sharers - 1) pd::send(to_[j] + second, meets_[j] + second_barrier, letter);
+    for (int j = 0; j < most_near; ++j) {
+      if (j >= most_) return;
+      const unsigned name = near(j);
+      const int p = int(name >> seat_bits);
+      post(p, int(name & (most_seats - 1)), j < sharers && p != own_);
     }
     if (sharers <= most_near) return;
-    const SharedAddress row = shared_address(here + own_ * seats_);
-    const SharedAddress meets = barrier(round).address();
-    int near = 0;
-    for (unsigned left = sharers_ & ~(1u << own_); left; left &= left - 1) {
-      if (++near < most_near) continue;
+    int count = 0;
+    for (unsigned left = sharers_; left; left &= left - 1) {
+      if (++count <= most_near) continue;
       const int p = __ffs(int(left)) - 1;
-      const SharedAddress to = row + seat_[p * seats_ + seat] * int(sizeof(Quad<T>));
-      pd::send(at_block(to, p), at_block(meets, p), letter);
+      post(p, seat_[p * seats_ + seat], p != own_);
     }
   }
 
   // until all letters are there
   PD_DEVICE void wait(unsigned round) const { barrier(round).wait((round - 1) >> 1 & 1); }
 
-  // The thread that sent, after the wait: the sum of what all patches sent.
+  // Whole warps, after the wait: the sum of what all patches sent, zero where the seat is not shared.
   PD_DEVICE Vec3<T> receive(unsigned round) const {
-    Vec3<T> sum = {T(0), T(0), T(0)};
-    const Quad<T>* const letters = place(round);
+    const Quad<T>* const letters = place(round) + threadIdx.x;
     const int sharers = __popc(sharers_);
+    Vec3<T> sum = {T(0), T(0), T(0)};
 #pragma unroll
-    for (int j = 0; j < most_near; ++j) {
-      if (j < sharers) sum = sum + vec3(letters[column_[j]]);
+    for (int first = 0; first < most_near; first += 4) {
+      if (first >= most_) return sum;
+      // asked for at once
+      Vec3<T> part[4];
+#pragma unroll
+      for (int j = 0; j < 4; ++j) {
+        part[j] = {T(0), T(0), T(0)};
+        if (first + j < sharers)
+          part[j] = vec3(letters[int(near(first + j) >> seat_bits) * seats_]);
+      }
+#pragma unroll
+      for (int j = 0; j < 4; ++j) sum = sum + part[j];
     }
     if (sharers <= most_near) return sum;
-    int near = 0;
+    int count = 0;
     for (unsigned left = sharers_; left; left &= left - 1) {
-      if (++near <= most_near) continue;
-      sum = sum + vec3(letters[(__ffs(int(left)) - 1) * seats_ + int(threadIdx.x)]);
+      if (++count > most_near) sum = sum + vec3(letters[(__ffs(int(left)) - 1) * seats_]);
     }
     return sum;
   }
 
  private:
   static constexpr int barriers_bytes = 16;
-  static constexpr int most_near = 4;  // patches of a vertex whose places are known beforehand
+  static constexpr int most_near = 8;  // patches of a vertex that are known without a look
+  static constexpr int seat_bits = 12, most_seats = 1 << seat_bits;
+
+  // The j-th patch that has the vertex of this thread's seat, and in the lower bits which seat it has there.
+  PD_DEVICE unsigned near(int j) const { return near_[j / 2] >> 16 * (j % 2) & 0xffff; }
 
   PD_DEVICE ByteBarrier barrier(unsigned round) const {
     return ByteBarrier(barrier_ + (round & 1));
@@ -123,11 +136,9 @@ class ClusterMail {
   Quad<T>* letters_;
   std::uint16_t* seat_;
   int seats_, patches_, own_;
-  // of the first patches that have the vertex of this thread's seat: where letters from there lie, and in order without
-  // this one where letters to there go and which barrier counts them
-  int column_[most_near];
-  SharedAddress to_[most_near - 1], meets_[most_near - 1];
+  unsigned near_[most_near / 2] = {};  // two of 16 bits each
   unsigned sharers_ = 0;  // a bit for each patch that has the vertex of this thread's seat
+  int most_ = 0;          // such patches of a thread of this warp
   int expected_ =
       0;  // bytes a round: at most 512 seats of 15 letters, and a barrier counts to 2^20
 };

@@ -284,11 +284,12 @@ __global__ void __launch_bounds__(vertex_threads)
     const bool soft = set.tolerance > 0;
     if (p.done) return;
     p.used += soft;
-    if (p.schedule.wants_energy(k)) p.schedule.check(total[0]);
     p.done = soft && total[1] <= set.tolerance * set.tolerance * total[2];
+    const auto weigh = [&](int next) { omega[next % guard_period] = p.schedule.next(next); };
+    weigh(k + 1);
+    if (p.schedule.wants_energy(k)) p.schedule.check(total[0]);
     // where nothing is asked in between, until the next look at the energy
-    for (int next = k + 1; next <= k + (soft ? 1 : guard_period); ++next)
-      omega[next % guard_period] = p.schedule.next(next);
+    for (int next = k + 2; !soft && next <= k + guard_period; ++next) weigh(next);
   } else {
     p.energy = total[0];
     (What == Decision::course ? p.course : p.residual) = total[1];

@@ -43,6 +43,15 @@ class TeamSums {
     }
   }
 
+  // The same, for the leading warp to gather before that barrier.
+  template <class Op>
+  PD_DEVICE void leave_early(const double (&value)[sums_count], int wanted, Op op) {
+    leave(value, wanted, op);
+    __syncwarp();
+    if (!leads()) asm volatile("bar.arrive 1, %0;" ::"r"(blockDim.x) : "memory");
+  }
+  PD_DEVICE void gather() const { asm volatile("bar.sync 1, %0;" ::"r"(blockDim.x) : "memory"); }
+
   // Leading warp: the sums of the block, to the other blocks.
   template <class Op>
   PD_DEVICE void send(Op op) {

@@ -3,7 +3,8 @@
 // classic   omega = 1 for k < S;  2 / (2 - rho^2) at k = S;  4 / (4 - rho^2 omega) after     (Wang 2015, eq. 14)
 // guarded   omega = 1 + min(b, n / (n + 3)), b = ((1 - sqrt(1 - rho^2)) / rho)^2 the limit of the classic sequence,
 //           n counted from the last restart; a restart whenever the energy rose between two checks. With n = 0 the step
-//           is plain descent on the weighted diagonal, which never raises the energy.
+//           is plain descent on the weighted diagonal, which never raises the energy. E(u_k) decides on omega from k + 2
+//           on, so that blocks of threads need not wait for each other's sums.
 #pragma once
 #include "math/scalar.h"
 #include "plan/views.h"
@@ -55,15 +56,14 @@ struct Schedule {
     return kind == ScheduleKind::guarded && k % guard_period == 0;
   }
 
-  // Whether it starts afresh.
-  PD_HD bool check(double energy) {
+  // E(u_k), after omega_{k+1} is known: a restart counts from the next one on.
+  PD_HD void check(double energy) {
     const bool rose = energy > last_energy + slack * absolute(last_energy);
     if (rose) {
       momentum = 0;
       ++restarts;
     }
     last_energy = energy;
-    return rose;
   }
 };
 
