@@ -2,6 +2,7 @@
 #pragma once
 #include "cuda/arena.h"
 #include "cuda/fused_momentum.h"
+#include "cuda/fused_start.h"
 #include "cuda/fused_visit.h"
 #include "cuda/launch.h"
 #include "cuda/runtime.h"

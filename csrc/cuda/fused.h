@@ -346,36 +346,17 @@ class FusedRunner {
     heed<MayStop>();
   }
 
-  // Shared slots have the first seats.
-  PD_DEVICE int slot_of_seat(int seat) const {
-    const int shared = patch_.shared();
-    return seat < shared ? patch_.interior + seat : seat - shared;
-  }
-  PD_DEVICE int row_of_seat(int seat) const {
-    return seat == int(threadIdx.x) ? row_ : patch_.row(slot_of_seat(seat));
-  }
-  // rounds of this warp's threads for so many seats
-  PD_DEVICE int rounds(int seats) const {
-    const int threads = blockDim.x;
-    return max(0, (seats - (int(threadIdx.x) - lane()) + threads - 1) / threads);
-  }
-  // In a visit the rounds without shared seats come first: letters are on the way meanwhile.
-  PD_DEVICE int seat_of_visit(int visit) const {
-    const int waiting = rounds(patch_.shared()), all = rounds(patch_.slots);
-    const int round = visit + waiting < all ? visit + waiting : visit + waiting - all;
-    return int(threadIdx.x) + round * int(blockDim.x);
-  }
-  PD_DEVICE void see(int seat) {
-    if (seat >= patch_.slots) return;
-    const int slot = slot_of_seat(seat);
-    seen_ = v_.see(slot);
-    at_ = {slot, row_of_seat(seat), vec3(origin_[slot])};
-  }
+  // ---- visits: cuda/fused_visit.h
+
+  PD_DEVICE int slot_of_seat(int seat) const;
+  PD_DEVICE int row_of_seat(int seat) const;
+  PD_DEVICE int rounds(int seats) const;
+  PD_DEVICE int seat_of_visit(int visit) const;
+  PD_DEVICE void see(int seat);
 
   // shared slots of earlier patches
   PD_DEVICE int earlier_shared() const { return patch_.first_slot - patch_.first_vertex; }
 
-  // cuda/fused_visit.h
   PD_DEVICE void post(int seat, const Vec3<T>& force) const;
   PD_DEVICE void post_shared();
   PD_DEVICE Vec3<T> read(int seat) const;
@@ -411,60 +392,12 @@ class FusedRunner {
     __syncthreads();
   }
 
-  // ---- start of a call
+  // ---- start of a call: cuda/fused_start.h
 
-  PD_DEVICE void load() {
-    if (threadIdx.x == 0) in_.read_contacts(planes_, balls_);
-    contacts_ = {planes_, balls_, call_.material.planes_count, call_.material.spheres_count};
-    each_slot([&](int s) {
-      v_.load(s, in_, patch_.vertex(s), h_);
-      const Vec3<T> none = {T(0), T(0), T(0)};
-      if constexpr (Many) {
-        slots_.set(s, none, rest_of<true>(patch_).position[s].bits());
-      } else {
-        position_[s] = quad(none);
-      }
-    });
-    __syncthreads();
-  }
-
-  PD_DEVICE void move_balls() {
-    if constexpr (!Touching) return;
-    __syncthreads();
-    for (int b = threadIdx.x; b < contacts_.ball_count; b += blockDim.x)
-      balls_[b].center = balls_[b].center + balls_[b].motion;
-    __syncthreads();
-  }
-
-  // a and 1 / D of every vertex, w V of every element, and the smallest a / D
-  PD_DEVICE void weigh() {
-    const T* stiffness = call_.material.stiffness.of(in_.environment);
-    weigh_with(stiffness, set_.weighted);
-    if (threadIdx.x == 0) control_.progress.done = false;
-    pending_ = false;
-    __syncthreads();
-    double least = HUGE_VAL;
-    pass<false>(
-        SolidDiagonal{}, [] {}, false,
-        [&](const Seat& at, const Seen&, const Vec3<T>& elastic) {
-          least = Least{}(least, v_.weigh(at.slot, elastic.x));
-        });
-    sums_.all_reduce({least, 0, 0}, 1, Least{});
-    if (threadIdx.x == 0) control_.progress.least = sums_.total(0);
-    if (set_.weighted) weigh_with(stiffness, false);
-    __syncthreads();
-  }
-
-  PD_DEVICE void weigh_with(const T* stiffness, bool bounded) {
-    weigh_pairs(patch_, rest_of<Many>(patch_), stiffness, bounded, weights());
-    __syncthreads();  // one lane has left the weights of two
-    if constexpr (Many) half_ = read_half(patch_, weights(), threadIdx.x);
-    if constexpr (Many && Near) {
-      Quad<T> seen[4];
-      look(half_, slots_, seen);
-      inverse_ = half_inverse(half_, slots_, seen);
-    }
-  }
+  PD_DEVICE void load();
+  PD_DEVICE void move_balls();
+  PD_DEVICE void weigh();
+  PD_DEVICE void weigh_with(const T* stiffness, bool bounded);
 
   // ---- momentum: cuda/fused_momentum.h
 

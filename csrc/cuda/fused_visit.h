@@ -4,6 +4,41 @@
 
 namespace pd::inline PD_TARGET {
 
+// Shared slots have the first seats.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE int FusedRunner<T, Touching, Kind, Near>::slot_of_seat(int seat) const {
+  const int shared = patch_.shared();
+  return seat < shared ? patch_.interior + seat : seat - shared;
+}
+
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE int FusedRunner<T, Touching, Kind, Near>::row_of_seat(int seat) const {
+  return seat == int(threadIdx.x) ? row_ : patch_.row(slot_of_seat(seat));
+}
+
+// rounds of this warp's threads for so many seats
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE int FusedRunner<T, Touching, Kind, Near>::rounds(int seats) const {
+  const int threads = blockDim.x;
+  return max(0, (seats - (int(threadIdx.x) - lane()) + threads - 1) / threads);
+}
+
+// In a visit the rounds without shared seats come first: letters are on the way meanwhile.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE int FusedRunner<T, Touching, Kind, Near>::seat_of_visit(int visit) const {
+  const int waiting = rounds(patch_.shared()), all = rounds(patch_.slots);
+  const int round = visit + waiting < all ? visit + waiting : visit + waiting - all;
+  return int(threadIdx.x) + round * int(blockDim.x);
+}
+
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::see(int seat) {
+  if (seat >= patch_.slots) return;
+  const int slot = slot_of_seat(seat);
+  seen_ = v_.see(slot);
+  at_ = {slot, row_of_seat(seat), vec3(origin_[slot])};
+}
+
 // Of a grid: the force on a shared vertex goes to the other patches.
 template <class T, bool Touching, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::post(int seat, const Vec3<T>& force) const {

@@ -1,0 +1,83 @@
+// What the kernel of the multilevel solver is given, and what it keeps where.
+#pragma once
+#include "cuda/cycle.h"
+#include "cuda/pairs.h"
+#include "cuda/stream.h"
+
+namespace pd::inline PD_TARGET {
+
+constexpr int outer_dots = 2 * history + 3;  // sums that one pass over the vertices may make
+constexpr int ranges_count = 2;              // that a round of Ranges compares
+constexpr int most_chunks = 640;             // of vertices, whose sums every block adds up
+// Threads of a block: a multiprocessor each, but for meshes of one patch, of which two share it. Few enough that each has the
+// registers for what it asks of memory at once.
+constexpr int outer_threads = 512, small_outer_threads = 256;
+constexpr int small_outer_blocks = 2;
+constexpr int outer_warps = outer_threads / warp_size;
+
+// Device memory of the teams.
+template <class T>
+struct OuterMemory {
+  Quad<T>*base, *pull, *fresh;        // [teams, vertices]
+  Quad<T>*s, *y;                      // [teams, history, vertices], with pairs
+  Mat3<T>*free, *fresh_free;          // [teams, vertices], with contacts
+  Quad<T>*gradient, *fresh_gradient;  // [teams, vertices], with contacts
+  CycleMemory<T> cycle;               // [teams, ...]
+  double* chunk_dots;                 // [teams, 2, outer_dots, chunks], passes alternate
+  double* patch_sums;                 // [teams, patches, sums_count]
+  Range* ranges;                      // [teams, 2, blocks, ranges_count], rounds alternate
+  Misfit* misfit;                     // [batch]
+  unsigned* counter;                  // [teams], zero at the launch
+};
+
+template <class T>
+struct OuterCall {
+  StreamCall<T> stream;
+  OuterMemory<T> memory;
+  int teams, blocks;         // blocks of a team
+  std::size_t shared_cycle;  // where the cycle's fields stand in shared memory; 0: in device memory
+
+  PD_HD const DevicePlan<T>& plan() const { return stream.step.plan; }
+  // Warps whose vertices are added up together, a divisor of those of a block: one where the block is small, since a patch
+  // has fewer slots than most_chunks warps have lanes. The plan alone decides, so that an environment gives the same bits
+  // whatever the number of blocks.
+  PD_HD int warps_of_chunk() const {
+    for (int warps : {1, 2, 4, 8}) {
+      if (chunks_of(plan().vertices, warps) <= most_chunks) return warps;
+    }
+    return outer_warps;
+  }
+  PD_HD static int chunks_of(int count, int warps) {
+    return (count + warps * warp_size - 1) / (warps * warp_size);
+  }
+  PD_HD int chunks() const { return chunks_of(plan().vertices, warps_of_chunk()); }
+};
+
+// In shared memory: what all threads of a block go by; its first thread decides.
+struct OuterControl {
+  Outer outer;
+  Pairs pairs;
+  double total[outer_dots];
+  double factor[history];  // of the pairs' ways in the direction
+  double warp_dot[outer_warps][outer_dots];
+  bool accepted, finite, done;
+};
+
+// The arrays of one team.
+template <class T>
+PD_DEVICE OuterMemory<T> of_team(const OuterCall<T>& call, int team) {
+  OuterMemory<T> m = call.memory;
+  const std::int64_t n = call.plan().vertices, at = team * n;
+  for (Quad<T>** array : {&m.base, &m.pull, &m.fresh, &m.gradient, &m.fresh_gradient}) *array += at;
+  m.s += history * at;
+  m.y += history * at;
+  m.free += at;
+  m.fresh_free += at;
+  m.cycle = cycle_of_team(call.plan().levels, m.cycle, team);
+  m.chunk_dots += std::int64_t(team) * 2 * call.chunks() * outer_dots;
+  m.patch_sums += std::int64_t(team) * call.plan().patches * sums_count;
+  m.ranges += std::int64_t(team) * 2 * call.blocks * ranges_count;
+  return m;
+}
+
+}  // namespace pd::inline PD_TARGET
