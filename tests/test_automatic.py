@@ -128,7 +128,7 @@ def test_print_says_why_and_any_other_solver_ends_it() -> None:
     text = repr(sim)
     assert "solver: Multilevel lbfgs" in text
     assert (
-        "chosen because about 374 iterations of Chebyshev reach 0.001, or about 25 of Multilevel, each as long as 4.2"
+        "chosen because about 374 iterations of Chebyshev reach 0.001, or about 25 of Multilevel, each as long as 3.8"
         in text
     )
     sim.solver = pd.Chebyshev()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 
 import numpy as np
@@ -15,7 +15,7 @@ from runs import arguments_of, displacement, moving, reference_run, rounded_prob
 from test_determinism import different_environments
 from test_determinism import scene as scene_of_all_effects
 from test_same_iterates import CASES as SAME_CASES
-from test_same_iterates import SOLVERS, in_a_corner, stirred
+from test_same_iterates import RESTARTS, SOLVERS, in_a_corner, restarting, stirred
 
 import torchpd as pd
 from torchpd.reference import StepProblem
@@ -32,7 +32,7 @@ TOLERANCE = {torch.float64: 1e-12, torch.float32: 2e-5}
 # A vertex of 3200 tetrahedra instead of 24 adds up 130 times as many forces: their rounding, of random sign, is 12
 # times as large.
 LOOSE = {"inverted": 10.0, "flat": 10.0, "cones": 12.0}
-COUNTS = (1, 2, 5, 9, 20)
+COUNTS = (1, 2, 5, 6, 9, 20)
 
 
 def graded() -> Case:
@@ -86,9 +86,13 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 
 
+# of RESTARTS; the second for the kernel "far"
+RESTARTING = {"restarting": restarting, "restarting, large": lambda: restarting((25, 4, 4), 20.0, 0.015)}
+
+
 @cache
 def problem_of(name: str, dtype: torch.dtype) -> tuple[Case, StepProblem, Array]:
-    case = CASES[name]()
+    case = {**CASES, **RESTARTING}[name]()
     problem = rounded_problem(case, dtype)
     return case, problem, problem.first_iterate(case.start)
 
@@ -96,13 +100,13 @@ def problem_of(name: str, dtype: torch.dtype) -> tuple[Case, StepProblem, Array]
 @cache
 def reference(name: str, dtype: torch.dtype, solver: str, iterations: int) -> Iterates:
     _, problem, first = problem_of(name, dtype)
-    return reference_run(problem, first, SOLVERS[solver], iterations)
+    return reference_run(problem, first, {**SOLVERS, "restarting": RESTARTS}[solver], iterations)
 
 
-def check(sim: pd.Simulator, name: str, solver: str) -> None:
+def check(sim: pd.Simulator, name: str, solver: str, counts: Sequence[int] = COUNTS) -> None:
     case, problem, _ = problem_of(name, sim.dtype)
     tolerance = TOLERANCE[sim.dtype] * LOOSE.get(name, 1.0)
-    for sim.iterations in COUNTS:
+    for sim.iterations in counts:
         expected = reference(name, sim.dtype, solver, sim.iterations)
         scale = np.abs(expected.displacement).max()
         for batch in (1, 5):
@@ -173,6 +177,18 @@ def test_every_schedule_and_start(name: str, solver: str, kernel: str, precision
 
 
 @pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("kernel", [*KERNELS, "far"])
+def test_a_restart_counts_from_the_second_next_iteration(kernel: str, precision: str) -> None:
+    """However early or late blocks tell each other of their energies: with a tolerance they do it otherwise."""
+    dtype, name = DTYPES[precision], "restarting, large" if kernel == "far" else "restarting"
+    case, *_ = problem_of(name, dtype)
+    for tolerance in (0.0, 1e-30):
+        sim = on_gpu(case, dtype, kernel, solver=RESTARTS, tolerance=tolerance)
+        check(sim, name, "restarting", range(16, 21))
+    assert reference(name, dtype, "restarting", 20).restarts == [16]
+
+
+@pytest.mark.parametrize("precision", DTYPES)
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("start", ["velocity", "inertial", "given"])
 def test_any_number_of_iterations_is_that_of_the_cpu(start: str, kernel: str, precision: str) -> None:
@@ -189,6 +205,7 @@ def test_any_number_of_iterations_is_that_of_the_cpu(start: str, kernel: str, pr
         expected, facts = plain(exact, start=guess.cpu().double() if start == "given" else start, return_info=True)
         assert relative(after.velocities, expected.velocities) <= 2 * TOLERANCE[dtype], count
         assert torch.equal(info.iterations.cpu(), facts.iterations)
+        assert torch.equal(info.restarts.cpu(), facts.restarts)
         # twice the error of the iterate, for E is quadratic
         assert relative(info.energy, facts.energy) <= 8 * TOLERANCE[dtype], count
         assert relative(info.rho, facts.rho) <= 16 * torch.finfo(dtype).eps

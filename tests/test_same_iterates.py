@@ -24,7 +24,7 @@ SOLVERS = {
     "guarded": pd.Chebyshev(),
     "guarded, given rho": pd.Chebyshev(rho=0.9, relaxation=1.2),
 }
-COUNTS = (1, 2, 5, 20)
+COUNTS = (1, 2, 5, 6, 20)
 
 
 def stirred(case: Case, *, seed: int = 0, size: float = 0.01) -> Case:
@@ -93,6 +93,15 @@ def in_a_corner() -> Case:
     return stirred(Case(scene, x, np.tile([-1.0, -1.0, 0.0], (len(x), 1)), 1.0 / 60.0))
 
 
+def restarting(cells: tuple[int, int, int] = (10, 2, 2), youngs: float = 100.0, size: float = 0.03) -> Case:
+    """A bar so soft that with RESTARTS the momentum has grown past its use by iteration 16, where the energy rises."""
+    vertices, tets = box((1.0, 0.2, 0.2), cells)
+    body = pd.Solid(pd.TetMesh(vertices, tets), youngs)
+    scene = pd.Scene(body, pd.Pin(body, vertices[:, 0] == 0.0))
+    return stirred(Case(scene, vertices, 0.0 * vertices, 1.0 / 60.0), size=size)
+
+
+RESTARTS = pd.Chebyshev(rho=0.9999)
 CASES: dict[str, Callable[[], Case]] = {
     "pins, velocity start": lambda: pinned("velocity"),
     "pins, inertial start": lambda: pinned("inertial"),
@@ -124,6 +133,20 @@ def test_iterates_are_those_of_the_reference(
         expected = reference_run(problem, first, solver, sim.iterations)
         for batch in (1, 9):  # lanes run over elements, and over environments
             after, info = sim(state_of(scene, sim, batch), **arguments_of(scene, sim, batch), return_info=True)
+            check_iterate(problem, expected, sim, after, info, item=batch - 1)
+
+
+def test_a_restart_counts_from_the_second_next_iteration(dtype: torch.dtype, device: torch.device) -> None:
+    """E(u_16) has risen, so omega_18 is 1: u_19 is the first that tells."""
+    scene = restarting()
+    problem = rounded_problem(scene, dtype)
+    first = problem.first_iterate(scene.start)
+    sim = simulator(scene, dtype, device, solver=RESTARTS)
+    for sim.iterations in (16, 17, 18, 19, 20):
+        expected = reference_run(problem, first, RESTARTS, sim.iterations)
+        assert expected.restarts == [16] * (sim.iterations > 16)
+        for batch in (1, 9):
+            after, info = sim(state_of(scene, sim, batch), return_info=True)
             check_iterate(problem, expected, sim, after, info, item=batch - 1)
 
 

@@ -144,6 +144,8 @@ class FusedRunner {
     __syncthreads();
   }
 
+  // When the sums of an iteration are sent and concluded: with one block, or where they may stop it, in the next one before
+  // its vertices. Near patches send them at its end, far ones at the start of the next; both conclude at the end of that.
   PD_DEVICE void iterate(int k) {
     const bool guard = set_.schedule == ScheduleKind::guarded && k % guard_period == 0;
     const bool stops = set_.tolerance > 0, early = guard && leaves_early();
@@ -184,7 +186,7 @@ class FusedRunner {
       // while others are still busy
       if (leads()) {
         if (early) {
-          sums_.gather();
+          sums_.await_early();
           sums_.send(Add{});
         } else if (pending_ && !stops) {
           conclude();
@@ -303,7 +305,8 @@ class FusedRunner {
   }
 
   // Elements, then every slot once with the force on its vertex. `lead` is for the leading warp, before the slots; where it
-  // `MayStop`, an environment that is done is not visited any more. `early`: the energy is left to the leading warp before.
+  // `MayStop`, an environment that is done is not visited any more. `early`: energies are left before
+  // the wait for letters.
   template <bool MayStop, class Element, class Lead, class Visit>
   PD_DEVICE void pass(const Element& element, const Lead& lead, bool early, const Visit& visit) {
     energy_ = double(each_element(element));
@@ -367,7 +370,7 @@ class FusedRunner {
   PD_DEVICE void visit_seat(bool early, const Visit& visit);
   PD_DEVICE void leave_energy();
 
-  // Whether energies are left and sent while letters are on their way.
+  // Whether energies are left before the wait for letters, and sent once the leading warp has made its own visits.
   PD_DEVICE bool leaves_early() const { return Many && Near && !(set_.tolerance > 0); }
 
   // Leading warp: what follows from the sums of the last iteration.

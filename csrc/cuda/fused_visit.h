@@ -61,10 +61,17 @@ PD_DEVICE Vec3<T> FusedRunner<T, Touching, Kind, Near>::read(int seat) const {
                          round_);
 }
 
-// What the first visited vertex knows of itself: asked for before the barrier, as the next one's before a visit.
+// Of a far grid: what the first visited vertex knows of itself, asked for before the barrier, as the next one's before a visit.
 template <class T, bool Touching, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::see_first() {
-  see(Near ? int(threadIdx.x) : seat_of_visit(0));
+  see(seat_of_visit(0));
+}
+
+// What the guard wants to know of this iterate, before it is moved.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::leave_energy() {
+  if (int(threadIdx.x) < patch_.slots && at_.owned()) energy_ += seen_.energy();
+  sums_.leave_early({energy_, 0, 0}, 1, Add{});
 }
 
 // A warp's rounds of seats without shared ones, then those whose letters have come meanwhile.
@@ -90,13 +97,6 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_patch(const Visit& vi
     if (here) visit(at, seen, force);
     __syncwarp();
   }
-}
-
-// What the guard wants to know of this iterate, before it is moved.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::leave_energy() {
-  if (int(threadIdx.x) < patch_.slots && at_.owned()) energy_ += seen_.energy();
-  sums_.leave_early({energy_, 0, 0}, 1, Add{});
 }
 
 // The same where each thread has the one seat of its number. Warps wait as one, else lanes would go on one after another.

@@ -7,7 +7,8 @@
 
 namespace pd::inline PD_TARGET {
 
-static_assert(most_cluster_blocks <= 16);  // others of a seat are counted in four bits
+// of a seat others are counted in four bits, and names have four for the patch
+static_assert(most_cluster_blocks <= 16);
 
 // Each thread has the seat of its number: shared slots have the first ones. In shared memory, mail_bytes: two barriers, letters
 // [2, patches, seats], and [patches, seats] which seat the vertex has there.
@@ -39,13 +40,13 @@ class ClusterMail {
     }
     unsigned left = sharers_;
 #pragma unroll
-    for (int j = 0; j < most_near; ++j, left &= left - 1) {
+    for (int j = 0; j < most_named; ++j, left &= left - 1) {
       const int p = left ? __ffs(int(left)) - 1 : own_;
-      near_[j / 2] |= unsigned(p << seat_bits | (left ? seat_[p * seats_ + seat] : 0))
-                      << 16 * (j % 2);
+      names_[j / 2] |= unsigned(p << seat_bits | (left ? seat_[p * seats_ + seat] : 0))
+                       << 16 * (j % 2);
     }
     const int sharers = __popc(sharers_);
-    most_ = __reduce_max_sync(whole_warp, sharers);
+    most_sharers_ = __reduce_max_sync(whole_warp, sharers);
     int letters = 0;
     const int others = sharers > 0 ? sharers - 1 : 0;
     for (int bit = 0; bit < 4; ++bit) letters += __syncthreads_count(others >> bit & 1) << bit;
@@ -72,16 +73,16 @@ class ClusterMail {
     };
     const int sharers = __popc(sharers_);
 #pragma unroll
-    for (int j = 0; j < most_near; ++j) {
-      if (j >= most_) return;
-      const unsigned name = near(j);
-      const int p = int(name >> seat_bits);
-      post(p, int(name & (most_seats - 1)), j < sharers && p != own_);
+    for (int j = 0; j < most_named; ++j) {
+      if (j >= most_sharers_) return;
+      const unsigned there = name(j);
+      const int p = int(there >> seat_bits);
+      post(p, int(there & (most_seats - 1)), j < sharers && p != own_);
     }
-    if (sharers <= most_near) return;
+    if (sharers <= most_named) return;
     int count = 0;
     for (unsigned left = sharers_; left; left &= left - 1) {
-      if (++count <= most_near) continue;
+      if (++count <= most_named) continue;
       const int p = __ffs(int(left)) - 1;
       post(p, seat_[p * seats_ + seat], p != own_);
     }
@@ -96,34 +97,34 @@ class ClusterMail {
     const int sharers = __popc(sharers_);
     Vec3<T> sum = {T(0), T(0), T(0)};
 #pragma unroll
-    for (int first = 0; first < most_near; first += 4) {
-      if (first >= most_) return sum;
+    for (int first = 0; first < most_named; first += 4) {
+      if (first >= most_sharers_) return sum;
       // asked for at once
       Vec3<T> part[4];
 #pragma unroll
       for (int j = 0; j < 4; ++j) {
         part[j] = {T(0), T(0), T(0)};
         if (first + j < sharers)
-          part[j] = vec3(letters[int(near(first + j) >> seat_bits) * seats_]);
+          part[j] = vec3(letters[int(name(first + j) >> seat_bits) * seats_]);
       }
 #pragma unroll
       for (int j = 0; j < 4; ++j) sum = sum + part[j];
     }
-    if (sharers <= most_near) return sum;
+    if (sharers <= most_named) return sum;
     int count = 0;
     for (unsigned left = sharers_; left; left &= left - 1) {
-      if (++count > most_near) sum = sum + vec3(letters[(__ffs(int(left)) - 1) * seats_]);
+      if (++count > most_named) sum = sum + vec3(letters[(__ffs(int(left)) - 1) * seats_]);
     }
     return sum;
   }
 
  private:
   static constexpr int barriers_bytes = 16;
-  static constexpr int most_near = 8;  // patches of a vertex that are known without a look
+  static constexpr int most_named = 8;  // patches of a vertex that are known without a look
   static constexpr int seat_bits = 12, most_seats = 1 << seat_bits;
 
   // The j-th patch that has the vertex of this thread's seat, and in the lower bits which seat it has there.
-  PD_DEVICE unsigned near(int j) const { return near_[j / 2] >> 16 * (j % 2) & 0xffff; }
+  PD_DEVICE unsigned name(int j) const { return names_[j / 2] >> 16 * (j % 2) & 0xffff; }
 
   PD_DEVICE ByteBarrier barrier(unsigned round) const {
     return ByteBarrier(barrier_ + (round & 1));
@@ -136,9 +137,9 @@ class ClusterMail {
   Quad<T>* letters_;
   std::uint16_t* seat_;
   int seats_, patches_, own_;
-  unsigned near_[most_near / 2] = {};  // two of 16 bits each
+  unsigned names_[most_named / 2] = {};  // two of 16 bits each
   unsigned sharers_ = 0;  // a bit for each patch that has the vertex of this thread's seat
-  int most_ = 0;          // such patches of a thread of this warp
+  int most_sharers_ = 0;  // such patches of a thread of this warp
   int expected_ =
       0;  // bytes a round: at most 512 seats of 15 letters, and a barrier counts to 2^20
 };

@@ -285,11 +285,11 @@ __global__ void __launch_bounds__(vertex_threads)
     if (p.done) return;
     p.used += soft;
     p.done = soft && total[1] <= set.tolerance * set.tolerance * total[2];
-    const auto weigh = [&](int next) { omega[next % guard_period] = p.schedule.next(next); };
-    weigh(k + 1);
+    const auto set_omega = [&](int next) { omega[next % guard_period] = p.schedule.next(next); };
+    set_omega(k + 1);
     if (p.schedule.wants_energy(k)) p.schedule.check(total[0]);
     // where nothing is asked in between, until the next look at the energy
-    for (int next = k + 2; !soft && next <= k + guard_period; ++next) weigh(next);
+    for (int next = k + 2; !soft && next <= k + guard_period; ++next) set_omega(next);
   } else {
     p.energy = total[0];
     (What == Decision::course ? p.course : p.residual) = total[1];

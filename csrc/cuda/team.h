@@ -23,6 +23,7 @@ PD_DEVICE int lane() { return int(threadIdx.x) % warp_size; }
 template <Blocks Kind>
 class TeamSums {
   static constexpr bool Many = Kind != Blocks::one;  // blocks, patch by patch
+  static constexpr int early_barrier = 1;            // that of __syncthreads is 0
 
  public:
   // `box` [2, patches, sums_count], of a grid, starts with tags of zero; `cluster`: of a cluster
@@ -43,14 +44,19 @@ class TeamSums {
     }
   }
 
-  // The same, for the leading warp to gather before that barrier.
+  // The same, for the leading warp to send before that barrier.
   template <class Op>
   PD_DEVICE void leave_early(const double (&value)[sums_count], int wanted, Op op) {
     leave(value, wanted, op);
     __syncwarp();
-    if (!leads()) asm volatile("bar.arrive 1, %0;" ::"r"(blockDim.x) : "memory");
+    if (!leads())
+      asm volatile("bar.arrive %0, %1;" ::"n"(early_barrier), "r"(blockDim.x) : "memory");
   }
-  PD_DEVICE void gather() const { asm volatile("bar.sync 1, %0;" ::"r"(blockDim.x) : "memory"); }
+  // Leading warp: until all have left theirs early.
+  PD_DEVICE void await_early() const {
+    __syncwarp();
+    asm volatile("bar.sync %0, %1;" ::"n"(early_barrier), "r"(blockDim.x) : "memory");
+  }
 
   // Leading warp: the sums of the block, to the other blocks.
   template <class Op>

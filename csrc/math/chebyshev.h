@@ -12,6 +12,7 @@
 namespace pd::inline PD_TARGET {
 
 constexpr int guard_period = 4;       // iterations from one look at the energy to the next
+static_assert(guard_period > 1);      // a verdict falls before the next look
 constexpr double guard_slack = 1e-5;  // relative rise that rounding may cause
 constexpr double guard_slack_friction =
     1e-2;  // the energy lacks the work of friction, and may rise by it
@@ -56,7 +57,7 @@ struct Schedule {
     return kind == ScheduleKind::guarded && k % guard_period == 0;
   }
 
-  // E(u_k), after omega_{k+1} is known: a restart counts from the next one on.
+  // E(u_k), after next(k + 1) and before next(k + 2): a restart makes omega_{k+2} 1.
   PD_HD void check(double energy) {
     const bool rose = energy > last_energy + slack * absolute(last_energy);
     if (rose) {
