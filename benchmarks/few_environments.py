@@ -1,4 +1,4 @@
-"""Up to how many environments of a small mesh the kernel "grid" is faster than "block", which `kernel="auto"` takes.
+"""Up to how many environments of a small mesh the kernel "cluster" is faster than "block", which `kernel="auto"` takes.
 
 Bars that are held at one end and thrown downwards, float32, 64 guarded iterations. A time is that of a CUDA graph of
 one step, so the start of the graph is in it; medians.
@@ -37,7 +37,7 @@ def microseconds(cells: tuple[int, int, int], kernel: str, batch: int) -> float:
 def measure_mesh(cells: tuple[int, int, int]) -> dict[str, Any]:
     """One row of the result: times by kernel, in the order of BATCHES."""
     mesh = GpuScene("few", cells).build().solids[0].mesh
-    times = {kernel: [microseconds(cells, kernel, batch) for batch in BATCHES] for kernel in ("block", "grid")}
+    times = {kernel: [microseconds(cells, kernel, batch) for batch in BATCHES] for kernel in ("block", "cluster")}
     return {"vertices": len(mesh.vertices), "tets": len(mesh.tets), "batches": BATCHES, "microseconds": times}
 
 
@@ -52,7 +52,7 @@ def main() -> None:
     for row in rows:
         print(f"{row['vertices']} vertices, {row['tets']} tets; environments: {row['batches']}")
         for kernel, times in row["microseconds"].items():
-            print(f"  {kernel:5} us a step: " + " ".join(f"{time:.0f}" for time in times))
+            print(f"  {kernel:7} us a step: " + " ".join(f"{time:.0f}" for time in times))
     if options.out:
         result = {**describe_run(torch.device("cuda"), torch.get_num_threads()), "rows": rows}
         options.out.write_text(json.dumps(result, indent=1) + "\n")

@@ -134,8 +134,8 @@ GPU_SCENES = (
         for batch in BATCHES
     ),
     GpuScene("256x8192-five", SMALL[256], 8192, mesh="five", aims=(BATCH_AIM, STEP_AIM)),
-    *_pair("one-1200-tets", (8, 5, 5), "grid", SMALL_AIM),
-    GpuScene("one-1200-tets-five", (15, 4, 4), kernel="grid", mesh="five", aims=(SMALL_AIM,)),
+    *_pair("one-1200-tets", (8, 5, 5), "cluster", SMALL_AIM),
+    GpuScene("one-1200-tets-five", (15, 4, 4), kernel="cluster", mesh="five", aims=(SMALL_AIM,)),
     *_pair("one-10k", (39, 15, 15), "grid", _iteration(3.0, 2.3)),
     *_pair("one-100k", (99, 31, 31), "auto", _iteration(14.0, 11.0)),
     *_pair("one-1M", (255, 63, 63), "stream", _iteration(130.0, 105.0)),
@@ -145,7 +145,7 @@ GPU_SCENES = (
 QUICK_GPU_SCENES = tuple(
     GpuScene(f"tiny-{kernel}{_suffix(mesh)}", (6, 2, 2), batch, kernel, mesh, 4, (BATCH_AIM,))
     for mesh in MESHES
-    for kernel, batch in (("block", 9), ("grid", 2), ("stream", 1))
+    for kernel, batch in (("block", 9), ("cluster", 3), ("grid", 2), ("stream", 1))
 )
 
 

@@ -171,9 +171,9 @@ void check_levels(const P& plan, bool wanted) {
                     "plan has no multilevel preconditioner; a Simulator with solver=Multilevel() "
                     "makes one");
   if constexpr (requires { plan.kernel; }) {
-    constexpr int stream = 2;  // of DeviceKernel, which this file does not see
+    constexpr int stream = 3;  // of DeviceKernel, which this file does not see
     TORCH_CHECK_VALUE(plan.kernel == stream,
-                      "plan must be one for kernel 2 (stream), which the multilevel solver runs "
+                      "plan must be one for kernel 3 (stream), which the multilevel solver runs "
                       "with, got kernel ",
                       plan.kernel);
   }
@@ -197,7 +197,7 @@ constexpr int part_slot_array = int(DevicePlanArray::part_slot);
 struct DevicePlanRows {
   std::int64_t size, vertex, pin, pinned_vertex, block, patch_end, patch, slot, shared_end,
       shared_slot, piece_slot, part_patch_end, part_end, part_slot, piece_end, part, stored_block,
-      rest_slot, fixed_slot, computed_block, computed_patch, sender;
+      rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex;
 };
 
 template <class T>
@@ -213,14 +213,15 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
 #define X(name, meaning) plan.name = size[size_##name];
 #include "plan/device_sizes.def"
 #undef X
-  TORCH_CHECK_VALUE(plan.kernel >= 0 && plan.kernel <= 2 && plan.patches >= 1 &&
+  TORCH_CHECK_VALUE(plan.kernel >= 0 && plan.kernel <= 3 && plan.patches >= 1 &&
                         (plan.kernel != 0 || plan.patches == 1) && plan.most_slots >= 1 &&
                         plan.most_slots <= plan.slots && plan.most_entries >= 0,
-                    "plan.sizes must name a kernel, 0 to 2, and at least one patch, one alone for "
+                    "plan.sizes must name a kernel, 0 to 3, and at least one patch, one alone for "
                     "kernel 0, got kernel ",
                     plan.kernel, " and ", plan.patches, " patches; compile the scene again");
-  // every slot that does not hold an interior vertex of its patch holds a shared one; pieces and pins may be absent
-  const bool pieces = plan.pieces > 0;
+  // every slot that does not hold an interior vertex of its patch holds a shared one, but of a cluster, where all are inside
+  // one patch; pieces and pins may be absent
+  const bool pieces = plan.pieces > 0, cluster = plan.kernel == 1;
   DevicePlanRows count{};
   count.size = size_count;
   count.vertex = plan.vertices;
@@ -231,7 +232,8 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.patch_end = plan.patches + 1;
   count.slot = plan.slots;
   count.shared_end = plan.shared + 1;
-  count.shared_slot = plan.slots - (plan.vertices - plan.shared);
+  count.shared_slot = cluster ? 0 : plan.slots - (plan.vertices - plan.shared);
+  count.copied_vertex = cluster ? plan.vertices : 0;
   count.piece_slot = pieces ? plan.slots : 0;
   count.part_patch_end = pieces ? plan.patches + 1 : 0;
   count.part_end = pieces ? plan.parts + 1 : 0;
@@ -245,9 +247,9 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.computed_block = computed ? plan.blocks : 0;
   count.computed_patch = computed ? plan.patches : 0;
   count.sender = plan.senders;
-  TORCH_CHECK_VALUE(plan.kernel != 1 || plan.senders >= count.shared_slot,
+  TORCH_CHECK_VALUE(plan.kernel != 2 || plan.senders >= count.shared_slot,
                     "plan.sizes must count a row of senders for each of the ", count.shared_slot,
-                    " shared slots of kernel 1, got ", plan.senders, "; compile the scene again");
+                    " shared slots of kernel 2, got ", plan.senders, "; compile the scene again");
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = 0;
   using real = T;

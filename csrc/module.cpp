@@ -1,5 +1,6 @@
 // `torchpd._C`: mesh work on NumPy arrays, the tables, what was built. Loading it also registers the ops.
 #include "cpu/dispatch.h"
+#include "cuda/launch.h"
 #include "plan/build.h"
 #include "plan/device_build.h"
 #include "plan/multilevel_build.h"
@@ -10,8 +11,10 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include <algorithm>
 #include <map>
 #include <span>
+#include <vector>
 
 namespace py = pybind11;
 
@@ -78,6 +81,20 @@ py::dict build_plan(const Doubles& positions, const Indices& tets, int patch_siz
   return arrays;
 }
 
+// What a cluster wants beside: a vertex for every patch, and tetrahedra at every vertex.
+void check_cluster(std::int64_t vertices, const Indices& tets, int patches) {
+  const std::int64_t most = std::min<std::int64_t>(vertices, pd::most_cluster_blocks);
+  if (patches > most)
+    throw py::value_error("patches of kernel 1, a cluster, must lie in 1.." + std::to_string(most) +
+                          ", got " + std::to_string(patches));
+  std::vector<bool> used(vertices, false);
+  for (py::ssize_t i = 0; i < tets.size(); ++i) used[tets.data()[i]] = true;
+  const auto lone = std::find(used.begin(), used.end(), false);
+  if (lone != used.end())
+    throw py::value_error("vertex " + std::to_string(lone - used.begin()) +
+                          " belongs to no tetrahedron, which kernel 1, a cluster, wants of all");
+}
+
 py::dict build_device_plan(const Doubles& positions, const Indices& tets, int patches, int kernel,
                            bool fixed, const Numbers& piece,
                            const std::function<void(double)>& progress) {
@@ -86,9 +103,10 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets, int pa
     throw py::value_error("patches must lie in 1.." + std::to_string(tets.shape(0)) +
                           ", the number of tetrahedra, got " + std::to_string(patches));
   }
-  if (kernel < 0 || kernel > 2)
-    throw py::value_error("kernel must be 0, 1 or 2, got " + std::to_string(kernel));
+  if (kernel < 0 || kernel > 3)
+    throw py::value_error("kernel must be 0, 1, 2 or 3, got " + std::to_string(kernel));
   const std::int64_t vertices = positions.shape(0);
+  if (kernel == int(pd::DeviceKernel::cluster)) check_cluster(vertices, tets, patches);
   if (piece.ndim() != 1 || piece.shape(0) != vertices)
     throw py::value_error("piece must be int32 [vertices], a number for each row of positions");
   for (std::int64_t v = 0; v < vertices; ++v) {
@@ -231,14 +249,25 @@ PYBIND11_MODULE(_C, m) {
         "Shared memory of a block of the kernels block and (many patches) grid.");
   m.def(
       "fits_cluster",
-      [](std::size_t real, std::size_t slots, std::size_t pairs) {
-        return pd::is_near(real, slots, pairs, pd::most_patch_threads(real));
+      [](std::size_t real, std::size_t pairs, std::size_t interior) {
+        return pd::cluster_threads(real, pairs, interior) <= pd::most_patch_threads(real);
       },
-      py::arg("real"), py::arg("slots"), py::arg("pairs"));
-  m.def("cluster_shared_bytes", &pd::cluster_shared_bytes, py::arg("real"), py::arg("fused_bytes"),
-        py::arg("slots"), py::arg("seats"), py::arg("patches"),
-        "The same of a block of the kernel grid whose blocks form a cluster.");
+      py::arg("real"), py::arg("pairs"), py::arg("interior"),
+      "Whether a block of a cluster has a thread for everything in a patch of such sizes.");
+  m.def("cluster_shared_bytes", &pd::cluster_shared_bytes, py::arg("real"), py::arg("slots"),
+        py::arg("entries"), py::arg("interior"), py::arg("planes"), py::arg("balls"),
+        "Shared memory of a block of the kernel cluster.");
   m.attr("most_cluster_blocks") = pd::most_cluster_blocks;
+  m.def(
+      "largest_cluster",
+      [] {
+#if defined(TORCHPD_CUDA)
+        return pd::largest_cluster();
+#else
+        return 1;
+#endif
+      },
+      "Blocks of the largest cluster that the current CUDA device runs; 1: none.");
   m.attr("outer_static_bytes") = pd::outer_static_bytes;
   m.attr("pass_static_bytes") = pd::pass_static_bytes;
   m.def("pass_shared_bytes", &pd::pass_shared_bytes, py::arg("real"), py::arg("slots"),

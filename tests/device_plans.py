@@ -21,10 +21,11 @@ from torchpd.tables import DEVICE_PLAN_TABLE
 
 LANES, SLICE, NONE, SENDERS = 32, 8, 65535, 7
 SLOT_STEP = 8  # slots in pair_corner
-KERNELS = BLOCK, GRID, STREAM = range(3)
+KERNELS = BLOCK, CLUSTER, GRID, STREAM = range(4)
+MOST_CLUSTER = 16  # patches
 BOTH = [[0, 1, 2, 3], [0, 1, 2, 4]]  # the corners of both tetrahedra of a pair
 SIZES = ["kernel", "vertices", "tets", "pins", "pieces", "blocks", "patches", "slots", "shared", "parts", "senders"]
-SIZES += ["most_slots", "most_pairs", "most_entries", "most_shared", "most_parts"]
+SIZES += ["most_slots", "most_pairs", "most_entries", "most_interior", "most_shared", "most_parts"]
 
 
 def delaunay_mesh() -> pd.TetMesh:
@@ -85,10 +86,15 @@ class Arrays(SimpleNamespace):
         return cls(**{row.name: t.numpy() for row, t in zip(DEVICE_PLAN_TABLE, tensors, strict=True)})
 
 
+def patches_of(case: tuple[str, int], kernel: int) -> int:
+    """As many as the case wants, or as a cluster has."""
+    return min(case[1], MOST_CLUSTER) if kernel == CLUSTER else case[1]
+
+
 @cache
 def arrays_of(case: tuple[str, int], kernel: int, dtype: torch.dtype = torch.float64) -> Arrays:
     """One of CASES."""
-    return Arrays.of(values_of(case[0]), case[1], kernel, dtype)
+    return Arrays.of(values_of(case[0]), patches_of(case, kernel), kernel, dtype)
 
 
 @dataclass(frozen=True)
@@ -101,6 +107,7 @@ class Lanes:
     entry: NDArray[np.int64]  # [lanes, 5] in the patch
     vertex: NDArray[np.int64]  # [lanes, 5] user's
     tet: NDArray[np.int32]  # [lanes, 2] user's
+    counted: NDArray[np.bool_]  # [lanes, 2] whether there is one that no other patch counts
     bound: NDArray[np.float64]  # [lanes, 2]
 
     @classmethod
@@ -110,13 +117,15 @@ class Lanes:
         number = np.arange(len(patch)) - plan.patch_block[patch] * LANES
         packed = plan.pair_corner.view(np.uint32).reshape(-1, 5, LANES).transpose(0, 2, 1).reshape(-1, 5)
         slot, entry = (packed & 65535).astype(np.int64) // SLOT_STEP, (packed >> 16).astype(np.int64)
+        tet = plan.pair_tet.reshape(-1, 2, LANES).transpose(0, 2, 1).reshape(-1, 2)
         return cls(
             number < plan.patch_pairs[patch],
             patch,
             slot,
             entry,
             plan.vertex_order[plan.slot_vertex[plan.patch_slot[patch][:, None] + slot]].astype(np.int64),
-            plan.pair_tet.reshape(-1, 2, LANES).transpose(0, 2, 1).reshape(-1, 2),
+            np.where(tet < -1, -2 - tet, tet),
+            tet >= 0,
             plan.pair_bound.reshape(-1, 2, LANES).transpose(0, 2, 1).reshape(-1, 2),
         )
 

@@ -15,6 +15,8 @@ import pytest
 import torch
 from devices import missing_gpu
 
+from torchpd.gpu import properties_of
+
 ROOT = Path(__file__).parents[1]
 
 SCHEMA: dict[str, Any] = {
@@ -280,7 +282,10 @@ def test_quick_run_on_a_gpu(tmp_path: Path) -> None:
     ended = run("--quick", "--device", "cuda", "--out", str(out))
     assert ended.returncode == 0, ended.stderr
     result = json.loads(out.read_text())
-    assert {row["kernel"] for row in result["results"]} == {"block", "grid", "stream"}
+    clusters = {"cluster"} if properties_of(torch.device("cuda", 0)).cluster > 1 else set()
+    kernels = {"block", "grid", "stream"} | clusters
+    assert {row["kernel"] for row in result["results"]} == kernels
+    assert {name.split(":")[0] for name in result["call_microseconds"]} == kernels
     for row in result["results"]:
         assert row["step_microseconds"] > 0.0
         assert row["aims"][0]["share_of_must"] > 0.0

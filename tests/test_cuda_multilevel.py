@@ -234,7 +234,7 @@ def test_solvers_can_be_exchanged() -> None:
     assert block.solver == pd.Chebyshev()
     levels = sim_with_levels.plan.arrays[-len(MULTILEVEL_TABLE) :]
     numbers = {**block.numbers(inertial=False, report=False), **pd.Multilevel().numbers()}
-    with pytest.raises(ValueError, match="plan must be one for kernel 2"):
+    with pytest.raises(ValueError, match="plan must be one for kernel 3"):
         torch.ops.torchpd.step(*start, None, None, block.material(), [*block.plan.arrays, *levels], **numbers)
 
 

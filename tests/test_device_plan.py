@@ -10,6 +10,7 @@ import torch
 from cases import box
 from device_plans import (  # noqa: F401  (fixtures)
     BLOCK,
+    CLUSTER,
     GRID,
     KERNELS,
     LANES,
@@ -26,6 +27,7 @@ from device_plans import (  # noqa: F401  (fixtures)
     fixture_lanes,
     fixture_plan,
     fixture_values,
+    patches_of,
     rows_of,
     values_of,
 )
@@ -43,6 +45,7 @@ from torchpd.tables import DEVICE_PLAN_TABLE
 def test_every_tetrahedron_is_in_one_lane(lanes: Lanes, values: SceneValues) -> None:
     both = lanes.tet[lanes.live]
     assert (both[:, 0] >= 0).all()
+    np.testing.assert_array_equal(lanes.counted, lanes.tet >= 0)
     np.testing.assert_array_equal(np.sort(both[both >= 0]), np.arange(len(values.tets)))
     np.testing.assert_array_equal(
         np.sort(lanes.tet_vertices[lanes.real], axis=1), np.sort(values.tets[lanes.tet[lanes.real]], axis=1)
@@ -50,14 +53,15 @@ def test_every_tetrahedron_is_in_one_lane(lanes: Lanes, values: SceneValues) -> 
 
 
 def test_kernels_differ_in_rest_shapes_and_senders_alone(case: tuple[str, int]) -> None:
-    """So that what is shown of the plan for one of them holds for all."""
-    plans = [arrays_of(case, kernel) for kernel in KERNELS]
+    """So that what is shown of the plan for one of them holds for all but a cluster: see test_cluster_plan.py."""
+    plans = {kernel: arrays_of(case, kernel) for kernel in KERNELS if kernel != CLUSTER}
     own = {"sizes", "pair_rest", "pair_factor", "slot_rest", "slot_fixed", "patch_unit", "slot_sender"}
-    for plan in plans:
+    for plan in plans.values():
+        assert len(plan.slot_copy) == 0
         for row in DEVICE_PLAN_TABLE:
             if row.name not in own:
-                np.testing.assert_array_equal(getattr(plan, row.name), getattr(plans[0], row.name), row.name)
-    assert [len(plan.slot_sender) for plan in plans] == [0, len(plans[GRID].slot_sender), 0]
+                np.testing.assert_array_equal(getattr(plan, row.name), getattr(plans[GRID], row.name), row.name)
+    assert len(plans[BLOCK].slot_sender) == len(plans[STREAM].slot_sender) == 0
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -82,7 +86,7 @@ def test_rest_shapes_are_there_once(kernel: int, case: tuple[str, int]) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_rest_shapes_fit_the_order_of_corners(
-    kernel: int, dtype: torch.dtype, case: tuple[str, int], lanes: Lanes, values: SceneValues
+    kernel: int, dtype: torch.dtype, case: tuple[str, int], values: SceneValues
 ) -> None:
     """F of a deformed body is that of its tetrahedra, also where the corners wind the other way.
 
@@ -92,6 +96,7 @@ def test_rest_shapes_fit_the_order_of_corners(
     and what the plan holds in `dtype` is rounded once more.
     """
     noise = np.random.default_rng(0).standard_normal(values.rest_positions.shape)
+    lanes = Lanes.of(arrays_of(case, kernel, dtype))
 
     def edges(positions: NDArray[np.float64]) -> NDArray[np.float64]:
         p = positions[lanes.tet_vertices[lanes.real]]
@@ -112,27 +117,27 @@ def test_rest_shapes_fit_the_order_of_corners(
     assert (np.abs(rest.volume[lanes.real] - volume) <= limit).all()
 
 
-def test_bounds_are_those_of_the_reference(lanes: Lanes, values: SceneValues) -> None:
+@pytest.mark.parametrize("kernel", [CLUSTER, GRID])
+def test_bounds_are_those_of_the_reference(kernel: int, case: tuple[str, int], values: SceneValues) -> None:
+    lanes = Lanes.of(arrays_of(case, kernel))
     expected = elements(values.rest_positions, values.tets).spread[lanes.tet[lanes.real]]
     np.testing.assert_allclose(lanes.bound[lanes.real], expected, rtol=1e-9)
 
 
-def test_rest_positions_are_relative_to_the_first_slot(
-    case: tuple[str, int], plan: Arrays, values: SceneValues
-) -> None:
+@pytest.mark.parametrize("kernel", [CLUSTER, GRID, STREAM])
+def test_rest_positions_are_relative_to_the_first_slot(kernel: int, case: tuple[str, int], values: SceneValues) -> None:
     """Rounded once: to float64, or to the patch's unit, of which whole numbers leave 29 bits to its extent."""
+    plan, single = arrays_of(case, kernel), arrays_of(case, kernel, torch.float32)
     patch, _, _ = rows_of(plan)
     x = values.rest_positions[plan.vertex_order[plan.slot_vertex]]
     expected = np.zeros((len(x), 4))
     expected[:, :3] = x - x[plan.patch_slot[patch]]
-    for kernel in (GRID, STREAM):
-        np.testing.assert_array_equal(arrays_of(case, kernel).slot_rest, expected)
-        single = arrays_of(case, kernel, torch.float32)
-        unit = single.patch_unit.astype(np.float64)
-        assert (np.frexp(unit)[0] == 0.5).all()
-        assert (np.abs(single.slot_fixed * unit[patch][:, None] - expected) <= 0.5 * unit[patch][:, None]).all()
-        extent = np.maximum.reduceat(np.abs(single.slot_fixed).max(axis=1), single.patch_slot[:-1])
-        assert (extent >= 2**28).all()
+    np.testing.assert_array_equal(plan.slot_rest, expected)
+    unit = single.patch_unit.astype(np.float64)
+    assert (np.frexp(unit)[0] == 0.5).all()
+    assert (np.abs(single.slot_fixed * unit[patch][:, None] - expected) <= 0.5 * unit[patch][:, None]).all()
+    extent = np.maximum.reduceat(np.abs(single.slot_fixed).max(axis=1), single.patch_slot[:-1])
+    assert (extent >= 2**28).all()
 
 
 def test_differences_of_rest_positions_fit_32_bits() -> None:
@@ -257,6 +262,7 @@ def test_sizes_count_the_arrays(kernel: int, case: tuple[str, int], values: Scen
         "most_slots": np.diff(plan.patch_slot).max(),
         "most_pairs": plan.patch_pairs.max(),
         "most_entries": entries_of(plan).max(),
+        "most_interior": np.diff(plan.patch_vertex).max(),
         "most_shared": shared.max(),
         "most_parts": np.diff(plan.patch_part).max() if len(free) else 0,
     }
@@ -266,7 +272,7 @@ def test_sizes_count_the_arrays(kernel: int, case: tuple[str, int], values: Scen
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_arrays_are_those_of_the_table(kernel: int, case: tuple[str, int], values: SceneValues) -> None:
     kinds = {"real": torch.float32, "int32": torch.int32}
-    tensors = compile_device_plan(values, case[1], kernel, torch.float32)
+    tensors = compile_device_plan(values, patches_of(case, kernel), kernel, torch.float32)
     for row, array in zip(DEVICE_PLAN_TABLE, tensors, strict=True):
         assert array.dtype == kinds[row.type], row.name
         assert array.is_contiguous(), row.name
@@ -323,8 +329,8 @@ def test_bad_arguments_are_refused() -> None:
     for patches in (0, -1, 2):
         with pytest.raises(ValueError, match=rf"patches must lie in 1\.\.1, the number of tetrahedra, got {patches}"):
             compile_device_plan(values, patches, 0, torch.float32)
-    for kernel in (-1, 3):
-        refusal = f"kernel must be 0, 1 or 2, got {kernel}"
+    for kernel in (-1, 4):
+        refusal = f"kernel must be 0, 1, 2 or 3, got {kernel}"
         with pytest.raises(ValueError, match=refusal):
             compile_device_plan(values, 1, kernel, torch.float32)
         with pytest.raises(ValueError, match=refusal):

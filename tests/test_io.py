@@ -129,8 +129,8 @@ def test_material_of_every_environment_comes_back(tmp_path: Path) -> None:
 
 def test_kernel_comes_back_and_older_files_have_none(file: Path) -> None:
     body = pd.Solid(pd.shapes.single_tet(), youngs=1e4)
-    pd.Simulator(pd.Scene(body), kernel="grid").save(file)
-    assert pd.Simulator.load(file).kernel == "grid"
+    pd.Simulator(pd.Scene(body), kernel="cluster").save(file)
+    assert pd.Simulator.load(file).kernel == "cluster"
     rewrite(file, lambda _, record: record.pop("kernel"))
     assert pd.Simulator.load(file).kernel == "auto"
     rewrite(file, lambda _, record: record.update(kernel="warp"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -31,41 +32,96 @@ def test_auto_takes_the_first_that_fits() -> None:
     """Just enough memory for a kernel chooses it, one byte less the next one."""
     values = values_of((6, 6, 6))
     for dtype in REAL:
-        needs = {}
-        for name in ("block", "grid"):
-            needs[name] = shared_bytes(choose_plan(values, dtype, H100._replace(cluster=1), name), 0, 0)
-        assert needs["grid"] < needs["block"]
+        needs = {name: shared_bytes(choose_plan(values, dtype, H100, name), 0, 0) for name in KERNELS[:-1]}
+        assert needs["grid"] < needs["cluster"] < needs["block"]
         for shared, kernel in (
             (needs["block"], "block"),
-            (needs["block"] - 1, "grid"),
+            (needs["block"] - 1, "cluster"),
+            (needs["cluster"], "cluster"),
+            (needs["cluster"] - 1, "grid"),
             (needs["grid"], "grid"),
             (needs["grid"] - 1, "stream"),
         ):
-            plan = choose_plan(values, dtype, Properties(132, shared))
+            plan = choose_plan(values, dtype, Properties(132, shared, 16))
             assert plan.kernel == kernel
             assert f"{shared:,} B are there" in plan.why
             assert all(f"{name} needs" in plan.why for name in KERNELS[: KERNELS.index(kernel)])
 
 
-def test_small_meshes_are_cut_for_a_cluster_where_there_is_one() -> None:
-    small, large = values_of((11, 11, 11)), values_of((12, 12, 12))
-    assert choose_plan(small, torch.float32, H100, "grid").patches == 16
-    assert choose_plan(large, torch.float32, H100, "grid").patches == len(large.tets) // regimes._GRID_TETS
-    alone = len(small.tets) // regimes._GRID_TETS
-    assert choose_plan(small, torch.float32, A100, "grid").patches == alone
-    plan = choose_plan(small, torch.float32, H100, "grid")
-    sizes = [plan.size(name) for name in ("most_slots", "most_shared", "patches")]
-    needed = _C.cluster_shared_bytes(4, shared_bytes(plan, 0, 0), *sizes)
-    assert choose_plan(small, torch.float32, Properties(132, needed, 16), "grid").patches == 16
-    assert choose_plan(small, torch.float32, Properties(132, needed - 16, 16), "grid").patches == alone
+def test_auto_looks_at_clusters_of_small_meshes_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = values_of((6, 6, 6))
+    shared = shared_bytes(choose_plan(values, torch.float32, H100, "block"), 0, 0) - 1
+    for most, blocks, kernel in ((1296, 16, "cluster"), (1295, 16, "grid"), (1296, 1, "grid")):
+        monkeypatch.setattr(regimes, "_CLUSTER_TETS", most)
+        plan = choose_plan(values, torch.float32, Properties(132, shared, blocks))
+        assert plan.kernel == kernel
+        assert ("cluster needs" in plan.why) == (kernel == "cluster")
+    # who asks for one gets it for any mesh that fits
+    monkeypatch.setattr(regimes, "_CLUSTER_TETS", 0)
+    assert choose_plan(values, torch.float32, H100, "cluster").kernel == "cluster"
 
 
 def test_patches_too_large_for_a_cluster_go_to_a_grid() -> None:
-    """Eight patches of 4116 tetrahedra want more than a thread each: then there are as many as multiprocessors take."""
-    values = values_of((14, 7, 7))
-    assert choose_plan(values, torch.float32, Properties(170, 101_376, 8), "grid").patches == 4116 // 150
-    assert choose_plan(values, torch.float32, Properties(170, 232_448, 16), "grid").patches == 16
-    assert choose_plan(values_of((13, 7, 7)), torch.float32, Properties(170, 101_376, 8), "grid").patches == 8
+    """Every vertex of a patch wants threads, and in float32 every tetrahedron one of its own."""
+    large = values_of((14, 7, 7))  # 4116 tetrahedra, 960 vertices
+    needs = r"cluster needs patches smaller than \d+ pairs of tetrahedra and \d+ vertices"
+    for gpu, dtype in ((H100, torch.float64), (Properties(170, 101_376, 8), torch.float32)):
+        plan = choose_plan(values_of((6, 4, 4)), dtype, gpu, "cluster")
+        assert _C.fits_cluster(REAL[dtype], plan.size("most_pairs"), plan.size("most_interior"))
+        with pytest.raises(
+            ValueError, match=rf"'cluster' does not fit this GPU: .*{needs}, .*; take \"grid\" or \"stream"
+        ):
+            choose_plan(large, dtype, gpu, "cluster")
+        plan = choose_plan(large, dtype, gpu)
+        assert (plan.kernel, plan.patches) == ("grid", 4116 // regimes._GRID_TETS)
+        assert re.search(needs, plan.why)
+
+
+def test_a_mesh_that_no_cluster_could_have_is_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the patches, one has a sixteenth of the tetrahedra at least."""
+    values = values_of((12, 12, 12))
+
+    def fail(*_: object, **__: object) -> None:
+        raise AssertionError("a plan was built")
+
+    monkeypatch.setattr(regimes, "compile_device_plan", fail)
+    for dtype in REAL:
+        with pytest.raises(ValueError, match=r"cluster needs patches smaller than 324 pairs .* and 138 vertices"):
+            choose_plan(values, dtype, H100, "cluster")
+
+
+def test_a_gpu_without_clusters_is_told() -> None:
+    values = values_of((3, 3, 3))
+    refusal = r'kernel="cluster" needs .*\(NVIDIA compute capability 9\.0\).*has none; take "block", "grid" or "stream"'
+    with pytest.raises(ValueError, match=refusal):
+        choose_plan(values, torch.float32, A100, "cluster")
+
+
+def test_who_is_refused_hears_of_kernels_that_may_fit() -> None:
+    small, large = values_of((3, 3, 3)), values_of((12, 12, 12))
+    tight = H100._replace(shared=100)
+    for values, gpu, others in (
+        (small, tight, '"cluster", "grid" or "stream"'),
+        (small, tight._replace(cluster=1), '"grid" or "stream"'),
+        (large, tight, '"grid" or "stream"'),
+    ):
+        with pytest.raises(
+            ValueError, match=f"'block' does not fit this GPU: .* are there; take {others}, or \"auto\""
+        ):
+            choose_plan(values, torch.float32, gpu, "block")
+
+
+def test_shared_memory_of_a_cluster() -> None:
+    """One byte less than a patch needs is too little."""
+    values = values_of((6, 6, 6), pd.Ground(), pd.Sphere((0, -3, 0), 1.0))
+    for dtype, real in REAL.items():
+        plan = choose_plan(values, dtype, H100, "cluster")
+        needed = shared_bytes(plan, 1, 1)
+        sizes = (plan.size(name) for name in ("most_slots", "most_entries", "most_interior"))
+        assert needed == _C.cluster_shared_bytes(real, *sizes, 1, 1)
+        assert choose_plan(values, dtype, Properties(132, needed, 16), "cluster").patches == plan.patches
+        with pytest.raises(ValueError, match=rf"cluster needs {needed:,} B, {needed - 1:,} B are there; take"):
+            choose_plan(values, dtype, Properties(132, needed - 1, 16), "cluster")
 
 
 def test_number_of_patches() -> None:
@@ -74,9 +130,15 @@ def test_number_of_patches() -> None:
     for dtype in REAL:
         assert choose_plan(small, dtype, H100, "block").patches == 1
         grid, tets = choose_plan(small, dtype, H100, "grid").patches, len(small.tets)
-        assert 2 < grid < 16
-        assert tets / grid >= regimes._CLUSTER_EACH > tets / (grid + 1)
+        assert grid > 2
+        assert tets / grid >= regimes._GRID_TETS > tets / (grid + 1)
         assert choose_plan(small, dtype, Properties(5, 232_448), "grid").patches == 5
+        middle = values_of((9, 3, 3))
+        cluster, tets = choose_plan(middle, torch.float32, H100, "cluster").patches, len(middle.tets)
+        assert 2 < cluster < 16
+        assert tets / cluster >= regimes._CLUSTER_EACH > tets / (cluster + 1)
+        assert choose_plan(small, dtype, H100, "cluster").patches == 16
+        assert choose_plan(small, dtype, H100._replace(multiprocessors=9), "cluster").patches == 9
         stream, tets = choose_plan(large, dtype, H100, "stream").patches, len(large.tets)
         assert stream > 1
         assert tets / stream <= regimes._STREAM_TETS[dtype] < tets / (stream - 1)
@@ -85,17 +147,25 @@ def test_number_of_patches() -> None:
         assert stream % 2 == 1
         assert choose_plan(large, dtype, few, "stream").patches == stream + 1
     one = pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e5)).values()
-    assert [choose_plan(one, torch.float32, H100, name).patches for name in KERNELS] == [1, 1, 1]
+    assert [choose_plan(one, torch.float32, H100, name).patches for name in KERNELS] == [1, 1, 1, 1]
+    # tetrahedra that share no vertices have many of them
+    corners = one.rest_positions + 2.0 * np.arange(70)[:, None, None] * [1, 0, 0]
+    apart = pd.Scene(pd.Solid(pd.TetMesh(corners.reshape(-1, 3), np.arange(280).reshape(-1, 4)), 1e5)).values()
+    for dtype, real in REAL.items():
+        plan = choose_plan(apart, dtype, H100, "cluster")
+        assert plan.patches > 2
+        assert _C.fits_cluster(real, plan.size("most_pairs"), plan.size("most_interior"))
 
 
 def test_a_kernel_that_does_not_fit_is_refused_with_numbers() -> None:
     values = values_of((12, 12, 12))
     with pytest.raises(
-        ValueError, match=r"'block' does not fit this GPU: it needs at least [\d,]+ B .*101,376 B.*grid"
+        ValueError, match=r"'block' does not fit this GPU: .*block needs at least [\d,]+ B, 101,376 B are there; .*grid"
     ):
         choose_plan(values, torch.float32, SMALL, "block")
     with pytest.raises(
-        ValueError, match=r"'grid' does not fit this GPU: it needs (at least )?[\d,]+ B .*5,000 B are there.*stream"
+        ValueError,
+        match=r"'grid' does not fit this GPU: .*grid needs (at least )?[\d,]+ B, 5,000 B are there; .*stream",
     ):
         choose_plan(values, torch.float32, Properties(132, 5000), "grid")
     with pytest.raises(ValueError, match=r"kernel must be \"auto\""):
@@ -106,7 +176,7 @@ def test_shared_memory_by_hand(dtype: torch.dtype) -> None:
     """Many patches keep six numbers a slot (position, rest position) in place of eight, and both 1 KB for control."""
     values, real = values_of((4, 4, 4)), torch.finfo(dtype).bits // 8
     for kernel, numbers in (("block", 8), ("grid", 6)):
-        plan = choose_plan(values, dtype, H100._replace(cluster=1), kernel)
+        plan = choose_plan(values, dtype, H100, kernel)
         slots, entries = plan.size("most_slots"), plan.size("most_entries")
         filled = -(-numbers * real * slots // 16) * 16
         assert shared_bytes(plan, 2, 3) == 1024 + filled + real * (4 * entries + 5 * 2 + 8 * 3)

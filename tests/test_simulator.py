@@ -14,6 +14,7 @@ from runs import moving, same_bits, simulate
 
 import torchpd as pd
 from torchpd.placing import check_wanted_device
+from torchpd.plan import KERNELS
 from torchpd.solvers import Solver
 
 pytestmark = pytest.mark.usefixtures("poisoned")
@@ -126,9 +127,10 @@ def test_pickled_simulator_takes_the_same_step(dtype: torch.dtype) -> None:
 def test_kernel_changes_nothing_on_the_cpu(dtype: torch.dtype) -> None:
     sim = simulate(dtype)
     state = moving(sim)
-    for kernel in ("block", "grid", "stream"):
+    for kernel in KERNELS:
         assert same_bits(simulate(dtype, kernel=kernel)(state), sim(state))
-    with pytest.raises(ValueError, match='kernel must be "auto", "block", "grid" or "stream", got \'warp\''):
+    refusal = 'kernel must be "auto", "block", "cluster", "grid" or "stream", got \'warp\''
+    with pytest.raises(ValueError, match=refusal):
         simulate(dtype, kernel="warp")
 
 

@@ -86,16 +86,37 @@ def test_absent_effects_change_no_bits(dtype: torch.dtype, device: torch.device)
     [
         (
             "block",
-            ("1 patch,", "one thread block an environment", '"grid", sooner done with a few environments, or "stream"'),
+            (
+                "1 patch,",
+                "one thread block an environment",
+                '"cluster", sooner done with a few environments, "grid" or "stream"',
+            ),
         ),
-        ("grid", ("2 patches,", "a thread block for each patch, all iterations in one launch", '"block" or "stream"')),
+        (
+            "cluster",
+            (
+                "2 patches,",
+                "a cluster of thread blocks, one for each patch",
+                "copies of tetrahedra",
+                '"block", "grid" or "stream"',
+            ),
+        ),
+        (
+            "grid",
+            (
+                "2 patches,",
+                "a thread block for each patch, all iterations in one launch",
+                "vertices that patches share",
+                '"block", "cluster" or "stream"',
+            ),
+        ),
         ("stream", ("1 patch,", "launches for every iteration", "B an environment during a step")),
     ],
 )
 def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...]) -> None:
     sim = simulator(bare(pd.Ground()), torch.float32)
     values = sim.scene.values()
-    sim.plan = choose_plan(values, torch.float32, Properties(132, 232_448), kernel)
+    sim.plan = choose_plan(values, torch.float32, Properties(132, 232_448, 16), kernel)
     text = str(sim)
     for fact in (*facts, f"kernel {kernel}:", f"why {kernel}: asked for", f"plan {sim.plan.bytes:,} B", "grounds: 1"):
         assert fact in text, fact

@@ -34,29 +34,29 @@ from torch import Tensor
 import torchpd as pd
 from torchpd import multilevel, regimes
 from torchpd.device_plan import compile_device_plan
+from torchpd.gpu import properties_of
 from torchpd.plan import KERNELS as PLAN_KERNELS
 from torchpd.plan import Plan
 from torchpd.render import Camera
 from torchpd.tables import DEVICE_PLAN_TABLE
 
-# for few patches the kernel "grid" forms clusters; "far" is a grid of patches that are too large for that
+# "far" is a grid of patches that have several tetrahedra and vertices a thread
 KERNELS = ("block", "cluster", "grid", "far", "stream")
 RUNS = (*KERNELS, "levels", "patches")  # and what the multilevel solver runs with, and the ops of free-form patches
 SOLVERS = (pd.Chebyshev(), pd.Jacobi(), pd.Chebyshev("classic", rho=0.9, delay=1))
 ops = torch.ops.torchpd
 
 
-FEW_PATCHES = {"_CLUSTER_TETS": 8000, "_CLUSTER_EACH": 40}
-MANY_PATCHES = {"_CLUSTER_TETS": 0, "_GRID_TETS": 8}
-LARGE_PATCHES = {"_CLUSTER_TETS": 0, "_GRID_TETS": 1200}
+# constants of torchpd.regimes that decide how many patches there are
+SIZES = {"cluster": ("_CLUSTER_EACH", 40), "grid": ("_GRID_TETS", 8), "far": ("_GRID_TETS", 1200)}
 CELLS = {"far": (13, 5, 4)}  # of a bar
 
 
 def compiled_for(kernel: str) -> str:
     """The name that a simulator knows one of KERNELS by, from now on: a "grid" gets more patches than a cluster has."""
-    for name, value in {"grid": MANY_PATCHES, "far": LARGE_PATCHES}.get(kernel, FEW_PATCHES).items():
-        setattr(regimes, name, value)
-    return "grid" if kernel in ("cluster", "far") else kernel
+    if kernel in SIZES:
+        setattr(regimes, *SIZES[kernel])
+    return "grid" if kernel == "far" else kernel
 
 
 def scene(*, contacts: bool, pieces: bool, pins: bool, cells: tuple[int, int, int] = (6, 2, 2)) -> pd.Scene:
@@ -196,6 +196,9 @@ def run(kernels: Sequence[str]) -> int:
             continue
         if kernel == "patches":
             count += free_form(dtype)
+            continue
+        if kernel == "cluster" and properties_of(torch.device("cuda", 0)).cluster == 1:
+            print("no clusters: this GPU has none (compute capability 9.0)")
             continue
         name, cells = compiled_for(kernel), CELLS.get(kernel, (6, 2, 2))
         for number, (contacts, pieces) in enumerate(flags):

@@ -49,11 +49,12 @@ class Costs(NamedTuple):
 
 
 # Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers,
-# `more` with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were not measured on "grid" and
-# "stream": without `more` the choice for a batch is that for one environment.
+# `more` with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were measured on "block"
+# alone: without `more` the choice for a batch is that for one environment.
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
     "block": Costs(Cost(2.6, 5.0, 0.05), Cost(32.0, 3.0, 0.9)),
+    "cluster": Costs(Cost(0.9, 0.35), Cost(40.0, 2.0)),
     "grid": Costs(Cost(1.2, 0.13), Cost(40.0, 2.0)),
     "stream": Costs(Cost(6.0, 0.18), Cost(40.0, 2.0)),
 }

@@ -26,9 +26,11 @@ def compile_device_plan(
 
     Args:
         values: the flat arrays of `Scene.values`.
-        patches: parts of the mesh that one thread block each works on, 1 to the number of tetrahedra; more are needed
-            when a patch has more numbers than 16 bits count, from about 20 000 tetrahedra on.
-        kernel: 0 when one thread block steps a whole environment, 1 when a grid does, 2 for kernels per iteration.
+        patches: parts of the mesh that one thread block each works on, 1 to the number of tetrahedra, of a cluster to
+            that of vertices and to 16; more are needed when a patch has more numbers than 16 bits count, from about
+            20 000 tetrahedra on.
+        kernel: 0 when one thread block steps a whole environment, 1 when a cluster of them does, 2 when a grid does,
+            3 for kernels per iteration.
         dtype: torch.float32 or torch.float64.
         progress: show a bar when the mesh is large.
 
@@ -38,7 +40,7 @@ def compile_device_plan(
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
     if kernel not in range(len(KERNELS)):
-        raise ValueError(f"kernel must be 0, 1 or 2, got {kernel}")
+        raise ValueError(f"kernel must be 0, 1, 2 or 3, got {kernel}")
     piece, _ = free_pieces(values)
     with compiling(len(values.tets), progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_device_plan(

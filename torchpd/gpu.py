@@ -22,19 +22,13 @@ class Properties(NamedTuple):
 
 def properties_of(device: torch.device) -> Properties:
     """Those of a GPU."""
+    from . import _C  # the doctor works without it
+
     found = torch.cuda.get_device_properties(device)
     # missing from the stubs of torch
     shared: int = found.shared_memory_per_block_optin  # type: ignore[attr-defined]
-    return Properties(found.multi_processor_count, shared, _cluster_of((found.major, found.minor)))
-
-
-def _cluster_of(capability: tuple[int, int]) -> int:
-    """Blocks of a cluster: 8 is what every device with clusters has, Hopper and the large Blackwells have more."""
-    from . import _C  # the doctor works without it
-
-    if capability < (9, 0):
-        return 1
-    return _C.most_cluster_blocks if capability[0] in (9, 10) else 8
+    with torch.cuda.device(device):
+        return Properties(found.multi_processor_count, shared, _C.largest_cluster())
 
 
 def why_not(built: bool, torch_cuda: str | None, devices: int, capability: tuple[int, int] | None = None) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,11 +17,11 @@ from . import _C
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, PLAN_TABLE, PlanRow
 
-__all__ = ["KERNELS", "Plan", "compile_plan", "compiling", "free_pieces", "internal_numbers"]
+__all__ = ["KERNELS", "Plan", "any_of", "compile_plan", "compiling", "free_pieces", "internal_numbers"]
 
 _WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
 # by their number in the `sizes` of a GPU's plan
-KERNELS = ("block", "grid", "stream")
+KERNELS = ("block", "cluster", "grid", "stream")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Plan:
 
     @property
     def kernel(self) -> str | None:
-        """Which kernel of a GPU the plan is for: "block", "grid" or "stream"; None for the CPU."""
+        """Which kernel of a GPU the plan is for: "block", "cluster", "grid" or "stream"; None for the CPU."""
         return KERNELS[self.size("kernel")] if self.table[: len(DEVICE_PLAN_TABLE)] == DEVICE_PLAN_TABLE else None
 
     def size(self, name: str) -> int:
@@ -117,6 +117,12 @@ def _patch_size(tets: int) -> int:
     patches = max(1, -(-tets // 2048))
     patches = -(-patches // 4) * 4 if tets >= 1024 else min(2, max(1, tets // 256))
     return max(16, -(-tets // patches))
+
+
+def any_of(names: Sequence[str]) -> str:
+    """Names of kernels as a sentence has them: "block", "grid" or "stream"."""
+    *before, last = (f'"{name}"' for name in names)
+    return f"{', '.join(before)} or {last}" if before else last
 
 
 def free_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

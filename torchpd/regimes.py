@@ -1,17 +1,24 @@
 """Which kernel of a GPU steps a scene, and the plan for it.
 
-    block   one thread block an environment, all iterations in one launch: the mesh fits a block's shared memory
-    grid    a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
-    stream  launches for every iteration: any mesh
+    block    one thread block an environment, all iterations in one launch: the mesh fits a block's shared memory
+    cluster  up to 16 blocks that reach each other's shared memory (compute capability 9.0), a patch each, all
+             iterations in one launch: a small mesh
+    grid     a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
+    stream   launches for every iteration: any mesh
 
-Up to 16 patches of a "grid" exchange through each other's shared memory where the GPU has clusters of blocks (compute
-capability 9.0): a few environments of a small mesh are then done in a third of the time of "block", which is for many.
+A few environments of a small mesh are done in a third of the time with "cluster" as with "block", which is for many.
+Every vertex belongs to one patch of a cluster, and a patch has every tetrahedron that touches one of its own vertices:
+those at the borders are worked out by several. So no forces are exchanged, and once an iteration the new position of a
+vertex is sent into the shared memory of the patches that have a copy of it. Patches of the others share no tetrahedra,
+and exchange the forces on vertices that they share.
 
 The batch does not enter: an environment gives the same bits alone and in any batch.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -21,15 +28,16 @@ import torch
 from . import _C
 from .device_plan import compile_device_plan
 from .gpu import Properties
-from .plan import KERNELS, Plan
+from .plan import KERNELS, Plan, any_of
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE
 
 __all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
 _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
-# of meshes that are cut in so few patches that their blocks may form a cluster (csrc/cuda/cluster.h)
-_CLUSTER_TETS, _CLUSTER_EACH = 8000, 200
+# "auto" looks at clusters for meshes of so many at most; where there are blocks, a patch of one for every so many
+_CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
+_CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
 # with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block
 _LEVEL_TETS, _LEVEL_ALONE = 384, 1152
 # a patch at most, six rounds of its threads, and how many share a multiprocessor of an H100 (csrc/cuda/stream.h)
@@ -40,8 +48,9 @@ _MOST_FIELDS = 2  # of a pass: the products with a second derivative
 
 def check_kernel(kernel: str) -> str:
     """The name of a kernel, or "auto"."""
-    if kernel not in ("auto", *KERNELS):
-        raise ValueError(f'Simulator: kernel must be "auto", "block", "grid" or "stream", got {kernel!r}')
+    names = ("auto", *KERNELS)
+    if kernel not in names:
+        raise ValueError(f"Simulator: kernel must be {any_of(names)}, got {kernel!r}")
     return kernel
 
 
@@ -53,6 +62,8 @@ def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
         return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.outer_static_bytes
     if plan.kernel == "stream":
         return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.pass_static_bytes
+    if plan.kernel == "cluster":
+        return _C.cluster_shared_bytes(real, slots, entries, plan.size("most_interior"), planes, balls)
     return _C.fused_shared_bytes(real, plan.kernel == "grid", slots, entries, planes, balls)
 
 
@@ -65,6 +76,15 @@ class _Scene(NamedTuple):
     def tets(self) -> int:
         return len(self.values.tets)
 
+    @property
+    def vertices(self) -> int:
+        return len(self.values.rest_positions)
+
+    @property
+    def real(self) -> int:
+        """Bytes of a number."""
+        return torch.finfo(self.dtype).bits // 8
+
     def plan(self, kernel: str, patches: int) -> Plan:
         number = KERNELS.index(kernel)
         arrays = compile_device_plan(self.values, patches, number, self.dtype, progress=self.progress)
@@ -73,30 +93,19 @@ class _Scene(NamedTuple):
     def shared_bytes(self, plan: Plan) -> int:
         return shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
 
-    def cluster_bytes(self, plan: Plan) -> int:
-        """Of a block, where the blocks of a "grid" form a cluster."""
-        real = torch.finfo(self.dtype).bits // 8
-        slots, seats = plan.size("most_slots"), plan.size("most_shared")
-        return _C.cluster_shared_bytes(real, self.shared_bytes(plan), slots, seats, plan.patches)
-
-    def forms_cluster(self, plan: Plan, gpu: Properties) -> bool:
-        """Whether its patches are as small as those of a cluster have to be (csrc/cuda/fused.cuh)."""
-        real = torch.finfo(self.dtype).bits // 8
-        small = _C.fits_cluster(real, plan.size("most_slots"), plan.size("most_pairs"))
-        return small and self.cluster_bytes(plan) <= gpu.shared
-
     def patches(self, kernel: str, gpu: Properties) -> int:
         if kernel == "block":
             return 1
         if kernel == "cluster":
-            return min(gpu.cluster, gpu.multiprocessors, max(2, self.tets // _CLUSTER_EACH), self.tets)
+            wanted = max(2, self.tets // _CLUSTER_EACH, math.ceil(self.vertices / (_CLUSTER_OWN * self.most_own())))
+            return min(gpu.cluster, gpu.multiprocessors, wanted, self.vertices, self.tets)
         if kernel == "grid":
             return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
         if kernel == "levels":
             if self.tets <= _LEVEL_ALONE:
                 return 1
             # 2.5 entries and at least a third of a slot a tetrahedron, see pass_shared_bytes
-            each = (4 * 2.5 + 6 / 3) * torch.finfo(self.dtype).bits / 8
+            each = (4 * 2.5 + 6 / 3) * self.real
             least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes))
             rounds = -(-int(least) // gpu.multiprocessors)
             return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
@@ -105,29 +114,46 @@ class _Scene(NamedTuple):
         wave = _STREAM_TOGETHER[self.dtype] * gpu.multiprocessors
         return patches if patches <= wave else -(-patches // wave) * wave
 
-    def least_shared_bytes(self, kernel: str, patches: int) -> int:
-        """Of the kernels block and grid, without building the plan: two tetrahedra have at least five entries."""
-        slots = len(self.values.rest_positions) if patches == 1 else 4
-        entries = 5 * -(-self.tets // patches) // 2
-        real = torch.finfo(self.dtype).bits // 8
+    def most_own(self) -> int:
+        """Vertices that a block of a cluster has threads for."""
+        return next(count - 1 for count in itertools.count(1) if not _C.fits_cluster(self.real, 1, count))
+
+    def considers(self, kernel: str, gpu: Properties) -> bool:
+        """Whether "auto" looks at a kernel."""
+        return kernel != "cluster" or (gpu.cluster > 1 and self.tets <= _CLUSTER_TETS)
+
+    def refuse_unbuilt(self, kernel: str, patches: int, gpu: Properties) -> str:
+        """What is too much of a kernel whatever the plan, which need not be built then; empty where nothing is."""
+        tets = -(-self.tets // patches)  # one patch has so many, and in a cluster copies of others
+        if kernel == "cluster":
+            return self.refuse_patch(-(-tets // 2), -(-self.vertices // patches))
+        slots = self.vertices if patches == 1 else 4
         planes, balls = len(self.values.planes), len(self.values.spheres)
-        return _C.fused_shared_bytes(real, kernel == "grid", slots, entries, planes, balls)
+        # two tetrahedra have at least five entries
+        least = _C.fused_shared_bytes(self.real, kernel == "grid", slots, 5 * tets // 2, planes, balls)
+        return f"at least {least:,} B" if least > gpu.shared else ""
+
+    def refuse_patch(self, pairs: int, interior: int) -> str:
+        """Why a patch of a cluster is too large for the threads of a block; empty where it is not."""
+        if _C.fits_cluster(self.real, pairs, interior):
+            return ""
+        return f"patches smaller than {pairs} pairs of tetrahedra and {interior} vertices"
 
 
 def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | None, str]:
-    """The plan, and the shared memory of a block; None where that is more than there is."""
-    if kernel == "grid" and gpu.cluster > 1 and scene.tets <= _CLUSTER_TETS:
-        plan = scene.plan("grid", scene.patches("cluster", gpu))
-        if scene.forms_cluster(plan, gpu):
-            return plan, f"{scene.cluster_bytes(plan):,} B"
+    """The plan, and what it needs; None where there is not as much."""
     patches = scene.patches(kernel, gpu)
-    least = scene.least_shared_bytes(kernel, patches)
-    if least > gpu.shared:
-        return None, f"at least {least:,} B"
+    refusal = scene.refuse_unbuilt(kernel, patches, gpu)
+    if refusal:
+        return None, refusal
     try:
         plan = scene.plan(kernel, patches)
     except ValueError as error:  # more entries or slots in a patch than 16 bits count
         return None, f"more than can be counted ({error})"
+    if kernel == "cluster":
+        refusal = scene.refuse_patch(plan.size("most_pairs"), plan.size("most_interior"))
+        if refusal:
+            return None, refusal
     needed = scene.shared_bytes(plan)
     return (plan if needed <= gpu.shared else None), f"{needed:,} B"
 
@@ -177,7 +203,8 @@ def choose_plan(
         values: the flat arrays of `Scene.values`.
         dtype: torch.float32 or torch.float64.
         gpu: what the device has.
-        kernel: "auto" takes the first of "block", "grid" and "stream" that fits.
+        kernel: "auto" takes the first of "block", "cluster", "grid" and "stream" that fits; a "cluster" where the GPU
+            has them, and for a small mesh alone.
         levels: for a multilevel solver, which runs as "stream" does but for its iterations.
         progress: show a bar when the mesh is large.
     """
@@ -189,24 +216,33 @@ def choose_plan(
                 f'Simulator: Multilevel runs with kernel="stream" on a GPU, got kernel={kernel!r}; leave it at "auto"'
             )
         return replace(_level_plan(scene, gpu), why="what Multilevel runs with")
+    if kernel == "cluster" and gpu.cluster == 1:
+        raise ValueError(
+            'Simulator: kernel="cluster" needs thread blocks that reach each other\'s shared memory (NVIDIA compute '
+            'capability 9.0), and this GPU has none; take "block", "grid" or "stream", or "auto", which takes the '
+            "first that fits"
+        )
     needs = []
-    for name in ("block", "grid"):
-        if kernel not in ("auto", name):
+    for name in KERNELS[:-1]:
+        if kernel != name and not (kernel == "auto" and scene.considers(name, gpu)):
             continue
         plan, needed = _fused_plan(scene, name, gpu)
         needs.append(f"{name} needs {needed}")
         if plan is not None:
             return replace(plan, why=_reason(kernel, needs, gpu))
         if kernel == name:
-            others = '"stream", which always fits' if name == "grid" else '"grid" or "stream"'
+            # those that come later need less
+            others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.considers(other, gpu)]
             raise ValueError(
-                f"Simulator: kernel={kernel!r} does not fit this GPU: it needs {needed} of shared memory a thread "
-                f'block, and {gpu.shared:,} B are there; take {others}, or "auto", which takes the first that fits'
+                f"Simulator: kernel={kernel!r} does not fit this GPU: {_facts(needs, gpu)}; take {any_of(others)}, or "
+                '"auto", which takes the first that fits'
             )
     return replace(_stream_plan(scene, gpu), why=_reason(kernel, needs, gpu))
 
 
 def _reason(kernel: str, needs: list[str], gpu: Properties) -> str:
-    if kernel != "auto":
-        return "asked for"
+    return "asked for" if kernel != "auto" else _facts(needs, gpu)
+
+
+def _facts(needs: list[str], gpu: Properties) -> str:
     return f"shared memory a thread block: {', '.join(needs)}, {gpu.shared:,} B are there"

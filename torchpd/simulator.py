@@ -49,8 +49,8 @@ class Simulator(Model):
             environments, "auto" for one.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
-        kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "grid" or "stream", see `torchpd.regimes`;
-            "auto" takes the first that fits. Changes nothing on the CPU.
+        kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "cluster", "grid" or "stream", see
+            `torchpd.regimes`; "auto" takes the first that fits. Changes nothing on the CPU.
         progress: show a bar while a large scene compiles.
     """
 

@@ -8,6 +8,7 @@ import torch
 
 from . import _C
 from .forecast import FAR_TOO_FEW, forecast
+from .plan import any_of
 from .regimes import shared_bytes
 from .solvers import Chebyshev, Multilevel, Solver
 from .tables import MULTILEVEL_TABLE
@@ -102,7 +103,8 @@ def _pass_line(sim: Simulator) -> str:
 
 _LAUNCHES = {
     "block": "one thread block an environment, all iterations in one launch",
-    "grid": "a thread block for each patch, all iterations in one launch",  # up to 16 form a cluster where they can
+    "cluster": "a cluster of thread blocks, one for each patch, all iterations in one launch",
+    "grid": "a thread block for each patch, all iterations in one launch",
     "stream": "a thread block for each patch, launches for every iteration",
 }
 _LEVEL_LAUNCHES = "some thread blocks an environment, all iterations in one launch"
@@ -112,17 +114,18 @@ def _kernel_lines(sim: Simulator) -> list[str]:
     plan = sim.plan
     kernel = str(plan.kernel)
     block = shared_bytes(plan, sim.planes.shape[-2], sim.spheres.shape[-2])
-    pairs = int(plan.patch_pairs.sum())
-    mesh = (
-        f"{plan.patches} patch{'es' * (plan.patches > 1)}, {pairs} pairs of tetrahedra, {plan.size('shared')} vertices"
-    )
+    patches = f"{plan.patches} patch{'es' * (plan.patches > 1)}, {int(plan.patch_pairs.sum())} pairs of tetrahedra"
+    shared = f"{plan.size('shared')} vertices that patches share"
+    if kernel == "cluster":
+        copies = int((plan.pair_tet < -1).sum()), plan.size("slots") - plan.vertices
+        shared = "{} copies of tetrahedra and {} of vertices".format(*copies)
     launches = _LEVEL_LAUNCHES if plan.for_levels else _LAUNCHES[kernel]
-    others = " or ".join(f'"{name}"' for name in _LAUNCHES if name != kernel)
+    others = any_of([name for name in _LAUNCHES if name != kernel])
     if kernel == "block":
-        others = others.replace('"grid"', '"grid", sooner done with a few environments,')
+        others = others.replace('"cluster"', '"cluster", sooner done with a few environments')
     return [
         f"kernel {kernel}: {launches}",
-        f"mesh: {mesh} that patches share, {block:,} B of shared memory a thread block",
+        f"mesh: {patches}, {shared}, {block:,} B of shared memory a thread block",
         f"why {kernel}: {plan.why}" + ("" if plan.for_levels else f"; Simulator(..., kernel=...) may ask for {others}"),
     ]
 
@@ -151,8 +154,11 @@ def _step_bytes(sim: Simulator, real: int) -> str:
         held = 26 if sim.scene.grounds or sim.scene.spheres else 0
         numbers = 4 * (7 + (16 if sim.solver.outer == "lbfgs" else 0)) + held
         return f"{own}, and {real * plan.vertices * numbers:,} B for each that the GPU has in work at a time"
-    # five vectors of four numbers a slot, the weights of 32 pairs a block
-    team = real * (20 * slots + 64 * plan.size("blocks"))
+    # five vectors of four numbers a slot; the weights of 32 pairs a block, but where each thread has its own
+    if plan.kernel != "cluster":
+        team = real * (20 * slots + 64 * plan.size("blocks"))
+    else:
+        team = 0 if real == 4 else real * 64 * plan.size("blocks")
     return f"{team:,} B for each environment that the GPU has in work at a time"
 
 

@@ -91,6 +91,22 @@ class ByteBarrier {
   SharedAddress at_;
 };
 
+// From another block's shared memory.
+PD_DEVICE float read_shared(SharedAddress from, float) {
+  float number = 0;
+#if PD_HAS_CLUSTERS
+  asm volatile("ld.shared::cluster.f32 %0, [%1];" : "=f"(number) : "r"(from) : "memory");
+#endif
+  return number;
+}
+PD_DEVICE double read_shared(SharedAddress from, double) {
+  double number = 0;
+#if PD_HAS_CLUSTERS
+  asm volatile("ld.shared::cluster.f64 %0, [%1];" : "=d"(number) : "r"(from) : "memory");
+#endif
+  return number;
+}
+
 // To another block's shared memory, whose barrier counts the bytes.
 PD_DEVICE void send(SharedAddress to, SharedAddress barrier, double a) {
 #if PD_HAS_CLUSTERS

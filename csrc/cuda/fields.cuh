@@ -113,7 +113,7 @@ __global__ void __launch_bounds__(field_threads)
     const Vec3<T> force = sum_entries(fields.entries, plan.slot_row[slot]);
     if (s < patch.interior) {
       write_vertex<Numbers>(work.field, environment, patch.first_vertex + s, force);
-    } else {
+    } else if (plan.shared > 0) {  // of a cluster none are, and their owners have all of the force
       work.shared_force[environment * plan.slots + slot] = quad(force);
     }
   }
@@ -152,7 +152,7 @@ __global__ void __launch_bounds__(field_threads)
                              numbers.template shape<OneOf<T, 1>>().inverse};
     for (int e = 0; e < 2; ++e) {
       const int tet = plan.pair_tet[place.in(2, e)];
-      if (tet < 0) continue;
+      if (tet < 0) continue;  // none, or written by another patch
       Vec3<T> x[4], dx[4];
       for (int c = 0; c < 4; ++c) {
         const int at = pair.slot(c < 3 ? c : 3 + e);

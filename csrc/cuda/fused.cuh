@@ -1,6 +1,7 @@
 // The fused kernel and its launch, for one precision.
 #pragma once
 #include "cuda/arena.h"
+#include "cuda/fused_halo.h"
 #include "cuda/fused_momentum.h"
 #include "cuda/fused_start.h"
 #include "cuda/fused_visit.h"
@@ -43,8 +44,13 @@ template <class T, bool Touching>
 FusedKernel<T> fused_kernel_for(Blocks kind, bool near, int threads) {
   constexpr int most = most_grid_threads<T>;
   if (kind == Blocks::cluster) {
-    if (threads <= 256) return fused_step<T, Touching, Blocks::cluster, true, 256, 1>;
-    return fused_step<T, Touching, Blocks::cluster, true, most, 1>;
+    constexpr int few = most * 5 / 8;  // have more registers each
+    if (threads <= few) {
+      if (near) return fused_step<T, Touching, Blocks::cluster, true, few, 1>;
+      return fused_step<T, Touching, Blocks::cluster, false, few, 1>;
+    }
+    if (near) return fused_step<T, Touching, Blocks::cluster, true, most, 1>;
+    return fused_step<T, Touching, Blocks::cluster, false, most, 1>;
   }
   if (kind == Blocks::grid) {
     if (near) return fused_step<T, Touching, Blocks::grid, true, most, 1>;
@@ -82,7 +88,7 @@ struct FusedLaunch {
   const void* function() const { return reinterpret_cast<const void*>(kernel); }
 
  private:
-  bool form_clusters(const DeviceStep<T>& step);
+  void form_clusters(const DeviceStep<T>& step);
   void keep_vertices(const DeviceStep<T>& step);
 };
 
@@ -112,9 +118,14 @@ bool near_with(const DevicePlan<T>& plan, int threads) {
 
 template <class T>
 FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
-    : kind(step.plan.kernel == int(DeviceKernel::grid) ? Blocks::grid : Blocks::one),
-      patches(kind == Blocks::grid ? step.plan.patches : 1) {
-  if (kind == Blocks::grid && form_clusters(step)) return;
+    : kind(step.plan.kernel == int(DeviceKernel::cluster) ? Blocks::cluster
+           : step.plan.kernel == int(DeviceKernel::grid)  ? Blocks::grid
+                                                          : Blocks::one),
+      patches(kind == Blocks::one ? 1 : step.plan.patches) {
+  if (kind == Blocks::cluster) {
+    form_clusters(step);
+    return;
+  }
   shared = fused_shared_bytes(step);
   threads = kind == Blocks::grid ? patch_threads(step.plan) : block_threads(sizeof(T), shared);
   if (kind == Blocks::grid) keep_vertices(step);
@@ -132,19 +143,35 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
 
 // Few patches, whose blocks reach each other's shared memory. The batch does not enter here either.
 template <class T>
-bool FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
-  if (patches > int(most_cluster_blocks)) return false;
+void FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
   shared = cluster_shared_bytes(step);
-  threads = patch_threads(step.plan);
-  if (!near_with(step.plan, threads)) return false;
-  kernel = fused_kernel(step, Blocks::cluster, true, threads);
-  if (resident_blocks(function(), threads, shared) == 0) return false;
-  const int clusters = resident_clusters(function(), threads, shared, patches);
-  if (clusters == 0) return false;
-  kind = Blocks::cluster;
+  threads = int(cluster_threads(sizeof(T), step.plan.most_pairs, step.plan.most_interior));
+  const bool near = halo_lanes(sizeof(T), step.plan.most_pairs, step.plan.most_interior) == 8;
+  kernel = fused_kernel(step, Blocks::cluster, near, threads);
+  int clusters = 0;
+  if (threads <= most_grid_threads<T> && resident_blocks(function(), threads, shared) > 0)
+    clusters = resident_clusters(function(), threads, shared, patches);
+  if (clusters == 0)
+    throw std::runtime_error(
+        "torchpd: this device runs no cluster of " + std::to_string(patches) + " blocks with " +
+        std::to_string(threads) + " threads and " + std::to_string(shared) +
+        " bytes of shared memory each; build the simulator with kernel=\"grid\"");
   kept = vertex_arrays;
   teams = int(std::min<std::int64_t>(step.batch, clusters));
-  return true;
+}
+
+// The most blocks of a cluster that this device runs, however much shared memory they want, and that this build has code for; 1:
+// none.
+template <class T>
+int largest_cluster_with() {
+  constexpr int threads = most_grid_threads<T>;
+  const auto* kernel =
+      reinterpret_cast<const void*>(fused_kernel_for<T, true>(Blocks::cluster, true, threads));
+  const std::size_t shared = shared_memory_per_block();
+  if (resident_blocks(kernel, threads, shared) == 0) return 1;
+  int blocks = int(most_cluster_blocks);
+  while (blocks > 1 && resident_clusters(kernel, threads, shared, blocks) == 0) blocks /= 2;
+  return blocks;
 }
 
 // As many as fit a block that has a multiprocessor to itself.
@@ -170,7 +197,9 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaun
     const bool shared = a < launch.kept || (a == array_u && launch.kind == Blocks::one);
     arena.place(s.vertex[a], shared ? 0 : teams * plan.slots);
   }
-  arena.place(s.weights, teams * plan.blocks * 2 * pair_lanes);
+  // with one tetrahedron a thread has its weight itself
+  const bool own = launch.kind == Blocks::cluster && near_once(sizeof(T));
+  arena.place(s.weights, own ? 0 : teams * plan.blocks * 2 * pair_lanes);
   arena.place(s.shift, teams * launch.patches * plan.pieces);
   arena.place(s.part_sum, teams * plan.parts * 4);
   return s;

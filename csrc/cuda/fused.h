@@ -1,12 +1,13 @@
 // Runner of solver/step.h inside a kernel: all iterations, and all steps of a rollout, in one launch.
 //
 // A team of blocks has one environment at a time, each block one patch of the mesh. The iterate lives in shared memory. With
-// one patch nothing leaves the block; with several, patches send each other the forces on the vertices that they share, and
-// each adds them up in the same order and moves its own copy, so one exchange an iteration is all.
+// one patch nothing leaves the block; with several, one exchange an iteration is all. Patches of a grid send each other the forces
+// on the vertices that they share, and each adds them up in the same order and moves its own copy. Those of a cluster share no
+// vertices: each works out all tetrahedra that touch its own, and sends where these are now.
 #pragma once
 #include "cuda/fused_call.h"
 #include "cuda/half.h"
-#include "cuda/mail.h"
+#include "cuda/halo.h"
 #include "cuda/patch.h"
 #include "cuda/vertices.h"
 #include "plan/shared_memory.h"
@@ -15,15 +16,20 @@
 namespace pd::inline PD_TARGET {
 
 // `Touching`: the scene has contacts. `Near`: of several patches, which are so small that vertex arrays fit shared memory
-// and that no thread has more than one slot, nor in float32 more than one tetrahedron. Those of a cluster always are.
+// and that no thread has more than one slot, nor in float32 more than one tetrahedron; of a cluster, where all are as small, with
+// so few own vertices that each has eight lanes and not four.
 template <class T, bool Touching, Blocks Kind, bool Near>
 class FusedRunner {
   static constexpr bool Many = Kind != Blocks::one;  // patches an environment
-  static constexpr bool Once = Near && near_once(sizeof(T));
+  static constexpr bool Clustered = Kind == Blocks::cluster;
+  static constexpr bool AtHand =
+      Near || Clustered;  // patches have the rest shapes of first tetrahedra
+  static constexpr bool Once = AtHand && near_once(sizeof(T));
   // near patches have their vertices at hand
   static constexpr bool looks_ahead = Kind == Blocks::grid && !Near;
   using Lanes = Thread<T>;
   using Letter = pd::Letter<T>;
+  using OwnHalo = Halo<T, Near ? 8 : 4>;
   using Seen = typename Vertices<T, Touching>::Seen;
 
   // A slot as a pass visits it.
@@ -35,7 +41,7 @@ class FusedRunner {
   };
 
  public:
-  // `shared`: as many bytes as fused_shared_bytes (plan/shared_memory.h) says, a cluster's with those of its mail
+  // `shared`: as many bytes as fused_shared_bytes (plan/shared_memory.h) says, or cluster_shared_bytes
   PD_DEVICE FusedRunner(const FusedCall<T>& call, std::byte* shared)
       : call_(call.step),
         plan_(call.step.plan),
@@ -48,41 +54,12 @@ class FusedRunner {
         control_(*reinterpret_cast<Control<T>*>(shared)),
         sums_(control_.totals,
               call.scratch.sums + std::int64_t(team_) * 2 * plan_.patches * sums_count,
-              ClusterSums(shared + sums_begin(call.step)), index_, plan_.patches),
+              ClusterSums(shared + cluster_sums_begin), index_, plan_.patches),
         h_(T(call.step.settings.time_step)),
-        theta_(T(call.step.settings.relaxation)),
-        mail_(shared + mail_begin(call.step), plan_.most_shared, plan_.patches, index_) {
-    std::byte* slots = shared + fused_control_bytes;
-    if constexpr (Many) {
-      slots_ = Slots<T>(slots, plan_.most_slots);
-      entries_ = reinterpret_cast<Quad<T>*>(slots + slots_bytes(sizeof(T), plan_.most_slots, 2));
-    } else {
-      position_ = reinterpret_cast<Quad<T>*>(slots);
-      entries_ = position_ + 2 * plan_.most_slots;
-    }
-    const auto array = [&](VertexArray a) {
-      Quad<T>* const kept =
-          reinterpret_cast<Quad<T>*>(shared + vertices_begin(call.step, Kind == Blocks::cluster));
-      Quad<T>* const far = call.scratch.vertex[a] + first_slot();
-      if constexpr (Kind == Blocks::one) return a == array_u ? position_ + plan_.most_slots : far;
-      if constexpr (Near) return kept + a * plan_.most_slots;
-      return a < call.kept ? kept + a * plan_.most_slots : far;
-    };
-    v_ = {array(array_x), array(array_velocity), array(array_target), array(array_u),
-          array(array_before)};
-    origin_ = array(array_origin);
-    balls_ = reinterpret_cast<Ball<T>*>(entries_ + plan_.most_entries);
-    planes_ = reinterpret_cast<Plane<T>*>(balls_ + call_.material.spheres_count);
-    if constexpr (!Near) {
-      const int threads = blockDim.x;
-      soon_ = min((2 * patch_.outer + threads - 1) / threads * threads, soon_);
-    }
-    if (Many && int(threadIdx.x) < patch_.slots) row_ = patch_.row(slot_of_seat(threadIdx.x));
-    if constexpr (Kind == Blocks::cluster) {
-      mail_.open(patch_, reinterpret_cast<const Senders*>(plan_.slot_sender), earlier_shared());
-      if (threadIdx.x == 0) ClusterSums(shared + sums_begin(call.step)).open();
-      cluster_barrier();
-    }
+        theta_(in_register(T(call.step.settings.relaxation))),
+        halo_(shared + halo_begin, plan_.most_slots) {
+    lay_out(call, shared);
+    open(shared);
   }
 
   // All steps of one environment, with a record every `every`.
@@ -95,12 +72,14 @@ class FusedRunner {
       if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
       move_balls();
     }
+    // nothing is under way to a block when it ends
+    if constexpr (Clustered) await_positions();
     __syncthreads();
   }
 
   PD_DEVICE void predict() {
     __syncthreads();
-    const Vec3<T> anchor = vec3(v_.x[0]);
+    const Vec3<T> anchor = anchor_of_step();
     each_slot([&](int s) {
       v_.predict(s, in_, patch_.vertex(s), h_);
       origin_[s] = quad(vec3(v_.x[s]) - anchor);
@@ -116,17 +95,20 @@ class FusedRunner {
     if (threadIdx.x == 0) {
       control_.progress.schedule =
           Schedule(set_, control_.progress.least, contacts_.friction() > T(0));
+      if constexpr (Clustered) control_.omega = T(control_.progress.schedule.next(0));
       control_.progress.used = 0;
       control_.progress.done = false;
     }
     finished_ = pending_ = false;
     started_ = false;
+    moved_ = true;
     __syncthreads();
   }
 
   // Exact minimum of E along the translation of every piece that nothing holds or touches: its momentum is then right
   // however few iterations follow.
   PD_DEVICE void translate() {
+    if constexpr (Clustered) release();
     settle();
     const bool given_first = set_.start == StartKind::given && !started_;
     const bool first = !started_;
@@ -141,12 +123,14 @@ class FusedRunner {
       move(s, u);
       if (first) v_.set_before(s, u);
     });
+    moved_ = true;
     __syncthreads();
   }
 
   // When the sums of an iteration are sent and concluded: with one block, or where they may stop it, in the next one before
   // its vertices. Near patches send them at its end, far ones at the start of the next; both conclude at the end of that.
   PD_DEVICE void iterate(int k) {
+    if constexpr (Clustered) return stops_ ? iterate_own<true>(k) : iterate_own<false>(k);
     const bool guard = set_.schedule == ScheduleKind::guarded && k % guard_period == 0;
     const bool stops = set_.tolerance > 0, early = guard && leaves_early();
     if (pending_ && !leaves_early() && leads()) sums_.send(Add{});
@@ -204,6 +188,7 @@ class FusedRunner {
   // The gradient on the straight course x + h v is what residuals are relative to, whatever the first iterate.
   PD_DEVICE void measure_course() {
     each_slot([&](int s) { move(s, v_.at(s).first(contacts_, v_.straight(s, h_))); });
+    moved_ = true;
     measure();
     if (threadIdx.x == 0) control_.progress.course = control_.progress.residual;
   }
@@ -228,6 +213,7 @@ class FusedRunner {
   }
 
   PD_DEVICE void finish() {
+    if constexpr (Clustered) __syncthreads();
     each_slot([&](int s) { v_.finish(s, h_); });
   }
 
@@ -248,14 +234,18 @@ class FusedRunner {
   PD_DEVICE Word* letter_box() const {
     return memory_.letters + (std::int64_t(team_) * 2 + (round_ & 1)) * plan_.slots * Letter::words;
   }
+  // Of a cluster its own vertices.
   template <class Visit>
   PD_DEVICE void each_slot(const Visit& visit) {
-    for (int s = threadIdx.x; s < patch_.slots; s += blockDim.x) visit(s);
+    const int slots = Clustered ? patch_.interior : patch_.slots;
+    for (int s = threadIdx.x; s < slots; s += blockDim.x) visit(s);
   }
 
-  // for elements to see
+  // for elements to see; of a cluster that happens when it is sent
   PD_DEVICE void place(int s, const Vec3<T>& position) {
-    if constexpr (Many) {
+    if constexpr (Clustered) {
+      return;
+    } else if constexpr (Many) {
       slots_.set_first(s, position);
     } else {
       position_[s] = quad(position);
@@ -285,15 +275,27 @@ class FusedRunner {
       // what small patches do not work out again they have registers for
       const auto inverse_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4],
                                   bool first) {
-        return Near && (Once || first) ? inverse_ : half_inverse(numbers, slots_, seen);
+        if (AtHand && (Once || first)) return inverse_;
+        if constexpr (Clustered) {
+          return half_inverse(numbers, rest_of<true>(patch_).position);
+        } else {
+          return half_inverse(numbers, slots_, seen);
+        }
+      };
+      const auto counts = [&](int number, T met) {
+        return !Clustered || this->counts(number, met);
       };
       HalfNumbers<T> now = half_;
       T energy = T(0);
       const int all = 2 * patch_.pairs;
 #pragma unroll 1
       for (int begin = 0, end = soon_;; begin = end, end = all) {
-        energy += each_half<Once>(patch_, slots_, inverse_of, weights(), entries_, element, now,
-                                  begin, end);
+        if constexpr (Clustered) {
+          return each_half<Once>(patch_, halo_.positions(round_), inverse_of, counts, weights(),
+                                 entries_of_round(), element, now, 0, all);
+        }
+        energy += each_half<Once>(patch_, slots_, inverse_of, counts, weights(), entries_, element,
+                                  now, begin, end);
         if (Near || end == all) return energy;
         __syncthreads();
         post_shared();
@@ -309,6 +311,7 @@ class FusedRunner {
   // the wait for letters.
   template <bool MayStop, class Element, class Lead, class Visit>
   PD_DEVICE void pass(const Element& element, const Lead& lead, bool early, const Visit& visit) {
+    if constexpr (Clustered) return pass_own(element, visit);
     energy_ = double(each_element(element));
     first_ = second_ = 0;
     late_ = Many && MayStop && pending_ && set_.tolerance > 0;
@@ -368,10 +371,33 @@ class FusedRunner {
   PD_DEVICE void see_first();
   template <bool MayStop, class Visit>
   PD_DEVICE void visit_seat(bool early, const Visit& visit);
-  PD_DEVICE void leave_energy();
+  PD_DEVICE void leave_energy(bool owned);
 
-  // Whether energies are left before the wait for letters, and sent once the leading warp has made its own visits.
-  PD_DEVICE bool leaves_early() const { return Many && Near && !(set_.tolerance > 0); }
+  // ---- what is different in a cluster: cuda/fused_halo.h
+
+  // whether this warp has any own vertices, and whether this thread is the first of the lanes of one
+  PD_DEVICE bool has_own() const { return OwnHalo::first_vertex() < patch_.interior; }
+  PD_DEVICE bool is_first() const {
+    return OwnHalo::part() == 0 && OwnHalo::vertex() < patch_.interior;
+  }
+  PD_DEVICE bool counts(int number, T met) const;
+  PD_DEVICE bool counts_energy(int number) const;
+  PD_DEVICE Vec3<T> anchor_of_step();
+  PD_DEVICE Quad<T>* entries_of_round() const {
+    return entries_ + (round_ & 1) * plan_.most_entries;
+  }
+  PD_DEVICE void hold();
+  PD_DEVICE void release();
+  PD_DEVICE void await_positions();
+  PD_DEVICE void send_positions();
+  template <bool Stops>
+  PD_DEVICE void iterate_own(int k);
+  template <class Element, class Visit>
+  PD_DEVICE void pass_own(const Element& element, const Visit& visit);
+
+  // Whether nobody waits for the sums of the last iteration but the leading warp: energies are left before the wait for letters,
+  // and sent once it has made its own visits.
+  PD_DEVICE bool leaves_early() const { return Many && AtHand && !(set_.tolerance > 0); }
 
   // Leading warp: what follows from the sums of the last iteration.
   PD_DEVICE void conclude() {
@@ -397,10 +423,13 @@ class FusedRunner {
 
   // ---- start of a call: cuda/fused_start.h
 
+  PD_DEVICE void lay_out(const FusedCall<T>& call, std::byte* shared);
+  PD_DEVICE void open(std::byte* shared);
   PD_DEVICE void load();
   PD_DEVICE void move_balls();
   PD_DEVICE void weigh();
   PD_DEVICE void weigh_with(const T* stiffness, bool bounded);
+  PD_DEVICE T weigh_own(const T* stiffness, bool bounded);
 
   // ---- momentum: cuda/fused_momentum.h
 
@@ -435,27 +464,34 @@ class FusedRunner {
   const FusedScratch<T>& memory_;
   Control<T>& control_;
   TeamSums<Kind> sums_;
-  // where elements read vertices, from the patch's first; with many patches rest positions too
+  // where elements read vertices, from the patch's first; of a grid with rest positions; of a cluster halo_ has them
   Quad<T>* position_;
   Slots<T> slots_;
   Quad<T>* entries_;  // forces of elements
+  double* energies_;  // of a cluster: what each thread has met of them
   Vertices<T, Touching> v_;
-  Quad<T>* origin_;  // start of the step, from the patch's first
+  Quad<T>* origin_;  // start of the step, from the patch's first vertex, of a cluster the mesh's
   Plane<T>* planes_;
   Ball<T>* balls_;
   Inputs<T> in_;
   Contacts<T> contacts_;
-  ClusterMail<T> mail_;  // of a cluster
+  OwnHalo halo_;         // of a cluster
   HalfNumbers<T> half_;  // with many patches: this thread's first tetrahedron
   Mat3<T> inverse_;      // where they are near: its Dm^-1
-  int row_ = 0;          // with many patches: slot_row of this thread's first seat
-  Seat at_;              // the seat that comes next,
-  Seen seen_;            // with what a pass knows of its vertex
+  int row_ =
+      0;  // slot_row of a grid's first seat of this thread, of the vertex that it has in a cluster
+  Seat at_;    // the seat that comes next,
+  Seen seen_;  // with what a pass knows of its vertex
   T h_, theta_, omega_ = T(1);
   double energy_ = 0, first_ = 0, second_ = 0;  // this thread's part of the sums
-  unsigned round_ = 0;                          // exchanges of letters so far
+  unsigned round_ = 0;                          // exchanges so far
+  unsigned awaited_ = 0;                        // of a cluster: those that were waited for
   bool finished_ = false, pending_ = false, guarding_ = false, started_ = false, late_ = false;
   T coming_ = T(1);  // of the leader: the next omega
+  // of a cluster: whether vertices have moved since they were sent, whether seen_ is newer than their arrays, whether the environment
+  // has just been loaded, whether the energy of this thread's first tetrahedron counts; whether a tolerance may stop it
+  bool moved_ = false, held_ = false, loaded_ = false, counts_ = false;
+  int stops_ = in_register(int(set_.tolerance > 0));
 };
 
 }  // namespace pd::inline PD_TARGET

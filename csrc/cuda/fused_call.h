@@ -1,15 +1,15 @@
 // What the fused kernel is given, and what it keeps where.
 #pragma once
+#include "cuda/halo.h"
 #include "cuda/inputs.h"
 #include "cuda/launch.h"
-#include "cuda/mail.h"
 #include "cuda/team.h"
 #include "plan/shared_memory.h"
 
 namespace pd::inline PD_TARGET {
 
 // What a team knows of every slot and elements do not need, in the order of how often iterations ask for it. A block that has
-// one of several patches keeps as many as fit in its shared memory, a cluster's all.
+// one of several patches keeps as many as fit in its shared memory, a cluster's those of its own vertices.
 enum VertexArray { array_u, array_before, array_target, array_origin, array_x, array_velocity };
 constexpr int vertex_arrays = 6;
 
@@ -32,33 +32,31 @@ struct FusedCall {
   int kept;  // vertex arrays in shared memory
 };
 
-// Shared memory of a block, without a cluster's mail.
+// Shared memory of a block that is in no cluster.
 template <class T>
 PD_HD std::size_t fused_shared_bytes(const DeviceStep<T>& step) {
-  const bool many = step.plan.kernel != int(DeviceKernel::block);
+  const bool many = step.plan.kernel == int(DeviceKernel::grid);
   return pd::fused_shared_bytes(sizeof(T), many, step.plan.most_slots, step.plan.most_entries,
                                 step.material.planes_count, step.material.spheres_count);
 }
 
-// Where the parts lie that a block of a cluster has behind those.
-template <class T>
-PD_HD std::size_t sums_begin(const DeviceStep<T>& step) {
-  return aligned(fused_shared_bytes(step));
-}
-template <class T>
-PD_HD std::size_t mail_begin(const DeviceStep<T>& step) {
-  return sums_begin(step) + cluster_sums_bytes;
-}
-// `cluster`: behind the mail
+// Where the parts of a block's shared memory lie behind what it decides: of a cluster sums, energies and positions, then entries, planes and
+// balls, then vertex arrays; else positions first.
+constexpr std::size_t cluster_sums_begin = fused_control_bytes;
+constexpr std::size_t cluster_energy_begin = cluster_sums_begin + cluster_sums_bytes;
+constexpr std::size_t halo_begin = cluster_energy_begin + cluster_energy_bytes;
+
 template <class T>
 PD_HD std::size_t vertices_begin(const DeviceStep<T>& step, bool cluster) {
   if (!cluster) return aligned(fused_shared_bytes(step));
-  return mail_begin(step) + mail_bytes(sizeof(T), step.plan.most_shared, step.plan.patches);
+  return cluster_vertices_begin(sizeof(T), step.plan.most_slots, step.plan.most_entries,
+                                step.material.planes_count, step.material.spheres_count);
 }
 template <class T>
 PD_HD std::size_t cluster_shared_bytes(const DeviceStep<T>& step) {
-  return pd::cluster_shared_bytes(sizeof(T), fused_shared_bytes(step), step.plan.most_slots,
-                                  step.plan.most_shared, step.plan.patches);
+  return pd::cluster_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries,
+                                  step.plan.most_interior, step.material.planes_count,
+                                  step.material.spheres_count);
 }
 
 // What the leading warp of a block decides for it.
@@ -66,6 +64,9 @@ template <class T>
 struct Control {
   Progress progress;
   T omega;
+  // of a cluster: of even and of odd iterations; where the first vertex of the mesh is when a call begins
+  T turn_omega[2];
+  Vec3<T> anchor;
   TeamTotals totals;
 };
 

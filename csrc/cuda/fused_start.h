@@ -1,8 +1,56 @@
-// Members of FusedRunner that prepare an environment: its state in the memory of the block, its weights.
+// Members of FusedRunner that prepare a call and an environment: its state in the memory of the block, its weights.
 #pragma once
 #include "cuda/fused.h"
 
 namespace pd::inline PD_TARGET {
+
+// Where everything lies in the memory of the block, and what does not fit there.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::lay_out(const FusedCall<T>& call,
+                                                             std::byte* shared) {
+  std::byte* slots = shared + fused_control_bytes;
+  if constexpr (Clustered) {
+    energies_ = reinterpret_cast<double*>(shared + cluster_energy_begin);
+    entries_ =
+        reinterpret_cast<Quad<T>*>(shared + halo_begin + halo_bytes(sizeof(T), plan_.most_slots));
+  } else if constexpr (Many) {
+    slots_ = Slots<T>(slots, plan_.most_slots);
+    entries_ = reinterpret_cast<Quad<T>*>(slots + slots_bytes(sizeof(T), plan_.most_slots, 2));
+  } else {
+    position_ = reinterpret_cast<Quad<T>*>(slots);
+    entries_ = position_ + 2 * plan_.most_slots;
+  }
+  const auto array = [&](VertexArray a) {
+    Quad<T>* const kept = reinterpret_cast<Quad<T>*>(shared + vertices_begin(call.step, Clustered));
+    if constexpr (Clustered) return kept + a * plan_.most_interior;
+    Quad<T>* const far = call.scratch.vertex[a] + first_slot();
+    if constexpr (Kind == Blocks::one) return a == array_u ? position_ + plan_.most_slots : far;
+    if constexpr (Near) return kept + a * plan_.most_slots;
+    return a < call.kept ? kept + a * plan_.most_slots : far;
+  };
+  v_ = {array(array_x), array(array_velocity), array(array_target), array(array_u),
+        array(array_before)};
+  origin_ = array(array_origin);
+  balls_ = reinterpret_cast<Ball<T>*>(entries_ + (Clustered ? 2 : 1) * plan_.most_entries);
+  planes_ = reinterpret_cast<Plane<T>*>(balls_ + call_.material.spheres_count);
+}
+
+// What a thread knows of its patch.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::open(std::byte* shared) {
+  if constexpr (!Near) {
+    const int threads = blockDim.x;
+    soon_ = min((2 * patch_.outer + threads - 1) / threads * threads, soon_);
+  }
+  if constexpr (Clustered) {
+    if (OwnHalo::vertex() < patch_.interior) row_ = patch_.row(OwnHalo::vertex());
+    halo_.open(patch_);
+    if (threadIdx.x == 0) ClusterSums(shared + cluster_sums_begin).open();
+    cluster_barrier();
+  } else if constexpr (Many) {
+    if (int(threadIdx.x) < patch_.slots) row_ = patch_.row(slot_of_seat(threadIdx.x));
+  }
+}
 
 template <class T, bool Touching, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::load() {
@@ -11,12 +59,18 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::load() {
   each_slot([&](int s) {
     v_.load(s, in_, patch_.vertex(s), h_);
     const Vec3<T> none = {T(0), T(0), T(0)};
-    if constexpr (Many) {
+    if constexpr (Clustered) {
+      return;
+    } else if constexpr (Many) {
       slots_.set(s, none, rest_of<true>(patch_).position[s].bits());
     } else {
       position_[s] = quad(none);
     }
   });
+  // before the other blocks may write a step's result to the same place
+  if (Clustered && threadIdx.x == 0) control_.anchor = in_.at_vertex(call_.positions, 0);
+  loaded_ = true;
+  moved_ = false;
   __syncthreads();
 }
 
@@ -33,7 +87,13 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::move_balls() {
 template <class T, bool Touching, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::weigh() {
   const T* stiffness = call_.material.stiffness.of(in_.environment);
-  weigh_with(stiffness, set_.weighted);
+  constexpr bool own = Clustered && Once;
+  T plain = T(0);
+  if constexpr (own) {
+    plain = weigh_own(stiffness, set_.weighted);
+  } else {
+    weigh_with(stiffness, set_.weighted);
+  }
   if (threadIdx.x == 0) control_.progress.done = false;
   pending_ = false;
   __syncthreads();
@@ -45,7 +105,11 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::weigh() {
       });
   sums_.all_reduce({least, 0, 0}, 1, Least{});
   if (threadIdx.x == 0) control_.progress.least = sums_.total(0);
-  if (set_.weighted) weigh_with(stiffness, false);
+  if constexpr (own) {
+    half_.weight = plain;
+  } else if (set_.weighted) {
+    weigh_with(stiffness, false);
+  }
   __syncthreads();
 }
 
@@ -54,11 +118,30 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::weigh_with(const T* stiffne
   weigh_pairs(patch_, rest_of<Many>(patch_), stiffness, bounded, weights());
   __syncthreads();  // one lane has left the weights of two
   if constexpr (Many) half_ = read_half(patch_, weights(), threadIdx.x);
-  if constexpr (Many && Near) {
+  if constexpr (Clustered) {
+    inverse_ = half_inverse(half_, rest_of<true>(patch_).position);
+    counts_ = counts_energy(threadIdx.x);
+  } else if constexpr (Many && Near) {
     Quad<T> seen[4];
     look(half_, slots_, seen);
     inverse_ = half_inverse(half_, slots_, seen);
   }
+}
+
+// The same without memory where no thread has more than one tetrahedron. Returns its weight without the bound.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE T FusedRunner<T, Touching, Kind, Near>::weigh_own(const T* stiffness, bool bounded) {
+  const ComputedRest<T> rest = rest_of<true>(patch_);
+  const PairPlace place = place_of(patch_, min(int(threadIdx.x) / 2, patch_.pairs - 1));
+  const int which = int(threadIdx.x) % 2, tet = tet_of(plan_, place, which);
+  half_ = read_half<false, T>(patch_, nullptr, threadIdx.x);
+  const T bound = bounded ? plan_.pair_bound[place.in(2, which)] : T(1);
+  const T volume = tet < 0 ? T(0) : volume_of(rest.unit, half_.factor);
+  const T plain = tet < 0 ? T(0) : volume * stiffness[tet];
+  half_.weight = tet < 0 ? T(0) : volume * bound * stiffness[tet];
+  inverse_ = half_inverse(half_, rest.position);
+  counts_ = counts_energy(threadIdx.x);
+  return plain;
 }
 
 }  // namespace pd::inline PD_TARGET

@@ -1,4 +1,4 @@
-// Members of FusedRunner that visit the slots of one of several patches, and exchange forces meanwhile.
+// Members of FusedRunner that visit the slots of a patch of a grid, and exchange forces meanwhile.
 #pragma once
 #include "cuda/fused.h"
 
@@ -69,8 +69,8 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::see_first() {
 
 // What the guard wants to know of this iterate, before it is moved.
 template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::leave_energy() {
-  if (int(threadIdx.x) < patch_.slots && at_.owned()) energy_ += seen_.energy();
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::leave_energy(bool owned) {
+  if (owned) energy_ += seen_.energy();
   sums_.leave_early({energy_, 0, 0}, 1, Add{});
 }
 
@@ -108,29 +108,18 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_seat(bool early, cons
   // of the warp: any slots, any shared ones
   const bool here = seat - lane() < patch_.slots, waits = seat - lane() < shared;
   const bool sends = seat < shared;
-  if (Kind == Blocks::cluster && seat == 0) mail_.expect(round_);
   Vec3<T> force = {T(0), T(0), T(0)};
   if (here) {
     force = sum_entries_soon(entries_, row_);
-    if constexpr (Kind == Blocks::cluster) {
-      if (waits) mail_.send(force, round_);
-    } else {
-      if (sends) post(seat, force);
-    }
+    if (sends) post(seat, force);
     see(seat);
   }
-  if (early) leave_energy();
+  if (early) leave_energy(seat < patch_.slots && at_.owned());
   __syncwarp();
-  if (Kind == Blocks::cluster && waits) mail_.wait(round_);
   heed_late<MayStop>();
   if (finished_ || !here) return;
   if (waits) {
-    Vec3<T> sum;
-    if constexpr (Kind == Blocks::cluster) {
-      sum = mail_.receive(round_);
-    } else {
-      sum = read(seat);
-    }
+    const Vec3<T> sum = read(seat);
     if (sends) force = sum;
     __syncwarp();
   }

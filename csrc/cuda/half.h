@@ -16,8 +16,9 @@ struct HalfNumbers {
   PD_HD unsigned slot_times_8(int c) const { return corner[c] & 0xffff; }
 };
 
-// `number`: of the tetrahedron. 32 bits count the numbers of all pairs, of which there are fewer than 2^29.
-template <class T>
+// `number`: of the tetrahedron. 32 bits count the numbers of all pairs, of which there are fewer than 2^29. Without `Weighed` the
+// weight is not known yet.
+template <bool Weighed = true, class T>
 PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int number) {
   HalfNumbers<T> numbers;
   // lanes past the end repeat the last pair
@@ -32,7 +33,8 @@ PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int 
   for (unsigned c = 0; c < 3; ++c) numbers.corner[c] = corner(c);
   numbers.corner[3] = corner(3 + which);
   const unsigned own = of_two + which * pair_lanes;
-  numbers.weight = weights[own];
+  numbers.weight = T(0);
+  if constexpr (Weighed) numbers.weight = weights[own];
   numbers.factor = patch.plan.pair_factor[own];
   return numbers;
 }
@@ -47,8 +49,16 @@ PD_DEVICE Mat3<T> half_inverse(const HalfNumbers<T>& numbers, const Slots<T>& sl
   return ComputedRest<T>::between(point, numbers.factor);
 }
 
+// The same from the rest positions themselves.
 template <class T>
-PD_DEVICE void look(const HalfNumbers<T>& numbers, const Slots<T>& slots, Quad<T> (&seen)[4]) {
+PD_DEVICE Mat3<T> half_inverse(const HalfNumbers<T>& numbers, const RestPoint<T>* rest) {
+  RestPoint<T> point[4];
+  for (int c = 0; c < 4; ++c) point[c] = rest[numbers.slot_times_8(c) / 8];
+  return ComputedRest<T>::between(point, numbers.factor);
+}
+
+template <class T, class Slots>
+PD_DEVICE void look(const HalfNumbers<T>& numbers, const Slots& slots, Quad<T> (&seen)[4]) {
   for (int c = 0; c < 4; ++c) seen[c] = slots.look(numbers.slot_times_8(c));
 }
 
@@ -79,13 +89,14 @@ PD_DEVICE Vec3<T> add_partner(const Vec3<T>& a) {
 }
 
 // Runs an effect on the tetrahedra [begin, end) of all pairs; returns the sum of energies that this thread has met. `begin` and
-// an `end` before the last are multiples of the threads. `slots`: position and rest position. `now`: what `read_half` gave for
+// an `end` before the last are multiples of the threads. `slots`: where positions are. `now`: what `read_half` gave for
 // this thread's first tetrahedron from `begin` on; after it from `end` on. `inverse_of(numbers, seen, first)`: Dm^-1 of a
-// tetrahedron, given what was seen of its slots, and whether it is the thread's first of all. `Once`: no thread has a second.
-template <bool Once, class T, class Element, class InverseOf>
-PD_DEVICE T each_half(const Patch<T>& patch, const Slots<T>& slots, const InverseOf& inverse_of,
-                      const T* weights, Quad<T>* entries, const Element& element,
-                      HalfNumbers<T>& now, int begin, int end) {
+// tetrahedron, given what was seen of its slots, and whether it is the thread's first of all; `counts(number, met)`: whether its
+// energy does. `Once`: no thread has a second.
+template <bool Once, class T, class Slots, class Element, class InverseOf, class Counts>
+PD_DEVICE T each_half(const Patch<T>& patch, const Slots& slots, const InverseOf& inverse_of,
+                      const Counts& counts, const T* weights, Quad<T>* entries,
+                      const Element& element, HalfNumbers<T>& now, int begin, int end) {
   T energy = T(0);
   const int lane = int(threadIdx.x) % warp_size;
   for (int first = begin + int(threadIdx.x) - lane; first < end; first += blockDim.x) {
@@ -108,7 +119,7 @@ PD_DEVICE T each_half(const Patch<T>& patch, const Slots<T>& slots, const Invers
     const int entry = int((second ? now.corner[2] : now.corner[0]) >> 16);
     const int apex = int(now.corner[3] >> 16);
     if (here) {
-      energy += met;
+      if (counts(first + lane, met)) energy += met;
       entries[entry] = quad(own);
       if (!second) entries[now.corner[1] >> 16] = quad(force[1]);
       if (apex != no_entry) entries[apex] = quad(force[3]);

@@ -8,20 +8,25 @@ namespace pd {
 
 // How a plan is run, in DevicePlan::kernel.
 enum class DeviceKernel : int {
-  block = 0,   // one block an environment, all iterations in one launch
-  grid = 1,    // one block a patch, all iterations in one launch
-  stream = 2,  // kernels for every iteration
+  block = 0,  // one block an environment, all iterations in one launch
+  cluster =
+      1,  // one block a patch, which reach each other's shared memory, all iterations in one launch
+  grid = 2,    // one block a patch, all iterations in one launch
+  stream = 3,  // kernels for every iteration
 };
 
 constexpr int most_threads = 640;  // of a block
 
 using Stream = void*;  // cudaStream_t
 
-// Bytes of device memory that a run wants, aligned to 256. Fused: kernels block and grid.
+// Bytes of device memory that a run wants, aligned to 256. Fused: kernels block, cluster and grid.
 template <class T>
 std::int64_t fused_bytes(const DeviceStep<T>& call);
 template <class T>
 void run_fused(const DeviceStep<T>& call, void* memory, Stream stream);
+// Blocks of the largest cluster that the current device runs; 1: it has none, or this build no code for them.
+int largest_cluster();
+
 template <class T>
 std::int64_t stream_bytes(const DeviceStep<T>& call);
 template <class T>

@@ -23,6 +23,20 @@ PD_HD Quad<T> quad(const Vec3<T>& a, T w = T(0)) {
   return {a.x, a.y, a.z, w};
 }
 
+// What the compiler would rather work out again than keep.
+PD_DEVICE int in_register(int value) {
+  asm volatile("" : "+r"(value));
+  return value;
+}
+PD_DEVICE float in_register(float value) {
+  asm volatile("" : "+f"(value));
+  return value;
+}
+PD_DEVICE double in_register(double value) {
+  asm volatile("" : "+d"(value));
+  return value;
+}
+
 template <class T>
 PD_HD Vec3<T> read3(const T* p) {
   return {p[0], p[1], p[2]};

@@ -75,6 +75,13 @@ struct PairPlace {
   }
 };
 
+// A pair's tetrahedron by the user's number, -1: none; where several patches have it, all say so.
+template <class T>
+PD_DEVICE int tet_of(const DevicePlan<T>& plan, PairPlace place, int which) {
+  const int tet = plan.pair_tet[place.in(2, which)];
+  return tet < -1 ? -2 - tet : tet;
+}
+
 template <class T>
 PD_DEVICE PairPlace place_of(const Patch<T>& patch, int pair) {
   return {patch.first_block + pair / pair_lanes, pair % pair_lanes};
@@ -163,6 +170,12 @@ struct alignas(16) RestPoint<double> {
   PD_DEVICE static RestPoint of(const Vec3<double>& bits) { return {bits.x, bits.y, bits.z, 0}; }
 };
 
+// [m^3], given pair_factor and patch_unit
+template <class T>
+PD_HD T volume_of(T unit, T factor) {
+  return unit * unit / (T(6) * absolute(factor));
+}
+
 // Rest shapes worked out from rest positions: a quarter of the bytes.
 template <class T>
 struct ComputedRest {
@@ -178,7 +191,7 @@ struct ComputedRest {
     PD_HD RestShape<T> shape() const {
       constexpr int which = Take::which;
       return {between({corner[0], corner[1], corner[2], corner[3 + which]}, factor[which]),
-              unit * unit / (T(6) * absolute(factor[which]))};
+              volume_of(unit, factor[which])};
     }
   };
 
@@ -269,7 +282,7 @@ PD_DEVICE void weigh_pairs(const Patch<T>& patch, const Rest& rest, const T* sti
     const T volume[2] = {numbers.template shape<OneOf<T, 0>>().volume,
                          numbers.template shape<OneOf<T, 1>>().volume};
     for (int e = 0; e < 2; ++e) {
-      const int tet = patch.plan.pair_tet[place.in(2, e)];
+      const int tet = tet_of(patch.plan, place, e);
       const T bound = bounded ? patch.plan.pair_bound[place.in(2, e)] : T(1);
       weights[place.in(2, e)] = tet < 0 ? T(0) : volume[e] * bound * stiffness[tet];
     }

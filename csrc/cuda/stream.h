@@ -184,8 +184,9 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
   const auto inverse_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4], bool) {
     return half_inverse(numbers, slots, seen);
   };
-  const double energy = double(each_half<false>(patch, slots, inverse_of, w.weights, entries,
-                                                element, now, 0, 2 * patch.pairs));
+  const double energy = double(each_half<false>(
+      patch, slots, inverse_of, [](int, T) { return true; }, w.weights, entries, element, now, 0,
+      2 * patch.pairs));
   // on the way while the block meets
   int s = threadIdx.x, row = 0;
   decltype(see(0)) seen{};

@@ -36,6 +36,7 @@ class TeamSums {
   template <class Op>
   PD_DEVICE void leave(const double (&value)[sums_count], int wanted, Op op) {
     wanted_ = wanted;
+    left_ = blockDim.x / warp_size;
 #pragma unroll
     for (int n = 0; n < sums_count; ++n) {
       if (n >= wanted) break;
@@ -52,6 +53,16 @@ class TeamSums {
     if (!leads())
       asm volatile("bar.arrive %0, %1;" ::"n"(early_barrier), "r"(blockDim.x) : "memory");
   }
+  // Leading warp, in place of all: one value, of which every thread has left a part in `values` [threads] before a barrier.
+  template <class Op>
+  PD_DEVICE void gather(const double* values, Op op) {
+    double sum = Op::none;
+    for (int i = lane(); i < int(blockDim.x); i += warp_size) sum = op(sum, values[i]);
+    totals_.warp_sum[0][lane()] = sum;
+    wanted_ = 1;
+    left_ = warp_size;
+    __syncwarp();
+  }
   // Leading warp: until all have left theirs early.
   PD_DEVICE void await_early() const {
     __syncwarp();
@@ -61,11 +72,10 @@ class TeamSums {
   // Leading warp: the sums of the block, to the other blocks.
   template <class Op>
   PD_DEVICE void send(Op op) {
-    const int warps = blockDim.x / warp_size;
     ++round_;
 #pragma unroll 1
     for (int n = 0; n < wanted_; ++n) {
-      const double sum = across_warp(lane() < warps ? totals_.warp_sum[n][lane()] : Op::none, op);
+      const double sum = across_warp(lane() < left_ ? totals_.warp_sum[n][lane()] : Op::none, op);
       if constexpr (Kind == Blocks::cluster) {
         if (n == 0 && lane() == 0) cluster_.expect(round_, wanted_ * patches_);
         if (lane() < patches_) cluster_.send(lane(), patch_, n, sum, round_);
@@ -100,17 +110,16 @@ class TeamSums {
     __syncwarp();
   }
 
-  // All threads; the totals are there when it returns.
-  template <class Op>
+  // All threads; the totals are there when it returns. `Meets`: what any wrote before can be read by all after.
+  template <bool Meets = false, class Op>
   PD_DEVICE void all_reduce(const double (&value)[sums_count], int wanted, Op op) {
     leave(value, wanted, op);
     __syncthreads();
     if (leads()) {
-      // what other warps wrote before the barrier goes before the sums, and what is read after them goes after
-      if constexpr (Many) __threadfence();
+      if constexpr (Meets) __threadfence();
       send(op);
       receive(op);
-      if constexpr (Many) __threadfence();
+      if constexpr (Meets) __threadfence();
     }
     __syncthreads();
   }
@@ -120,8 +129,7 @@ class TeamSums {
     if constexpr (!Many) {
       __syncthreads();
     } else {
-      __threadfence();
-      all_reduce({0, 0, 0}, 1, Add{});
+      all_reduce<true>({0, 0, 0}, 1, Add{});
     }
   }
 
@@ -134,7 +142,8 @@ class TeamSums {
   Word* box_;
   ClusterSums cluster_;
   int patch_, patches_;
-  int wanted_ = 0;      // sums that were left
+  int wanted_ = 0;      // sums that were left,
+  int left_ = 0;        // in so many parts
   unsigned round_ = 0;  // exchanges so far
 };
 

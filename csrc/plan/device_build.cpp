@@ -1,10 +1,12 @@
 #include "plan/device_build.h"
 
 #include "cpu/team.h"
+#include "plan/ownership.h"
 #include "plan/pairing.h"
 #include "plan/partition.h"
 #include "plan/phases.h"
 #include "plan/rest.h"
+#include "plan/shared_memory.h"
 
 #include <algorithm>
 #include <cmath>
@@ -21,12 +23,21 @@ constexpr int lanes = 32, slice = 8;
 constexpr int small_pairs = 512;                          // of a patch
 constexpr std::int64_t none = 65535;                      // entries of a patch count up to one less
 constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
+// numbers of kernels, as DeviceKernel has them
+constexpr int block_kernel = 0, cluster_kernel = 1, grid_kernel = 2;
 
 struct Mesh {
   const double* positions;
   const std::int64_t* tets;
   Partition partition;
   Numbering numbering;
+  std::vector<std::int32_t> owner;  // of a cluster: the patch of each vertex
+
+  // The patch that counts a tetrahedron, where several work it out.
+  std::int32_t counted_by(std::int32_t tet) const {
+    const std::int64_t* v = tets + 4 * std::int64_t(tet);
+    return std::min({owner[v[0]], owner[v[1]], owner[v[2]], owner[v[3]]});
+  }
 };
 
 // A patch by its own numbers.
@@ -51,13 +62,14 @@ struct Patch {
 // Slots of a patch: interior vertices first, most forces first, which leaves little padding between entries. In a small patch,
 // which has room for padding and waits for others most of the time, shared ones come as they are numbered: all their patches
 // read and write them in runs then. Padding can grow to several times the forces where a few vertices have many.
-std::vector<std::int32_t> slots_of(const Patch& patch, const Numbering& numbering) {
+std::vector<std::int32_t> slots_of(const Patch& patch, int number, const Numbering& numbering) {
   std::vector<std::int32_t> order(patch.vertex.size()), slot(order.size());
   for (std::size_t v = 0; v < order.size(); ++v) order[v] = std::int32_t(v);
   const bool small = std::ssize(patch.pairs) <= small_pairs;
   std::stable_sort(order.begin(), order.end(), [&](std::int32_t a, std::int32_t b) {
     const std::int32_t one = patch.vertex[a], two = patch.vertex[b];
-    const bool shared = numbering.is_shared[one], other = numbering.is_shared[two];
+    const bool shared = !numbering.is_inside(number, one);
+    const bool other = !numbering.is_inside(number, two);
     if (shared != other) return other;
     return shared && small ? numbering.internal[one] < numbering.internal[two]
                            : patch.forces[a] > patch.forces[b];
@@ -85,12 +97,13 @@ void count_entries(Patch& patch) {
 }
 
 // As few as can be meet in a bank. In a patch that is not small those that touch shared vertices come in the first blocks.
-void order_pairs(Patch& patch, const Numbering& numbering) {
+void order_pairs(Patch& patch, int number, const Numbering& numbering) {
   patch.outer = std::ssize(patch.pairs);
   if (patch.outer <= small_pairs) return spread_banks(patch.pairs);
   const auto is_outer = [&](const Pair& pair) {
-    return std::any_of(pair.corner.begin(), pair.corner.end(),
-                       [&](std::int32_t s) { return numbering.is_shared[patch.vertex[s]] != 0; });
+    return std::any_of(pair.corner.begin(), pair.corner.end(), [&](std::int32_t s) {
+      return !numbering.is_inside(number, patch.vertex[s]);
+    });
   };
   const auto inner = std::stable_partition(patch.pairs.begin(), patch.pairs.end(), is_outer);
   // whole blocks, whose lanes are ordered together
@@ -103,8 +116,8 @@ void order_pairs(Patch& patch, const Numbering& numbering) {
 }
 
 // `number` [vertices] is -1 before and after.
-Patch make_patch(const Mesh& mesh, std::span<const std::int32_t> tets,
-                 std::vector<std::int32_t>& number) {
+Patch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& number) {
+  const std::span<const std::int32_t> tets = mesh.partition.patch(index);
   Patch patch;
   std::vector<Corners> corners(tets.size());
   for (std::size_t t = 0; t < tets.size(); ++t) {
@@ -124,14 +137,14 @@ Patch make_patch(const Mesh& mesh, std::span<const std::int32_t> tets,
   for (const Pair& pair : patch.pairs) {
     for (int c = 0; c < pair.corners(); ++c) ++patch.forces[pair.corner[c]];
   }
-  const std::vector<std::int32_t> slot = slots_of(patch, mesh.numbering);
+  const std::vector<std::int32_t> slot = slots_of(patch, index, mesh.numbering);
   scatter(patch.vertex, slot);
   scatter(patch.forces, slot);
   for (Pair& pair : patch.pairs) {
     for (std::int32_t& corner : pair.corner) corner = slot[corner];
     for (std::int32_t& tet : pair.tet) tet = tet < 0 ? -1 : tets[tet];
   }
-  order_pairs(patch, mesh.numbering);
+  order_pairs(patch, index, mesh.numbering);
   count_entries(patch);
   return patch;
 }
@@ -148,7 +161,7 @@ std::vector<Patch> make_patches(const Mesh& mesh, std::int64_t vertices) {
   run_team(most_threads(), [&](const Team& team) {
     std::vector<std::int32_t> number(vertices, -1);
     for (std::int64_t p = team.begin(std::ssize(patches)); p < team.end(std::ssize(patches)); ++p)
-      patches[p] = make_patch(mesh, partition.patch(int(p)), number);
+      patches[p] = make_patch(mesh, int(p), number);
   });
   for (const Patch& patch : patches) {
     if (patch.entries >= none) refuse(partition.patches(), patch.entries, "entries", none - 1);
@@ -204,8 +217,9 @@ void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, const
   }
 }
 
-void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, double unit,
-                 std::int64_t first_block) {
+void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number,
+                 double unit) {
+  const std::int64_t first_block = plan.patch_block[number];
   std::vector<std::int32_t> entry = patch.first;
   const std::int64_t count = std::ssize(patch.pairs);
   for (std::int64_t i = 0; i < patch.blocks() * lanes; ++i) {
@@ -217,8 +231,11 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, dou
       forces = 0;
     }
     fill_rest(plan, mesh, patch, pair, unit, block, lane);
-    for (int which = 0; which < 2; ++which)
-      plan.pair_tet[(2 * block + which) * lanes + lane] = pair.tet[which];
+    for (int which = 0; which < 2; ++which) {
+      const std::int32_t tet = pair.tet[which];
+      const bool copy = tet >= 0 && !mesh.owner.empty() && mesh.counted_by(tet) != number;
+      plan.pair_tet[(2 * block + which) * lanes + lane] = copy ? -2 - tet : tet;
+    }
     for (int c = 0; c < 5; ++c) {
       const std::int32_t slot = pair.corner[c];
       plan.pair_corner[(5 * block + c) * lanes + lane] =
@@ -228,16 +245,21 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, dou
   }
 }
 
-// Slots of one patch. Its interior vertices are numbered anew, in the order of their slots.
+// Interior vertices are numbered anew, in the order of their slots.
+void renumber(Numbering& numbering, const std::vector<Patch>& patches) {
+  for (std::size_t p = 0; p < patches.size(); ++p) {
+    const std::int32_t inside = numbering.patch_vertex[p];
+    for (std::int32_t s = 0; s < numbering.patch_vertex[p + 1] - inside; ++s) {
+      numbering.vertex_order[inside + s] = patches[p].vertex[s];
+      numbering.internal[patches[p].vertex[s]] = inside + s;
+    }
+  }
+}
+
 void fill_slots(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number) {
-  const Numbering& numbering = mesh.numbering;
-  const std::int32_t inside = numbering.patch_vertex[number];
-  const std::int32_t interior = numbering.patch_vertex[number + 1] - inside;
-  for (std::int32_t s = 0; s < std::int32_t(patch.vertex.size()); ++s) {
-    const std::int32_t v = patch.vertex[s];
-    const std::int32_t slot = plan.patch_slot[number] + s;
-    plan.slot_vertex[slot] = s < interior ? inside + s : numbering.internal[v];
-    if (s < interior) plan.vertex_order[inside + s] = v;
+  for (std::size_t s = 0; s < patch.vertex.size(); ++s) {
+    const std::size_t slot = plan.patch_slot[number] + s;
+    plan.slot_vertex[slot] = mesh.numbering.internal[patch.vertex[s]];
     plan.slot_row[slot] = packed(patch.first[s], patch.forces[s]);
   }
 }
@@ -267,6 +289,21 @@ void fill_rest_positions(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& pa
   for (std::size_t s = 0; s < count; ++s) {
     for (int c = 0; c < 3; ++c)
       plan.slot_fixed[first + 4 * s + c] = std::int32_t(std::llround(offset(s, c) / unit));
+  }
+}
+
+// Of a cluster: where each vertex has slots beside that of its owner.
+void link_copies(DeviceMeshPlan& plan) {
+  plan.slot_copy.assign(plan.vertex_order.size() * most_cluster_blocks, -1);
+  std::vector<std::int32_t> found(plan.vertex_order.size(), 0);
+  for (std::int32_t p = 0; p + 1 < std::int32_t(plan.patch_slot.size()); ++p) {
+    const std::int32_t first = plan.patch_slot[p];
+    const std::int32_t interior = plan.patch_vertex[p + 1] - plan.patch_vertex[p];
+    for (std::int32_t slot = first + interior; slot < plan.patch_slot[p + 1]; ++slot) {
+      const std::int32_t v = plan.slot_vertex[slot];
+      plan.slot_copy[v * std::int64_t(most_cluster_blocks) + found[v]++] = packed(slot - first, p);
+      plan.slot_row[slot] |= std::int32_t(0x80000000);
+    }
   }
 }
 
@@ -350,7 +387,9 @@ std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan, const std::vec
     raise(size_most_slots, slots);
     raise(size_most_pairs, std::ssize(patches[p].pairs));
     raise(size_most_entries, patches[p].entries);
-    raise(size_most_shared, slots - (plan.patch_vertex[p + 1] - plan.patch_vertex[p]));
+    const std::int64_t interior = plan.patch_vertex[p + 1] - plan.patch_vertex[p];
+    raise(size_most_interior, interior);
+    raise(size_most_shared, slots - interior);
     if (pieces > 0) raise(size_most_parts, plan.patch_part[p + 1] - plan.patch_part[p]);
   }
   return sizes;
@@ -362,20 +401,30 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
                                  const std::int64_t* tets, std::int64_t count, int patches,
                                  int kernel, bool fixed, const std::int32_t* piece,
                                  const std::function<void(double)>& progress) {
-  Mesh mesh{positions, tets, partition_mesh(positions, tets, count, patches, 1), {}};
+  Mesh mesh{positions, tets, {}, {}, {}};
+  if (kernel == cluster_kernel) {
+    Ownership owned = own_vertices(positions, vertices, tets, count, patches);
+    mesh.partition = std::move(owned.mesh);
+    mesh.owner = std::move(owned.owner);
+    mesh.numbering = number_owned(mesh.owner, patches);
+  } else {
+    mesh.partition = partition_mesh(positions, tets, count, patches, 1);
+    mesh.numbering = number_vertices(mesh.partition, tets, vertices);
+  }
   progress(0.4);
-  mesh.numbering = number_vertices(mesh.partition, tets, vertices);
   const std::vector<Patch> made = make_patches(mesh, vertices);
   progress(0.7);
 
   DeviceMeshPlan plan;
-  number_patches(plan, made, kernel == 0, fixed);
+  number_patches(plan, made, kernel == block_kernel, fixed);
+  renumber(mesh.numbering, made);
   plan.vertex_order = mesh.numbering.vertex_order;
   run_team(most_threads(), [&](const Team& team) {
     for (std::int64_t p = team.begin(patches); p < team.end(patches); ++p) {
       fill_slots(plan, mesh, made[p], int(p));
-      if (kernel != 0) fill_rest_positions(plan, mesh, made[p], int(p));
-      fill_blocks(plan, mesh, made[p], kernel != 0 ? plan.patch_unit[p] : 1.0, plan.patch_block[p]);
+      const bool computed = kernel != block_kernel;
+      if (computed) fill_rest_positions(plan, mesh, made[p], int(p));
+      fill_blocks(plan, mesh, made[p], int(p), computed ? plan.patch_unit[p] : 1.0);
     }
   });
   plan.patch_vertex = std::move(mesh.numbering.patch_vertex);
@@ -384,7 +433,8 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
   plan.shared_start = std::move(shared.start);
   plan.shared_slot = std::move(shared.slot);
   mark_owners(plan);
-  if (kernel == 1) link_slots(plan);
+  if (kernel == grid_kernel) link_slots(plan);
+  if (kernel == cluster_kernel) link_copies(plan);
   const std::int32_t pieces = *std::max_element(piece, piece + vertices) + 1;
   if (pieces > 0) add_parts(plan, piece, pieces);
   plan.sizes = count_sizes(plan, made, count, pieces, kernel);

@@ -1,14 +1,13 @@
 #include "plan/partition.h"
 
+#include "plan/bisect.h"
+
 #include <algorithm>
-#include <array>
 #include <numeric>
 
 namespace pd {
 
 namespace {
-
-using Point = std::array<double, 3>;
 
 // The least coordinates of every tetrahedron's corners. Ordered by them, a cut shares the vertices on one side of it alone;
 // ordered by centres it shares some on either side.
@@ -26,24 +25,9 @@ std::vector<Point> low_corners(const double* x, const std::int64_t* tets, std::i
 // Splits [begin, end) of `items` at `middle` across the longest side of the box of their low corners.
 void bisect(std::vector<std::int32_t>& items, const std::vector<Point>& corners, std::int64_t begin,
             std::int64_t middle, std::int64_t end) {
-  Point low = corners[items[begin]], high = low;
-  for (std::int64_t i = begin; i < end; ++i) {
-    for (int c = 0; c < 3; ++c) {
-      low[c] = std::min(low[c], corners[items[i]][c]);
-      high[c] = std::max(high[c], corners[items[i]][c]);
-    }
-  }
-  std::array<int, 3> axis = {0, 1, 2};
-  std::stable_sort(axis.begin(), axis.end(),
-                   [&](int a, int b) { return high[a] - low[a] > high[b] - low[b]; });
-  // a layer that is cut itself is cut across, and the last ties fall to the number, so that every platform makes the same plan
+  const auto axis = axes_by_length(std::span(items).subspan(begin, end - begin), corners);
   std::nth_element(items.begin() + begin, items.begin() + middle, items.begin() + end,
-                   [&](auto a, auto b) {
-                     for (const int c : axis) {
-                       if (corners[a][c] != corners[b][c]) return corners[a][c] < corners[b][c];
-                     }
-                     return a < b;
-                   });
+                   along(axis, corners));
 }
 
 void divide(Partition& mesh, const std::vector<Point>& corners, std::int64_t begin,

@@ -30,6 +30,11 @@ struct Numbering {
   std::vector<std::int32_t> vertex_order;  // internal number -> user's number
   std::vector<std::int32_t>
       patch_vertex;  // first interior vertex of each patch; the last entry is the first shared one
+
+  bool is_inside(std::int64_t patch, std::int64_t vertex) const {
+    const std::int32_t number = internal[vertex];
+    return number >= patch_vertex[patch] && number < patch_vertex[patch + 1];
+  }
 };
 
 Numbering number_vertices(const Partition& mesh, const std::int64_t* tets, std::int64_t vertices);

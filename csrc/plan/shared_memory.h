@@ -29,27 +29,47 @@ constexpr std::size_t most_cluster_blocks = 16;
 constexpr std::size_t cluster_sums_bytes =
     2 * sizeof(std::uint64_t) + 2 * most_cluster_blocks * 3 * sizeof(double);
 
-// what each keeps for letters (cuda/mail.h); `seats`: shared slots
-constexpr std::size_t mail_bytes(std::size_t real, std::size_t seats, std::size_t patches) {
-  return 2 * sizeof(std::uint64_t) + 8 * real * seats * patches +
-         aligned(sizeof(std::uint16_t) * seats * patches);
+// what each keeps of positions (cuda/halo.h), those of two iterations, as of entries
+constexpr std::size_t halo_bytes(std::size_t real, std::size_t slots) {
+  return 2 * sizeof(std::uint64_t) + 2 * 4 * real * slots;
 }
 
-// all of a block's in a cluster, which also has x, velocity, target, u, before and origin of every slot there
-constexpr std::size_t cluster_shared_bytes(std::size_t real, std::size_t fused_bytes,
-                                           std::size_t slots, std::size_t seats,
-                                           std::size_t patches) {
-  return aligned(fused_bytes) + cluster_sums_bytes + mail_bytes(real, seats, patches) +
-         6 * 4 * real * slots;
+// and of energies: one of every thread
+constexpr std::size_t cluster_energy_bytes = 512 * sizeof(double);
+
+// Without x, velocity, target, u, before and origin of its own vertices, which it has there too.
+constexpr std::size_t cluster_vertices_begin(std::size_t real, std::size_t slots,
+                                             std::size_t entries, std::size_t planes,
+                                             std::size_t balls) {
+  return fused_control_bytes + cluster_sums_bytes + cluster_energy_bytes + halo_bytes(real, slots) +
+         aligned(real * (2 * 4 * entries + 5 * planes + 8 * balls));
+}
+constexpr std::size_t cluster_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
+                                           std::size_t interior, std::size_t planes,
+                                           std::size_t balls) {
+  return cluster_vertices_begin(real, slots, entries, planes, balls) + 6 * 4 * real * interior;
 }
 
 // Threads of a block that has one of several patches, and whether the patch is so small that each thread has one slot at
-// most, and in float32 one tetrahedron; of float64 there are too few threads for that. Blocks of a cluster have such patches.
+// most, and in float32 one tetrahedron; of float64 there are too few threads for that.
 constexpr std::size_t most_patch_threads(std::size_t real) { return real == 4 ? 512 : 256; }
 constexpr bool near_once(std::size_t real) { return real == 4; }
 constexpr bool is_near(std::size_t real, std::size_t slots, std::size_t pairs,
                        std::size_t threads) {
   return slots <= threads && (!near_once(real) || 2 * pairs <= threads);
+}
+
+// Lanes that a block of a cluster has for each vertex of its own (cuda/halo.h), eight where there are threads for it
+// anyway, else four; and its threads, of which there must be no more than those: one warp has nothing but to lead.
+constexpr std::size_t whole_warps(std::size_t threads) { return (threads + 31) / 32 * 32; }
+constexpr std::size_t halo_lanes(std::size_t real, std::size_t pairs, std::size_t interior) {
+  const std::size_t all = near_once(real) ? whole_warps(2 * pairs) : most_patch_threads(real) - 32;
+  return 8 * interior <= all ? 8 : 4;
+}
+constexpr std::size_t cluster_threads(std::size_t real, std::size_t pairs, std::size_t interior) {
+  const std::size_t own = halo_lanes(real, pairs, interior) * interior;
+  const std::size_t tets = near_once(real) ? 2 * pairs : std::size_t(0);
+  return whole_warps(own > tets ? own : tets) + 32;
 }
 
 // what a pass keeps beside: three sums of up to 32 warps

@@ -1,0 +1,157 @@
+// Members of FusedRunner for a patch of a cluster, which owns its interior vertices and is told where the others are.
+#pragma once
+#include "cuda/fused.h"
+
+namespace pd::inline PD_TARGET {
+
+// Of the patches that work out a tetrahedron one counts its energy.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE bool FusedRunner<T, Touching, Kind, Near>::counts(int number, T met) const {
+  if (Once || number == int(threadIdx.x)) return counts_;
+  return !(met == T(0)) && counts_energy(number);
+}
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE bool FusedRunner<T, Touching, Kind, Near>::counts_energy(int number) const {
+  const PairPlace place = place_of(patch_, min(number / 2, patch_.pairs - 1));
+  return plan_.pair_tet[place.in(2, number % 2)] >= 0;
+}
+
+// What positions are relative to: for all patches of a cluster the same, since they tell each other their own.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE Vec3<T> FusedRunner<T, Touching, Kind, Near>::anchor_of_step() {
+  if constexpr (!Clustered) return vec3(v_.x[0]);
+  if (loaded_) {
+    loaded_ = false;
+    return control_.anchor;
+  }
+  cluster_barrier();
+  const SharedAddress first = at_block(shared_address(v_.x), 0);
+  T anchor[3];
+  for (int c = 0; c < 3; ++c) anchor[c] = read_shared(first + c * int(sizeof(T)), T(0));
+  cluster_barrier();  // the vertex moves on afterwards
+  return read3(anchor);
+}
+
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::await_positions() {
+  if (awaited_ != round_) halo_.wait(round_);
+  awaited_ = round_;
+}
+
+// What iterations go by and change: in registers from the first to the last.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::hold() {
+  const int own = OwnHalo::vertex();
+  if (own >= patch_.interior) return;
+  seen_ = v_.see(own);
+  at_ = {own, row_, vec3(origin_[own])};
+  held_ = true;
+}
+
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::release() {
+  if (held_ && is_first()) {
+    v_.set(at_.slot, seen_.u);
+    v_.set_before(at_.slot, seen_.before);
+  }
+  held_ = false;
+}
+
+// Own vertices that were moved by something else than an iteration.
+template <class T, bool Touching, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::send_positions() {
+  __syncthreads();
+  await_positions();
+  ++round_;
+  moved_ = false;
+  if (has_own()) {
+    const int own = min(OwnHalo::vertex(), patch_.interior - 1);
+    halo_.send(vec3(origin_[own]) + vec3(v_.u[own]), round_);
+  }
+}
+
+// As iterate(). Nobody waits at its end but for the positions, with which the next begins: what warps write before its barrier
+// and read after it has two places, for even and for odd iterations.
+template <class T, bool Touching, Blocks Kind, bool Near>
+template <bool Stops>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::iterate_own(int k) {
+  const bool guard = set_.schedule == ScheduleKind::guarded && k % guard_period == 0;
+  if (moved_) {
+    send_positions();
+    hold();
+  }
+  if (Stops && pending_ && leads()) sums_.send(Add{});
+  energy_ = guard && is_first() ? seen_.energy() : 0;
+  await_positions();
+  energy_ += double(each_element(SolidGradient<true>{guard}));
+  if (guard && !Stops) energies_[threadIdx.x] = energy_;
+  if (Stops) first_ = second_ = 0;
+  if (leads()) {
+    if (Stops && pending_) conclude();
+    if (is_leader()) {
+      control_.turn_omega[k % 2] = k == 0 ? control_.omega : coming_;
+      // before the energy that might change it is known: while others are busy
+      coming_ = T(control_.progress.schedule.next(k + 1));
+      if (!control_.progress.done) ++control_.progress.used;
+    }
+  }
+  __syncthreads();
+  if (Stops && control_.progress.done) {
+    finished_ = true;
+    pending_ = false;
+    return;
+  }
+  const Quad<T>* const entries = entries_of_round();
+  ++round_;
+  if (has_own()) {
+    const T omega = control_.turn_omega[k % 2];
+    const Vec3<T> force = OwnHalo::sum_entries(entries, row_);
+    const Vec3<T> next = seen_.next(contacts_, force, theta_, omega);
+    halo_.send(at_.origin + next, round_);
+    if (Stops && is_first()) {
+      const Vec3<T> change = next - seen_.u;
+      first_ = double(dot(change, change));
+      second_ = double(dot(next, next));
+    }
+    seen_.before = seen_.u;
+    seen_.u = next;
+  }
+  if (Stops) sums_.leave({energy_, first_, second_}, sums_count, Add{});
+  if (leads()) {
+    if (!Stops && guard) {
+      sums_.gather(energies_, Add{});
+      sums_.send(Add{});
+    } else if (!Stops && pending_) {
+      const Schedule& schedule = control_.progress.schedule;
+      const int before = schedule.restarts;
+      conclude();
+      // after a restart an omega hangs on nothing that came before it
+      if (is_leader() && schedule.restarts > before)
+        coming_ = T(control_.progress.schedule.next(k + 1));
+    }
+  }
+  guarding_ = guard;
+  pending_ = guard || Stops;
+  if (Stops) __syncthreads();
+}
+
+// As pass(), of which nobody moves anything.
+template <class T, bool Touching, Blocks Kind, bool Near>
+template <class Element, class Visit>
+PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::pass_own(const Element& element,
+                                                              const Visit& visit) {
+  if (moved_) send_positions();
+  await_positions();
+  energy_ = double(each_element(element));
+  first_ = second_ = 0;
+  __syncthreads();
+  if (!has_own()) return;
+  const Vec3<T> force = OwnHalo::sum_entries(entries_of_round(), row_);
+  if (is_first()) {
+    const int own = OwnHalo::vertex();
+    visit({own, row_, vec3(origin_[own])}, v_.see(own), force);
+  }
+  __syncwarp();
+}
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,125 @@
+// How the patches of a cluster know each other's vertices: every vertex has one owner, which sends its new position straight into
+// the shared memory of all patches whose tetrahedra touch it. Elements read it where it came, so that one exchange an iteration is
+// all, and nobody adds up what others send.
+#pragma once
+#include "cuda/cluster.h"
+#include "cuda/collect.h"
+#include "cuda/patch.h"
+
+namespace pd::inline PD_TARGET {
+
+// Where elements read positions of slots.
+template <class T>
+struct SlotPositions {
+  const Quad<T>* first;
+
+  // as pair_corner has slots
+  PD_DEVICE Quad<T> look(unsigned slot_times_8) const {
+    const auto* bytes = reinterpret_cast<const std::byte*>(first);
+    return *reinterpret_cast<const Quad<T>*>(bytes + slot_times_8 * (unsigned(sizeof(*first)) / 8));
+  }
+};
+
+// Every own vertex has some lanes of a warp: with four vertices a warp lane, lane + 4, lane + 8, ..., which add up forces and send
+// by turns. All of them know the vertex and move it alike. In shared memory, halo_bytes: two barriers, positions [2, slots].
+template <class T, int Lanes>
+class Halo {
+  static constexpr int vertices = warp_size / Lanes;               // of a warp
+  static constexpr int most_places = most_cluster_blocks / Lanes;  // that a lane sends to
+
+ public:
+  PD_DEVICE Halo(std::byte* shared, int slots)
+      : barrier_(reinterpret_cast<std::uint64_t*>(shared)),
+        position_(reinterpret_cast<Quad<T>*>(shared + barriers_bytes)),
+        slots_(slots) {}
+
+  // The own vertex of this lane, and of the first lane of its warp; the number of the lane among those of its vertex.
+  PD_DEVICE static int vertex() { return first_vertex() + int(threadIdx.x) % vertices; }
+  PD_DEVICE static int first_vertex() { return int(threadIdx.x) / warp_size * vertices; }
+  PD_DEVICE static int part() { return int(threadIdx.x) % warp_size / vertices; }
+
+  // All threads, before a barrier of the cluster.
+  PD_DEVICE void open(const Patch<T>& patch) {
+    if (vertex() < patch.interior) {
+      const int32* copies =
+          patch.plan.slot_copy + (patch.first_vertex + vertex()) * int(most_cluster_blocks);
+      for (int j = 0; j < most_places; ++j) {
+        // the owner's own place is the first; those that there are come before those that there are not
+        const int n = j * Lanes + part();
+        const int place = n == 0 ? patch.index << 16 | vertex() : copies[max(n - 1, 0)];
+        place_[j] = max(place, 0);
+        places_ += place >= 0;
+      }
+    }
+    most_ = __reduce_max_sync(whole_warp, places_);
+    expected_ = patch.slots * int(sizeof(Quad<T>));
+    if (threadIdx.x == 0) {
+      for (int round = 0; round < 2; ++round) barrier(round).open();
+    }
+  }
+
+  PD_DEVICE SlotPositions<T> positions(unsigned round) const { return {place(round)}; }
+
+  // Whole warps that have own vertices, once a round, numbered from 1, after the wait for the one before.
+  PD_DEVICE void send(const Vec3<T>& position, unsigned round) const {
+    const Quad<T> letter = quad(position);
+    const Quad<T>* const row = place(round);
+    const SharedAddress meets = barrier(round).address();
+    if (threadIdx.x == 0) barrier(round).expect(expected_);
+#pragma unroll
+    for (int j = 0; j < most_places; ++j) {
+      if (j > 0 && j >= most_) break;
+      const int patch = place_[j] >> 16, slot = place_[j] & 0xffff;
+      pd::send(at_block(shared_address(row + slot), patch), at_block(meets, patch), letter,
+               j < places_);
+    }
+    __syncwarp();
+  }
+
+  // until the positions of all slots are there
+  PD_DEVICE void wait(unsigned round) const { barrier(round).wait((round - 1) >> 1 & 1); }
+
+  // Whole warps: the force on the vertex of this lane, whose entries its lanes take by turns, four at a time.
+  PD_DEVICE static Vec3<T> sum_entries(const Quad<T>* entries, int row) {
+    constexpr int together = 4, step = Lanes * entry_stride;
+    const int count = row >> 16 & 0x7fff;
+    const Quad<T>* entry = entries + (unsigned(row) & 0xffff) + part() * entry_stride;
+    Vec3<T> sum = {T(0), T(0), T(0)};
+#pragma unroll 1
+    for (int j = part(); j < count; j += together * Lanes, entry += together * step) {
+      Vec3<T> force[together];
+#pragma unroll
+      for (int i = 0; i < together; ++i) {
+        force[i] = {T(0), T(0), T(0)};
+        if (j + i * Lanes < count) force[i] = vec3(entry[i * step]);
+      }
+#pragma unroll
+      for (int i = 0; i < together; ++i) sum = sum + force[i];
+    }
+    __syncwarp();
+#pragma unroll
+    for (int distance = vertices; distance < warp_size; distance *= 2) {
+      sum = sum + Vec3<T>{__shfl_xor_sync(whole_warp, sum.x, distance),
+                          __shfl_xor_sync(whole_warp, sum.y, distance),
+                          __shfl_xor_sync(whole_warp, sum.z, distance)};
+    }
+    return sum;
+  }
+
+ private:
+  static constexpr int barriers_bytes = 16;
+
+  PD_DEVICE ByteBarrier barrier(unsigned round) const {
+    return ByteBarrier(barrier_ + (round & 1));
+  }
+  PD_DEVICE Quad<T>* place(unsigned round) const { return position_ + (round & 1) * slots_; }
+
+  std::uint64_t* barrier_;
+  Quad<T>* position_;
+  int slots_;
+  int place_[most_places] = {};  // where patches have the vertex, see slot_copy
+  int places_ = 0, most_ = 0;    // how many there are of them, and of any lane of the warp
+  int expected_ = 0;             // bytes a round
+};
+
+}  // namespace pd::inline PD_TARGET
