@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from devices import missing_gpu
 from runs import same_bits
 
 import torchpd as pd
-from torchpd import automatic
+from torchpd import automatic, model
 from torchpd.accuracy import exact_steps
 from torchpd.automatic import AIM, COSTS, Cost, Costs
 from torchpd.plan import KERNELS
@@ -115,6 +116,26 @@ def test_the_batch_decides_where_environments_share_a_device(monkeypatch: pytest
     assert isinstance(alone.solver, pd.Chebyshev)
     alone.solver = "auto"
     assert isinstance(alone.solver, pd.Multilevel)
+
+
+def test_the_kernel_of_chebyshev_is_compared_whatever_ran_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a GPU a simulator with Multilevel has a plan of other patches, whose costs are not Chebyshev's."""
+    sim = beam(1e6)
+    sim.plan = dataclasses.replace(sim.plan, for_levels=True)
+    solvers = []
+
+    def fails(sim: pd.Simulator, *_: object) -> None:
+        solvers.append(sim.solver)
+        raise ArithmeticError
+
+    monkeypatch.setattr(model, "choose_solver", fails)
+    for choose in (lambda: setattr(sim, "solver", "auto"), sim.prepare_solver):
+        with pytest.raises(ArithmeticError):
+            choose()
+        assert isinstance(solvers.pop(), pd.Chebyshev)
+        # all or nothing
+        assert isinstance(sim.solver, pd.Multilevel)
+        assert sim.plan.for_levels
 
 
 @pytest.mark.parametrize("youngs", [1e3, 1e4, 1e5, 1e6])

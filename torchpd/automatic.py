@@ -54,7 +54,7 @@ class Costs(NamedTuple):
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
     "block": Costs(Cost(2.6, 5.0, 0.05), Cost(32.0, 3.0, 0.9)),
-    "cluster": Costs(Cost(0.9, 0.35), Cost(40.0, 2.0)),
+    "cluster": Costs(Cost(0.7, 0.9), Cost(40.0, 2.0)),
     "grid": Costs(Cost(1.2, 0.13), Cost(40.0, 2.0)),
     "stream": Costs(Cost(6.0, 0.18), Cost(40.0, 2.0)),
 }

@@ -120,20 +120,20 @@ class Model(nn.Module):
 
     def _choose_solver(self, iterations: int | None, wanted: Auto) -> None:
         """What "auto" does, see `choose_solver`."""
-        self.solver, choice = choose_solver(self, iterations, wanted)
-        self.iterations, self.choice = choice.iterations, choice
-
-    def _choose_again(self, choice: Choice) -> None:
-        """Iterations that somebody has set since stay."""
-        own = choice.sets_iterations and self.iterations == choice.iterations
         before = self.plan, self._solver, self.choice, self.iterations
         try:
             if self.plan.for_levels:
                 self.solver = Chebyshev()  # its kernel is one of the costs that are compared
-            self._choose_solver(None if own else self.iterations, Auto(choice.batch))
+            self.solver, choice = choose_solver(self, iterations, wanted)
+            self.iterations, self.choice = choice.iterations, choice
         except BaseException:
             self.plan, self._solver, self.choice, self.iterations = before
             raise
+
+    def _choose_again(self, choice: Choice) -> None:
+        """Iterations that somebody has set since stay."""
+        own = choice.sets_iterations and self.iterations == choice.iterations
+        self._choose_solver(None if own else self.iterations, Auto(choice.batch))
 
     def prepare_solver(self) -> None:
         """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`, the choice of "auto".
