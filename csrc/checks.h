@@ -79,7 +79,8 @@ constexpr int level_arrays = 0
 // Lengths of the arrays, by the names in multilevel.def.
 struct LevelRows {
   std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_lift, fine_node_end, middle_end,
-      middle_entry, middle, middle_lift, middle_node_end, coarse_entry, device_coarse_entry;
+      middle_entry, middle, middle_lift, middle_node_end, coarse_entry, device_coarse_entry,
+      host_vertex;
 };
 
 // The preconditioner's arrays, which begin at `first`.
@@ -111,6 +112,7 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   count.middle_node_end = middle ? levels.middle_nodes + 1 : 0;
   count.coarse_entry = coarse * (coarse + 1) / 2;
   count.device_coarse_entry = place.device.is_cuda() ? count.coarse_entry : 0;
+  count.host_vertex = place.device.is_cuda() ? 0 : vertices;
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = first;
   using real = T;
@@ -392,9 +394,9 @@ struct Numbers {
 
 inline Settings settings_of(const Numbers& n, bool given, std::int64_t steps, std::int64_t every) {
   constexpr std::int64_t most = 1'000'000'000;
-  TORCH_CHECK_VALUE(n.schedule >= 0 && n.schedule <= 4,
-                    "schedule must be 0 (jacobi), 1 (classic), 2 (guarded), 3 (lbfgs) or 4 "
-                    "(momentum), got ",
+  TORCH_CHECK_VALUE(n.schedule >= 0 && n.schedule <= 5,
+                    "schedule must be 0 (jacobi), 1 (classic), 2 (guarded), 3 (lbfgs), 4 "
+                    "(momentum) or 5 (corotated), got ",
                     n.schedule);
   TORCH_CHECK_VALUE(n.iterations >= 0 && n.iterations <= most, "iterations must be 0..1e9, got ",
                     n.iterations);

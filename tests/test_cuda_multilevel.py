@@ -88,6 +88,7 @@ def share(gpu: pd.Simulator, cpu: pd.Simulator) -> None:
     levels = {row.name: getattr(gpu.plan, row.name).cpu().numpy() for row in MULTILEVEL_TABLE}
     internal = np.argsort(cpu.plan.vertex_order.numpy())
     arrays = reordered(levels, internal[gpu.plan.vertex_order.cpu().numpy()])
+    arrays["turning_weight"] = cpu.plan.turning_weight.numpy()  # a GPU has none
     kept = cpu.plan.arrays[: -len(MULTILEVEL_TABLE)]
     own = cpu.plan.arrays[-len(MULTILEVEL_TABLE) :]
     new = (torch.tensor(arrays[row.name]).to(t.dtype) for row, t in zip(MULTILEVEL_TABLE, own, strict=True))

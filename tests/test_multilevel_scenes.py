@@ -21,8 +21,8 @@ from torchpd.reference_solvers import relative_error, solve_with_contact
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
-SOLVERS = [pd.Multilevel(), pd.Multilevel("momentum")]
-IDS = ["lbfgs", "momentum"]
+SOLVERS = [pd.Multilevel(), pd.Multilevel("momentum"), pd.Multilevel("corotated")]
+IDS = ["lbfgs", "momentum", "corotated"]
 
 
 def errors(case: Case, solver: Any, counts: list[int], solution: Any) -> list[float]:
@@ -338,7 +338,7 @@ def test_print_says_what_it_prepared() -> None:
 
 def test_settings_are_checked() -> None:
     for keywords, message in (
-        ({"outer": "newton"}, r"Multilevel\.outer must be one of 'lbfgs', 'momentum', got 'newton'"),
+        ({"outer": "newton"}, r"Multilevel\.outer must be one of 'lbfgs', 'momentum', 'corotated', got 'newton'"),
         ({"relaxation": 2.0}, r"Multilevel\.relaxation must lie in \(0, 2\)"),
         ({"relaxation": 0.0}, r"Multilevel\.relaxation must lie in \(0, 2\)"),
     ):
@@ -361,7 +361,7 @@ def test_ops_want_the_arrays_of_the_preconditioner() -> None:
         ops.precondition(torch.zeros(1, 3, 3), plan)
     with pytest.raises(TypeError, match=r"field must be float32 or float64"):
         ops.precondition(state.positions.long(), plan)
-    with pytest.raises(ValueError, match=r"plan must be the 16 arrays of Plan\.arrays, or 41 with those of"):
+    with pytest.raises(ValueError, match=r"plan must be the 16 arrays of Plan\.arrays, or 42 with those of"):
         ops.precondition(state.positions, plan[:-1])
     with pytest.raises(ValueError, match=r"plan\.reference_stiffness must be \[\d+\] .*compile the scene again"):
         ops.precondition(state.positions, [*plan[:17], plan[17][:-1].contiguous(), *plan[18:]])

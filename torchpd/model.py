@@ -286,6 +286,8 @@ class Model(nn.Module):
                 self._choose_again(choice)
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
+        if wanted.device.type == "cuda":
+            check_solver(self.solver, wanted.device)
         changes_precision = wanted.dtype != self.dtype
         # first, because it may refuse
         plan = plan_on(self, wanted.dtype, wanted.device)

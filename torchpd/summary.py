@@ -136,7 +136,9 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     numbers = 22 * plan.vertices + 8 * len(plan.slot_vertex)
     if isinstance(solver, Multilevel):
         # four vectors of the outer iteration, four of a cycle, and eight pairs
-        numbers += 4 * plan.vertices * (8 + (16 if solver.outer == "lbfgs" else 0))
+        numbers += 4 * plan.vertices * (8 + (16 if solver.outer != "momentum" else 0))
+        # of each vertex sixteen numbers, and A times them
+        numbers += 32 * plan.vertices if solver.outer == "corotated" else 0
     return real * numbers
 
 
@@ -152,7 +154,7 @@ def _step_bytes(sim: Simulator, real: int) -> str:
             return own
         # three vectors of the outer iteration, four of a cycle, eight pairs; two more and two matrices with contacts
         held = 26 if sim.scene.grounds or sim.scene.spheres else 0
-        numbers = 4 * (7 + (16 if sim.solver.outer == "lbfgs" else 0)) + held
+        numbers = 4 * (7 + (16 if sim.solver.outer != "momentum" else 0)) + held
         return f"{own}, and {real * plan.vertices * numbers:,} B for each that the GPU has in work at a time"
     # five vectors of four numbers a slot; the weights of 32 pairs a block, but where each thread has its own
     if plan.kernel != "cluster":

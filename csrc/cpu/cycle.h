@@ -35,7 +35,7 @@ class Cycle {
   }
 
   Value* input() const { return fine_.in; }
-  const Value* result() const { return fine_.z; }
+  Value* result() const { return fine_.z; }
 
   // result = M input. All of the team; the input has to be complete, the result is when this returns.
   void run(const Team& team) const {

@@ -25,7 +25,9 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
                     const Team& team, std::int64_t first, Work& outer)
       : Base(call, work, scratch, team, first),
         o_(outer),
-        lbfgs_(set_.schedule == ScheduleKind::lbfgs) {}
+        lbfgs_(set_.learns()),
+        corotates_(set_.schedule == ScheduleKind::corotated),
+        corotation_(plan_, team, work, outer.corotation) {}
 
   // All steps of the call, with a record every `set_.every`.
   void roll() {
@@ -42,6 +44,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   void start() {
     Base::start();
     newest_ = 0;
+    corotated_ = false;
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
       outer_[lane] = {};
@@ -49,6 +52,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       outer_[lane].friction = Lanes::lane(friction, lane) > 0;
       outer_[lane].slack = outer_[lane].friction ? guard_slack_friction : energy_noise<T>();
       pairs_[lane] = {};
+      made_[lane] = doubted_[lane] = 0;
+      if (corotates_) corotation_.forget(lane);
       schedule_[lane].rho = misfit_[lane].spread;
     }
   }
@@ -77,6 +82,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     for (int lane = 0; lane < width; ++lane) {
       if (done_[lane]) {
         Lanes::set_lane(accepted_, lane, T(0));
+        // what moves on in its lane has no part in sums either
+        Lanes::set_lane(finite_, lane, T(0));
         continue;
       }
       const double work = outer_[lane].known ? Lanes::lane(sum.first, lane) : 0;
@@ -92,6 +99,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   // The pair from the base to the trial, kept or not: it holds for the curvature on the way. Then the base moves on.
   void learn(int k) {
     newest_ = (newest_ + 1) % history;
+    iteration_ = k;
     pass([&](std::int64_t i, Value(&sum)[dots]) {
       if (k == 0) {
         o_.base[i] = w_.u[i];
@@ -137,6 +145,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
   void precondition() {
+    if (corotates_) corotate(iteration_);
     Real alpha[history] = {}, scale;
     for (int lane = 0; lane < width; ++lane) {
       for (int j = 0; j < history; ++j) Lanes::set_lane(alpha[j], lane, T(pairs_[lane].alpha[j]));
@@ -151,7 +160,11 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       }
       in[i] = scale * q;
     });
-    o_.cycle.run(team_);
+    if (!corotated_) {
+      o_.cycle.run(team_);
+    } else {
+      run_corotated(scale);
+    }
     if (lbfgs_) return correct();
     each_vertex([&](std::int64_t i) { o_.direction[i] = o_.cycle.result()[i]; });
   }
@@ -195,6 +208,34 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   }
 
  private:
+  // The lanes whose small problem is made at iteration k, of where they stand: once they are near enough, and again after so
+  // many trials failed that it no longer holds. A step that goes on failing does without.
+  void corotate(int k) {
+    bool asks[width], some = false;
+    for (int lane = 0; lane < width; ++lane) {
+      const int failed = outer_[lane].restarts - doubted_[lane];
+      const bool first = k == turning_begins, again = made_[lane] > 0 && failed >= turning_doubts;
+      asks[lane] = !done_[lane] && (first || (again && made_[lane] < turning_most));
+      some = some || asks[lane];
+      if (!asks[lane] && again) corotation_.forget(lane);
+      if (!asks[lane]) continue;
+      ++made_[lane];
+      doubted_[lane] = outer_[lane].restarts;
+    }
+    if (some) corotation_.make(o_.base, asks);
+    corotated_ = corotated_ || some;
+  }
+
+  // the cycle between what the small problem takes and what it gives
+  void run_corotated(const Real& scale) {
+    Value *in = o_.cycle.input(), *z = o_.cycle.result();
+    corotation_.measure(in);
+    each_vertex([&](std::int64_t i) { in[i] = corotation_.without(i, in[i]); });
+    o_.cycle.run(team_);
+    corotation_.answer(z, scale);
+    each_vertex([&](std::int64_t i) { z[i] = corotation_.with(i, z[i]); });
+  }
+
   // where the lane accepted its trial `a`, else `b`
   Value choose(const Value& a, const Value& b) const { return pick(accepted_, a, b); }
 
@@ -320,8 +361,12 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   }
 
   Work& o_;
-  bool lbfgs_, strangers_ = false;  // strangers: vertices that M knows too little of, in any lane
-  int newest_ = 0;
+  bool lbfgs_, corotates_,
+      corotated_ = false,
+      strangers_ = false;  // strangers: vertices that M knows too little of, in any lane
+  int newest_ = 0, iteration_ = 0;
+  int made_[width] = {}, doubted_[width] = {};  // times, and failed trials by then
+  Corotation<Lanes> corotation_;
   Value none_ = Lanes::value({Real(T(0)), Real(T(0)), Real(T(0))});
   Real accepted_{T(1)}, finite_{T(1)}, trusted_{T(1)};
   Misfit misfit_[width];

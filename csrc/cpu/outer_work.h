@@ -1,5 +1,6 @@
 // Memory of the multilevel solver's outer iteration.
 #pragma once
+#include "cpu/corotation.h"
 #include "cpu/cycle.h"
 #include "math/mat.h"
 
@@ -16,6 +17,7 @@ struct OuterWork {
   static constexpr int chunk = 256;             // vertices that one of them covers
 
   Cycle<Lanes> cycle;
+  CorotationWork<Lanes> corotation;
   Value *base, *pull, *fresh,
       *direction;  // [vertices] iterate to go on from, residuals there and at the trial
   Value *s[history], *y[history];  // [vertices] L-BFGS pairs
@@ -27,8 +29,10 @@ struct OuterWork {
   int chunks;
 
   OuterWork(const StepCall<typename Lanes::Scalar>& call, bool touching, int threads)
-      : cycle(call.plan.levels), chunks((call.plan.vertices + chunk - 1) / chunk) {
-    const bool pairs = call.settings.schedule == ScheduleKind::lbfgs;
+      : cycle(call.plan.levels),
+        corotation(call.plan, call.settings.schedule == ScheduleKind::corotated, threads),
+        chunks((call.plan.vertices + chunk - 1) / chunk) {
+    const bool pairs = call.settings.learns();
     const std::int64_t n = call.plan.vertices, held = touching ? n : 0;
     const std::int64_t vectors = 4 * n + 2 * held + (pairs ? 2 * history * n : 0);
     storage_ = allocate_zeroed(vectors * sizeof(Value) + 2 * held * sizeof(Mat3<Real>) +

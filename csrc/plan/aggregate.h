@@ -38,4 +38,15 @@ struct Aggregates {
 Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_out,
                      std::int32_t wanted);
 
+using Positions = std::vector<std::array<double, 3>>;
+
+// For a few aggregates: centres begin as far from one another as can be, and move to the middle of their aggregate in space,
+// so that the aggregates part a body across.
+Aggregates aggregate_far_apart(const Graph& graph, const std::vector<std::uint8_t>& left_out,
+                               const Positions& position, std::int32_t wanted);
+
+// How far each vertex is along the graph from the nearest of an aggregate, infinite where no way leads there.
+std::vector<double> distances_to(const Graph& graph, const Aggregates& aggregates,
+                                 std::int32_t aggregate);
+
 }  // namespace pd

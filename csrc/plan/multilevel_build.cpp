@@ -18,6 +18,8 @@ constexpr int most_coarse_nodes = 256;              // 1024 unknowns of the dens
 constexpr std::int32_t most_of_two_levels = 12000;  // free vertices that two levels serve
 constexpr double fine_smoothing = 1.14, middle_smoothing = 1.333;  // omega of I - omega D^-1 A
 constexpr double weakest_coupling = 0.02;  // of middle nodes, of their scaled blocks
+constexpr int turning_groups = 4;          // as many as solver/corotation.h has
+constexpr double turning_reach = 2;     // how far groups overlap, in mean depths of their vertices
 constexpr double coarse_shift = 1e-12;  // of the diagonal: above what rounding takes from a pivot
 constexpr double dependent = 1e-8;  // what orthogonalisation leaves of a column that adds nothing
 
@@ -273,6 +275,40 @@ Aggregates group_nodes(const BlockMatrix& matrix,
   return limited(aggregate(graph, Mask(matrix.rows, 0), wanted), most_coarse_nodes);
 }
 
+// Four groups of vertices that overlap: 1 inside, falling to nothing a way off, over the sum of all. [vertices, 4]
+std::vector<double> turning_weights(const Graph& graph, const Mask& held,
+                                    const Positions& position) {
+  const std::int32_t vertices = graph.vertices();
+  const Aggregates groups =
+      limited(aggregate_far_apart(graph, held, position, turning_groups), turning_groups);
+  std::array<std::vector<double>, turning_groups> distance;
+  for (int g = 0; g < turning_groups; ++g) distance[g] = distances_to(graph, groups, g);
+  // how deep vertices lie in their group, in the mean
+  double depth = 0, count = 0;
+  for (std::int32_t v = 0; v < vertices; ++v) {
+    double least = HUGE_VAL;
+    for (int g = 0; g < turning_groups; ++g) {
+      if (g != groups.of[v]) least = std::min(least, distance[g][v]);
+    }
+    if (held[v] || !(least < HUGE_VAL)) continue;
+    depth += least;
+    ++count;
+  }
+  const double way = depth > 0 ? turning_reach * depth / count : 1;
+  std::vector<double> weights(std::size_t(vertices) * turning_groups, 0.0);
+  for (std::int32_t v = 0; v < vertices; ++v) {
+    if (held[v]) continue;
+    double* of = &weights[std::size_t(v) * turning_groups];
+    double sum = 0;
+    for (int g = 0; g < turning_groups; ++g) {
+      of[g] = std::max(0.0, 1 - distance[g][v] / way);
+      sum += of[g];
+    }
+    for (int g = 0; g < turning_groups; ++g) of[g] /= sum;
+  }
+  return weights;
+}
+
 using Numbers = std::vector<std::int32_t>;
 
 void store(BlockMatrix& matrix, Numbers& start, Numbers& column, std::vector<double>& value) {
@@ -301,6 +337,10 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
     t.reference_inertia.push_back(scene.inertia[scene.vertex_order[i]]);
   t.level_sizes.assign(level_size_count, 0);
   t.level_sizes[level_fine_entries] = fine.matrix.start.back();
+  const Affine rest = affine(scene);
+  const Graph graph = coupling_graph(
+      fine.matrix.rows, couplings(fine.matrix, diagonal(fine.matrix), rest.position, 0));
+  t.turning_weight = turning_weights(graph, fine.held, rest.position);
   if (scene.vertices <= scene.most_direct) {
     t.level_sizes[level_direct] = 1;
     t.coarse_factor = coarse_factor(fine.matrix, fine.held, threads);
@@ -310,9 +350,6 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
     progress(1.0);
     return t;
   }
-  const Affine rest = affine(scene);
-  const Graph graph = coupling_graph(
-      fine.matrix.rows, couplings(fine.matrix, diagonal(fine.matrix), rest.position, 0));
   const auto free = std::int32_t(std::count(fine.held.begin(), fine.held.end(), 0));
   const bool middle =
       free > most_of_two_levels || connected_pieces(graph, fine.held) > most_coarse_nodes;

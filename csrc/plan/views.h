@@ -102,8 +102,15 @@ struct Material {
   int planes_count = 0, spheres_count = 0;
 };
 
-// the last two are multilevel
-enum class ScheduleKind : int { jacobi = 0, classic = 1, guarded = 2, lbfgs = 3, momentum = 4 };
+// from lbfgs on multilevel
+enum class ScheduleKind : int {
+  jacobi = 0,
+  classic = 1,
+  guarded = 2,
+  lbfgs = 3,
+  momentum = 4,
+  corotated = 5
+};
 enum class StartKind : int { velocity = 0, inertial = 1, given = 2 };
 
 struct Settings {
@@ -120,6 +127,8 @@ struct Settings {
   bool report = false;    // residual and energy cost two more local steps
 
   PD_HD bool multilevel() const { return schedule >= ScheduleKind::lbfgs; }
+  // by L-BFGS
+  PD_HD bool learns() const { return multilevel() && schedule != ScheduleKind::momentum; }
 };
 
 // Numbers of an info row, double each.
