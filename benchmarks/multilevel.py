@@ -30,7 +30,7 @@ import torchpd as pd
 from torchpd.tables import PLAN_TABLE
 
 ERRORS = (1e-2, 1e-3, 1e-4)
-OUTERS: tuple[Literal["lbfgs", "momentum"], ...] = ("lbfgs", "momentum")
+OUTERS: tuple[Literal["lbfgs", "momentum", "corotated"], ...] = ("lbfgs", "momentum", "corotated")
 MOST = 160
 ROUND, MOST_OF_BLOCKS = 4, 512  # iterations
 CHEBYSHEV = 512

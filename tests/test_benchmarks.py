@@ -139,9 +139,9 @@ def test_beam_counts_iterations() -> None:
 def test_multilevel_counts_iterations() -> None:
     command = [sys.executable, "benchmarks/multilevel.py", "--cells", "3", "--youngs", "1e6"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    name, lbfgs, momentum, chebyshev = result.stdout.splitlines()
+    name, lbfgs, momentum, corotated, chebyshev = result.stdout.splitlines()
     assert name.startswith("box 3, 1e+06 Pa: 256 vertices")
-    for line, outer in ((lbfgs, "lbfgs"), (momentum, "momentum")):
+    for line, outer in ((lbfgs, "lbfgs"), (momentum, "momentum"), (corotated, "corotated")):
         counts = line.split()[1:4]
         assert line.split()[0] == outer
         assert sorted(counts, key=int) == counts
