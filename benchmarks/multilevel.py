@@ -115,7 +115,7 @@ def measure(name: str, scene: pd.Scene, state: pd.State) -> None:
 
 def measure_blocks(name: str, scene: pd.Scene, state: pd.State) -> None:
     """Iterations and milliseconds to each error, with rigid motions and alone."""
-    sim = pd.Simulator(scene, 1 / 30, ROUND, pd.Multilevel(), torch.float64, progress=False)
+    sim = pd.Simulator(scene, 1 / 30, ROUND, pd.Multilevel("lbfgs"), torch.float64, progress=False)
     start = time.process_time()
     pieces = pd.RigidPieces(sim)
     setup = time.process_time() - start

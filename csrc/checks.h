@@ -79,8 +79,7 @@ constexpr int level_arrays = 0
 // Lengths of the arrays, by the names in multilevel.def.
 struct LevelRows {
   std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_lift, fine_node_end, middle_end,
-      middle_entry, middle, middle_lift, middle_node_end, coarse_entry, device_coarse_entry,
-      host_vertex;
+      middle_entry, middle, middle_lift, middle_node_end, coarse_entry, device_coarse_entry;
 };
 
 // The preconditioner's arrays, which begin at `first`.
@@ -112,7 +111,6 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   count.middle_node_end = middle ? levels.middle_nodes + 1 : 0;
   count.coarse_entry = coarse * (coarse + 1) / 2;
   count.device_coarse_entry = place.device.is_cuda() ? count.coarse_entry : 0;
-  count.host_vertex = place.device.is_cuda() ? 0 : vertices;
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = first;
   using real = T;

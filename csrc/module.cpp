@@ -269,10 +269,13 @@ PYBIND11_MODULE(_C, m) {
       },
       "Blocks of the largest cluster that the current CUDA device runs; 1: none.");
   m.attr("outer_static_bytes") = pd::outer_static_bytes;
+  m.attr("corotation_bytes") = pd::corotation_bytes;
   m.attr("pass_static_bytes") = pd::pass_static_bytes;
   m.def("pass_shared_bytes", &pd::pass_shared_bytes, py::arg("real"), py::arg("slots"),
         py::arg("entries"), py::arg("fields"),
         "Shared memory of a block of the kernel stream and of energies and their derivatives.");
+  m.def("outer_shared_bytes", &pd::outer_shared_bytes, py::arg("real"), py::arg("slots"),
+        py::arg("entries"), "Shared memory of a block of the multilevel solver.");
   m.def("build_info", &build_info, "What this build can do on this machine.");
   m.def("multiply_adds_per_second", &multiply_adds_per_second,
         "float32, one thread, widest SIMD: for comparing machines.");

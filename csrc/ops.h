@@ -29,8 +29,6 @@ void step_typed(const StepTensors& t, const Settings& settings) {
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
   check_levels(call.plan, settings.multilevel());
-  TORCH_CHECK_VALUE(settings.schedule != ScheduleKind::corotated || place.device.is_cpu(),
-                    "schedule 5 (corotated) runs on the CPU, got tensors on ", place.device);
   call.material =
       material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch, place);
   check_tets(t.material[0], call.plan.tets);

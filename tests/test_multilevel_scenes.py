@@ -21,7 +21,7 @@ from torchpd.reference_solvers import relative_error, solve_with_contact
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
-SOLVERS = [pd.Multilevel(), pd.Multilevel("momentum"), pd.Multilevel("corotated")]
+SOLVERS = [pd.Multilevel("lbfgs"), pd.Multilevel("momentum"), pd.Multilevel()]
 IDS = ["lbfgs", "momentum", "corotated"]
 
 
@@ -328,7 +328,7 @@ def test_meta_is_refused() -> None:
 def test_print_says_what_it_prepared() -> None:
     text = str(simulate(torch.float32, solver=pd.Multilevel()))
     for fact in (
-        "Multilevel lbfgs: 12 iterations, relaxation 1.8",
+        "Multilevel corotated: 12 iterations, relaxation 1.8",
         "preconditioner: 45 vertices > ",
         "solved directly",
     ):
@@ -338,7 +338,7 @@ def test_print_says_what_it_prepared() -> None:
 
 def test_settings_are_checked() -> None:
     for keywords, message in (
-        ({"outer": "newton"}, r"Multilevel\.outer must be one of 'lbfgs', 'momentum', 'corotated', got 'newton'"),
+        ({"outer": "newton"}, r"Multilevel\.outer must be one of 'corotated', 'lbfgs', 'momentum', got 'newton'"),
         ({"relaxation": 2.0}, r"Multilevel\.relaxation must lie in \(0, 2\)"),
         ({"relaxation": 0.0}, r"Multilevel\.relaxation must lie in \(0, 2\)"),
     ):

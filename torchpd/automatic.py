@@ -21,6 +21,10 @@ __all__ = ["AIM", "COSTS", "Choice", "Cost", "Costs", "choose_solver"]
 
 AIM = 1e-3  # error of a step that "auto" sets its iterations for
 MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes
+MAKING = 3  # iterations of "lbfgs" that "corotated" must save to be worth its time
+
+
+_LEVELS = (Multilevel(), Multilevel("lbfgs"))
 
 
 class Cost(NamedTuple):
@@ -53,10 +57,10 @@ class Costs(NamedTuple):
 # alone: without `more` the choice for a batch is that for one environment.
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
-    "block": Costs(Cost(2.6, 5.0, 0.05), Cost(32.0, 3.0, 0.9)),
-    "cluster": Costs(Cost(0.7, 0.9), Cost(40.0, 2.0)),
-    "grid": Costs(Cost(1.2, 0.13), Cost(40.0, 2.0)),
-    "stream": Costs(Cost(6.0, 0.18), Cost(40.0, 2.0)),
+    "block": Costs(Cost(2.6, 5.0, 0.05), Cost(31.0, 3.0, 0.9)),
+    "cluster": Costs(Cost(0.7, 0.9), Cost(50.0, 2.4)),
+    "grid": Costs(Cost(1.2, 0.13), Cost(50.0, 2.4)),
+    "stream": Costs(Cost(6.0, 0.18), Cost(50.0, 2.4)),
 }
 
 
@@ -89,10 +93,11 @@ def choose_solver(sim: Model, iterations: int | None, wanted: Auto) -> tuple[Sol
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
     if spectrum is None:
         return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
-    expected = {solver: forecast(sim, solver, spectrum) for solver in (chebyshev, Multilevel())}
-    plain, levels = (_known(each) for each in expected.values())
+    plain, lasting, short = (_known(forecast(sim, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
+    saves = short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
+    multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
-    if not _runs(Multilevel(), sim):
+    if not _runs(multilevel, sim):
         where = f"{sim.device} with kernel={sim.kernel!r}" if sim.device.type == "cuda" else str(sim.device)
         return chebyshev, chosen(_enough(plain), f"{counts}, and Multilevel does not run on {where}")
     costs = COSTS[sim.plan.kernel or "cpu"]
@@ -106,7 +111,7 @@ def choose_solver(sim: Model, iterations: int | None, wanted: Auto) -> tuple[Sol
         better = iterations < _enough(plain) and levels.rate > plain.rate
         both += f"; {iterations} leave about {plain.error(iterations):.1g} or {levels.error(iterations):.1g}"
     if better:
-        return Multilevel(), chosen(_enough(levels), both)
+        return multilevel, chosen(_enough(levels), both)
     return chebyshev, chosen(_enough(plain), both)
 
 

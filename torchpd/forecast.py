@@ -28,7 +28,7 @@ __all__ = ["Forecast", "Spectrum", "UnsolvedWarning", "forecast", "spectrum_of",
 
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
 # iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
-_LEVELS_LEAST, _LEVELS_SLOPE = 2.0, 3.0
+_LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
 _LEVELS_CONTACTS = 1.25  # times as many where vertices may touch something
 _MOST = 10_000
 FAR_TOO_FEW = 0.1  # error that is left
@@ -116,7 +116,7 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     if isinstance(solver, Multilevel):
         body = max(len(solid.mesh.vertices) for solid in sim.scene.solids)
         reach = min(spectrum.slow * body ** (2.0 / 3.0), 1.0)
-        decade = _LEVELS_LEAST + _LEVELS_SLOPE * math.log10(1.0 / reach)
+        decade = _LEVELS_LEAST + _LEVELS_SLOPE[solver.outer] * math.log10(1.0 / reach)
         contacts = sim.planes.shape[-2] + sim.spheres.shape[-2]
         return Forecast(math.log(10.0) / (decade * (_LEVELS_CONTACTS if contacts else 1.0)))
     theta, rho = numbers["relaxation"], numbers["rho"]

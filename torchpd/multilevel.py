@@ -97,7 +97,6 @@ def precondition_plan(
         )  # fmt: skip
     if plan.kernel is not None:
         arrays["coarse_columns"] = _by_columns(arrays["coarse_factor"])
-        arrays["turning_weight"] = arrays["turning_weight"][:0]
     levels = (
         torch.from_numpy(arrays[row.name]).to(
             # the host reads sizes, and must not wait for a device

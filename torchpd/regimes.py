@@ -59,7 +59,7 @@ def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
     real = torch.finfo(plan.dtype).bits // 8
     slots, entries = plan.size("most_slots"), plan.size("most_entries")
     if plan.for_levels:
-        return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.outer_static_bytes
+        return _C.outer_shared_bytes(real, slots, entries)
     if plan.kernel == "stream":
         return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.pass_static_bytes
     if plan.kernel == "cluster":
@@ -106,7 +106,7 @@ class _Scene(NamedTuple):
                 return 1
             # 2.5 entries and at least a third of a slot a tetrahedron, see pass_shared_bytes
             each = (4 * 2.5 + 6 / 3) * self.real
-            least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes))
+            least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes - _C.corotation_bytes))
             rounds = -(-int(least) // gpu.multiprocessors)
             return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
         patches = -(-self.tets // _STREAM_TETS[self.dtype])

@@ -37,11 +37,11 @@ class RigidPieces:
     """Stiff pieces of a scene, and steps that move them as rigid bodies between the iterations of the simulator.
 
     A piece is a connected set of elements that are stiffer than the rest; one that hard pins hold is left to the
-    solver. Worth it from contrasts of about a thousand, with `Multilevel`. Made for the material, time step, precision
-    and device of now: after a change of these a step is refused until `prepare` (writes through `.data` cannot be
-    seen). Contacts are not known to these motions: such scenes are refused. Results may depend on the batch by
-    rounding. `Simulator.rollout`, `capture`, `tune`, `save` and `load` do not know of it: they take the simulator's own
-    steps.
+    solver. Worth it from contrasts of about a thousand, with `Multilevel("lbfgs")`: rounds are too short for
+    "corotated". Made for the material, time step, precision and device of now: after a change of these a step is
+    refused until `prepare` (writes through `.data` cannot be seen). Contacts are not known to these motions: such
+    scenes are refused. Results may depend on the batch by rounding. `Simulator.rollout`, `capture`, `tune`, `save` and
+    `load` do not know of it: they take the simulator's own steps.
 
     Holds four numbers for each vertex and piece, in the precision of the simulator. Making it takes a sparse
     factorisation of the matrix of the surroundings and a solve for each of these columns, on the CPU in float64, a few

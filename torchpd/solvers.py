@@ -130,7 +130,7 @@ class Chebyshev:
         }
 
 
-_SCHEDULES = {"lbfgs": 3, "momentum": 4, "corotated": 5}  # Multilevel.outer, as the ops call it
+_SCHEDULES = {"corotated": 5, "lbfgs": 3, "momentum": 4}  # Multilevel.outer, as the ops call it
 
 
 @dataclass(frozen=True)
@@ -147,16 +147,16 @@ class Multilevel:
     M / s, s its largest ratio of inertia or stiffness to that material. `Info.rho` says how unlike the two are.
 
     Args:
-        outer: "lbfgs" corrects M by the last eight steps, "momentum" (no inner products) extrapolates. "corotated" is
-            "lbfgs" with another M for motions in which whole parts of a body turn, for which A is far too stiff: on the
-            rigid motions of four overlapping groups of vertices it has the inverse of the energy's second derivative,
-            that of corotated elasticity. That is made once in most steps, after three iterations, for the time of some
-            twelve local steps on a small mesh. Bodies that bend or spin need a third to two thirds of the
-            iterations, others about as many as with "lbfgs". On a CPU alone.
+        outer: "lbfgs" corrects M by the last eight steps, "momentum" (no inner products) extrapolates. "corotated", the
+            usual one, is "lbfgs" with another M for motions in which whole parts of a body turn, for which A is far too
+            stiff: on the rigid motions of four overlapping groups of vertices it has the inverse of the energy's second
+            derivative, that of corotated elasticity. That is made once in most steps, after three iterations, for
+            the time of two more. Bodies that bend or spin need a third to two thirds of the iterations, others as many
+            as with "lbfgs".
         relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8.
     """
 
-    outer: Literal["lbfgs", "momentum", "corotated"] = "lbfgs"
+    outer: Literal["corotated", "lbfgs", "momentum"] = "corotated"
     relaxation: float | None = None
 
     def __post_init__(self) -> None:
@@ -209,6 +209,4 @@ def check_solver(solver: object, device: torch.device) -> Solver:
         raise TypeError(f'Simulator: solver must be Jacobi, Chebyshev, Multilevel, Auto or "auto", got {given}')
     if isinstance(solver, Multilevel) and device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"Simulator: Multilevel is prepared on the CPU or on a GPU, not on {device}")
-    if isinstance(solver, Multilevel) and solver.outer == "corotated" and device.type != "cpu":
-        raise RuntimeError(f'Simulator: Multilevel("corotated") runs on the CPU, not on {device}; take Multilevel()')
     return solver

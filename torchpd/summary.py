@@ -154,7 +154,9 @@ def _step_bytes(sim: Simulator, real: int) -> str:
             return own
         # three vectors of the outer iteration, four of a cycle, eight pairs; two more and two matrices with contacts
         held = 26 if sim.scene.grounds or sim.scene.spheres else 0
-        numbers = 4 * (7 + (16 if sim.solver.outer != "momentum" else 0)) + held
+        # and of each vertex where it is, sixteen numbers, and A times them
+        small = 36 if sim.solver.outer == "corotated" else 0
+        numbers = 4 * (7 + (16 if sim.solver.outer != "momentum" else 0)) + held + small
         return f"{own}, and {real * plan.vertices * numbers:,} B for each that the GPU has in work at a time"
     # five vectors of four numbers a slot; the weights of 32 pairs a block, but where each thread has its own
     if plan.kernel != "cluster":

@@ -43,16 +43,16 @@ class TurningElements {
         first_(position_ + plan.most_slots),
         last_(first_ + plan.most_slots) {}
 
-  // `position(slot)`: relative to the patch; `shift`: of that to the middle of the turns
-  template <class Position>
-  void add(int patch, const Position& position, const Vec3<T>& shift,
+  // `position(slot)`: relative to the patch; `shift`: of that to the middle of the turns; `weight_of(vertex, group)`
+  template <class Position, class Weight>
+  void add(int patch, const Position& position, const Vec3<T>& shift, const Weight& weight_of,
            std::array<double, turning_pairs>& to) {
     const int first = plan_.patch_slot[patch], count = plan_.patch_slot[patch + 1] - first;
     for (int slot = 0; slot < count; ++slot) {
-      const T* w = plan_.levels.turning_weight + 4 * std::int64_t(plan_.slot_vertex[first + slot]);
+      const int vertex = plan_.slot_vertex[first + slot];
       position_[slot] = position(first + slot);
-      first_[slot] = to_quad(w[0], w[1], w[2]);
-      last_[slot] = to_quad(w[3], T(0), T(0));
+      first_[slot] = to_quad(weight_of(vertex, 0), weight_of(vertex, 1), weight_of(vertex, 2));
+      last_[slot] = to_quad(weight_of(vertex, 3), T(0), T(0));
     }
     using R = typename ElementsAcross<3, T>::R;
     R sum[turning_pairs];
@@ -60,25 +60,29 @@ class TurningElements {
     const Quad<T>* const fields[3] = {position_, first_, last_};
     LaneSums<Single<T>> unused;
     const Vec3<R> to_middle = {R(shift.x), R(shift.y), R(shift.z)};
-    each_element(plan_, patch,
-                 ElementsAcross<3, T>(plan_, fields, weights_, false, nullptr, unused),
-                 one_by_one([&](const auto& elements, int s) {
-                   Vec3<R> x[4], some[4], rest[4];
-                   elements.corners(s, 0, x);
-                   elements.corners(s, 1, some);
-                   elements.corners(s, 2, rest);
-                   const Mat3<R> inverse = elements.rest(s);
-                   const Mat3<R> turn = nearest_rotation(deformation_gradient(x, inverse));
-                   R weight[turning_groups][4];
-                   for (int c = 0; c < 4; ++c) {
-                     weight[0][c] = some[c].x;
-                     weight[1][c] = some[c].y;
-                     weight[2][c] = some[c].z;
-                     weight[3][c] = rest[c].x;
-                     x[c] = x[c] + to_middle;
-                   }
-                   add_strains(TurningStrain<R>(inverse, turn, x, weight), elements.weight(s), sum);
-                 }));
+    each_element(
+        plan_, patch, ElementsAcross<3, T>(plan_, fields, weights_, false, nullptr, unused),
+        one_by_one([&](const auto& elements, int s) {
+          Vec3<R> x[4], some[4], rest[4];
+          elements.corners(s, 0, x);
+          elements.corners(s, 1, some);
+          elements.corners(s, 2, rest);
+          const Mat3<R> inverse = elements.rest(s);
+          const Mat3<R> turn = nearest_rotation(deformation_gradient(x, inverse));
+          R weight[turning_groups][4];
+          for (int c = 0; c < 4; ++c) {
+            weight[0][c] = some[c].x;
+            weight[1][c] = some[c].y;
+            weight[2][c] = some[c].z;
+            weight[3][c] = rest[c].x;
+            x[c] = x[c] + to_middle;
+          }
+          const Mat3<R> back = transpose(turn);
+          const auto strain = [&](int k) {
+            return TurningStrain<R>(TurningGradient<R>(inverse, back, x, weight[k]));
+          };
+          add_strains({strain(0), strain(1), strain(2), strain(3)}, elements.weight(s), sum);
+        }));
     for (int p = 0; p < turning_pairs; ++p) {
       to[p] = 0;
       for (int lane = 0; lane < R::width; ++lane) to[p] += double(sum[p].v[lane]);
@@ -89,32 +93,29 @@ class TurningElements {
   // Groups with groups before them, and the modes of each where they meet: of six numbers half are none. The order of pairs is
   // that of `pair`.
   template <class R>
-  static void add_strains(const TurningStrain<R>& strain, const R& weight,
+  static void add_strains(const TurningStrain<R> (&strain)[turning_groups], const R& weight,
                           R (&sum)[turning_pairs]) {
     for (int k = 0; k < turning_groups; ++k) {
       R own[6][6];
       for (int i = 0; i < 6; ++i) {
-        for (int c = 0; c < 6; ++c) own[i][c] = weight * strain.h[6 * k + i][c];
+        for (int c = 0; c < 6; ++c) own[i][c] = weight * strain[k].h[i][c];
       }
       for (int l = 0; l < k; ++l) {
         R* to = sum + turning_pair(6 * k, 6 * l);
-        add_group<false>(own, strain.h + 6 * l, to);
+        add_group<false>(own, strain[l].h, to);
       }
-      add_group<true>(own, strain.h + 6 * k, sum + turning_pair(6 * k, 6 * k));
+      add_group<true>(own, strain[k].h, sum + turning_pair(6 * k, 6 * k));
     }
   }
 
   template <bool Same, class R>
-  static void add_group(const R (&own)[6][6], const R (*other)[6], R* sum) {
-#pragma GCC unroll 6
+  static void add_group(const R (&own)[6][6], const R (&other)[6][6], R* sum) {
+    PD_UNROLL
     for (int i = 0; i < 6; ++i) {
-#pragma GCC unroll 6
+      PD_UNROLL
       for (int j = 0; j < (Same ? i + 1 : 6); ++j) {
         R& to = sum[Same ? i * (i + 1) / 2 + j : 6 * i + j];
-#pragma GCC unroll 6
-        for (int c = 0; c < 6; ++c) {
-          if (strain_has(i, c) && strain_has(j, c)) to = multiply_add(own[i][c], other[j][c], to);
-        }
+        add_strain_product(own[i], i, other[j], j, to);
       }
     }
   }
@@ -175,8 +176,8 @@ class Corotation {
   Corotation(const Plan<T>& plan, const Team& team, const Workspace<Lanes>& work, Shared& shared)
       : plan_(plan), team_(team), w_(work), shared_(shared) {}
 
-  // Makes it for the lanes that ask, of positions x + u: `base` is u.
-  void make(const Value* base, const bool (&asks)[width]) {
+  // Makes it for the lanes that ask, of positions x + u: `base` is u. Their material is that of A times `scales` at most.
+  void make(const Value* base, const bool (&asks)[width], const double (&scales)[width]) {
     for (int lane = 0; lane < width; ++lane) Lanes::set_lane(wanted_, lane, T(asks[lane] ? 1 : 0));
     find_middle();
     each_vertex([&](std::int64_t i) { set_numbers(i, base); });
@@ -187,7 +188,7 @@ class Corotation {
         add_products_of(c, lane);
       add_elements(lane, base);
       team_.barrier();
-      if (team_.rank == 0) solve(lane);
+      if (team_.rank == 0) solve(lane, scales[lane]);
       team_.barrier();
     }
   }
@@ -209,6 +210,19 @@ class Corotation {
     for (int m = 0; m < turning_numbers; ++m)
       q = subtract_product(q, shared_.images[i].of[m], vector_[m]);
     return q;
+  }
+
+  // The same with M = A^-1: its result lacks V (Hc^-1 - Ac^-1) V^T q, since M A V = V, whatever the order.
+  void measure_direct(const Value* q, const Real& scale) {
+    sum_up(shared_.numbers, q, own_);
+    double soft[turning_modes], part[width][turning_modes];
+    for (int lane = 0; lane < width; ++lane) {
+      shared_.inverse[lane].energy.multiply(own_[lane], soft);
+      shared_.inverse[lane].matrix.multiply(own_[lane], part[lane]);
+      for (int m = 0; m < turning_modes; ++m)
+        part[lane][m] = soft[m] / number(scale, lane) - part[lane][m];
+    }
+    set_vectors(part);
   }
 
   // After it: what its result lacks. q came multiplied by `scale`.
@@ -344,11 +358,15 @@ class Corotation {
                 Lanes::get_lane(w_.origin[slot] + base[plan_.slot_vertex[slot]], lane);
             return to_quad(x.x, x.y, x.z);
           },
-          shift, shared_.strains[patch]);
+          shift,
+          [&](int vertex, int group) {
+            return T(number(shared_.numbers[vertex].of[4 * group], lane));
+          },
+          shared_.strains[patch]);
     }
   }
 
-  void solve(int lane) const {
+  void solve(int lane, double times) const {
     typename Shared::Products all = {};
     for (const typename Shared::Products& p : shared_.products) {
       for (int m = 0; m < turning_numbers; ++m) {
@@ -359,23 +377,44 @@ class Corotation {
       }
     }
     TurningMatrix energy, matrix;
-    add_products(all.inertia, energy);
-    add_products(all.matrix, matrix);
     for (int i = 0; i < turning_modes; ++i) {
       for (int j = 0; j <= i; ++j) {
         double sum = 0;
         for (const auto& of_patch : shared_.strains) sum += of_patch[turning_pair(i, j)];
-        energy.at[i][j] += sum;
-        if (i != j) energy.at[j][i] += sum;
+        energy.at[i][j] = mode_product(all.inertia, i, j) + sum;
+        energy.at[j][i] = mode_product(all.inertia, j, i) + sum;
+        matrix.at[i][j] = mode_product(all.matrix, i, j);
+        matrix.at[j][i] = mode_product(all.matrix, j, i);
       }
     }
     double scale[turning_modes];
-    for (int i = 0; i < turning_modes; ++i)
-      scale[i] = matrix.at[i][i] > 0 ? 1 / sqrt(matrix.at[i][i]) : 0;
+    for (int i = 0; i < turning_modes; ++i) scale[i] = turning_scale(matrix, i);
     typename Shared::Inverses found;
-    const bool sound = invert(energy, scale, turning_noise, found.energy) &&
+    const bool sound = invert(energy, scale, times * turning_noise, found.energy) &&
                        invert(matrix, scale, turning_noise, found.matrix);
     shared_.inverse[lane] = sound ? found : typename Shared::Inverses{};
+  }
+
+  // false where X is not positive
+  static bool invert(const TurningMatrix& x, const double (&scale)[turning_modes], double noise,
+                     TurningMatrix& inverse) {
+    constexpr int n = turning_modes;
+    TurningMatrix now, next;
+    for (int i = 0; i < n; ++i) {
+      for (int j = 0; j < n; ++j) now.at[i][j] = scaled_entry(x, scale[i], scale[j], i, j, noise);
+    }
+    for (int k = 0; k < n; ++k) {
+      if (!(now.at[k][k] > 0)) return false;
+      const double share = 1 / now.at[k][k];
+      for (int i = 0; i < n; ++i) {
+        for (int j = 0; j < n; ++j) next.at[i][j] = swept(now, k, share, i, j);
+      }
+      now = next;
+    }
+    for (int i = 0; i < n; ++i) {
+      for (int j = 0; j < n; ++j) inverse.at[i][j] = -scale[i] * scale[j] * now.at[i][j];
+    }
+    return true;
   }
 
   // sums of the sixteen numbers times a field, as modes, chunk by chunk: neither threads nor the batch change their order

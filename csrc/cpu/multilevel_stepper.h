@@ -208,31 +208,36 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   }
 
  private:
-  // The lanes whose small problem is made at iteration k, of where they stand: once they are near enough, and again after so
-  // many trials failed that it no longer holds. A step that goes on failing does without.
+  // The lanes whose small problem is made at iteration k, of where they stand.
   void corotate(int k) {
     bool asks[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
-      const int failed = outer_[lane].restarts - doubted_[lane];
-      const bool first = k == turning_begins, again = made_[lane] > 0 && failed >= turning_doubts;
-      asks[lane] = !done_[lane] && (first || (again && made_[lane] < turning_most));
+      const TurningPlan plan(k, made_[lane], outer_[lane].restarts - doubted_[lane]);
+      asks[lane] = !done_[lane] && plan.make;
       some = some || asks[lane];
-      if (!asks[lane] && again) corotation_.forget(lane);
+      if (plan.forget) corotation_.forget(lane);
       if (!asks[lane]) continue;
       ++made_[lane];
       doubted_[lane] = outer_[lane].restarts;
     }
-    if (some) corotation_.make(o_.base, asks);
+    double scales[width];
+    for (int lane = 0; lane < width; ++lane) scales[lane] = outer_[lane].scale;
+    if (some) corotation_.make(o_.base, asks, scales);
     corotated_ = corotated_ || some;
   }
 
   // the cycle between what the small problem takes and what it gives
   void run_corotated(const Real& scale) {
     Value *in = o_.cycle.input(), *z = o_.cycle.result();
-    corotation_.measure(in);
-    each_vertex([&](std::int64_t i) { in[i] = corotation_.without(i, in[i]); });
-    o_.cycle.run(team_);
-    corotation_.answer(z, scale);
+    if (plan_.levels.direct) {
+      corotation_.measure_direct(in, scale);
+      o_.cycle.run(team_);
+    } else {
+      corotation_.measure(in);
+      each_vertex([&](std::int64_t i) { in[i] = corotation_.without(i, in[i]); });
+      o_.cycle.run(team_);
+      corotation_.answer(z, scale);
+    }
     each_vertex([&](std::int64_t i) { z[i] = corotation_.with(i, z[i]); });
   }
 

@@ -41,25 +41,26 @@ PD_DEVICE void add_across_warp(double (&value)[Count]) {
 
 // The sums of many values over a warp, written by one lane each. Two steps leave a lane one of four values, so that this takes a
 // third of the exchanges.
-template <int Count>
-PD_DEVICE void write_warp_sums(const double (&value)[Count], double* to) {
+template <int Count, class T>
+PD_DEVICE void write_warp_sums(const T (&value)[Count], double* to) {
   const int lane = int(threadIdx.x) % warp_size;
   const bool high = lane & 16, odd = lane & 8;
-  const auto half = [](bool upper, double a, double b, int distance) {
-    const double keep = upper ? b : a, give = upper ? a : b;
+  const auto half = [](bool upper, T a, T b, int distance) {
+    const T keep = upper ? b : a, give = upper ? a : b;
     return keep + __shfl_xor_sync(whole_warp, give, distance);
   };
 #pragma unroll
   for (int first = 0; first < Count; first += 4) {
-    double four[4];
+    T four[4];
 #pragma unroll
-    for (int n = 0; n < 4; ++n) four[n] = first + n < Count ? value[min(first + n, Count - 1)] : 0;
-    double sum = half(odd, half(high, four[0], four[2], 16), half(high, four[1], four[3], 16), 8);
+    for (int n = 0; n < 4; ++n)
+      four[n] = first + n < Count ? value[min(first + n, Count - 1)] : T(0);
+    T sum = half(odd, half(high, four[0], four[2], 16), half(high, four[1], four[3], 16), 8);
 #pragma unroll
     for (int distance = 4; distance > 0; distance /= 2)
       sum += __shfl_xor_sync(whole_warp, sum, distance);
     const int own = first + 2 * high + odd;
-    if (lane % 8 == 0 && own < Count) to[own] = sum;
+    if (lane % 8 == 0 && own < Count) to[own] = double(sum);
   }
 }
 

@@ -59,22 +59,24 @@ class DeviceCycle {
     m_.fine.in[i] = quad(right);
     m_.fine.part[i] = quad(T(Smoother::first) * inverse * right);
   }
+  PD_DEVICE Vec3<T> right_side(int i) const { return vec3(m_.fine.in[i]); }
   PD_DEVICE Vec3<T> result(int i) const { return vec3(m_.fine.z[i]); }
 
   // result = M times what was set, there for all of the team when it returns
   PD_DEVICE void run() {
-    if (levels_.direct) return solve_coarse(m_.fine.in, m_.fine.z);
-    const bool middle = levels_.has_middle();
-    descend(fine_level(levels_), m_.fine);
-    restrict_to(fine_level(levels_), m_.fine.rest, middle ? m_.middle.in : m_.coarse_in,
-                levels_.middle_inverse, middle ? m_.middle.part : nullptr);
+    const bool middle = levels_.has_middle(), direct = levels_.direct;
+    if (!direct) {
+      descend(fine_level(levels_), m_.fine);
+      restrict_to(fine_level(levels_), m_.fine.rest, middle ? m_.middle.in : m_.coarse_in,
+                  levels_.middle_inverse, middle ? m_.middle.part : nullptr);
+    }
     if (middle) {
       descend(middle_level(levels_), m_.middle);
       restrict_to(middle_level(levels_), m_.middle.rest, m_.coarse_in, nullptr, nullptr);
     }
-    solve_coarse(m_.coarse_in, m_.coarse_out);
+    solve_coarse(direct ? m_.fine.in : m_.coarse_in, direct ? m_.fine.z : m_.coarse_out);
     if (middle) ascend(middle_level(levels_), m_.middle, m_.coarse_out);
-    ascend(fine_level(levels_), m_.fine, middle ? m_.middle.z : m_.coarse_out);
+    if (!direct) ascend(fine_level(levels_), m_.fine, middle ? m_.middle.z : m_.coarse_out);
   }
 
  private:

@@ -112,14 +112,15 @@ template <class T>
 struct OuterLaunch {
   OuterKernel<T> kernel;
   int threads;
-  std::size_t shared, shared_cycle = 0;
+  std::size_t shared, shared_cycle = 0, shared_corotation = 0;
   int resident;
 
   explicit OuterLaunch(const DeviceStep<T>& step)
       : kernel(kernel_of(step)),
         threads(is_small(step) ? small_outer_threads : outer_threads),
-        shared(pass_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries, 2)),
-        resident(blocks_with(shared)) {
+        shared(pass_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries, 2)) {
+    if (step.settings.schedule == ScheduleKind::corotated) add_corotation();
+    resident = blocks_with(shared);
     keep_cycle(step);
     if (resident == 0)
       throw std::runtime_error("torchpd: a patch of the plan wants " + std::to_string(shared) +
@@ -134,6 +135,19 @@ struct OuterLaunch {
     // the material is compared by the same teams
     return std::min(of(reinterpret_cast<const void*>(kernel), bytes),
                     of(reinterpret_cast<const void*>(compare_material<T>), 0));
+  }
+
+  // The small problem, behind as much memory for making it as the number of blocks allows.
+  void add_corotation() {
+    const auto begin = [&](std::size_t scratch) { return corotation_begin(shared, scratch); };
+    const auto blocks = [&](std::size_t scratch) {
+      return blocks_with(begin(scratch) + corotation_bytes);
+    };
+    std::size_t scratch = threads * turning_tile_numbers * sizeof(float);
+    while (scratch > turning_scratch_bytes && blocks(scratch) < blocks(turning_scratch_bytes))
+      scratch /= 2;
+    shared_corotation = begin(std::max(scratch, turning_scratch_bytes));
+    shared = shared_corotation + corotation_bytes;
   }
 
   // The fields of the cycle in shared memory, where one block has an environment to itself and there is room.
@@ -171,7 +185,7 @@ struct OuterLaunch {
     const bool spread = plan.levels.direct && !is_small(stream.step);
     const int useful = std::max(plan.patches, spread ? useful_blocks(plan.levels) : 1);
     const Teams teams(stream.step.batch, resident, useful);
-    return {stream, {}, teams.count, teams.blocks, shared_cycle};
+    return {stream, {}, teams.count, teams.blocks, shared_cycle, shared_corotation};
   }
 };
 
@@ -179,7 +193,8 @@ template <class T>
 OuterMemory<T> arrange(Arena& arena, const OuterCall<T>& call) {
   const DeviceStep<T>& step = call.stream.step;
   const std::int64_t teams = call.teams, n = step.plan.vertices;
-  const std::int64_t pairs = step.settings.schedule == ScheduleKind::lbfgs ? history * n : 0;
+  const std::int64_t pairs = step.settings.learns() ? history * n : 0;
+  const std::int64_t small = step.settings.schedule == ScheduleKind::corotated ? teams : 0;
   const std::int64_t held = OuterLaunch<T>::touching(step) ? n : 0;
   OuterMemory<T> m;
   // what must start as zero comes first
@@ -189,7 +204,13 @@ OuterMemory<T> arrange(Arena& arena, const OuterCall<T>& call) {
   for (Mat3<T>** array : {&m.free, &m.fresh_free}) arena.place(*array, teams * held);
   for (Quad<T>** array : {&m.gradient, &m.fresh_gradient}) arena.place(*array, teams * held);
   arrange(arena, step.plan.levels, int(teams), m.cycle);
-  arena.place(m.chunk_dots, teams * 2 * call.chunks() * outer_dots);
+  arena.place(m.corotation.arm, small * n);
+  for (Quad<T>** array : {&m.corotation.numbers, &m.corotation.images})
+    arena.place(*array, small * turning_groups * n);
+  arena.place(m.corotation.products, small * turning_chunks(int(n)) * 2 * turning_products);
+  arena.place(m.corotation.strains, small * step.plan.patches * turning_pairs);
+  arena.place(m.corotation.totals, small * turning_totals);
+  arena.place(m.chunk_dots, teams * 2 * call.chunks() * most_sums);
   arena.place(m.patch_sums, teams * step.plan.patches * sums_count);
   arena.place(m.ranges, teams * 2 * call.blocks * ranges_count);
   arena.place(m.misfit, step.batch);

@@ -1,7 +1,7 @@
 // Runner of solver/multilevel.h on a GPU: all iterations of one environment by a team of blocks, see also
 // cpu/multilevel_stepper.h. What goes before and after them is a launch each, as in stream.h.
 #pragma once
-#include "cuda/outer_call.h"
+#include "cuda/corotation_maker.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -20,7 +20,9 @@ class MultilevelRunner {
         c_(control),
         cycle_(call.plan().levels, memory.cycle, team),
         shared_(shared),
-        lbfgs_(call.stream.step.settings.schedule == ScheduleKind::lbfgs) {
+        lbfgs_(call.stream.step.settings.learns()),
+        corotates_(call.shared_corotation > 0),
+        corotation_(call.plan().vertices, memory.corotation, shared + call.shared_corotation) {
     const Misfit& misfit = m_.misfit[environment];
     strangers_ = misfit.strangers;
     trusted_ = T(misfit.trusted);
@@ -32,10 +34,7 @@ class MultilevelRunner {
       c_.pairs = {};
       c_.done = false;
     }
-    if (is_first()) {
-      w_.progress.schedule.rho = misfit.spread;
-      w_.progress.used = 0;
-    }
+    if (is_first()) w_.progress.schedule.rho = misfit.spread;
     __syncthreads();
   }
 
@@ -52,6 +51,12 @@ class MultilevelRunner {
       write_sums<Visit::measure>(sums, m_.patch_sums + patch * sums_count);
     }
     team_.barrier();
+    // those of this thread, on the way to the shared vertices
+    patch_sum_[0] = patch_sum_[1] = 0;
+#pragma unroll 1
+    for (int patch = threadIdx.x; patch < w_.plan.patches; patch += blockDim.x) {
+      for (int n = 0; n < 2; ++n) patch_sum_[n] += m_.patch_sums[patch * sums_count + n];
+    }
     if (w_.plan.shared == 0) {
       if (threadIdx.x == 0) c_.total[0] = c_.total[1] = 0;
       return;
@@ -69,11 +74,7 @@ class MultilevelRunner {
   // every block decides from the same sums, so all decide alike
   PD_DEVICE void judge(int) {
     // the shared vertices' part is there
-    double sum[2] = {0, 0};
-#pragma unroll 1
-    for (int patch = threadIdx.x; patch < w_.plan.patches; patch += blockDim.x) {
-      for (int n = 0; n < 2; ++n) sum[n] += m_.patch_sums[patch * sums_count + n];
-    }
+    double sum[2] = {patch_sum_[0], patch_sum_[1]};
     add_across_warp(sum);
     const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
     if (lane == 0) {
@@ -98,25 +99,26 @@ class MultilevelRunner {
   // The pair from the base to the trial, kept or not: it holds for the curvature on the way. Then the base moves on.
   PD_DEVICE void learn(int k) {
     newest_ = (newest_ + 1) % history;
-    pass<outer_dots>([&](int i, double (&sum)[outer_dots]) {
+    iteration_ = k;
+    pass<outer_dots, T>([&](int i, T(&sum)[outer_dots]) {
       const Vec3<T> u = vec3(w_.v.u[i]), fresh = vec3(m_.fresh[i]);
       const Vec3<T> base = k == 0 ? u : vec3(m_.base[i]), pull = k == 0 ? fresh : vec3(m_.pull[i]);
       const Vec3<T> change = u - base;
       Vec3<T> s = let_through(i, change, k), y = let_through(i, fresh - pull, k);
       if constexpr (Touching) keep_directions(i, k);
       const bool accepted = c_.accepted;
-      // what momentum goes on along
-      if (accepted || k == 0) w_.v.set_before(i, base);
       const Vec3<T> left = accepted ? fresh : pull;
-      m_.base[i] = quad(accepted ? u : base);
-      m_.pull[i] = quad(left);
-      sum[2 * history] += double(dot(change, change));
-      sum[2 * history + 1] += double(dot(u, u));
-      if (!lbfgs_) return;
+      sum[2 * history] += dot(change, change);
+      sum[2 * history + 1] += dot(u, u);
+      const auto keep = [&] {
+        // what momentum goes on along
+        if (accepted || k == 0) w_.v.set_before(i, base);
+        m_.base[i] = quad(accepted ? u : base);
+        m_.pull[i] = quad(left);
+      };
+      if (!lbfgs_) return keep();
       // a trial out of range must not poison sums in which it has no part
       if (!c_.finite) s = y = none();
-      m_.s[newest_ * vertices() + i] = quad(s);
-      m_.y[newest_ * vertices() + i] = quad(y);
       const Vec3<T> g = let_through(i, left);
       Vec3<T> ways[history];
       see_pairs(m_.s, i, ways);
@@ -124,10 +126,13 @@ class MultilevelRunner {
       for (int j = 0; j < history; ++j) {
         if (j != newest_ && !c_.pairs.valid[j]) continue;
         const Vec3<T> way = j == newest_ ? s : ways[j];
-        sum[j] += double(dot(way, y));
-        sum[history + j] += double(dot(way, g));
+        sum[j] += dot(way, y);
+        sum[history + j] += dot(way, g);
       }
-      sum[2 * history + 2] += double(dot(y, y));
+      sum[2 * history + 2] += dot(y, y);
+      keep();
+      m_.s[newest_ * vertices() + i] = quad(s);
+      m_.y[newest_ * vertices() + i] = quad(y);
     });
     if (threadIdx.x < warp_size) {
       if (threadIdx.x == 0) {
@@ -142,8 +147,9 @@ class MultilevelRunner {
 
   // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
   PD_DEVICE void precondition() {
-    const T scale = T(w_.settings().relaxation / c_.outer.scale);
-    each_vertex([&](int i) {
+    if (corotates_) corotate();
+    const double scale = w_.settings().relaxation / c_.outer.scale;
+    const auto right_side = [&](int i) {
       Vec3<T> q = let_through(i, vec3(m_.pull[i]));
       if (lbfgs_) {
         Vec3<T> y[history];
@@ -154,9 +160,29 @@ class MultilevelRunner {
         }
         q = let_through(i, q);
       }
-      cycle_.set(i, scale * q);
-    });
+      return T(scale) * q;
+    };
+    // the small problem takes its part before the cycle, and gives what that lacks after it
+    const bool direct = w_.plan.levels.direct, around = corotated_ && !direct;
+    if (corotated_) {
+      pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
+        const Vec3<T> q = right_side(i);
+        cycle_.set(i, q);
+        corotation_.multiply_modes(i, q, sum);
+      });
+      corotation_.measure(c_.total, direct, scale);
+    } else {
+      each_vertex([&](int i) { cycle_.set(i, right_side(i)); });
+    }
+    if (around)
+      each_vertex([&](int i) { cycle_.set(i, corotation_.without(i, cycle_.right_side(i))); });
     cycle_.run();
+    if (around) {
+      pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
+        corotation_.multiply_images(i, cycle_.result(i), sum);
+      });
+      corotation_.answer(c_.total, scale);
+    }
     if (lbfgs_) correct();
   }
 
@@ -167,7 +193,7 @@ class MultilevelRunner {
     const double limit = accelerates ? w_.progress.schedule.limit : Outer::momentum_limit();
     __syncthreads();
     if (threadIdx.x == 0) c_.total[0] = extrapolates ? c_.outer.extrapolation(limit) : 0;
-    if (is_first()) ++w_.progress.used;
+    ++used_;
     __syncthreads();
     const T beta = T(c_.total[0]), length = T((1 + c_.total[0]) * c_.outer.length());
     const T theta = T(w_.settings().relaxation);
@@ -190,6 +216,7 @@ class MultilevelRunner {
     if (is_first()) {
       w_.progress.schedule.restarts = c_.outer.restarts;
       w_.progress.done = c_.done;
+      w_.progress.used = used_;
     }
     team_.barrier();
   }
@@ -198,6 +225,18 @@ class MultilevelRunner {
   PD_DEVICE bool is_first() const { return team_.thread() == 0; }
   PD_DEVICE std::int64_t vertices() const { return w_.plan.vertices; }
   PD_DEVICE static Vec3<T> none() { return {T(0), T(0), T(0)}; }
+
+  PD_DEVICE void corotate() {
+    const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_);
+    if (plan.forget) corotation_.clear();
+    if (!plan.make) return;
+    ++made_;
+    doubted_ = c_.outer.restarts;
+    corotated_ = true;
+    team_ = make_corotation(CorotationInput<T>{w_.v.x, w_.v.u, w_.v.before, m_.base, w_.weights},
+                            m_.corotation, team_, shared_, call_.shared_corotation, c_.outer.scale,
+                            corotation_.prepared(call_.plan()));
+  }
 
   PD_DEVICE void look_at(int i, const typename Vertices<T, Touching>::Seen& seen,
                          const Vec3<T>& force, ThreadSums& sums) const {
@@ -221,28 +260,28 @@ class MultilevelRunner {
     team_.barrier();
   }
 
-  // visit(vertex, sums); then the totals are in c_.total
-  template <int Count, class Visit>
+  // visit(vertex, sums); then the totals are in c_.total. `Sum`: of the sums of a warp.
+  template <int Count, class Sum = double, class Visit>
   PD_DEVICE void pass(const Visit& visit) {
-    add_up<Count>(w_.plan.vertices, visit);
+    add_up<Count, Sum>(w_.plan.vertices, visit);
   }
 
   // visit(number, sums) for numbers 0 ... count - 1, a lane each, chunk by chunk of them
-  template <int Count, class Visit>
+  template <int Count, class Sum = double, class Visit>
   PD_DEVICE void add_up(int count, const Visit& visit) {
     const int together = call_.warps_of_chunk(), chunks = call_.chunks_of(count, together);
     const int groups = warps / together;  // chunks that a block works on at a time
     const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
     // nobody overwrites what others may still read
     parity_ = !parity_;
-    double* dots = m_.chunk_dots + (parity_ ? std::int64_t(call_.chunks()) * outer_dots : 0);
+    double* dots = m_.chunk_dots + (parity_ ? std::int64_t(call_.chunks()) * most_sums : 0);
     // neighbouring chunks in different blocks: few are spread over all multiprocessors
     const auto chunk_of = [&](int round, int group) {
       return (round * groups + group) * team_.blocks() + team_.rank();
     };
 #pragma unroll 1
     for (int round = 0; chunk_of(round, 0) < chunks; ++round) {
-      double sum[Count] = {};
+      Sum sum[Count] = {};
       const int from = (chunk_of(round, warp / together) * together + warp % together) * warp_size;
       if (from < count) {
         if (from + lane < count) visit(from + lane, sum);
@@ -294,15 +333,20 @@ class MultilevelRunner {
 
   // the second loop of L-BFGS, and the slope g.d
   PD_DEVICE void correct() {
-    pass<history + 1>([&](int i, double (&sum)[history + 1]) {
-      const Vec3<T> z = cycle_.result(i);
+    pass<history + 1, T>([&](int i, T(&sum)[history + 1]) {
+      // before anything is written, that it may be asked for with the rest
       Vec3<T> y[history];
       see_pairs(m_.y, i, y);
+      Vec3<T> z = cycle_.result(i);
+      if (corotated_) {
+        z = corotation_.with(i, z);
+        m_.cycle.fine.z[i] = quad(z);
+      }
 #pragma unroll
       for (int j = 0; j < history; ++j) {
-        if (c_.pairs.valid[j]) sum[j] += double(dot(y[j], z));
+        if (c_.pairs.valid[j]) sum[j] += dot(y[j], z);
       }
-      sum[history] += double(dot(vec3(m_.pull[i]), way(i, z)));
+      sum[history] += dot(vec3(m_.pull[i]), way(i, z));
     });
     if (threadIdx.x < warp_size) PairLanes(c_.pairs, newest_).second_loop(c_.total, c_.factor);
     if (threadIdx.x == 0) {
@@ -330,12 +374,12 @@ class MultilevelRunner {
     return d;
   }
 
-  // A field of the pairs at a vertex, all asked for at once: in place of one that is not valid the newest, which is there.
+  // A field of the pairs at a vertex, all asked for at once: in place of one that is not valid any that is there.
   PD_DEVICE void see_pairs(const Quad<T>* field, int i, Vec3<T> (&seen)[history]) const {
 #pragma unroll
     for (int j = 0; j < history; ++j) {
-      const int pair = c_.pairs.valid[j] ? j : newest_;
-      seen[j] = vec3(field[pair * vertices() + i]);
+      const Quad<T>* from = c_.pairs.valid[j] ? field + j * vertices() : w_.v.u;
+      seen[j] = vec3(from[i]);
     }
   }
 
@@ -382,9 +426,12 @@ class MultilevelRunner {
   OuterControl& c_;
   DeviceCycle<T> cycle_;
   std::byte* shared_;
-  bool lbfgs_, strangers_;
+  bool lbfgs_, corotates_, corotated_ = false, strangers_;
+  DeviceCorotation<T> corotation_;
   T trusted_;
-  int newest_ = 0;
+  double patch_sum_[2] = {0, 0};
+  int newest_ = 0, iteration_ = 0, used_ = 0;
+  int made_ = 0, doubted_ = 0;  // small problems, and trials that had failed by then
   bool parity_ = false;
 };
 

@@ -1,14 +1,17 @@
 // What the kernel of the multilevel solver is given, and what it keeps where.
 #pragma once
+#include "cuda/corotation.h"
 #include "cuda/cycle.h"
 #include "cuda/pairs.h"
 #include "cuda/stream.h"
 
 namespace pd::inline PD_TARGET {
 
-constexpr int outer_dots = 2 * history + 3;  // sums that one pass over the vertices may make
-constexpr int ranges_count = 2;              // that a round of Ranges compares
-constexpr int most_chunks = 640;             // of vertices, whose sums every block adds up
+constexpr int outer_dots =
+    2 * history + 3;  // sums that learning makes in its pass over the vertices
+constexpr int most_sums = outer_dots > turning_modes ? outer_dots : turning_modes;  // of any pass
+constexpr int ranges_count = 2;   // that a round of Ranges compares
+constexpr int most_chunks = 640;  // of vertices, whose sums every block adds up
 // Threads of a block: a multiprocessor each, but for meshes of one patch, of which two share it. Few enough that each has the
 // registers for what it asks of memory at once.
 constexpr int outer_threads = 512, small_outer_threads = 256;
@@ -23,7 +26,8 @@ struct OuterMemory {
   Mat3<T>*free, *fresh_free;          // [teams, vertices], with contacts
   Quad<T>*gradient, *fresh_gradient;  // [teams, vertices], with contacts
   CycleMemory<T> cycle;               // [teams, ...]
-  double* chunk_dots;                 // [teams, 2, outer_dots, chunks], passes alternate
+  CorotationMemory<T> corotation;     // [teams, ...], with its small problem
+  double* chunk_dots;                 // [teams, 2, most_sums, chunks], passes alternate
   double* patch_sums;                 // [teams, patches, sums_count]
   Range* ranges;                      // [teams, 2, blocks, ranges_count], rounds alternate
   Misfit* misfit;                     // [batch]
@@ -36,6 +40,7 @@ struct OuterCall {
   OuterMemory<T> memory;
   int teams, blocks;         // blocks of a team
   std::size_t shared_cycle;  // where the cycle's fields stand in shared memory; 0: in device memory
+  std::size_t shared_corotation;  // where a CorotationControl stands there; 0: nowhere
 
   PD_HD const DevicePlan<T>& plan() const { return stream.step.plan; }
   // Warps whose vertices are added up together, a divisor of those of a block: one where the block is small, since a patch
@@ -57,9 +62,9 @@ struct OuterCall {
 struct OuterControl {
   Outer outer;
   Pairs pairs;
-  double total[outer_dots];
+  double total[most_sums];
   double factor[history];  // of the pairs' ways in the direction
-  double warp_dot[outer_warps][outer_dots];
+  double warp_dot[outer_warps][most_sums];
   bool accepted, finite, done;
 };
 
@@ -74,7 +79,14 @@ PD_DEVICE OuterMemory<T> of_team(const OuterCall<T>& call, int team) {
   m.free += at;
   m.fresh_free += at;
   m.cycle = cycle_of_team(call.plan().levels, m.cycle, team);
-  m.chunk_dots += std::int64_t(team) * 2 * call.chunks() * outer_dots;
+  CorotationMemory<T>& c = m.corotation;
+  c.arm += at;
+  c.numbers += turning_groups * at;
+  c.images += turning_groups * at;
+  c.products += std::int64_t(team) * turning_chunks(int(n)) * 2 * turning_products;
+  c.strains += std::int64_t(team) * call.plan().patches * turning_pairs;
+  c.totals += std::int64_t(team) * turning_totals;
+  m.chunk_dots += std::int64_t(team) * 2 * call.chunks() * most_sums;
   m.patch_sums += std::int64_t(team) * call.plan().patches * sums_count;
   m.ranges += std::int64_t(team) * 2 * call.blocks * ranges_count;
   return m;

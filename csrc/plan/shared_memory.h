@@ -76,12 +76,27 @@ constexpr std::size_t cluster_threads(std::size_t real, std::size_t pairs, std::
 constexpr std::size_t pass_static_bytes = 3 * 32 * sizeof(double);
 
 // the same with all that the iterations of the multilevel solver keep
-constexpr std::size_t outer_static_bytes = 4608;
+constexpr std::size_t outer_static_bytes = 5120;
 
 // `fields` vectors of every slot, one or two
 constexpr std::size_t pass_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
                                         std::size_t fields) {
   return slots_bytes(real, slots, fields) + 4 * real * entries;
+}
+
+// The small problem of the multilevel solver, with the schedule that has one: what it keeps, and the least that it wants of
+// the memory of a pass while it is made. Tetrahedra of which it has so many numbers are faster in more.
+constexpr std::size_t corotation_bytes = 11264;
+constexpr std::size_t turning_tile_numbers = 49;
+constexpr std::size_t turning_scratch_bytes = 4 * 24 * 24 * sizeof(double);
+constexpr std::size_t corotation_begin(std::size_t pass_bytes, std::size_t scratch_bytes) {
+  return aligned(pass_bytes < scratch_bytes ? scratch_bytes : pass_bytes);
+}
+
+// of a block, by a plan for the multilevel solver
+constexpr std::size_t outer_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries) {
+  return corotation_begin(pass_shared_bytes(real, slots, entries, 2), turning_scratch_bytes) +
+         corotation_bytes + outer_static_bytes;
 }
 
 }  // namespace pd

@@ -38,6 +38,18 @@ PD_HD constexpr bool strain_has(int mode, int c) {
   return has[mode][c];
 }
 
+// Whether the small problem is to be made at iteration k, which it was `made` times before, `failed` trials ago. If not, whether
+// it is to be forgotten: a step that goes on failing does without.
+struct TurningPlan {
+  bool make, forget;
+
+  PD_HD TurningPlan(int k, int made, int failed) {
+    const bool doubted = made > 0 && failed >= turning_doubts;
+    make = k == turning_begins || (doubted && made < turning_most);
+    forget = doubted && !make;
+  }
+};
+
 struct TurningMatrix {
   double at[turning_modes][turning_modes] = {};
 
@@ -58,24 +70,19 @@ PD_HD void each_turn(const Visit& visit) {
   }
 }
 
-// sum V_i . W_i over vertices, for sums p of products of their sixteen numbers
-PD_HD void add_products(const double (&p)[turning_numbers][turning_numbers], TurningMatrix& to) {
-  for (int k = 0; k < turning_groups; ++k) {
-    for (int l = 0; l < turning_groups; ++l) {
-      const int row = 6 * k, column = 6 * l, m = 4 * k, n = 4 * l;
-      double trace = 0;
-      for (int c = 1; c < 4; ++c) trace += p[m + c][n + c];
-      for (int a = 0; a < 3; ++a) {
-        to.at[row + a][column + a] += p[m][n];
-        to.at[row + 3 + a][column + 3 + a] += trace;
-        for (int b = 0; b < 3; ++b) to.at[row + 3 + a][column + 3 + b] -= p[m + 1 + b][n + 1 + a];
-      }
-      each_turn([&](int a, int b, int c, int sign) {
-        to.at[row + a][column + 3 + b] += sign * p[m][n + 1 + c];
-        to.at[row + 3 + b][column + a] += sign * p[m + 1 + c][n];
-      });
-    }
+// sum V_i . W_j over vertices, for sums p of products of their sixteen numbers
+PD_HD double mode_product(const double (&p)[turning_numbers][turning_numbers], int i, int j) {
+  const int m = 4 * (i / 6), n = 4 * (j / 6), a = i % 3, b = j % 3, c = 3 - a - b;
+  const bool turns = i % 6 >= 3, other_turns = j % 6 >= 3;
+  if (turns && other_turns) {
+    const double trace = p[m + 1][n + 1] + p[m + 2][n + 2] + p[m + 3][n + 3];
+    return (a == b ? trace : 0) - p[m + 1 + b][n + 1 + a];
   }
+  if (turns == other_turns) return a == b ? p[m][n] : 0;
+  if (a == b) return 0;
+  const bool even = b == (a + 1) % 3;  // the permutation (a, b, c)
+  const double product = turns ? -p[m + 1 + c][n] : p[m][n + 1 + c];
+  return even ? product : -product;
 }
 
 // V^T q, for sums of the sixteen numbers times q
@@ -104,66 +111,61 @@ PD_HD void vectors_of(const double (&mode)[turning_modes], double (&vector)[turn
   }
 }
 
-// (X + noise diag Ac)^-1 in the scale of the diagonal of Ac, nothing for modes that move nothing; false where X is not positive.
-PD_HD bool invert(const TurningMatrix& x, const double (&scale)[turning_modes], double noise,
-                  TurningMatrix& inverse) {
-  constexpr int n = turning_modes;
-  double l[n][n] = {};  // L, then L^-1, of the scaled matrix
-  for (int i = 0; i < n; ++i) {
-    for (int j = 0; j <= i; ++j) {
-      double rest = scale[i] * scale[j] * 0.5 * (x.at[i][j] + x.at[j][i]);
-      if (i == j) rest += scale[i] > 0 ? noise : 1;
-      for (int k = 0; k < j; ++k) rest -= l[i][k] * l[j][k];
-      if (i == j && !(rest > 0)) return false;
-      l[i][j] = i == j ? sqrt(rest) : rest / l[j][j];
-    }
-  }
-  for (int j = 0; j < n; ++j) {
-    l[j][j] = 1 / l[j][j];
-    for (int i = j + 1; i < n; ++i) {
-      double rest = 0;
-      for (int k = j; k < i; ++k) rest -= l[i][k] * l[k][j];
-      l[i][j] = rest / l[i][i];
-    }
-  }
-  for (int i = 0; i < n; ++i) {
-    for (int j = 0; j < n; ++j) {
-      double sum = 0;
-      for (int k = i < j ? j : i; k < n; ++k) sum += l[k][i] * l[k][j];
-      inverse.at[i][j] = scale[i] * scale[j] * sum;
-    }
-  }
-  return true;
+// Modes in the scale of the diagonal of Ac, 0 for one that moves nothing.
+PD_HD double turning_scale(const TurningMatrix& matrix, int i) {
+  return matrix.at[i][i] > 0 ? 1 / sqrt(matrix.at[i][i]) : 0;
 }
 
-// Six numbers of sym(dF R^T), dF being what a mode does to an element: their products are those of the matrices.
-// `rotation`: of Ds Dm^-1; `position`, `weight`: of the four corners.
+// X + noise diag Ac in that scale, one where a mode moves nothing
+PD_HD double scaled_entry(const TurningMatrix& x, double scale_i, double scale_j, int i, int j,
+                          double noise) {
+  const double entry = scale_i * scale_j * 0.5 * (x.at[i][j] + x.at[j][i]);
+  return i != j ? entry : entry + (scale_i > 0 ? noise : 1);
+}
+
+// Step k of the sweeps that turn a positive matrix into minus its inverse (Goodnight 1979): what entry (i, j) becomes.
+// `share` is one over the pivot, which is positive.
+PD_HD double swept(const TurningMatrix& a, int k, double share, int i, int j) {
+  if (i == k && j == k) return -share;
+  if (i == k || j == k) return share * a.at[i][j];
+  return a.at[i][j] - share * (a.at[i][k] * a.at[k][j]);
+}
+
+// What the modes of a group do to an element: dF R^T of a translation along e is e g^T, that of a turn about e is e x p.
+// `back`: R^T of Ds Dm^-1; `position`, `weight`: of the four corners.
+template <class R>
+struct TurningGradient {
+  Vec3<R> g;
+  Mat3<R> p;
+
+  PD_HD TurningGradient(const Mat3<R>& rest_inverse, const Mat3<R>& back,
+                        const Vec3<R> (&position)[4], const R (&weight)[4]) {
+    const Vec3<R> change = {weight[1] - weight[0], weight[2] - weight[0], weight[3] - weight[0]};
+    g = (change * rest_inverse) * back;
+    Vec3<R> moved[4];
+    for (int c = 0; c < 4; ++c) moved[c] = weight[c] * position[c];
+    p = (from_columns(moved[1] - moved[0], moved[2] - moved[0], moved[3] - moved[0]) *
+         rest_inverse) *
+        back;
+  }
+  PD_HD TurningGradient(const Vec3<R>& gradient, const Mat3<R>& product)
+      : g(gradient), p(product) {}
+};
+
+// Six numbers of the symmetric part of that for each mode of a group: their products are those of the matrices.
 template <class R>
 struct TurningStrain {
-  R h[turning_modes][6];
+  R h[6][6];
 
-  PD_HD TurningStrain(const Mat3<R>& rest_inverse, const Mat3<R>& rotation,
-                      const Vec3<R> (&position)[4], const R (&weight)[turning_groups][4]) {
-    const Mat3<R> back = transpose(rotation);
-    for (int k = 0; k < turning_groups; ++k) {
-      const R(&w)[4] = weight[k];
-      const Vec3<R> change = {w[1] - w[0], w[2] - w[0], w[3] - w[0]};
-      const Vec3<R> g = rotation * (transpose(rest_inverse) * change);
-      Vec3<R> moved[4];
-      for (int c = 0; c < 4; ++c) moved[c] = w[c] * position[c];
-      const Mat3<R> p =
-          (from_columns(moved[1] - moved[0], moved[2] - moved[0], moved[3] - moved[0]) *
-           rest_inverse) *
-          back;
-      const Vec3<R> none = {R(scalar_of<R>(0)), R(scalar_of<R>(0)), R(scalar_of<R>(0))};
-      const Vec3<R> minus[3] = {-p.row[0], -p.row[1], -p.row[2]};
-      set(6 * k, {{g, none, none}});
-      set(6 * k + 1, {{none, g, none}});
-      set(6 * k + 2, {{none, none, g}});
-      set(6 * k + 3, {{none, minus[2], p.row[1]}});
-      set(6 * k + 4, {{p.row[2], none, minus[0]}});
-      set(6 * k + 5, {{minus[1], p.row[0], none}});
-    }
+  PD_HD explicit TurningStrain(const TurningGradient<R>& of) {
+    const Vec3<R> none = {R(scalar_of<R>(0)), R(scalar_of<R>(0)), R(scalar_of<R>(0))};
+    const Mat3<R>& p = of.p;
+    set(0, {{of.g, none, none}});
+    set(1, {{none, of.g, none}});
+    set(2, {{none, none, of.g}});
+    set(3, {{none, -p.row[2], p.row[1]}});
+    set(4, {{p.row[2], none, -p.row[0]}});
+    set(5, {{-p.row[1], p.row[0], none}});
   }
 
  private:
@@ -177,5 +179,14 @@ struct TurningStrain {
     h[mode][5] = root_half * (d.row[1].z + d.row[2].y);
   }
 };
+
+// sum += the product of the strains of two modes, 0 to 5 of their groups: of six numbers half are none
+template <class R>
+PD_HD void add_strain_product(const R (&a)[6], int i, const R (&b)[6], int j, R& sum) {
+  PD_UNROLL
+  for (int c = 0; c < 6; ++c) {
+    if (strain_has(i, c) && strain_has(j, c)) sum = multiply_add(a[c], b[c], sum);
+  }
+}
 
 }  // namespace pd::inline PD_TARGET

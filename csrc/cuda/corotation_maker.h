@@ -1,0 +1,444 @@
+// How a team of blocks makes the small problem of solver/corotation.h of an iterate; see also cpu/corotation.h.
+#pragma once
+#include "cuda/half.h"
+#include "cuda/outer_call.h"
+
+namespace pd::inline PD_TARGET {
+
+// Sums of 36 numbers over a warp: afterwards each lane has one or two of them in front.
+template <class T>
+PD_DEVICE void spread_sums(T (&value)[36]) {
+  const int lane = int(threadIdx.x) % warp_size;
+  int size = 36;
+#pragma unroll
+  for (int distance = warp_size / 2; distance > 0; distance /= 2) {
+    const bool upper = lane & distance;
+    const int half = (size + 1) / 2;
+#pragma unroll
+    for (int n = 0; n < half; ++n) {
+      const T other = half + n < size ? value[min(half + n, 35)] : T(0);
+      const T keep = select(upper, other, value[n]), give = select(upper, value[n], other);
+      value[n] = keep + __shfl_xor_sync(whole_warp, give, distance);
+    }
+    size = half;
+  }
+}
+// Which of them.
+struct KeptSums {
+  int first = 0, count = 36;
+
+  PD_DEVICE explicit KeptSums(int lane) {
+    int size = count;
+    for (int distance = warp_size / 2; distance > 0; distance /= 2) {
+      const int half = (size + 1) / 2;
+      const bool upper = lane & distance;
+      if (upper) first += half;
+      count = upper ? max(count - half, 0) : min(count, half);
+      size = half;
+    }
+  }
+};
+
+// What the products of strains want of a tetrahedron: g and p of each group, and w V. Neighbours lie side by side.
+template <class T>
+class TurningTile {
+  static constexpr int of_group = 12, numbers = turning_groups * of_group + 1;
+  static_assert(numbers == turning_tile_numbers);
+
+ public:
+  PD_DEVICE TurningTile(std::byte* shared, std::size_t bytes)
+      : memory_(reinterpret_cast<T*>(shared)),
+        size_(min(int(bytes / (numbers * sizeof(T))), int(blockDim.x)) / warp_size * warp_size) {}
+
+  PD_DEVICE int size() const { return size_; }
+
+  PD_DEVICE void set(int e, int group, const TurningGradient<T>& of) const {
+    const T number[of_group] = {of.g.x,        of.g.y,        of.g.z,        of.p.row[0].x,
+                                of.p.row[0].y, of.p.row[0].z, of.p.row[1].x, of.p.row[1].y,
+                                of.p.row[1].z, of.p.row[2].x, of.p.row[2].y, of.p.row[2].z};
+    for (int n = 0; n < of_group; ++n) at(e, group, n) = number[n];
+  }
+  PD_DEVICE TurningStrain<T> strain(int e, int group) const {
+    const auto row = [&](int n) {
+      return Vec3<T>{at(e, group, n), at(e, group, n + 1), at(e, group, n + 2)};
+    };
+    return TurningStrain<T>(TurningGradient<T>(row(0), {{row(3), row(6), row(9)}}));
+  }
+  PD_DEVICE T& weight(int e) const { return memory_[(numbers - 1) * size_ + e]; }
+
+ private:
+  PD_DEVICE T& at(int e, int group, int n) const {
+    return memory_[(group * of_group + n) * size_ + e];
+  }
+
+  T* memory_;
+  int size_;
+};
+
+// Of an environment: x, 1 / D and a in the w of u and `inertia`, where it stands, and w V of every pair.
+template <class T>
+struct CorotationInput {
+  const Quad<T>*x, *u, *inertia, *base;
+  const T* weights;
+};
+
+template <class T>
+class CorotationMaker {
+  static constexpr int threads_of_row = 4;  // of A
+
+ public:
+  PD_DEVICE CorotationMaker(const CorotationInput<T>& in, const CorotationMemory<T>& memory,
+                            BlockTeam& team, std::byte* scratch, std::size_t scratch_bytes,
+                            double times, CorotationControl<T>& control)
+      : plan_(control.plan),
+        scratch_(scratch),
+        scratch_bytes_(scratch_bytes),
+        times_(times),
+        in_(in),
+        m_(memory),
+        team_(team),
+        c_(control) {}
+
+  PD_DEVICE void make() const {
+    const Vec3<T> middle = find_middle();
+    for (int i = team_.thread(); i < plan_.vertices; i += team_.threads())
+      set(i, (vec3(in_.x[i]) - middle) + vec3(in_.base[i]), in_.u[i].w > T(0));
+    team_.barrier();
+    multiply();
+    team_.barrier();
+#pragma unroll 1
+    for (int c = team_.rank(); c < turning_chunks(plan_.vertices); c += team_.blocks())
+      add_products(c);
+#pragma unroll 1
+    for (int patch = team_.rank(); patch < plan_.patches; patch += team_.blocks())
+      add_strains(patch);
+    team_.barrier();
+    add_up();
+    team_.barrier();
+    solve();
+  }
+
+ private:
+  // Any place amid the vertices will do. What is held has no part in it, be it NaN.
+  PD_DEVICE Vec3<T> find_middle() const {
+    const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
+    const int count = turning_chunk(plan_.vertices), chunks = turning_chunks(plan_.vertices);
+    double* of_chunk = m_.products;  // which are not there yet
+    double sum[4];
+#pragma unroll 1
+    for (int c = team_.warp(); c < chunks; c += team_.warps()) {
+      for (double& s : sum) s = 0;
+      const int end = min((c + 1) * count, plan_.vertices);
+#pragma unroll 4
+      for (int i = c * count + lane; i < end; i += warp_size) {
+        const bool moves = in_.u[i].w > T(0);
+        const Vec3<T> x = vec3(in_.x[i]);
+        sum[0] += moves ? double(x.x) : 0;
+        sum[1] += moves ? double(x.y) : 0;
+        sum[2] += moves ? double(x.z) : 0;
+        sum[3] += moves ? 1 : 0;
+      }
+      write_warp_sums(sum, of_chunk + 4 * c);
+    }
+    team_.barrier();
+    double* total = reinterpret_cast<double*>(scratch_);
+    if (warp == 0) {
+      for (double& s : sum) s = 0;
+#pragma unroll 1
+      for (int c = lane; c < chunks; c += warp_size) {
+#pragma unroll
+        for (int n = 0; n < 4; ++n) sum[n] += of_chunk[4 * c + n];
+      }
+      write_warp_sums(sum, total);
+    }
+    __syncthreads();
+    const double share = total[3] > 0 ? 1 / total[3] : 0;
+    return {T(share * total[0]), T(share * total[1]), T(share * total[2])};
+  }
+
+  // what is held, here or by what M was made of, turns with nothing
+  PD_DEVICE void set(int i, const Vec3<T>& arm, bool moves) const {
+    m_.arm[i] = quad(arm);
+    const bool has_part = moves && plan_.levels.fine_inverse[i] > T(0);
+    const Quad<T> w = reinterpret_cast<const Quad<T>*>(plan_.levels.turning_weight)[i];
+    const T weight[turning_groups] = {w.x, w.y, w.z, w.w};
+    for (int k = 0; k < turning_groups; ++k) {
+      Quad<T> numbers = {T(0), T(0), T(0), T(0)};
+      if (has_part) numbers = {weight[k], weight[k] * arm.x, weight[k] * arm.y, weight[k] * arm.z};
+      m_.numbers[at(k, i)] = numbers;
+    }
+  }
+
+  PD_DEVICE void multiply() const {
+    const Level<1, T> level = fine_level(plan_.levels);
+    const int lane = int(threadIdx.x) % threads_of_row;
+    const int own = int(threadIdx.x) % warp_size / threads_of_row;
+    constexpr int rows = warp_size / threads_of_row;
+#pragma unroll 1
+    for (int first = team_.warp() * rows; first < level.rows; first += team_.warps() * rows) {
+      const int row = min(first + own, level.rows - 1);
+      Quad<T> sum[turning_groups] = {};
+#pragma unroll 2
+      for (int p = level.start[row] + lane; p < level.start[row + 1]; p += threads_of_row) {
+        const T a = level.value[p];
+        for (int k = 0; k < turning_groups; ++k)
+          sum[k] = multiply_add(a, m_.numbers[at(k, level.column[p])], sum[k]);
+      }
+      // the lanes of a row keep a group each
+      static_assert(threads_of_row == turning_groups);
+      const bool high = lane & 2, odd = lane & 1;
+      const Quad<T> total =
+          swap(odd, swap(high, sum[0], sum[2], 2), swap(high, sum[1], sum[3], 2), 1);
+      if (first + own < level.rows) m_.images[at(lane, row)] = total;
+    }
+  }
+
+  // Products of the sixteen numbers of a chunk of vertices with a times them, and with their images.
+  PD_DEVICE void add_products(int chunk) const {
+    constexpr int together = 64, stride = together + 1;  // vertices in shared memory at a time
+    constexpr int vectors = 2 * turning_groups, sums = 2;
+    Quad<T>* seen = reinterpret_cast<Quad<T>*>(scratch_);  // [vectors, stride]
+    T* inertia = reinterpret_cast<T*>(seen + vectors * stride);
+    static_assert((4 * vectors * stride + together) * sizeof(double) <= turning_scratch_bytes);
+    const int count = turning_chunk(plan_.vertices);
+    const int end = min((chunk + 1) * count, plan_.vertices);
+    double sum[sums] = {0, 0};
+#pragma unroll 1
+    for (int begin = chunk * count; begin < end; begin += together) {
+      const int here = min(together, end - begin);
+      __syncthreads();
+      for (int t = threadIdx.x; t < vectors * together; t += blockDim.x) {
+        const int group = t / together, i = t % together;
+        if (i >= here) continue;
+        const Quad<T>* from = group < turning_groups ? m_.numbers : m_.images;
+        seen[group * stride + i] = from[at(group % turning_groups, begin + i)];
+        if (group == 0) inertia[i] = in_.inertia[begin + i].w;
+      }
+      __syncthreads();
+#pragma unroll
+      for (int s = 0; s < sums; ++s) {
+        const int t = int(threadIdx.x) + s * int(blockDim.x);
+        if (t >= 2 * turning_products) break;
+        const bool of_matrix = t >= turning_products;
+        const int m = t / turning_numbers % turning_numbers, n = t % turning_numbers;
+        const T* one = &seen[m / 4 * stride].x + m % 4;
+        const T* other = &seen[(n / 4 + (of_matrix ? turning_groups : 0)) * stride].x + n % 4;
+#pragma unroll 4
+        for (int i = 0; i < here; ++i) {
+          const double a = of_matrix ? 1.0 : double(inertia[i]);
+          sum[s] += a * double(one[4 * i]) * double(other[4 * i]);
+        }
+      }
+    }
+    double* to = m_.products + std::int64_t(chunk) * 2 * turning_products;
+    for (int s = 0; s < sums; ++s) {
+      const int t = int(threadIdx.x) + s * int(blockDim.x);
+      if (t < 2 * turning_products) to[t] = sum[s];
+    }
+  }
+
+  // Sums of products of the strains of all modes over a patch.
+  PD_DEVICE void add_strains(int number) const {
+    // a warp two groups, of which k is not before l, and one of some slices; what was in their place is of no use any more
+    constexpr int meetings = turning_groups * (turning_groups + 1) / 2, slices = 3;
+    double* const sum = c_.at(0);
+    static_assert(slices * turning_pairs * sizeof(double) <= sizeof(c_.inverse));
+    const Patch<T> patch(plan_, number);
+    const TurningTile<T> tile(scratch_, scratch_bytes_);
+    __syncthreads();
+    for (int p = threadIdx.x; p < slices * turning_pairs; p += blockDim.x) sum[p] = 0;
+#pragma unroll 1
+    for (int first = 0; first < 2 * patch.pairs; first += tile.size()) {
+      __syncthreads();
+      if (int(threadIdx.x) < tile.size()) see(patch, first, tile);
+      __syncthreads();
+      const int count = min(tile.size(), 2 * patch.pairs - first);
+#pragma unroll 1
+      for (int task = threadIdx.x / warp_size; task < slices * meetings;
+           task += int(blockDim.x) / warp_size) {
+        const int b = task / slices, slice = task % slices;
+        const int k = b < 1 ? 0 : b < 3 ? 1 : b < 6 ? 2 : 3, l = b - k * (k + 1) / 2;
+        multiply_strains<slices>(tile, slice, count, k, l, sum + slice * turning_pairs);
+      }
+    }
+    __syncthreads();
+    double* to = m_.strains + std::int64_t(number) * turning_pairs;
+    for (int p = threadIdx.x; p < turning_pairs; p += blockDim.x) {
+      double total = 0;
+      for (int slice = 0; slice < slices; ++slice) total += sum[slice * turning_pairs + p];
+      to[p] = total;
+    }
+  }
+
+  // A tetrahedron of the patch, to place threadIdx.x of the tile.
+  PD_DEVICE void see(const Patch<T>& patch, int first, const TurningTile<T>& tile) const {
+    const int place = threadIdx.x, tet = first + place;
+    const HalfNumbers<T> numbers = read_half(patch, in_.weights, tet);
+    const bool there = tet < 2 * patch.pairs && numbers.weight > T(0);
+    Vec3<T> x[4];
+    T weight[turning_groups][4];
+    for (int c = 0; c < 4; ++c) {
+      const int vertex = patch.vertex(int(numbers.slot_times_8(c)) / 8);
+      x[c] = vec3(m_.arm[vertex]);
+      for (int k = 0; k < turning_groups; ++k) weight[k][c] = m_.numbers[at(k, vertex)].x;
+    }
+    Mat3<T> inverse = half_inverse(numbers, rest_of<true>(patch).position);
+    Mat3<T> f = deformation_gradient(x, inverse);
+    // what is not there may be anything
+    const auto keep = [&](T& a, T other) { a = select(there, a, other); };
+    for (int r = 0; r < 3; ++r) {
+      for (T* a : {&inverse.row[r].x, &inverse.row[r].y, &inverse.row[r].z}) keep(*a, T(0));
+      keep(f.row[r].x, T(r == 0));
+      keep(f.row[r].y, T(r == 1));
+      keep(f.row[r].z, T(r == 2));
+    }
+    const Mat3<T> back = transpose(nearest_rotation(f));
+    for (int k = 0; k < turning_groups; ++k)
+      tile.set(place, k, TurningGradient<T>(inverse, back, x, weight[k]));
+    tile.weight(place) = select(there, numbers.weight, T(0));
+  }
+
+  // A warp, which has every `Slices`-th 32 of `count` tetrahedra.
+  template <int Slices>
+  PD_DEVICE static void multiply_strains(const TurningTile<T>& tile, int slice, int count, int k,
+                                         int l, double* sum) {
+    const int lane = int(threadIdx.x) % warp_size;
+    T part[36] = {};
+#pragma unroll 1
+    for (int e = slice * warp_size + lane; e < count; e += Slices * warp_size) {
+      const TurningStrain<T> own = tile.strain(e, k), other = tile.strain(e, l);
+      const T w = tile.weight(e);
+#pragma unroll
+      for (int i = 0; i < 6; ++i) {
+        T row[6];
+#pragma unroll
+        for (int c = 0; c < 6; ++c) row[c] = w * own.h[i][c];
+#pragma unroll
+        for (int j = 0; j < 6; ++j) add_strain_product(row, i, other.h[j], j, part[6 * i + j]);
+      }
+    }
+    spread_sums(part);
+    const KeptSums kept(lane);
+    for (int n = 0; n < 2; ++n) {
+      const int i = 6 * k + (kept.first + n) / 6, j = 6 * l + (kept.first + n) % 6;
+      if (n < kept.count && j <= i) sum[turning_pair(i, j)] += double(part[n]);
+    }
+  }
+
+  // A warp a number; all there are fewer than 2^31.
+  PD_DEVICE void add_up() const {
+    const int lane = int(threadIdx.x) % warp_size;
+#pragma unroll 1
+    for (int t = team_.warp(); t < turning_totals; t += team_.warps()) {
+      const bool of_strain = t >= 2 * turning_products;
+      const int width = of_strain ? turning_pairs : 2 * turning_products;
+      const int rows = of_strain ? plan_.patches : turning_chunks(plan_.vertices);
+      const double* from = of_strain ? m_.strains + (t - 2 * turning_products) : m_.products + t;
+      double sum = 0;
+#pragma unroll 4
+      for (int row = lane; row < rows; row += warp_size) sum += from[std::int64_t(row) * width];
+      sum = across_warp(sum, Add{});
+      if (lane == 0) m_.totals[t] = sum;
+    }
+  }
+
+  // Every block for itself, from the same totals.
+  PD_DEVICE void solve() const {
+    using Products = double[turning_numbers][turning_numbers];
+    double* totals = reinterpret_cast<double*>(scratch_);
+    for (int t = threadIdx.x; t < turning_totals; t += blockDim.x) totals[t] = m_.totals[t];
+    __syncthreads();
+    const auto* products = reinterpret_cast<const Products*>(totals);
+    const double* strains = totals + 2 * turning_products;
+    TurningMatrix* const matrix = c_.inverse;
+    each_entry([&](int of, int i, int j) {
+      const double strain = strains[i < j ? turning_pair(j, i) : turning_pair(i, j)];
+      matrix[of].at[i][j] = mode_product(products[of], i, j) + (of == 0 ? strain : 0);
+    });
+    __syncthreads();
+    if (threadIdx.x < turning_modes)
+      c_.scale[threadIdx.x] = turning_scale(c_.inverse[1], int(threadIdx.x));
+    __syncthreads();
+    if (!invert()) c_.clear();
+  }
+
+  PD_DEVICE std::int64_t at(int group, int i) const {
+    return std::int64_t(group) * plan_.vertices + i;
+  }
+
+  PD_DEVICE static Quad<T> multiply_add(T a, const Quad<T>& b, const Quad<T>& c) {
+    return {pd::multiply_add(a, b.x, c.x), pd::multiply_add(a, b.y, c.y),
+            pd::multiply_add(a, b.z, c.z), pd::multiply_add(a, b.w, c.w)};
+  }
+
+  // of two sums a lane keeps one and adds its neighbour's
+  PD_DEVICE static Quad<T> swap(bool upper, const Quad<T>& a, const Quad<T>& b, int distance) {
+    const auto half = [&](T x, T y) {
+      return select(upper, y, x) + __shfl_xor_sync(whole_warp, select(upper, x, y), distance);
+    };
+    return {half(a.x, b.x), half(a.y, b.y), half(a.z, b.z), half(a.w, b.w)};
+  }
+
+  // visit(matrix, i, j): the entries of Hc and Ac that this thread has
+  template <class Visit>
+  PD_DEVICE static void each_entry(const Visit& visit) {
+    constexpr int entries = turning_modes * turning_modes;
+    for (int e = threadIdx.x; e < 2 * entries; e += blockDim.x) {
+      const int of = e >= entries, i = e / turning_modes - of * turning_modes;
+      visit(of, i, e % turning_modes);
+    }
+  }
+
+  // Both, in the scale of c_.scale; false where one is not positive. All threads.
+  PD_DEVICE bool invert() const {
+    TurningMatrix* const matrix = c_.inverse;
+    TurningMatrix *now = reinterpret_cast<TurningMatrix*>(scratch_), *next = now + 2;
+    static_assert(4 * sizeof(TurningMatrix) <= turning_scratch_bytes);
+    const double* scale = c_.scale;
+    each_entry([&](int of, int i, int j) {
+      now[of].at[i][j] = scaled_entry(matrix[of], scale[i], scale[j], i, j,
+                                      of ? turning_noise : times_ * turning_noise);
+    });
+    __syncthreads();
+#pragma unroll 1
+    for (int k = 0; k < turning_modes; ++k) {
+      const double pivot[2] = {now[0].at[k][k], now[1].at[k][k]};
+      if (!(pivot[0] > 0 && pivot[1] > 0)) return false;
+      const double share[2] = {1 / pivot[0], 1 / pivot[1]};
+      each_entry([&](int of, int i, int j) {
+        next[of].at[i][j] = swept(now[of], k, of ? share[1] : share[0], i, j);
+      });
+      __syncthreads();
+      TurningMatrix* const done = now;
+      now = next;
+      next = done;
+    }
+    each_entry([&](int of, int i, int j) {
+      matrix[of].at[i][j] = -scale[i] * scale[j] * now[of].at[i][j];
+    });
+    __syncthreads();
+    return true;
+  }
+
+  const DevicePlan<T>& plan_;
+  std::byte* scratch_;  // in shared memory
+  std::size_t scratch_bytes_;
+  double times_;  // the material is that of A so many times at most
+  const CorotationInput<T>& in_;
+  const CorotationMemory<T>& m_;
+  BlockTeam& team_;
+  CorotationControl<T>& c_;
+};
+
+// Out of line, so that the iterations keep their registers, with all that it needs as values or in shared memory: what a kernel
+// is given is far away there. Returns where the team stands.
+template <class T>
+__device__ __noinline__ BlockTeam make_corotation(CorotationInput<T> in, CorotationMemory<T> memory,
+                                                  BlockTeam team, std::byte* scratch,
+                                                  std::size_t scratch_bytes, double times,
+                                                  CorotationControl<T>& control) {
+  CorotationMaker<T>(in, memory, team, scratch, scratch_bytes, times, control).make();
+  return team;
+}
+
+}  // namespace pd::inline PD_TARGET
