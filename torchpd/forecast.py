@@ -4,7 +4,7 @@ The smallest ratio mu of inertia to diagonal bounds the spectrum of D^-1 A from 
 Jacobi and Chebyshev iterations. What `Multilevel` needs does not depend on the mesh, but on mu n^(2/3), n vertices of a
 body: about rho L^2 / (E h^2), how far a wave travels in a step against the size L of the body. It grows with the
 logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. On 190 random scenes
-nine of ten needed 0.3 to 1.7 times the forecast, meshes with slivers the least (`benchmarks/forecast.py`).
+nine of ten needed 0.3 to 1.5 times the forecast, meshes with slivers the least (`benchmarks/forecast.py`).
 `Simulator.tune` measures instead.
 
 Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.

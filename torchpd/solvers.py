@@ -150,9 +150,9 @@ class Multilevel:
         outer: "lbfgs" corrects M by the last eight steps, "momentum" (no inner products) extrapolates. "corotated", the
             usual one, is "lbfgs" with another M for motions in which whole parts of a body turn, for which A is far too
             stiff: on the rigid motions of four overlapping groups of vertices it has the inverse of the energy's second
-            derivative, that of corotated elasticity. That is made once in most steps, after three iterations, for
-            the time of two more. Bodies that bend or spin need a third to two thirds of the iterations, others as many
-            as with "lbfgs".
+            derivative, that of corotated elasticity. That is made once in most steps, after three iterations, for the
+            time of one or two more. Bodies that bend or spin need a third to two thirds of the iterations, others as
+            many as with "lbfgs".
         relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8.
     """
 

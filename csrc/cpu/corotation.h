@@ -91,7 +91,7 @@ class TurningElements {
 
  private:
   // Groups with groups before them, and the modes of each where they meet: of six numbers half are none. The order of pairs is
-  // that of `pair`.
+  // that of `turning_pair`.
   template <class R>
   static void add_strains(const TurningStrain<R> (&strain)[turning_groups], const R& weight,
                           R (&sum)[turning_pairs]) {

@@ -4,6 +4,8 @@
 #include "cpu/outer_work.h"
 #include "cpu/stepper.h"
 
+#include <algorithm>
+
 namespace pd::inline PD_TARGET {
 
 // `Touching`: see solver/vertex.h.
@@ -53,6 +55,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       outer_[lane].slack = outer_[lane].friction ? guard_slack_friction : energy_noise<T>();
       pairs_[lane] = {};
       made_[lane] = doubted_[lane] = 0;
+      has_[lane] = false;
       if (corotates_) corotation_.forget(lane);
       schedule_[lane].rho = misfit_[lane].spread;
     }
@@ -216,6 +219,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       asks[lane] = !done_[lane] && plan.make;
       some = some || asks[lane];
       if (plan.forget) corotation_.forget(lane);
+      has_[lane] = asks[lane] || (has_[lane] && !plan.forget);
       if (!asks[lane]) continue;
       ++made_[lane];
       doubted_[lane] = outer_[lane].restarts;
@@ -223,7 +227,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     double scales[width];
     for (int lane = 0; lane < width; ++lane) scales[lane] = outer_[lane].scale;
     if (some) corotation_.make(o_.base, asks, scales);
-    corotated_ = corotated_ || some;
+    corotated_ = std::any_of(has_, has_ + width, [](bool has) { return has; });
   }
 
   // the cycle between what the small problem takes and what it gives
@@ -370,6 +374,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       corotated_ = false,
       strangers_ = false;  // strangers: vertices that M knows too little of, in any lane
   int newest_ = 0, iteration_ = 0;
+  bool has_[width] = {};                        // a small problem
   int made_[width] = {}, doubted_[width] = {};  // times, and failed trials by then
   Corotation<Lanes> corotation_;
   Value none_ = Lanes::value({Real(T(0)), Real(T(0)), Real(T(0))});

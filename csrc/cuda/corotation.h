@@ -52,10 +52,8 @@ class DeviceCorotation {
   PD_DEVICE DeviceCorotation(int vertices, const CorotationMemory<T>& memory, std::byte* shared)
       : vertices_(vertices), m_(memory), c_(*reinterpret_cast<CorotationControl<T>*>(shared)) {}
 
-  PD_DEVICE void clear() const { c_.clear(); }
-
-  // for those who make it: a copy of the plan, which all threads write
-  PD_DEVICE CorotationControl<T>& prepared(const DevicePlan<T>& plan) const {
+  // for those who make it, with a copy of the plan, which all threads write
+  PD_DEVICE CorotationControl<T>& with_plan(const DevicePlan<T>& plan) const {
     constexpr int words = sizeof(plan) / sizeof(std::uint64_t);
     static_assert(sizeof(plan) % sizeof(std::uint64_t) == 0);
     for (int i = threadIdx.x; i < words; i += blockDim.x)

@@ -188,7 +188,7 @@ class CorotationMaker {
       static_assert(threads_of_row == turning_groups);
       const bool high = lane & 2, odd = lane & 1;
       const Quad<T> total =
-          swap(odd, swap(high, sum[0], sum[2], 2), swap(high, sum[1], sum[3], 2), 1);
+          halve(odd, halve(high, sum[0], sum[2], 2), halve(high, sum[1], sum[3], 2), 1);
       if (first + own < level.rows) m_.images[at(lane, row)] = total;
     }
   }
@@ -197,6 +197,7 @@ class CorotationMaker {
   PD_DEVICE void add_products(int chunk) const {
     constexpr int together = 64, stride = together + 1;  // vertices in shared memory at a time
     constexpr int vectors = 2 * turning_groups, sums = 2;
+    static_assert(2 * turning_products <= sums * small_outer_threads);
     Quad<T>* seen = reinterpret_cast<Quad<T>*>(scratch_);  // [vectors, stride]
     T* inertia = reinterpret_cast<T*>(seen + vectors * stride);
     static_assert((4 * vectors * stride + together) * sizeof(double) <= turning_scratch_bytes);
@@ -292,6 +293,9 @@ class CorotationMaker {
       keep(f.row[r].y, T(r == 1));
       keep(f.row[r].z, T(r == 2));
     }
+    for (Vec3<T>& corner : x) {
+      for (T* a : {&corner.x, &corner.y, &corner.z}) keep(*a, T(0));
+    }
     const Mat3<T> back = transpose(nearest_rotation(f));
     for (int k = 0; k < turning_groups; ++k)
       tile.set(place, k, TurningGradient<T>(inverse, back, x, weight[k]));
@@ -346,6 +350,7 @@ class CorotationMaker {
   PD_DEVICE void solve() const {
     using Products = double[turning_numbers][turning_numbers];
     double* totals = reinterpret_cast<double*>(scratch_);
+    static_assert(turning_totals * sizeof(double) <= turning_scratch_bytes);
     for (int t = threadIdx.x; t < turning_totals; t += blockDim.x) totals[t] = m_.totals[t];
     __syncthreads();
     const auto* products = reinterpret_cast<const Products*>(totals);
@@ -372,7 +377,7 @@ class CorotationMaker {
   }
 
   // of two sums a lane keeps one and adds its neighbour's
-  PD_DEVICE static Quad<T> swap(bool upper, const Quad<T>& a, const Quad<T>& b, int distance) {
+  PD_DEVICE static Quad<T> halve(bool upper, const Quad<T>& a, const Quad<T>& b, int distance) {
     const auto half = [&](T x, T y) {
       return select(upper, y, x) + __shfl_xor_sync(whole_warp, select(upper, x, y), distance);
     };

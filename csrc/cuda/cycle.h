@@ -61,6 +61,7 @@ class DeviceCycle {
   }
   PD_DEVICE Vec3<T> right_side(int i) const { return vec3(m_.fine.in[i]); }
   PD_DEVICE Vec3<T> result(int i) const { return vec3(m_.fine.z[i]); }
+  PD_DEVICE void set_result(int i, const Vec3<T>& z) const { m_.fine.z[i] = quad(z); }
 
   // result = M times what was set, there for all of the team when it returns
   PD_DEVICE void run() {

@@ -144,8 +144,8 @@ struct OuterLaunch {
       return blocks_with(begin(scratch) + corotation_bytes);
     };
     std::size_t scratch = threads * turning_tile_numbers * sizeof(float);
-    while (scratch > turning_scratch_bytes && blocks(scratch) < blocks(turning_scratch_bytes))
-      scratch /= 2;
+    const int most = std::max(blocks(turning_scratch_bytes), 1);
+    while (scratch > turning_scratch_bytes && blocks(scratch) < most) scratch /= 2;
     shared_corotation = begin(std::max(scratch, turning_scratch_bytes));
     shared = shared_corotation + corotation_bytes;
   }

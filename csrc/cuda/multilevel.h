@@ -228,14 +228,14 @@ class MultilevelRunner {
 
   PD_DEVICE void corotate() {
     const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_);
-    if (plan.forget) corotation_.clear();
+    if (plan.forget) corotated_ = false;
     if (!plan.make) return;
     ++made_;
     doubted_ = c_.outer.restarts;
     corotated_ = true;
     team_ = make_corotation(CorotationInput<T>{w_.v.x, w_.v.u, w_.v.before, m_.base, w_.weights},
                             m_.corotation, team_, shared_, call_.shared_corotation, c_.outer.scale,
-                            corotation_.prepared(call_.plan()));
+                            corotation_.with_plan(call_.plan()));
   }
 
   PD_DEVICE void look_at(int i, const typename Vertices<T, Touching>::Seen& seen,
@@ -340,7 +340,7 @@ class MultilevelRunner {
       Vec3<T> z = cycle_.result(i);
       if (corotated_) {
         z = corotation_.with(i, z);
-        m_.cycle.fine.z[i] = quad(z);
+        cycle_.set_result(i, z);
       }
 #pragma unroll
       for (int j = 0; j < history; ++j) {
