@@ -137,9 +137,9 @@ _SCHEDULES = {"corotated": 5, "lbfgs": 3, "momentum": 4}  # Multilevel.outer, as
 class Multilevel:
     """Iterations with a multilevel approximation M of A^-1, A the constant matrix of projective dynamics.
 
-    For stiff and for accurate steps: a few dozen iterations do, however stiff or fine the mesh, each at about four
-    times the cost of a Jacobi iteration on a CPU, and 4 to 24 times on a GPU, where M of a mesh of up to 1024 vertices
-    is A^-1 itself. The scene takes longer to compile.
+    For stiff and for accurate steps: a dozen or two of iterations do, however stiff or fine the mesh, each at four to
+    five times the cost of a Jacobi iteration on a CPU, and 5 to 36 times on a GPU, where M of a mesh of up to 1024
+    vertices is A^-1 itself. The scene takes longer to compile.
 
     Every iterate is judged by its energy before the next one starts from it. Contacts project every iterate; while they
     hold vertices M fits less well. With friction, which has no energy, the judgement allows a rise of 1 %.
