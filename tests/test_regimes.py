@@ -206,7 +206,7 @@ def test_a_patch_with_a_busy_vertex_is_split_until_it_fits() -> None:
 
 
 def test_a_patch_with_more_slots_than_can_be_counted_is_split() -> None:
-    count = 2200  # of them 2280 go in a patch otherwise
+    count = 2200  # of them 2304 go in a patch otherwise
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     vertices = (corners + 2.0 * np.arange(count)[:, None, None] * [1, 0, 0]).reshape(-1, 3)
     mesh = pd.TetMesh(vertices, np.arange(4 * count).reshape(-1, 4))

@@ -218,6 +218,13 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   const int number = int(blockIdx.x % call.step.plan.patches);
   const StreamWork<T, Touching> w(call, blockIdx.x / call.step.plan.patches);
   if (skips<What>(w)) return;
+  // what the vertices inside want once their forces are known
+  const Patch<T> patch(w.plan, number);
+  if constexpr (What != Visit::weigh) {
+    bring_near(w.v.before + patch.first_vertex, patch.interior);
+    bring_near(w.v.target + patch.first_vertex, patch.interior);
+  }
+  bring_near(w.plan.slot_row + patch.first_slot, patch.slots);
   ThreadSums sums = no_sums<What>();
   const double energy = pass_over_patch(
       w, number, shared, typename ElementOf<What>::type{}, [&](int i) { return see<What>(w, i); },
