@@ -251,16 +251,17 @@ def _plain(number: float) -> str:
 
 
 def costs_of_batches(rows: list[Row]) -> str:
-    """What `torchpd.automatic.COSTS` holds as `more`, from each row, the first environment as the table has it."""
+    """What `torchpd.automatic.COSTS` holds of environments beside the first, for which the table's number is taken."""
     lines = []
     for row in rows:
         kernel, vertices = row["kernel"] or "cpu", row["vertices"]
         for name, own in row["solvers"].items():
             cost, took = getattr(COSTS[kernel], name.lower()), own["microseconds_an_iteration"]
-            more = 1e3 * (took - cost.iteration(vertices)) / ((row["batch"] - 1) * vertices)
+            other = (took - cost.first(vertices)) / (row["batch"] - 1)
             lines.append(
                 f"{kernel}: {name}, {row['batch']} of {vertices:,} vertices: {took:.3g} us an iteration, "
-                f"{cost.iteration(vertices, row['batch']):.3g} by the table; more={more:.2g} measured, {cost} in use"
+                f"{cost.iteration(vertices, row['batch']):.3g} by the table; every environment but the first adds "
+                f"{other:.2g} us, {cost.other(vertices):.2g} by the table"
             )
     return "\n".join(lines)
 

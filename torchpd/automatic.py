@@ -30,19 +30,27 @@ _LEVELS = (Multilevel(), Multilevel("lbfgs"))
 class Cost(NamedTuple):
     """Time of an iteration in microseconds, n thousand vertices an environment.
 
-    `latency` + `each` n of the first environment, `more` n of every other one; None where they take turns, and every
-    one takes as long as the first.
+    `latency` + `each` n of the first environment, `more` n + `square` n^2 of every other one; `more` is None where they
+    take turns, and every one takes as long as the first.
     """
 
     latency: float
     each: float
     more: float | None = None
+    square: float = 0.0
 
     def iteration(self, vertices: int, batch: int = 1) -> float:
         """Microseconds, all environments together."""
+        return self.first(vertices) + (batch - 1) * self.other(vertices)
+
+    def first(self, vertices: int) -> float:
+        """Microseconds of an environment alone."""
+        return self.latency + self.each * vertices / 1000.0
+
+    def other(self, vertices: int) -> float:
+        """Microseconds that every further environment adds."""
         thousands = vertices / 1000.0
-        first = self.latency + self.each * thousands
-        return first + (batch - 1) * (first if self.more is None else self.more * thousands)
+        return self.first(vertices) if self.more is None else self.more * thousands + self.square * thousands**2
 
 
 class Costs(NamedTuple):
@@ -53,11 +61,12 @@ class Costs(NamedTuple):
 
 
 # Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers,
-# `more` with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were measured on "block"
-# alone: without `more` the choice for a batch is that for one environment.
+# those of further environments with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were
+# measured on "block" alone, where the dense factor of so small a matrix makes the square: without `more` the choice for
+# a batch is that for one environment.
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
-    "block": Costs(Cost(2.6, 5.0, 0.05), Cost(31.0, 3.0, 0.9)),
+    "block": Costs(Cost(2.6, 5.0, 0.05), Cost(31.0, 3.0, 0.1, 2.4)),
     "cluster": Costs(Cost(0.7, 0.9), Cost(50.0, 2.4)),
     "grid": Costs(Cost(1.2, 0.13), Cost(50.0, 2.4)),
     "stream": Costs(Cost(6.0, 0.18), Cost(50.0, 2.4)),
