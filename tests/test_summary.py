@@ -11,6 +11,7 @@ from runs import moving, same_bits, simulator
 
 import torchpd as pd
 from torchpd.gpu import Properties
+from torchpd.multilevel import precondition_plan, reference_of_levels
 from torchpd.regimes import choose_plan
 
 pytestmark = pytest.mark.usefixtures("poisoned")
@@ -124,3 +125,18 @@ def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...]) ->
     sim.plan = choose_plan(values, torch.float32, Properties(132, 232_448))
     assert "why block: shared memory a thread block: block needs" in str(sim)
     assert "232,448 B are there" in str(sim)
+
+
+@pytest.mark.parametrize(("outer", "count"), [("momentum", 4_032), ("lbfgs", 13_248), ("corotated", 31_424)])
+def test_print_says_what_the_multilevel_solver_keeps_on_a_gpu(outer: str, count: int) -> None:
+    """Of 36 vertices in float32: 7 quads, eight pairs of quads more, and for the small problem nine quads more.
+
+    That adds up products of 16 and 16 numbers, twice, in one chunk and in all, and 300 of strains likewise.
+    """
+    sim = simulator(bare(), torch.float32, solver=pd.Multilevel(outer))
+    values = sim.scene.values()
+    plan = choose_plan(values, torch.float32, Properties(132, 232_448), levels=True)
+    sim.plan = precondition_plan(plan, values, *reference_of_levels(sim.plan.arrays))
+    assert sim.vertices == 36
+    assert sim.plan.patches == 1
+    assert f"and {count:,} B for each that the GPU has in work at a time" in str(sim)

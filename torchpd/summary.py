@@ -157,13 +157,21 @@ def _step_bytes(sim: Simulator, real: int) -> str:
         # and of each vertex where it is, sixteen numbers, and A times them
         small = 36 if sim.solver.outer == "corotated" else 0
         numbers = 4 * (7 + (16 if sim.solver.outer != "momentum" else 0)) + held + small
-        return f"{own}, and {real * plan.vertices * numbers:,} B for each that the GPU has in work at a time"
+        team = real * plan.vertices * numbers + (_turning_bytes(plan) if small else 0)
+        return f"{own}, and {team:,} B for each that the GPU has in work at a time"
     # five vectors of four numbers a slot; the weights of 32 pairs a block, but where each thread has its own
     if plan.kernel != "cluster":
         team = real * (20 * slots + 64 * plan.size("blocks"))
     else:
         team = 0 if real == 4 else real * 64 * plan.size("blocks")
     return f"{team:,} B for each environment that the GPU has in work at a time"
+
+
+def _turning_bytes(plan: Plan) -> int:
+    """What a GPU adds up to make the small problem of "corotated" (csrc/cuda/corotation.h), doubles all."""
+    products, pairs = 2 * 16 * 16, 24 * 25 // 2
+    chunks = -(-plan.vertices // max(64, -(-plan.vertices // 128)))
+    return 8 * (products * (chunks + 1) + pairs * (plan.patches + 1))
 
 
 def describe(sim: Simulator) -> str:

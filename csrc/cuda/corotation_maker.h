@@ -1,4 +1,4 @@
-// How a team of blocks makes the small problem of solver/corotation.h of an iterate; see also cpu/corotation.h.
+// How a team of blocks makes the small problem of solver/corotation.h of an iterate; see also cpu/corotation_maker.h.
 #pragma once
 #include "cuda/half.h"
 #include "cuda/outer_call.h"

@@ -157,6 +157,7 @@ template <class R>
 struct TurningStrain {
   R h[6][6];
 
+  TurningStrain() = default;
   PD_HD explicit TurningStrain(const TurningGradient<R>& of) {
     const Vec3<R> none = {R(scalar_of<R>(0)), R(scalar_of<R>(0)), R(scalar_of<R>(0))};
     const Mat3<R>& p = of.p;
