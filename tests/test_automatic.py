@@ -97,7 +97,7 @@ def test_every_kind_of_device_has_costs() -> None:
 
 
 def test_time_of_a_batch() -> None:
-    """2 + 4 * 0.5 us of one environment of 500 vertices; two others take turns, or 0.8 * 0.5 us each, or 1.2 / 4 more."""
+    """2 + 4 * 0.5 us of one environment, 500 vertices; two others take turns, or 0.8 * 0.5 us each, or 1.2 / 4 more."""
     assert Cost(2.0, 4.0).iteration(500) == 4.0
     assert Cost(2.0, 4.0).iteration(500, 3) == 12.0
     assert Cost(2.0, 4.0, 0.8).iteration(500, 3) == pytest.approx(4.0 + 2 * 0.4)
