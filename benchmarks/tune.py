@@ -112,11 +112,16 @@ def judge(sim: pd.Simulator, state: pd.State) -> Row:
     }  # fmt: skip
 
 
-def run_scene(number: int, error: float) -> Row:
-    """Tune a scene and judge it."""
+def draw_scene(number: int) -> tuple[Row, pd.Simulator, pd.State, pd.State]:
+    """The scene of a number, the motion that it is tuned from and that it is judged on."""
     rng = np.random.default_rng([2024, number])
     facts, sim = random_scene(rng)
-    start, other = random_state(sim, rng), random_state(sim, rng)
+    return facts, sim, random_state(sim, rng), random_state(sim, rng)
+
+
+def run_scene(number: int, error: float) -> Row:
+    """Tune a scene and judge it."""
+    facts, sim, start, other = draw_scene(number)
     row: Row = {"scene": number, **facts}
     begin = time.perf_counter()
     with warnings.catch_warnings():
@@ -213,27 +218,35 @@ def main(words: list[str]) -> None:
     parser.add_argument("--scenes", type=int, default=200, help="how many (%(default)s)")
     parser.add_argument("--error", type=float, default=1e-2, help="to tune for (%(default)g)")
     parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
+    parser.add_argument("--budgets", action="store_true", help="measure the budgets of kept scenes anew, all of them")
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
     options = parser.parse_args(words)
     torch.set_num_threads(options.threads)
-    known = json.loads(options.out.read_text())["rows"] if options.out and options.out.exists() else []
-    rows = {row["scene"]: row for row in known if row["asked"] == options.error}
+    kept = json.loads(options.out.read_text()) if options.out and options.out.exists() else {"rows": []}
+    rows = {row["scene"]: row for row in kept["rows"] if row["asked"] == options.error}
+    now = describe_run(torch.device("cpu"), options.threads)
+    # the promises stay those of the earlier run
+    header = {name: kept[name] for name in now} if options.budgets and rows else now
     for number in tqdm(range(options.scenes), desc="scenes", unit="scene"):
         if number not in rows:
             rows[number] = {"asked": options.error, **run_scene(number, options.error)}
-            write(options, list(rows.values()))
+        elif options.budgets:
+            _, sim, start, other = draw_scene(number)
+            rows[number]["budget"] = {**judge_budget(sim, start, other), "commit": now["commit"]}
+        else:
+            continue
+        write(options.out, header, list(rows.values()))
     chosen = [rows[number] for number in range(options.scenes)]
     print(json.dumps(summary(chosen), indent=1))
-    write(options, chosen)
+    write(options.out, header, chosen)
 
 
-def write(options: argparse.Namespace, rows: list[Row]) -> None:
+def write(out: Path | None, header: Row, rows: list[Row]) -> None:
     """Everything so far."""
-    if options.out is None:
+    if out is None:
         return
-    run = describe_run(torch.device("cpu"), options.threads)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps({"schema": 1, **run, "summary": summary(rows), "rows": rows}, indent=1) + "\n")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps({"schema": 1, **header, "summary": summary(rows), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

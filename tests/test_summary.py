@@ -13,6 +13,7 @@ import torchpd as pd
 from torchpd.gpu import Properties
 from torchpd.multilevel import precondition_plan, reference_of_levels
 from torchpd.regimes import choose_plan
+from torchpd.summary import workspace_bytes
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -127,16 +128,27 @@ def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...]) ->
     assert "232,448 B are there" in str(sim)
 
 
-@pytest.mark.parametrize(("outer", "count"), [("momentum", 4_032), ("lbfgs", 13_248), ("corotated", 31_424)])
-def test_print_says_what_the_multilevel_solver_keeps_on_a_gpu(outer: str, count: int) -> None:
-    """Of 36 vertices in float32: 7 quads, eight pairs of quads more, and for the small problem nine quads more.
+@pytest.mark.parametrize(
+    ("outer", "direct", "count"),
+    [("momentum", 0, 4_032), ("lbfgs", 0, 13_248), ("lbfgs", 36, 12_672), ("corotated", 36, 30_848)],
+)
+def test_print_says_what_the_multilevel_solver_keeps_on_a_gpu(outer: str, direct: int, count: int) -> None:
+    """Of 36 vertices in float32: 7 quads, of a direct solve 6, eight pairs of quads, and for the small problem nine.
 
     That adds up products of 16 and 16 numbers, twice, in one chunk and in all, and 300 of strains likewise.
     """
     sim = simulator(bare(), torch.float32, solver=pd.Multilevel(outer))
     values = sim.scene.values()
     plan = choose_plan(values, torch.float32, Properties(132, 232_448), levels=True)
-    sim.plan = precondition_plan(plan, values, *reference_of_levels(sim.plan.arrays))
-    assert sim.vertices == 36
-    assert sim.plan.patches == 1
+    sim.plan = precondition_plan(plan, values, *reference_of_levels(sim.plan.arrays), most_direct=direct)
+    assert (sim.vertices, sim.plan.patches) == (36, 1)
     assert f"and {count:,} B for each that the GPU has in work at a time" in str(sim)
+
+
+@pytest.mark.parametrize(("outer", "more"), [("momentum", 8), ("lbfgs", 24), ("corotated", 24 + 8)])
+def test_workspace_of_the_multilevel_solver(outer: str, more: int) -> None:
+    """Quads of a vertex beside those of Chebyshev; one chunk and one patch of sums and two matrices of 24 modes."""
+    sim = simulator(bare(), torch.float32, solver=pd.Multilevel(outer))
+    assert sim.plan.patches == 1
+    extra = workspace_bytes(sim.plan, 4, sim.solver) - workspace_bytes(sim.plan, 4, pd.Chebyshev())
+    assert extra == 16 * 36 * more + (8 * (512 + 300 + 2 * 576) if outer == "corotated" else 0)

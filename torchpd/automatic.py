@@ -62,11 +62,11 @@ class Costs(NamedTuple):
 
 # Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers,
 # those of further environments with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were
-# measured on "block" alone, where the dense factor of so small a matrix makes the square: without `more` the choice for
-# a batch is that for one environment.
+# measured on "block" alone, with 256 and 936 vertices; the square is mostly that of the dense factor of a small matrix.
+# Kernels without `more` choose for a batch as for one environment.
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
-    "block": Costs(Cost(2.6, 5.0, 0.05), Cost(31.0, 3.0, 0.1, 2.4)),
+    "block": Costs(Cost(2.6, 5.0, 0.033, 0.022), Cost(31.0, 3.0, 0.1, 2.4)),
     "cluster": Costs(Cost(0.7, 0.9), Cost(50.0, 2.4)),
     "grid": Costs(Cost(1.2, 0.13), Cost(50.0, 2.4)),
     "stream": Costs(Cost(6.0, 0.18), Cost(50.0, 2.4)),

@@ -40,7 +40,8 @@ _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
 _CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
 # with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block
 _LEVEL_TETS, _LEVEL_ALONE = 384, 1152
-# a patch at most, six rounds of its threads, and how many share a multiprocessor of an H100 (csrc/cuda/stream.h)
+# a patch at most, six rounds of its threads where all have partners, and how many patches share a multiprocessor of an
+# H100 (csrc/cuda/stream.h)
 _STREAM_TETS = {torch.float32: 2304, torch.float64: 960}
 _STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
 _MOST_FIELDS = 2  # of a pass: the products with a second derivative

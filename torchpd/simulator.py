@@ -221,7 +221,7 @@ class Simulator(Model):
             state: where typical motions start [B, V, 3], the rest state by default; up to four environments are
                 studied over 30 steps, without forces and with the targets of the scene. Times are for its batch.
             error: of a step, |x - x*| / |x_0 - x*|, x* converged and x_0 the first iterate; in (0, 1).
-            milliseconds: of a step on this machine; the error is then as low as that allows.
+            milliseconds: of `sim(state)` on this machine; the error is then as low as that allows.
             candidates: solvers to choose from; by default those that cannot diverge.
             most: iterations of a step, at most.
             progress: show a bar.

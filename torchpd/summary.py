@@ -22,6 +22,8 @@ __all__ = ["describe", "workspace_bytes"]
 # What each effect adds to a step; folded ones are part of the weights and targets that every vertex has anyway.
 _FOLDED = "folded into the inertia of a vertex: nothing per iteration"
 
+_TURNING_MODES = 24  # of the small problem of Multilevel("corotated"), see csrc/solver/corotation.h
+
 
 def _solver_line(sim: Simulator) -> str:
     numbers = sim.solver.numbers()
@@ -134,12 +136,15 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     """Memory of a step on the CPU beside plan, material and states, of one environment; `real` bytes a number."""
     # five vectors of four numbers, two weights, and the slots of the patches
     numbers = 22 * plan.vertices + 8 * len(plan.slot_vertex)
-    if isinstance(solver, Multilevel):
-        # four vectors of the outer iteration, four of a cycle, and eight pairs
-        numbers += 4 * plan.vertices * (8 + (16 if solver.outer != "momentum" else 0))
-        # of each vertex sixteen numbers, and A times them
-        numbers += 32 * plan.vertices if solver.outer == "corotated" else 0
-    return real * numbers
+    if not isinstance(solver, Multilevel):
+        return real * numbers
+    # four vectors of the outer iteration, four of a cycle, and eight pairs
+    numbers += 4 * plan.vertices * (8 + (16 if solver.outer != "momentum" else 0))
+    if solver.outer != "corotated":
+        return real * numbers
+    # of each vertex sixteen numbers, and A times them; and two inverses
+    inverses = 8 * 2 * _TURNING_MODES**2
+    return real * (numbers + 32 * plan.vertices) + _turning_sums(plan, 256) + inverses
 
 
 def _step_bytes(sim: Simulator, real: int) -> str:
@@ -152,13 +157,7 @@ def _step_bytes(sim: Simulator, real: int) -> str:
         own = f"{4 * real * (5 * plan.vertices + 2 * slots):,} B an environment during a step"
         if not isinstance(sim.solver, Multilevel):
             return own
-        # three vectors of the outer iteration, four of a cycle, eight pairs; two more and two matrices with contacts
-        held = 26 if sim.scene.grounds or sim.scene.spheres else 0
-        # and of each vertex where it is, sixteen numbers, and A times them
-        small = 36 if sim.solver.outer == "corotated" else 0
-        numbers = 4 * (7 + (16 if sim.solver.outer != "momentum" else 0)) + held + small
-        team = real * plan.vertices * numbers + (_turning_bytes(plan) if small else 0)
-        return f"{own}, and {team:,} B for each that the GPU has in work at a time"
+        return f"{own}, and {_team_bytes(sim, sim.solver, real):,} B for each that the GPU has in work at a time"
     # five vectors of four numbers a slot; the weights of 32 pairs a block, but where each thread has its own
     if plan.kernel != "cluster":
         team = real * (20 * slots + 64 * plan.size("blocks"))
@@ -167,11 +166,26 @@ def _step_bytes(sim: Simulator, real: int) -> str:
     return f"{team:,} B for each environment that the GPU has in work at a time"
 
 
-def _turning_bytes(plan: Plan) -> int:
-    """What a GPU adds up to make the small problem of "corotated" (csrc/cuda/corotation.h), doubles all."""
-    products, pairs = 2 * 16 * 16, 24 * 25 // 2
-    chunks = -(-plan.vertices // max(64, -(-plan.vertices // 128)))
-    return 8 * (products * (chunks + 1) + pairs * (plan.patches + 1))
+def _team_bytes(sim: Simulator, solver: Multilevel, real: int) -> int:
+    """Memory of an environment that a GPU has in work with `Multilevel`, but for a few sums."""
+    plan = sim.plan
+    # three vectors of the outer iteration, those of a cycle, eight pairs; two more and two matrices with contacts
+    *_, direct = plan.level_sizes.tolist()
+    cycle = 3 if direct else 4
+    held = 26 if sim.scene.grounds or sim.scene.spheres else 0
+    numbers = 4 * (3 + cycle + (16 if solver.outer != "momentum" else 0)) + held
+    if solver.outer != "corotated":
+        return real * plan.vertices * numbers
+    # of each vertex where it is, sixteen numbers, and A times them; and the sums of all chunks, and of all patches
+    chunk = max(64, -(-plan.vertices // 128))
+    totals = 8 * (2 * 16 * 16 + _TURNING_MODES * (_TURNING_MODES + 1) // 2)
+    return real * plan.vertices * (numbers + 36) + _turning_sums(plan, chunk) + totals
+
+
+def _turning_sums(plan: Plan, chunk: int) -> int:
+    """Bytes of what the small problem of "corotated" adds up: for every `chunk` vertices, and for every patch."""
+    products, pairs = 2 * 16 * 16, _TURNING_MODES * (_TURNING_MODES + 1) // 2
+    return 8 * (products * -(-plan.vertices // chunk) + pairs * plan.patches)
 
 
 def describe(sim: Simulator) -> str:

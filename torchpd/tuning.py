@@ -76,7 +76,7 @@ class Promise:
     iterations: int
     error: float  # promised, of a step
     studied_error: float  # worst of the study
-    milliseconds: float  # median of a step of the batch that tune saw, on the machine where it ran
+    milliseconds: float  # median of sim(state), of the batch that tune saw, on the machine where it ran
     residual_limit: float  # `info.residual` above which the promise is not to be relied on
     error_per_residual: float  # largest ratio in the study
     time_step: float  # s
@@ -336,19 +336,19 @@ def _for_time(sim: Simulator, study: _Study, start: State, budget: float | None,
     return seek
 
 
+@torch.no_grad()
 def _milliseconds(sim: Simulator, start: State, trial: Trial) -> float:
-    """A step of the whole batch: the lowest median of three series, so that a disturbance of one does not count."""
+    """Of `sim(state)`: the lowest median of three series, so that a disturbance of one does not count."""
     timed = copy.copy(sim)
     timed.solver, timed.iterations, timed.tolerance = trial.solver, trial.iterations, 0.0
-    state = State(start[0].clone(), start[1].clone())
-    timed.step_(state)
+    timed(start)
     medians = []
     for _ in range(3):
         times: list[float] = []
         while len(times) < 5 or (sum(times) < 0.05 and len(times) < 50):
             _wait_for(sim)
             begin = time.perf_counter()
-            timed.step_(state)
+            timed(start)
             _wait_for(sim)
             times.append(time.perf_counter() - begin)
         medians.append(statistics.median(times))

@@ -1,6 +1,8 @@
 // How the small problem of solver/corotation.h acts on vectors, on the CPU.
 #pragma once
 #include "cpu/corotation_maker.h"
+#include "cpu/team.h"
+#include "cpu/workspace.h"
 
 #include <algorithm>
 

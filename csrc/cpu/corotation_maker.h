@@ -4,6 +4,7 @@
 #include "cpu/corotation_work.h"
 #include "cpu/team.h"
 #include "cpu/workspace.h"
+#include "effects/solid.h"
 #include "solver/multilevel.h"
 
 #include <array>
@@ -61,31 +62,31 @@ class TurningElements {
     const Mat3<R> back = transpose(nearest_rotation(deformation_gradient(x, inverse)));
     for (Vec3<R>& position : x) position = position + to_middle;
     TurningStrain<R> strain[turning_groups];
-    bool there[turning_groups];
+    bool present[turning_groups];
     for (int k = 0; k < turning_groups; ++k) {
       R weight[4];
       for (int c = 0; c < 4; ++c)
         weight[c] = k == 0 ? some[c].x : k == 1 ? some[c].y : k == 2 ? some[c].z : rest[c].x;
-      there[k] = any((weight[0] + weight[1]) + (weight[2] + weight[3]) > R(T(0)));
-      if (there[k]) strain[k] = TurningStrain<R>(TurningGradient<R>(inverse, back, x, weight));
+      present[k] = any((weight[0] + weight[1]) + (weight[2] + weight[3]) > R(T(0)));
+      if (present[k]) strain[k] = TurningStrain<R>(TurningGradient<R>(inverse, back, x, weight));
     }
-    add_strains(strain, there, elements.weight(s), sum);
+    add_strains(strain, present, elements.weight(s), sum);
   }
 
   // Groups with groups before them, and the modes of each where they meet: of six numbers half are none. The order of pairs is
-  // that of `turning_pair`. Most elements have two or three of the groups, and others would add zeros.
+  // that of `turning_pair`. A pack of elements seldom has all groups; the others would add zeros.
   template <class R>
   static void add_strains(const TurningStrain<R> (&strain)[turning_groups],
-                          const bool (&there)[turning_groups], const R& weight,
+                          const bool (&present)[turning_groups], const R& weight,
                           R (&sum)[turning_pairs]) {
     for (int k = 0; k < turning_groups; ++k) {
-      if (!there[k]) continue;
+      if (!present[k]) continue;
       R own[6][6];
       for (int i = 0; i < 6; ++i) {
         for (int c = 0; c < 6; ++c) own[i][c] = weight * strain[k].h[i][c];
       }
       for (int l = 0; l < k; ++l) {
-        if (!there[l]) continue;
+        if (!present[l]) continue;
         R* to = sum + turning_pair(6 * k, 6 * l);
         add_group<false>(own, strain[l].h, to);
       }

@@ -1,5 +1,6 @@
 // Runner of solver/multilevel.h on the CPU: what Stepper does of a step, and another way to the next iterate.
 #pragma once
+#include "cpu/corotation.h"
 #include "cpu/misfit.h"
 #include "cpu/outer_work.h"
 #include "cpu/stepper.h"

@@ -1,6 +1,6 @@
 // Memory of the multilevel solver's outer iteration.
 #pragma once
-#include "cpu/corotation.h"
+#include "cpu/corotation_work.h"
 #include "cpu/cycle.h"
 #include "math/mat.h"
 

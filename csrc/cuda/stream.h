@@ -218,7 +218,7 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   const int number = int(blockIdx.x % call.step.plan.patches);
   const StreamWork<T, Touching> w(call, blockIdx.x / call.step.plan.patches);
   if (skips<What>(w)) return;
-  // what the vertices inside want once their forces are known
+  // what is read once the elements are done
   const Patch<T> patch(w.plan, number);
   if constexpr (What != Visit::weigh) {
     bring_near(w.v.before + patch.first_vertex, patch.interior);
