@@ -182,8 +182,11 @@ def test_costs_of_a_batch_come_beside_the_first_environment() -> None:
 
     row = {**_time_to_error_row(300, 20, "Multilevel"), "kernel": "block", "vertices": 500, "batch": 11}
     for own, cost in zip(row["solvers"].values(), COSTS["block"], strict=True):
-        own["microseconds_an_iteration"] = cost.iteration(500) + 10 * 0.5 * 0.3
-    assert [line.split("more=")[1].split()[0] for line in costs_of_batches([row]).splitlines()] == ["0.3", "0.3"]
+        own["microseconds_an_iteration"] = cost.iteration(500) + 10 * 0.15
+    lines = costs_of_batches([row]).splitlines()
+    assert [line.split(" adds ")[1].split(" us, ")[0] for line in lines] == ["0.15", "0.15"]
+    # as COSTS has it: 0.033 / 2 + 0.022 / 4 and 0.1 / 2 + 2.4 / 4
+    assert [line.split(" us, ")[-1] for line in lines] == ["0.022 by the table", "0.65 by the table"]
 
 
 @pytest.mark.usefixtures("on_path")
