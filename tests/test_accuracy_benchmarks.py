@@ -185,8 +185,8 @@ def test_costs_of_a_batch_come_beside_the_first_environment() -> None:
         own["microseconds_an_iteration"] = cost.iteration(500) + 10 * 0.15
     lines = costs_of_batches([row]).splitlines()
     assert [line.split(" adds ")[1].split(" us, ")[0] for line in lines] == ["0.15", "0.15"]
-    # as COSTS has it: 0.033 / 2 + 0.022 / 4 and 0.1 / 2 + 2.4 / 4
-    assert [line.split(" us, ")[-1] for line in lines] == ["0.022 by the table", "0.65 by the table"]
+    table = [f"{cost.other(500):.2g} by the table" for cost in COSTS["block"]]
+    assert [line.split(" us, ")[-1] for line in lines] == table
 
 
 @pytest.mark.usefixtures("on_path")
