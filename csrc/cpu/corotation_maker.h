@@ -7,6 +7,7 @@
 #include "effects/solid.h"
 #include "solver/multilevel.h"
 
+#include <algorithm>
 #include <array>
 #include <cstring>
 
@@ -289,17 +290,23 @@ class CorotationMaker {
   static bool invert(const TurningMatrix& x, const double (&scale)[turning_modes], double noise,
                      TurningMatrix& inverse) {
     constexpr int n = turning_modes;
-    TurningMatrix now, next;
+    TurningMatrix now;
     for (int i = 0; i < n; ++i) {
       for (int j = 0; j < n; ++j) now.at[i][j] = scaled_entry(x, scale[i], scale[j], i, j, noise);
     }
+    // swept(), in place and row by row
     for (int k = 0; k < n; ++k) {
       if (!(now.at[k][k] > 0)) return false;
       const double share = 1 / now.at[k][k];
+      double row[n];
+      std::copy_n(now.at[k], n, row);
       for (int i = 0; i < n; ++i) {
-        for (int j = 0; j < n; ++j) next.at[i][j] = swept(now, k, share, i, j);
+        const double factor = now.at[i][k];
+        for (int j = 0; j < n; ++j) now.at[i][j] -= share * (factor * row[j]);
+        now.at[i][k] = share * factor;
       }
-      now = next;
+      for (int j = 0; j < n; ++j) now.at[k][j] = share * row[j];
+      now.at[k][k] = -share;
     }
     for (int i = 0; i < n; ++i) {
       for (int j = 0; j < n; ++j) inverse.at[i][j] = -scale[i] * scale[j] * now.at[i][j];
