@@ -62,7 +62,7 @@ class Costs(NamedTuple):
 
 # Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers,
 # those of further environments with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were
-# measured on "block" alone, with 256 and 936 vertices; the square is mostly that of the dense factor of a small matrix.
+# measured on "block" alone, with 256 and 936 vertices, which the squares fit; M of such a mesh is dense.
 # Kernels without `more` choose for a batch as for one environment.
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
