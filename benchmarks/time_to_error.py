@@ -21,6 +21,7 @@ import json
 import statistics
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -148,7 +149,8 @@ def run_case(
         "uncertainty": case.uncertainty, "solvers": {},
     }  # fmt: skip
     timed: dict[str, tuple[Solver, int]] = {}
-    for name, solver in SOLVERS.items():
+    for name, alone in SOLVERS.items():
+        solver = replace(alone, batch=batch) if isinstance(alone, pd.Multilevel) else alone
         begin = time.perf_counter()
         sim.solver, expected = solver, forecast(sim, solver)
         row["solvers"][name] = own = {"setup_ms": 1e3 * (time.perf_counter() - begin)}

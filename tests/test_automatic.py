@@ -148,7 +148,19 @@ def test_the_kernel_of_chebyshev_is_compared_whatever_ran_before(monkeypatch: py
 @pytest.mark.parametrize("youngs", [1e3, 1e4, 1e5, 1e6])
 def test_on_the_cpu_the_batch_changes_nothing(youngs: float) -> None:
     alone, many = beam(youngs), beam(youngs, solver=pd.Auto(batch=1024))
-    assert (alone.solver, alone.iterations) == (many.solver, many.iterations)
+    assert (type(alone.solver), alone.iterations) == (type(many.solver), many.iterations)
+
+
+def test_a_multilevel_solver_is_told_of_the_batch() -> None:
+    """Which chooses its patches on a GPU."""
+    sim = beam(1e6, solver=pd.Auto(batch=1024))
+    assert isinstance(sim.solver, pd.Multilevel)
+    assert sim.solver.batch == 1024
+    assert "solver: Multilevel corotated for a batch of 1024: " in repr(sim)
+    alone = beam(1e6)
+    assert isinstance(alone.solver, pd.Multilevel)
+    assert alone.solver.batch == 1
+    assert "for a batch" not in repr(alone)
 
 
 def test_print_says_why_and_any_other_solver_ends_it() -> None:

@@ -152,6 +152,7 @@ def test_solvers_are_checked() -> None:
         (lambda: pd.Chebyshev(rho=math.nan), r"Chebyshev\.rho must be finite"),
         (lambda: pd.Chebyshev(relaxation=3.0), r"Chebyshev\.relaxation must lie in \(0, 2\)"),
         (lambda: pd.Chebyshev(delay=5), r'Chebyshev\.delay belongs to schedule="classic"'),
+        (lambda: pd.Multilevel(batch=0), r"Multilevel\.batch must be a whole number >= 1, got 0"),
         (lambda: pd.Auto(batch=0), r"Auto\.batch must be a whole number >= 1, got 0"),
         (lambda: pd.Auto(batch=None), r"Auto\.batch must be a whole number >= 1, got None"),
         (lambda: pd.Auto(batch=1.5), r"Auto\.batch must be a whole number >= 1, got 1.5"),

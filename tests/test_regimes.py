@@ -231,6 +231,23 @@ def test_patches_of_a_multilevel_solver_fit(gpu: Properties, dtype: torch.dtype)
         choose_plan(values, dtype, gpu, "block", levels=True)
 
 
+@pytest.mark.parametrize("gpu", [Properties(1, 232_448), Properties(20, 101_376), H100])
+def test_many_environments_of_a_multilevel_solver_get_larger_patches(gpu: Properties, dtype: torch.dtype) -> None:
+    values = values_of((9, 9, 9))  # 3 645 or more tetrahedra
+    least = -(-gpu.multiprocessors // 3)
+    few, many = (choose_plan(values, dtype, gpu, levels=True, batch=batch) for batch in (least - 1, least))
+    assert (few.many, many.many) == (False, True)
+    assert many.for_levels
+    assert "for many environments" in many.why
+    assert shared_bytes(many, 0, 0) <= gpu.shared
+    if gpu == H100 and dtype == torch.float32:
+        assert (few.patches, many.patches) == (12, 3)
+    # a block's own memory holds such a patch twice over, whatever the number
+    assert choose_plan(values_of((3, 3, 3)), dtype, gpu, levels=True, batch=least).patches == 1
+    # the batch says nothing of other solvers
+    assert not choose_plan(values, dtype, gpu, batch=least).many
+
+
 def test_contacts_take_shared_memory() -> None:
     values = values_of((3, 3, 3))
     plan = choose_plan(values, torch.float32, H100, "block")

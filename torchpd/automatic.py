@@ -8,7 +8,7 @@ alone and in any batch.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from .forecast import Forecast, Spectrum, forecast, spectrum_of
@@ -62,11 +62,11 @@ class Costs(NamedTuple):
 
 # Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers,
 # those of further environments with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were
-# measured on "block" alone, with 256 and 936 vertices, which the squares fit; M of such a mesh is dense.
+# measured on "block" alone, with 256 and 936 vertices, which the squares fit.
 # Kernels without `more` choose for a batch as for one environment.
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
-    "block": Costs(Cost(2.6, 5.0, 0.033, 0.022), Cost(31.0, 3.0, 0.1, 2.4)),
+    "block": Costs(Cost(2.6, 5.0, 0.033, 0.022), Cost(31.0, 3.0, 0.6, 0.79)),
     "cluster": Costs(Cost(0.7, 0.9), Cost(50.0, 2.4)),
     "grid": Costs(Cost(1.2, 0.13), Cost(50.0, 2.4)),
     "stream": Costs(Cost(6.0, 0.18), Cost(50.0, 2.4)),
@@ -104,7 +104,8 @@ def choose_solver(sim: Model, iterations: int | None, wanted: Auto) -> tuple[Sol
         return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
     plain, lasting, short = (_known(forecast(sim, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
     saves = short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
-    multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
+    unprepared, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
+    multilevel = replace(unprepared, batch=wanted.batch)
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
     if not _runs(multilevel, sim):
         where = f"{sim.device} with kernel={sim.kernel!r}" if sim.device.type == "cuda" else str(sim.device)

@@ -13,7 +13,7 @@ from .checks import check_whole
 from .forecast import warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_batches, check_material, material_of
 from .multilevel import has_levels
-from .placing import check_wanted_device, plan_for_solver, plan_on
+from .placing import check_wanted_device, plan_for_solver, plan_on, suits_solver
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
@@ -109,7 +109,7 @@ class Model(nn.Module):
             return self._choose_solver(None, wanted)
         before = self._solver, self.choice
         self._solver, self.choice = check_solver(solver, self.device), None
-        if isinstance(solver, Multilevel) == has_levels(self.plan.arrays):
+        if isinstance(solver, Multilevel) == has_levels(self.plan.arrays) and suits_solver(self.plan, solver):
             return None
         try:
             self._prepare()

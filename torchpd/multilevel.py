@@ -19,7 +19,8 @@ from .tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE
 
 __all__ = ["has_levels", "precondition_plan", "reference_of", "reference_of_levels", "without_levels"]
 
-# Two dense products there take less time than the many short phases of a cycle: each of those waits for all blocks.
+# Two dense products there take less time than the many short phases of a cycle: each of those waits for all blocks. With
+# many environments, of a block or two each, the cycle's fewer numbers take less.
 MOST_DIRECT = 1024
 
 Reference = tuple[Tensor, Tensor]  # stiffness [E] Pa, and inertia a [V] N/m in the user's order, inf where held
@@ -78,13 +79,14 @@ def precondition_plan(
         values: of the scene that the plan was compiled from.
         stiffness: [E] Pa.
         inertia: a of each vertex [V] N/m in the user's order, inf where held.
-        most_direct: up to so many vertices M is A^-1, without levels. None: `MOST_DIRECT` on a GPU, 0 on a CPU.
+        most_direct: up to so many vertices M is A^-1, without levels. None: `MOST_DIRECT` on a GPU that has few
+            environments, else 0.
         progress: show a bar when the mesh is large.
     """
     plan = without_levels(plan)
     order = plan.vertex_order.cpu().numpy()
     if most_direct is None:
-        most_direct = MOST_DIRECT if plan.kernel is not None else 0
+        most_direct = MOST_DIRECT if plan.kernel is not None and not plan.many else 0
 
     def rounded(values: Tensor) -> NDArray[np.float64]:
         """In the plan's precision, which the arrays will have: it decides the bits."""

@@ -29,13 +29,15 @@ class Plan:
     """Constant arrays of a scene in the order of a table that C++ declares, also by name: `plan.vertex_order`.
 
     The CPU and GPUs have a table each, which that of a multilevel preconditioner may follow. `why` says in words why a
-    GPU's plan is for the kernel that it is for; `for_levels`: its patches are those of a multilevel solver.
+    GPU's plan is for the kernel that it is for; `for_levels`: its patches are those of a multilevel solver, and `many`
+    those for so many environments that each has few multiprocessors.
     """
 
     arrays: tuple[Tensor, ...]
     table: tuple[PlanRow, ...] = PLAN_TABLE
     why: str = ""
     for_levels: bool = False
+    many: bool = False
 
     def __getattr__(self, name: str) -> Tensor:
         for number, row in enumerate(self.table):

@@ -12,7 +12,7 @@ those at the borders are worked out by several. So no forces are exchanged, and 
 vertex is sent into the shared memory of the patches that have a copy of it. Patches of the others share no tetrahedra,
 and exchange the forces on vertices that they share.
 
-The batch does not enter: an environment gives the same bits alone and in any batch.
+The batch of a state does not enter: an environment gives the same bits alone and in any batch.
 """
 
 from __future__ import annotations
@@ -32,14 +32,16 @@ from .plan import KERNELS, Plan, any_of
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE
 
-__all__ = ["check_kernel", "choose_plan", "shared_bytes"]
+__all__ = ["are_many", "check_kernel", "choose_plan", "shared_bytes"]
 
 _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
 # "auto" looks at clusters for meshes of so many at most; where there are blocks, a patch of one for every so many
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
 _CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
-# with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block
+# with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block; where environments have no
+# more multiprocessors than so many each, fewer patches take less
 _LEVEL_TETS, _LEVEL_ALONE = 384, 1152
+_MANY_SHARE, _MANY_TETS = 3, 1900
 # a patch at most, six rounds of its threads where all have partners, and how many patches share a multiprocessor of an
 # H100 (csrc/cuda/stream.h)
 _STREAM_TETS = {torch.float32: 2304, torch.float64: 960}
@@ -53,6 +55,11 @@ def check_kernel(kernel: str) -> str:
     if kernel not in names:
         raise ValueError(f"Simulator: kernel must be {any_of(names)}, got {kernel!r}")
     return kernel
+
+
+def are_many(batch: int, gpu: Properties) -> bool:
+    """Whether a multilevel solver gets a plan for many environments."""
+    return _MANY_SHARE * batch >= gpu.multiprocessors
 
 
 def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
@@ -102,9 +109,11 @@ class _Scene(NamedTuple):
             return min(gpu.cluster, gpu.multiprocessors, wanted, self.vertices, self.tets)
         if kernel == "grid":
             return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
+        if kernel in ("levels", "many") and self.tets <= _LEVEL_ALONE:
+            return 1
+        if kernel == "many":
+            return max(2, -(-self.tets // _MANY_TETS))
         if kernel == "levels":
-            if self.tets <= _LEVEL_ALONE:
-                return 1
             # 2.5 entries and at least a third of a slot a tetrahedron, see pass_shared_bytes
             each = (4 * 2.5 + 6 / 3) * self.real
             least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes - _C.corotation_bytes))
@@ -164,22 +173,25 @@ def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
     return _plan_that_fits(scene, gpu, "stream", lambda patches: 2 * patches)
 
 
-def _level_plan(scene: _Scene, gpu: Properties) -> Plan:
+def _level_plan(scene: _Scene, gpu: Properties, many: bool) -> Plan:
     """For a multilevel solver: as many patches for every multiprocessor, where one each is not enough."""
 
     def more(patches: int) -> int:
         rounds = -(-patches // gpu.multiprocessors)
         return (rounds + 1 + rounds // 4) * gpu.multiprocessors
 
-    return _plan_that_fits(scene, gpu, "levels", more)
+    if not many:
+        return replace(_plan_that_fits(scene, gpu, "levels", more), why="what Multilevel runs with")
+    plan = _plan_that_fits(scene, gpu, "many", lambda patches: patches + 1 + patches // 4)
+    return replace(plan, many=True, why="what Multilevel runs with, of patches for many environments")
 
 
 def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
-    """For "stream" or "levels"; `more`: the patches to try after so many, whose slots or forces are too many."""
+    """For "stream", "levels" or "many"; `more`: the patches to try after so many, whose slots or forces are too many."""
     patches = min(scene.patches(name, gpu), scene.tets)
     while True:
         try:
-            plan = replace(scene.plan("stream", patches), for_levels=name == "levels")
+            plan = replace(scene.plan("stream", patches), for_levels=name != "stream")
         except ValueError:  # more in a patch than can be counted
             if patches == scene.tets:
                 raise
@@ -196,6 +208,7 @@ def choose_plan(
     kernel: str = "auto",
     *,
     levels: bool = False,
+    batch: int = 1,
     progress: bool = True,
 ) -> Plan:
     """The plan of a scene for a GPU, on the CPU; move it with `Plan.to`.
@@ -207,6 +220,7 @@ def choose_plan(
         kernel: "auto" takes the first of "block", "cluster", "grid" and "stream" that fits; a "cluster" where the GPU
             has them, and for a small mesh alone.
         levels: for a multilevel solver, which runs as "stream" does but for its iterations.
+        batch: environments that such a solver is to be fast with.
         progress: show a bar when the mesh is large.
     """
     check_kernel(kernel)
@@ -216,7 +230,7 @@ def choose_plan(
             raise ValueError(
                 f'Simulator: Multilevel runs with kernel="stream" on a GPU, got kernel={kernel!r}; leave it at "auto"'
             )
-        return replace(_level_plan(scene, gpu), why="what Multilevel runs with")
+        return _level_plan(scene, gpu, are_many(batch, gpu))
     if kernel == "cluster" and gpu.cluster == 1:
         raise ValueError(
             'Simulator: kernel="cluster" needs thread blocks that reach each other\'s shared memory (NVIDIA compute '

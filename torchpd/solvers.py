@@ -138,8 +138,8 @@ class Multilevel:
     """Iterations with a multilevel approximation M of A^-1, A the constant matrix of projective dynamics.
 
     For stiff and for accurate steps: a dozen or two of iterations do, however stiff or fine the mesh, each at four to
-    five times the cost of a Jacobi iteration on a CPU, and 5 to 39 times on a GPU, where M of a mesh of up to 1024
-    vertices is A^-1 itself. The scene takes longer to compile.
+    five times the cost of a Jacobi iteration on a CPU, and 5 to 36 times on a GPU, where M of a mesh of up to 1024
+    vertices is A^-1 itself unless it comes in batches. The scene takes longer to compile.
 
     Every iterate is judged by its energy before the next one starts from it. Contacts project every iterate; while they
     hold vertices M fits less well. With friction, which has no energy, the judgement allows a rise of 1 %.
@@ -154,13 +154,19 @@ class Multilevel:
             time of one or two more. Bodies that bend or spin need a third to two thirds of the iterations, others as
             many as with "lbfgs".
         relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8.
+        batch: environments that a step will have, a whole number >= 1. Where they leave a GPU no more than three
+            multiprocessors each, it gets larger patches, and levels also for a mesh of up to 1024 vertices: less to
+            read in place of shorter phases. States of any other batch may come, and each environment's bits stay. On
+            a CPU it changes nothing.
     """
 
     outer: Literal["corotated", "lbfgs", "momentum"] = "corotated"
     relaxation: float | None = None
+    batch: int = 1
 
     def __post_init__(self) -> None:
         _check_choice("Multilevel.outer", self.outer, tuple(_SCHEDULES))
+        object.__setattr__(self, "batch", check_whole("Multilevel.batch", self.batch, minimum=1))
         if self.relaxation is not None and not 0.0 < check_scalar("Multilevel.relaxation", self.relaxation) < 2.0:
             raise ValueError(f"Multilevel.relaxation must lie in (0, 2), got {self.relaxation}")
 

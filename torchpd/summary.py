@@ -31,7 +31,8 @@ def _solver_line(sim: Simulator) -> str:
     if isinstance(sim.solver, Chebyshev):
         name = f"Chebyshev {sim.solver.schedule}"
     if isinstance(sim.solver, Multilevel):
-        name = f"Multilevel {sim.solver.outer}"
+        batch = f" for a batch of {sim.solver.batch}" if sim.solver.batch > 1 else ""
+        name = f"Multilevel {sim.solver.outer}{batch}"
     stop = f"at most {sim.iterations}" if sim.tolerance else f"{sim.iterations}"
     rho = f", rho {numbers['rho']:g}" if numbers["rho"] else ""
     diagonal = "weighted" if numbers["weighted"] else "plain"
