@@ -213,7 +213,7 @@ def test_rollout_is_its_steps_and_a_recording_too() -> None:
 
 @pytest.mark.parametrize("outer", SOLVERS)
 def test_plans_for_many_environments(outer: str) -> None:
-    """Other patches, and levels in place of a direct solve: the CPU's iterates, and the same bits alone and in a batch."""
+    """Other patches, and levels in place of a direct solve: iterates of the CPU, the same bits alone and in a batch."""
     case = contact_block(pd.Ground(), velocity=(0.0, -1.0, 0.0), youngs=1e6, cells=7)
     few = simulator(case, torch.float64, GPU, solver=SOLVERS[outer], iterations=8)
     solver = replace(SOLVERS[outer], batch=1024)

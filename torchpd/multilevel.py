@@ -19,8 +19,8 @@ from .tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE
 
 __all__ = ["has_levels", "precondition_plan", "reference_of", "reference_of_levels", "without_levels"]
 
-# Two dense products there take less time than the many short phases of a cycle: each of those waits for all blocks. With
-# many environments, of a block or two each, the cycle's fewer numbers take less.
+# Two dense products there take less time than the many short phases of a cycle: each of those waits for all blocks.
+# With many environments, of a block or two each, the cycle's fewer numbers take less.
 MOST_DIRECT = 1024
 
 Reference = tuple[Tensor, Tensor]  # stiffness [E] Pa, and inertia a [V] N/m in the user's order, inf where held

@@ -38,8 +38,8 @@ _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than th
 # "auto" looks at clusters for meshes of so many at most; where there are blocks, a patch of one for every so many
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
 _CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
-# with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block; where environments have no
-# more multiprocessors than so many each, fewer patches take less
+# with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block; where environments have
+# no more multiprocessors than so many each, fewer patches take less
 _LEVEL_TETS, _LEVEL_ALONE = 384, 1152
 _MANY_SHARE, _MANY_TETS = 3, 1900
 # a patch at most, six rounds of its threads where all have partners, and how many patches share a multiprocessor of an
@@ -187,7 +187,7 @@ def _level_plan(scene: _Scene, gpu: Properties, many: bool) -> Plan:
 
 
 def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
-    """For "stream", "levels" or "many"; `more`: the patches to try after so many, whose slots or forces are too many."""
+    """For "stream", "levels" or "many"; `more`: the patches to try after so many with too many slots or forces."""
     patches = min(scene.patches(name, gpu), scene.tets)
     while True:
         try:
