@@ -109,7 +109,8 @@ class Model(nn.Module):
             return self._choose_solver(None, wanted)
         before = self._solver, self.choice
         self._solver, self.choice = check_solver(solver, self.device), None
-        if isinstance(solver, Multilevel) == has_levels(self.plan.arrays) and suits_solver(self.plan, solver):
+        there = isinstance(solver, Multilevel) == has_levels(self.plan.arrays)
+        if there and suits_solver(self.plan, self._solver):
             return None
         try:
             self._prepare()
