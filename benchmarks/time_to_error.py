@@ -21,7 +21,6 @@ import json
 import statistics
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +57,7 @@ class Case:
         subject = SUBJECTS["beam"]()
         self.scene = subject.scene(subject.mesh(cells), youngs)
         self.time_step = subject.time_step
+        self.batch = batch
         wide = self.simulator(torch.float64, torch.device("cpu"), pd.Multilevel())
         start = pd.State(*(part.float() for part in subject.start(wide)))
         self.solution, self.uncertainty = converged(wide, pd.State(*(part.double() for part in start)))
@@ -66,7 +66,8 @@ class Case:
         self.first = start.velocities[0].double() * self.time_step
 
     def simulator(self, dtype: torch.dtype, device: torch.device, solver: Solver) -> pd.Simulator:
-        return pd.Simulator(self.scene, self.time_step, 64, solver, dtype, progress=False).to(device)
+        sim = pd.Simulator(self.scene, self.time_step, 64, solver, dtype, batch=self.batch, progress=False)
+        return sim.to(device)
 
     def error(self, solver: Solver, iterations: int) -> float:
         self.sim.solver, self.sim.iterations = solver, iterations
@@ -149,8 +150,7 @@ def run_case(
         "uncertainty": case.uncertainty, "solvers": {},
     }  # fmt: skip
     timed: dict[str, tuple[Solver, int]] = {}
-    for name, alone in SOLVERS.items():
-        solver = replace(alone, batch=batch) if isinstance(alone, pd.Multilevel) else alone
+    for name, solver in SOLVERS.items():
         begin = time.perf_counter()
         sim.solver, expected = solver, forecast(sim, solver)
         row["solvers"][name] = own = {"setup_ms": 1e3 * (time.perf_counter() - begin)}
@@ -172,7 +172,7 @@ def run_case(
 def run_auto(case: Case, seconds: float) -> Row:
     """What "auto" chose for this batch, its error and time."""
     sim = case.sim
-    sim.solver = pd.Auto(len(case.state.positions))
+    sim.solver = "auto"
     assert sim.choice is not None
     solver, count, why = sim.solver, sim.iterations, sim.choice.why
     return {

@@ -107,22 +107,23 @@ def test_time_of_a_batch() -> None:
 def test_the_batch_decides_where_environments_share_a_device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """As on a GPU: Multilevel's iteration costs 9 times as much for one environment, 30 times for a thousand."""
     monkeypatch.setitem(automatic.COSTS, "cpu", Costs(Cost(1.0, 0.0, 0.04), Cost(9.0, 0.0, 1.22)))
-    alone, many = beam(1e6), beam(1e6, solver=pd.Auto(batch=1024))
+    unknown, alone, many = beam(1e6), beam(1e6, batch=1), beam(1e6, batch=1024)
+    assert isinstance(unknown.solver, pd.Multilevel)
     assert isinstance(alone.solver, pd.Multilevel)
     assert isinstance(many.solver, pd.Chebyshev)
     assert "each as long as 30 in a batch of 1024" in repr(many)
-    assert "in a batch" not in repr(alone)
+    assert "in a batch" not in repr(unknown)
     # another choice is for the same batch: after a change, in a file, on another precision
     many.prepare_solver()
     assert isinstance(many.solver, pd.Chebyshev)
     many.save(tmp_path / "beam.safetensors")
     loaded = pd.Simulator.load(tmp_path / "beam.safetensors")
+    assert loaded.batch == 1024
     loaded.prepare_solver()
     assert isinstance(loaded.solver, pd.Chebyshev)
-    alone.solver = pd.Auto(batch=1024)
-    assert isinstance(alone.solver, pd.Chebyshev)
-    alone.solver = "auto"
-    assert isinstance(alone.solver, pd.Multilevel)
+    many.solver = pd.Multilevel()
+    many.solver = "auto"
+    assert isinstance(many.solver, pd.Chebyshev)
 
 
 def test_the_kernel_of_chebyshev_is_compared_whatever_ran_before(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,20 +148,8 @@ def test_the_kernel_of_chebyshev_is_compared_whatever_ran_before(monkeypatch: py
 
 @pytest.mark.parametrize("youngs", [1e3, 1e4, 1e5, 1e6])
 def test_on_the_cpu_the_batch_changes_nothing(youngs: float) -> None:
-    alone, many = beam(youngs), beam(youngs, solver=pd.Auto(batch=1024))
-    assert (type(alone.solver), alone.iterations) == (type(many.solver), many.iterations)
-
-
-def test_a_multilevel_solver_is_told_of_the_batch() -> None:
-    """Which chooses its patches on a GPU."""
-    sim = beam(1e6, solver=pd.Auto(batch=1024))
-    assert isinstance(sim.solver, pd.Multilevel)
-    assert sim.solver.batch == 1024
-    assert "solver: Multilevel corotated for a batch of 1024: " in repr(sim)
-    alone = beam(1e6)
-    assert isinstance(alone.solver, pd.Multilevel)
-    assert alone.solver.batch == 1
-    assert "for a batch" not in repr(alone)
+    alone, many = beam(youngs), beam(youngs, batch=1024)
+    assert (alone.solver, alone.iterations) == (many.solver, many.iterations)
 
 
 def test_print_says_why_and_any_other_solver_ends_it() -> None:
@@ -176,7 +165,7 @@ def test_print_says_why_and_any_other_solver_ends_it() -> None:
     assert "chosen because" not in repr(sim)
     sim.solver = "auto"
     assert isinstance(sim.solver, pd.Multilevel)
-    with pytest.raises(TypeError, match=r"solver must be Jacobi, Chebyshev, Multilevel, Auto or \"auto\", got 'fast'"):
+    with pytest.raises(TypeError, match=r"solver must be Jacobi, Chebyshev, Multilevel or \"auto\", got 'fast'"):
         sim.solver = "fast"  # type: ignore[assignment]
     assert sim.choice is not None
 

@@ -34,13 +34,16 @@ def test_settings_of_a_simulator_are_checked() -> None:
         ({"iterations": "many"}, ValueError, r"iterations must be a whole number >= 0, got 'many'"),
         ({"iterations": math.nan}, ValueError, r"iterations must be a whole number >= 0, got nan"),
         ({"iterations": True}, ValueError, r"iterations must be a whole number >= 0, got True"),
+        ({"batch": 0}, ValueError, r"batch must be a whole number >= 1, got 0"),
+        ({"batch": 1.5}, ValueError, r"batch must be a whole number >= 1, got 1\.5"),
+        ({"batch": "many"}, ValueError, r"batch must be a whole number >= 1, got 'many'"),
         ({"tolerance": 1.0}, ValueError, r"tolerance must lie in \[0, 1\), got 1"),
         ({"tolerance": -0.1}, ValueError, r"tolerance must lie in \[0, 1\)"),
         ({"tolerance": math.nan}, ValueError, r"tolerance must lie in \[0, 1\), got nan"),
         (
             {"solver": "jacobi"},
             TypeError,
-            r"solver must be Jacobi, Chebyshev, Multilevel, Auto or \"auto\", got 'jacobi'",
+            r"solver must be Jacobi, Chebyshev, Multilevel or \"auto\", got 'jacobi'",
         ),
         ({"dtype": torch.float16}, ValueError, r"dtype must be torch\.float32 or torch\.float64, got torch\.float16"),
     ):
@@ -152,10 +155,6 @@ def test_solvers_are_checked() -> None:
         (lambda: pd.Chebyshev(rho=math.nan), r"Chebyshev\.rho must be finite"),
         (lambda: pd.Chebyshev(relaxation=3.0), r"Chebyshev\.relaxation must lie in \(0, 2\)"),
         (lambda: pd.Chebyshev(delay=5), r'Chebyshev\.delay belongs to schedule="classic"'),
-        (lambda: pd.Multilevel(batch=0), r"Multilevel\.batch must be a whole number >= 1, got 0"),
-        (lambda: pd.Auto(batch=0), r"Auto\.batch must be a whole number >= 1, got 0"),
-        (lambda: pd.Auto(batch=None), r"Auto\.batch must be a whole number >= 1, got None"),
-        (lambda: pd.Auto(batch=1.5), r"Auto\.batch must be a whole number >= 1, got 1.5"),
         (lambda: pd.Chebyshev(diagonal="plain"), r'Chebyshev\.diagonal must be "weighted" when guarded'),
     ):
         with pytest.raises(ValueError, match=message):

@@ -212,30 +212,28 @@ def test_rollout_is_its_steps_and_a_recording_too() -> None:
 
 
 @pytest.mark.parametrize("outer", SOLVERS)
-def test_plans_for_many_environments(outer: str) -> None:
-    """Other patches, and levels in place of a direct solve: iterates of the CPU, the same bits alone and in a batch."""
-    case = contact_block(pd.Ground(), velocity=(0.0, -1.0, 0.0), youngs=1e6, cells=7)
-    few = simulator(case, torch.float64, GPU, solver=SOLVERS[outer], iterations=8)
-    solver = replace(SOLVERS[outer], batch=1024)
-    cpu, many = pair(case, torch.float64, solver, iterations=8)
-    assert many.plan.many
-    assert (int(few.plan.level_sizes[6]), int(many.plan.level_sizes[6])) == (1, 0)
-    assert 1 < many.plan.patches < few.plan.patches
-    state = state_of(case, many, 5)
+@pytest.mark.parametrize(("batch", "cells", "patches", "direct"), [(1024, 7, 2, 0), (1, 5, 2, 1)])
+def test_plans_for_many_and_for_few_environments(outer: str, batch: int, cells: int, patches: int, direct: int) -> None:
+    """Other patches, for many levels in place of a direct solve: iterates of the CPU, the same bits in any batch."""
+    case = contact_block(pd.Ground(), velocity=(0.0, -1.0, 0.0), youngs=1e6, cells=cells)
+    usual = simulator(case, torch.float64, GPU, solver=SOLVERS[outer])
+    cpu, gpu = pair(case, torch.float64, SOLVERS[outer], iterations=8, batch=batch)
+    assert usual.plan.patches != gpu.plan.patches == patches
+    assert int(gpu.plan.level_sizes[6]) == direct
+    assert gpu.plan.many == (batch == 1024)
+    state = state_of(case, gpu, 5)
     factor = torch.linspace(0.5, 1.5, 5, dtype=torch.float64, device=GPU)[:, None, None]
     state = pd.State(state.positions, factor * state.velocities)
-    together = many(state)
+    together = gpu(state)
     expected = cpu(pd.State(*(part.cpu() for part in state)))
-    assert relative(together.positions - many.rest_positions, expected.positions - cpu.rest_positions) <= 1e-8
-    one = many(pd.State(state.positions[3:4], state.velocities[3:4]))
+    assert relative(together.positions - gpu.rest_positions, expected.positions - cpu.rest_positions) <= 1e-8
+    one = gpu(pd.State(state.positions[3:4], state.velocities[3:4]))
     assert same_bits(one, pd.State(together.positions[3:4], together.velocities[3:4]))
-    # the plan follows where the batch crosses the bound
-    many.solver = SOLVERS[outer]
-    assert not many.plan.many
-    assert same_bits(many(state), few(state))
-    many.solver = solver
-    assert many.plan.many
-    assert same_bits(many(state), together)
+    # another solver and back
+    gpu.solver = pd.Chebyshev()
+    assert not gpu.plan.many
+    gpu.solver = SOLVERS[outer]
+    assert same_bits(gpu(state), together)
 
 
 def test_solvers_can_be_exchanged() -> None:

@@ -19,6 +19,7 @@ from on_gpu import (
     crowd,
     device_work,
     full_on_gpu,
+    has_clusters,
     moved,
     on_gpu,
     relative,
@@ -326,7 +327,15 @@ def test_a_mesh_that_does_not_fit_is_refused_and_auto_finds_a_kernel() -> None:
     with pytest.raises(ValueError, match="cluster"):
         simulator(case, torch.float32, GPU, kernel="cluster")
     assert bool(sim(state_of(case, sim)).positions.isfinite().all())
-    assert simulator(bar((6, 2, 2)), torch.float32, GPU).plan.kernel == "block"
+    small = bar((6, 2, 2))
+    assert simulator(small, torch.float32, GPU).plan.kernel == "block"
+    # what few environments get is what one may ask for
+    few = simulator(small, torch.float32, GPU, batch=1)
+    assert few.plan.kernel == ("cluster" if has_clusters() else "block")
+    asked = simulator(small, torch.float32, GPU, kernel=few.plan.kernel)
+    assert same_bits(few(few.rest_state()), asked(asked.rest_state()))
+    assert "; for a batch of 1; " in str(few)
+    assert simulator(small, torch.float32, GPU, batch=1024).plan.kernel == "block"
     with pytest.raises((ValueError, TypeError), match="kernel"):
         simulator(case, torch.float32, GPU, kernel="wide")
 

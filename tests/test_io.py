@@ -56,7 +56,7 @@ SOLVERS = [
     pd.Jacobi(relaxation=0.7, diagonal="plain"),
     pd.Chebyshev(schedule="classic", rho=0.9921, delay=7, relaxation=0.9),
     pd.Multilevel(),
-    pd.Multilevel("momentum", relaxation=1.5, batch=1024),
+    pd.Multilevel("momentum", relaxation=1.5),
 ]
 
 

@@ -242,10 +242,25 @@ def test_many_environments_of_a_multilevel_solver_get_larger_patches(gpu: Proper
     assert shared_bytes(many, 0, 0) <= gpu.shared
     if gpu == H100 and dtype == torch.float32:
         assert (few.patches, many.patches) == (12, 3)
-    # a block's own memory holds such a patch twice over, whatever the number
-    assert choose_plan(values_of((3, 3, 3)), dtype, gpu, levels=True, batch=least).patches == 1
-    # the batch says nothing of other solvers
-    assert not choose_plan(values, dtype, gpu, batch=least).many
+
+
+def test_blocks_of_a_multilevel_solver_share_a_small_mesh_where_environments_are_few(dtype: torch.dtype) -> None:
+    """Alone in half the time; in large batches, and where nobody knows, one block does it."""
+    values = values_of((5, 5, 5))  # 625 or more tetrahedra
+    assert [choose_plan(values, dtype, H100, levels=True, batch=b).patches for b in (None, 1, 43, 44)] == [1, 2, 2, 1]
+    assert choose_plan(values_of((3, 3, 3)), dtype, H100, levels=True, batch=1).patches == 1
+
+
+def test_few_environments_of_a_small_mesh_get_a_cluster(dtype: torch.dtype) -> None:
+    """Which is done sooner; 132 multiprocessors have 44 environments or more before they are many."""
+    values = values_of((5, 5, 5))
+    kernels = [choose_plan(values, dtype, H100, batch=batch).kernel for batch in (None, 1, 43, 44, 1024)]
+    assert kernels == ["block", "cluster", "cluster", "block", "block"]
+    # what is asked for counts, and what fits
+    assert choose_plan(values, dtype, H100, "block", batch=1).kernel == "block"
+    assert choose_plan(values, dtype, H100._replace(cluster=1), batch=1).kernel == "block"
+    large = values_of((14, 14, 14))
+    assert choose_plan(large, dtype, H100, batch=1, progress=False).kernel == "grid"
 
 
 def test_contacts_take_shared_memory() -> None:

@@ -91,7 +91,7 @@ def test_absent_effects_change_no_bits(dtype: torch.dtype, device: torch.device)
             (
                 "1 patch,",
                 "one thread block an environment",
-                '"cluster", sooner done with a few environments, "grid" or "stream"',
+                '"cluster", sooner done with a few environments (batch=1), "grid" or "stream"',
             ),
         ),
         (

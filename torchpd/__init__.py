@@ -10,7 +10,7 @@ from .embedding import Embedding, embed
 from .extension import extension_error, load_extension
 from .mesh import MeshWarning, TetMesh, TriMesh
 from .scene import Scene
-from .solvers import Auto, Chebyshev, Jacobi, Multilevel
+from .solvers import Chebyshev, Jacobi, Multilevel
 from .state import Info, State, Track
 from .tetrahedralize import tetrahedralize
 from .version import __version__
@@ -41,7 +41,6 @@ else:  # meshes, scenes and the doctor work without it
 
 
 __all__ = [
-    "Auto",
     "CapturedStep",
     "Chebyshev",
     "Damping",

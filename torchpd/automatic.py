@@ -1,18 +1,18 @@
 """`solver="auto"`: guarded Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner.
 
 Decided when the simulator is made, when it moves to another device and by `Simulator.prepare_solver`, from the weights
-of the step (`forecast`) and what an iteration costs on the device, for the batch that `Auto` names. Nothing is run or
-timed, so the choice is the same every time. The batch of a state does not enter: an environment gives the same bits
-alone and in any batch.
+of the step (`forecast`) and what an iteration costs on the device, for the batch that the simulator was told. Nothing
+is run or timed, so the choice is the same every time. The batch of a state does not enter: an environment gives the
+same bits alone and in any batch.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from .forecast import Forecast, Spectrum, forecast, spectrum_of
-from .solvers import DEFAULT_ITERATIONS, Auto, Chebyshev, Multilevel, Solver, check_solver
+from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
 
 if TYPE_CHECKING:
     from .model import Model
@@ -67,7 +67,7 @@ class Costs(NamedTuple):
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
     "block": Costs(Cost(2.6, 5.0, 0.033, 0.022), Cost(31.0, 3.0, 0.6, 0.79)),
-    "cluster": Costs(Cost(0.7, 0.9), Cost(50.0, 2.4)),
+    "cluster": Costs(Cost(0.7, 0.9), Cost(29.0, 7.0)),
     "grid": Costs(Cost(1.2, 0.13), Cost(50.0, 2.4)),
     "stream": Costs(Cost(6.0, 0.18), Cost(50.0, 2.4)),
 }
@@ -80,23 +80,21 @@ class Choice:
     iterations: int
     sets_iterations: bool  # the user gave none
     why: str  # follows "chosen because"
-    batch: int = 1  # environments that it is for
 
 
-def choose_solver(sim: Model, iterations: int | None, wanted: Auto) -> tuple[Solver, Choice]:
+def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     """The solver for this scene and device, and why.
 
     Chebyshev gets a relaxation of min(1.9, 2 / (1 + mu)), which is best for a spectrum of [mu, 1].
 
     Args:
-        sim: scene, time step, material and device.
+        sim: scene, time step, material, device, and the batch to choose for.
         iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error. None
             sets as many as are expected to reach an error of `AIM`, times `MARGIN`.
-        wanted: the batch to choose for.
     """
 
     def chosen(enough: int, why: str) -> Choice:
-        return Choice(enough if iterations is None else iterations, iterations is None, why, wanted.batch)
+        return Choice(enough if iterations is None else iterations, iterations is None, why)
 
     spectrum = spectrum_of(sim)
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
@@ -104,17 +102,17 @@ def choose_solver(sim: Model, iterations: int | None, wanted: Auto) -> tuple[Sol
         return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
     plain, lasting, short = (_known(forecast(sim, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
     saves = short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
-    unprepared, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
-    multilevel = replace(unprepared, batch=wanted.batch)
+    multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
     if not _runs(multilevel, sim):
         where = f"{sim.device} with kernel={sim.kernel!r}" if sim.device.type == "cuda" else str(sim.device)
         return chebyshev, chosen(_enough(plain), f"{counts}, and Multilevel does not run on {where}")
     costs = COSTS[sim.plan.kernel or "cpu"]
-    times = [cost.iteration(sim.vertices, wanted.batch) for cost in (costs.chebyshev, costs.multilevel)]
+    batch = sim.batch or 1
+    times = [cost.iteration(sim.vertices, batch) for cost in (costs.chebyshev, costs.multilevel)]
     ratio = times[1] / times[0]
     both = f"{counts}, or {levels.words(AIM)} of Multilevel, each as long as {ratio:.2g}"
-    both += f" in a batch of {wanted.batch}" if wanted.batch > 1 else ""
+    both += f" in a batch of {batch}" if batch > 1 else ""
     if iterations is None:
         better = levels.iterations(AIM) * ratio < plain.iterations(AIM)
     else:

@@ -43,7 +43,7 @@ CONTENDERS: dict[str, Contender] = {
     "damped Jacobi": Contender(lambda sim, state: Jacobi(relaxation=1.9), safe=True),
     "classic Chebyshev": Contender(_classic, safe=False),
     "guarded Chebyshev": Contender(lambda sim, state: Chebyshev(), safe=True),
-    "Multilevel": Contender(lambda sim, state: Multilevel(batch=len(state.positions)), safe=True),
+    "Multilevel": Contender(lambda sim, state: Multilevel(), safe=True),
 }
 DEFAULT = "guarded Chebyshev"  # what `Simulator(scene)` does
 

@@ -73,6 +73,7 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         "iterations": sim.iterations,
         "tolerance": sim.tolerance,
         "kernel": sim.kernel,
+        "batch": sim.batch,
         "dtype": str(sim.dtype).removeprefix("torch."),
         "solver": {"kind": type(sim.solver).__name__, **dataclasses.asdict(sim.solver)},
         "choice": None if sim.choice is None else dataclasses.asdict(sim.choice),
@@ -208,6 +209,7 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
         dtype=_DTYPES[record["dtype"]],
         tolerance=record["tolerance"],
         kernel=record.get("kernel", "auto"),  # files of before there was a choice
+        batch=record.get("batch"),
     )
     sim.set_material(**{name: tensors[f"material.{name}"] for name, *_ in MATERIAL_TABLE})
     for name in record["trained"]:

@@ -13,11 +13,11 @@ from .checks import check_whole
 from .forecast import warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_batches, check_material, material_of
 from .multilevel import has_levels
-from .placing import check_wanted_device, plan_for_solver, plan_on, suits_solver
+from .placing import check_wanted_device, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
-from .solvers import DEFAULT_ITERATIONS, Auto, Chebyshev, Multilevel, Solver, auto_of, check_solver
+from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
 from .state import State
 from .targets import Anchors, Targets
 
@@ -47,11 +47,12 @@ class Model(nn.Module):
         scene: Scene,
         time_step: float = 1 / 60,
         iterations: int | None = None,
-        solver: Solver | Auto | Literal["auto"] | None = None,
+        solver: Solver | Literal["auto"] | None = None,
         dtype: torch.dtype = torch.float32,
         *,
         tolerance: float = 0.0,
         kernel: str = "auto",
+        batch: int | None = None,
         progress: bool = True,
     ) -> None:
         super().__init__()
@@ -61,13 +62,14 @@ class Model(nn.Module):
         self.time_step = _positive("time_step", time_step, "s")
         self.iterations = DEFAULT_ITERATIONS if iterations is None else check_whole("iterations", iterations, minimum=0)
         self._solver: Solver = Chebyshev()
-        wanted = auto_of(solver)
-        given = self._solver if solver is None or wanted is not None else check_solver(solver, torch.device("cpu"))
+        automatic = solver is None or _is_auto(solver)
+        given = self._solver if automatic else check_solver(solver, torch.device("cpu"))
         self.tolerance = float(tolerance)
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
         self.promise: Promise | None = None  # of `tune`
         self.kernel = check_kernel(kernel)
+        self.batch = None if batch is None else check_whole("batch", batch, minimum=1)
         values = scene.values()
         self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
         self.anchors = Anchors(scene, self.time_step)
@@ -75,8 +77,8 @@ class Model(nn.Module):
         for name, value in material_of(values, dtype).items():
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
         self.choice: Choice | None = None  # of "auto"
-        if wanted is not None:
-            self._choose_solver(None if iterations is None else self.iterations, wanted)
+        if _is_auto(solver):
+            self._choose_solver(None if iterations is None else self.iterations)
         else:
             self.solver = given
             if iterations is None:
@@ -99,18 +101,16 @@ class Model(nn.Module):
 
     @property
     def solver(self) -> Solver:
-        """How a step is solved. A multilevel one is prepared when it is set; "auto" and `Auto` set iterations too."""
+        """How a step is solved. A multilevel one is prepared when it is set; "auto" sets iterations too."""
         return self._solver
 
     @solver.setter
-    def solver(self, solver: Solver | Auto | Literal["auto"]) -> None:
-        wanted = auto_of(solver)
-        if wanted is not None:
-            return self._choose_solver(None, wanted)
+    def solver(self, solver: Solver | Literal["auto"]) -> None:
+        if _is_auto(solver):
+            return self._choose_solver(None)
         before = self._solver, self.choice
         self._solver, self.choice = check_solver(solver, self.device), None
-        there = isinstance(solver, Multilevel) == has_levels(self.plan.arrays)
-        if there and suits_solver(self.plan, self._solver):
+        if isinstance(solver, Multilevel) == has_levels(self.plan.arrays):
             return None
         try:
             self._prepare()
@@ -119,13 +119,13 @@ class Model(nn.Module):
             raise
         return None
 
-    def _choose_solver(self, iterations: int | None, wanted: Auto) -> None:
+    def _choose_solver(self, iterations: int | None) -> None:
         """What "auto" does, see `choose_solver`."""
         before = self.plan, self._solver, self.choice, self.iterations
         try:
             if self.plan.for_levels:
                 self.solver = Chebyshev()  # its kernel is one of the costs that are compared
-            self.solver, choice = choose_solver(self, iterations, wanted)
+            self.solver, choice = choose_solver(self, iterations)
             self.iterations, self.choice = choice.iterations, choice
         except BaseException:
             self.plan, self._solver, self.choice, self.iterations = before
@@ -134,7 +134,7 @@ class Model(nn.Module):
     def _choose_again(self, choice: Choice) -> None:
         """Iterations that somebody has set since stay."""
         own = choice.sets_iterations and self.iterations == choice.iterations
-        self._choose_solver(None if own else self.iterations, Auto(choice.batch))
+        self._choose_solver(None if own else self.iterations)
 
     def prepare_solver(self) -> None:
         """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`, the choice of "auto".
@@ -300,6 +300,10 @@ class Model(nn.Module):
             positions = self.scene.values().rest_positions
             self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
         return self
+
+
+def _is_auto(solver: object) -> bool:
+    return isinstance(solver, str) and solver == "auto"
 
 
 def _is_pair(state: Any) -> bool:

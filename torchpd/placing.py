@@ -13,13 +13,13 @@ from .gpu import free_memory, properties_of, refuse_full_memory, why_not
 from .material import material_of
 from .multilevel import precondition_plan, reference_of, reference_of_levels, without_levels
 from .plan import Plan, compile_plan
-from .regimes import are_many, choose_plan
-from .solvers import Multilevel, Solver
+from .regimes import choose_plan
+from .solvers import Multilevel
 
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_wanted_device", "plan_for_solver", "plan_on", "suits_solver"]
+__all__ = ["check_wanted_device", "plan_for_solver", "plan_on"]
 
 
 def _reason(device: torch.device | None = None) -> str:
@@ -58,24 +58,16 @@ def _compile(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
     if device.type != "cuda":
         return compile_plan(values, dtype=dtype, progress=False)
     levels = isinstance(sim.solver, Multilevel)
-    batch = sim.solver.batch if isinstance(sim.solver, Multilevel) else 1
-    return choose_plan(values, dtype, properties_of(device), sim.kernel, levels=levels, batch=batch, progress=False)
-
-
-def suits_solver(plan: Plan, solver: Solver) -> bool:
-    """Whether the patches of a plan are those for a solver; on the CPU all want the same."""
-    if plan.kernel is None:
-        return True
-    if not isinstance(solver, Multilevel):
-        return not plan.for_levels
-    return plan.for_levels and plan.many == are_many(solver.batch, properties_of(plan.device))
+    gpu = properties_of(device)
+    return choose_plan(values, dtype, gpu, sim.kernel, levels=levels, batch=sim.batch, progress=False)
 
 
 def plan_for_solver(sim: Model, material: Sequence[Tensor]) -> Plan:
     """The plan of a simulator for its solver, where it is, with what the solver prepares of a material."""
     wants = isinstance(sim.solver, Multilevel)
     plan = without_levels(sim.plan)
-    if not suits_solver(plan, sim.solver):
+    # kernels of a GPU want other patches for a multilevel solver than for the others
+    if plan.kernel is not None and wants != plan.for_levels:
         plan = _compile(sim, sim.dtype, sim.device).to(sim.device)
     if wants:
         plan = precondition_plan(plan, sim.scene.values(), *reference_of(plan, material, sim.time_step))

@@ -6,7 +6,8 @@
     grid     a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
     stream   launches for every iteration: any mesh
 
-A few environments of a small mesh are done in a quarter of the time with "cluster" as with "block", which is for many.
+A few environments of a small mesh are done in a quarter of the time with "cluster" as with "block", which is for many
+(`Simulator(batch=...)` says which they are).
 Every vertex belongs to one patch of a cluster, and a patch has every tetrahedron that touches one of its own vertices:
 those at the borders are worked out by several. So no forces are exchanged, and once an iteration the new position of a
 vertex is sent into the shared memory of the patches that have a copy of it. Patches of the others share no tetrahedra,
@@ -38,10 +39,11 @@ _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than th
 # "auto" looks at clusters for meshes of so many at most; where there are blocks, a patch of one for every so many
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
 _CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
-# with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block; where environments have
-# no more multiprocessors than so many each, fewer patches take less
-_LEVEL_TETS, _LEVEL_ALONE = 384, 1152
-_MANY_SHARE, _MANY_TETS = 3, 1900
+# environments are many where they have no more multiprocessors than so many each
+_MANY_SHARE = 3
+# with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block, of a mesh of so many at
+# most, fewer for few environments; many take less with fewer patches
+_LEVEL_TETS, _LEVEL_ALONE, _FEW_ALONE, _MANY_TETS = 384, 1152, 384, 1900
 # a patch at most, six rounds of its threads where all have partners, and how many patches share a multiprocessor of an
 # H100 (csrc/cuda/stream.h)
 _STREAM_TETS = {torch.float32: 2304, torch.float64: 960}
@@ -58,7 +60,7 @@ def check_kernel(kernel: str) -> str:
 
 
 def are_many(batch: int, gpu: Properties) -> bool:
-    """Whether a multilevel solver gets a plan for many environments."""
+    """Whether so many environments are better off with less work in all than with more blocks each."""
     return _MANY_SHARE * batch >= gpu.multiprocessors
 
 
@@ -109,11 +111,11 @@ class _Scene(NamedTuple):
             return min(gpu.cluster, gpu.multiprocessors, wanted, self.vertices, self.tets)
         if kernel == "grid":
             return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
-        if kernel in ("levels", "many") and self.tets <= _LEVEL_ALONE:
+        if kernel in ("levels", "few", "many") and self.tets <= (_FEW_ALONE if kernel == "few" else _LEVEL_ALONE):
             return 1
         if kernel == "many":
             return max(2, -(-self.tets // _MANY_TETS))
-        if kernel == "levels":
+        if kernel in ("levels", "few"):
             # 2.5 entries and at least a third of a slot a tetrahedron, see pass_shared_bytes
             each = (4 * 2.5 + 6 / 3) * self.real
             least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes - _C.corotation_bytes))
@@ -173,7 +175,7 @@ def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
     return _plan_that_fits(scene, gpu, "stream", lambda patches: 2 * patches)
 
 
-def _level_plan(scene: _Scene, gpu: Properties, many: bool) -> Plan:
+def _level_plan(scene: _Scene, gpu: Properties, few: bool, many: bool) -> Plan:
     """For a multilevel solver: as many patches for every multiprocessor, where one each is not enough."""
 
     def more(patches: int) -> int:
@@ -181,13 +183,14 @@ def _level_plan(scene: _Scene, gpu: Properties, many: bool) -> Plan:
         return (rounds + 1 + rounds // 4) * gpu.multiprocessors
 
     if not many:
-        return replace(_plan_that_fits(scene, gpu, "levels", more), why="what Multilevel runs with")
+        plan = _plan_that_fits(scene, gpu, "few" if few else "levels", more)
+        return replace(plan, why="what Multilevel runs with")
     plan = _plan_that_fits(scene, gpu, "many", lambda patches: patches + 1 + patches // 4)
     return replace(plan, many=True, why="what Multilevel runs with, of patches for many environments")
 
 
 def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
-    """For "stream", "levels" or "many"; `more`: the patches to try after so many with too many slots or forces."""
+    """For "stream", "levels", "few" or "many"; `more`: the patches to try after so many with too many slots or forces."""
     patches = min(scene.patches(name, gpu), scene.tets)
     while True:
         try:
@@ -208,7 +211,7 @@ def choose_plan(
     kernel: str = "auto",
     *,
     levels: bool = False,
-    batch: int = 1,
+    batch: int | None = None,
     progress: bool = True,
 ) -> Plan:
     """The plan of a scene for a GPU, on the CPU; move it with `Plan.to`.
@@ -218,19 +221,21 @@ def choose_plan(
         dtype: torch.float32 or torch.float64.
         gpu: what the device has.
         kernel: "auto" takes the first of "block", "cluster", "grid" and "stream" that fits; a "cluster" where the GPU
-            has them, and for a small mesh alone.
+            has them, and for a small mesh alone, and before a "block" for few environments.
         levels: for a multilevel solver, which runs as "stream" does but for its iterations.
-        batch: environments that such a solver is to be fast with.
+        batch: environments that a step will have, see `are_many`; None: not known.
         progress: show a bar when the mesh is large.
     """
     check_kernel(kernel)
     scene = _Scene(values, dtype, progress)
+    many = batch is not None and are_many(batch, gpu)
+    few = batch is not None and not many
     if levels:
         if kernel not in ("auto", "stream"):
             raise ValueError(
                 f'Simulator: Multilevel runs with kernel="stream" on a GPU, got kernel={kernel!r}; leave it at "auto"'
             )
-        return _level_plan(scene, gpu, are_many(batch, gpu))
+        return _level_plan(scene, gpu, few, many)
     if kernel == "cluster" and gpu.cluster == 1:
         raise ValueError(
             'Simulator: kernel="cluster" needs thread blocks that reach each other\'s shared memory (NVIDIA compute '
@@ -238,7 +243,7 @@ def choose_plan(
             "first that fits"
         )
     needs = []
-    for name in KERNELS[:-1]:
+    for name in ("cluster", "block", "grid") if few else ("block", "cluster", "grid"):
         if kernel != name and not (kernel == "auto" and scene.considers(name, gpu)):
             continue
         plan, needed = _fused_plan(scene, name, gpu)

@@ -45,12 +45,15 @@ class Simulator(Model):
         solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later. None is Chebyshev.
             "auto" takes Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner on the device,
             and as many iterations as that takes unless they are given; `print(sim)` says why. It chooses anew when the
-            simulator moves to another device and in `prepare_solver`. `Auto(batch=1024)` chooses for so many
-            environments, "auto" for one.
+            simulator moves to another device and in `prepare_solver`.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "cluster", "grid" or "stream", see
             `torchpd.regimes`; "auto" takes the first that fits. Changes nothing on the CPU.
+        batch: environments that a step will have, where you know it: a GPU's kernel, the patches and preconditioner of
+            `Multilevel` and the choice of "auto" are for so many. States of any batch may come, and an environment has
+            the same bits in all of them; but what is made for a thousand takes several times as long for one, and the
+            other way round. None: not known; kernels are then for many, the rest for one. Changes nothing on the CPU.
         progress: show a bar while a large scene compiles.
     """
 

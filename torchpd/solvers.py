@@ -7,17 +7,15 @@ from typing import Literal, TypedDict
 
 import torch
 
-from .checks import check_scalar, check_whole
+from .checks import check_scalar
 
 __all__ = [
     "DEFAULT_ITERATIONS",
-    "Auto",
     "Chebyshev",
     "Jacobi",
     "Multilevel",
     "Solver",
     "SolverNumbers",
-    "auto_of",
     "check_solver",
 ]
 
@@ -139,7 +137,7 @@ class Multilevel:
 
     For stiff and for accurate steps: a dozen or two of iterations do, however stiff or fine the mesh, each at four to
     five times the cost of a Jacobi iteration on a CPU, and 5 to 36 times on a GPU, where M of a mesh of up to 1024
-    vertices is A^-1 itself unless it comes in batches. The scene takes longer to compile.
+    vertices is A^-1 itself unless it comes in batches (`Simulator(batch=...)`). The scene takes longer to compile.
 
     Every iterate is judged by its energy before the next one starts from it. Contacts project every iterate; while they
     hold vertices M fits less well. With friction, which has no energy, the judgement allows a rise of 1 %.
@@ -154,19 +152,13 @@ class Multilevel:
             time of one or two more. Bodies that bend or spin need a third to two thirds of the iterations, others as
             many as with "lbfgs".
         relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8.
-        batch: environments that a step will have, a whole number >= 1. Where they leave a GPU no more than three
-            multiprocessors each, it gets larger patches, and levels also for a mesh of up to 1024 vertices: less to
-            read in place of shorter phases. States of any other batch may come, and each environment's bits stay. On
-            a CPU it changes nothing.
     """
 
     outer: Literal["corotated", "lbfgs", "momentum"] = "corotated"
     relaxation: float | None = None
-    batch: int = 1
 
     def __post_init__(self) -> None:
         _check_choice("Multilevel.outer", self.outer, tuple(_SCHEDULES))
-        object.__setattr__(self, "batch", check_whole("Multilevel.batch", self.batch, minimum=1))
         if self.relaxation is not None and not 0.0 < check_scalar("Multilevel.relaxation", self.relaxation) < 2.0:
             raise ValueError(f"Multilevel.relaxation must lie in (0, 2), got {self.relaxation}")
 
@@ -182,37 +174,15 @@ class Multilevel:
         }
 
 
-@dataclass(frozen=True)
-class Auto:
-    """In place of a solver: `Chebyshev` or `Multilevel`, whichever is expected to reach an error of 1e-3 sooner.
-
-    "auto" is short for `Auto()`. On a GPU many environments share the time of one, unequally for the two solvers, so
-    say how many there will be. States of any other batch may come: the choice stays, and with it the bits of each.
-
-    Args:
-        batch: environments that a step will have, a whole number >= 1.
-    """
-
-    batch: int = 1
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "batch", check_whole("Auto.batch", self.batch, minimum=1))
-
-
 Solver = Jacobi | Chebyshev | Multilevel
 DEFAULT_ITERATIONS = 64  # of a simulator that is given none
-
-
-def auto_of(solver: object) -> Auto | None:
-    """What asks to choose, if it does."""
-    return Auto() if isinstance(solver, str) and solver == "auto" else solver if isinstance(solver, Auto) else None
 
 
 def check_solver(solver: object, device: torch.device) -> Solver:
     """The solver, if a simulator on this device can have it."""
     if not isinstance(solver, Jacobi | Chebyshev | Multilevel):
         given = repr(solver) if isinstance(solver, str) else type(solver).__name__
-        raise TypeError(f'Simulator: solver must be Jacobi, Chebyshev, Multilevel, Auto or "auto", got {given}')
+        raise TypeError(f'Simulator: solver must be Jacobi, Chebyshev, Multilevel or "auto", got {given}')
     if isinstance(solver, Multilevel) and device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"Simulator: Multilevel is prepared on the CPU or on a GPU, not on {device}")
     return solver

@@ -31,8 +31,7 @@ def _solver_line(sim: Simulator) -> str:
     if isinstance(sim.solver, Chebyshev):
         name = f"Chebyshev {sim.solver.schedule}"
     if isinstance(sim.solver, Multilevel):
-        batch = f" for a batch of {sim.solver.batch}" if sim.solver.batch > 1 else ""
-        name = f"Multilevel {sim.solver.outer}{batch}"
+        name = f"Multilevel {sim.solver.outer}"
     stop = f"at most {sim.iterations}" if sim.tolerance else f"{sim.iterations}"
     rho = f", rho {numbers['rho']:g}" if numbers["rho"] else ""
     diagonal = "weighted" if numbers["weighted"] else "plain"
@@ -124,12 +123,14 @@ def _kernel_lines(sim: Simulator) -> list[str]:
         shared = "{} copies of tetrahedra and {} of vertices".format(*copies)
     launches = _LEVEL_LAUNCHES if plan.for_levels else _LAUNCHES[kernel]
     others = any_of([name for name in _LAUNCHES if name != kernel])
-    if kernel == "block":
-        others = others.replace('"cluster"', '"cluster", sooner done with a few environments')
+    if kernel == "block" and sim.batch is None:
+        others = others.replace('"cluster"', '"cluster", sooner done with a few environments (batch=1)')
+    batch = f"; for a batch of {sim.batch}" if sim.batch else ""
+    asked = "" if plan.for_levels else f"; Simulator(..., kernel=...) may ask for {others}"
     return [
         f"kernel {kernel}: {launches}",
         f"mesh: {patches}, {shared}, {block:,} B of shared memory a thread block",
-        f"why {kernel}: {plan.why}" + ("" if plan.for_levels else f"; Simulator(..., kernel=...) may ask for {others}"),
+        f"why {kernel}: {plan.why}{batch}{asked}",
     ]
 
 
