@@ -190,7 +190,7 @@ def _level_plan(scene: _Scene, gpu: Properties, few: bool, many: bool) -> Plan:
 
 
 def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
-    """For "stream", "levels", "few" or "many"; `more`: the patches to try after so many with too many slots or forces."""
+    """For "stream" or a multilevel solver; `more`: the patches to try after so many with too many slots or forces."""
     patches = min(scene.patches(name, gpu), scene.tets)
     while True:
         try:
