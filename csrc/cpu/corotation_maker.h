@@ -184,14 +184,21 @@ class CorotationMaker {
 
   void set_image(std::int64_t i) const {
     const Level<1, T> level = fine_level(plan_.levels);
-    Real sum[turning_numbers];
-    for (Real& s : sum) s = Real(T(0));
+    // of one environment several numbers at once
+    using Some = std::conditional_t<width == 1, Pack<T, native_width<T>>, Real>;
+    constexpr int packs = turning_numbers * sizeof(Real) / sizeof(Some);
+    Some sum[packs];
+    for (Some& s : sum) s = Some(T(0));
     for (int32 p = level.start[i]; p < level.start[i + 1]; ++p) {
-      const Real* from = shared_.numbers[level.column[p]].of;
-      const Real a(level.value[p]);
-      for (int m = 0; m < turning_numbers; ++m) sum[m] = multiply_add(a, from[m], sum[m]);
+      const T* from = reinterpret_cast<const T*>(shared_.numbers[level.column[p]].of);
+      const Some a(level.value[p]);
+      for (int n = 0; n < packs; ++n)
+        sum[n] = multiply_add(a, Some::load(from + n * Some::width), sum[n]);
     }
-    for (int m = 0; m < turning_numbers; ++m) renew(shared_.images[i].of[m], sum[m]);
+    Real found[turning_numbers];
+    static_assert(sizeof(found) == sizeof(sum));
+    std::memcpy(found, sum, sizeof(sum));
+    for (int m = 0; m < turning_numbers; ++m) renew(shared_.images[i].of[m], found[m]);
   }
 
   // only in lanes that ask
