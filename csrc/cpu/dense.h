@@ -5,14 +5,13 @@
 #pragma once
 #include "cpu/lanes.h"
 #include "cpu/team.h"
+#include "solver/multilevel.h"
 
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
 
 namespace pd::inline PD_TARGET {
-
-constexpr int row_chains = 4;
 
 template <class Lanes>
 class Dense {

@@ -85,7 +85,43 @@ PD_HD Level<4, T> middle_level(const Levels<T>& l) {
           l.middle_lift_weight, l.middle_node_start, l.middle_node_row,   l.middle_node_lift};
 }
 
+// What a processor without enough to do meanwhile would wait for: chains of sums, which are added up last.
+constexpr int row_chains = 4;
+
+template <class Value>
+PD_HD Value join(const Value (&sum)[row_chains]) {
+  return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+// A x, one row of numbers: number p of it goes to chain p mod 4.
+template <class Real, class T, class Value>
+PD_HD Value row_product(const Level<1, T>& level, const Value* x, int row) {
+  const int32 end = level.start[row + 1];
+  int32 p = level.start[row];
+  Value sum[row_chains] = {};
+  const auto add = [&](int c, int32 at, T a) {
+    sum[c] = multiply_add(Real(a), x[level.column[at]], sum[c]);
+  };
+  for (; p + row_chains < end; p += row_chains) {
+    for (int c = 0; c < row_chains; ++c) add(c, p + c, level.value[p + c]);
+  }
+  if constexpr (sizeof(Real) > sizeof(T)) {
+    for (int c = 0; p + c < end; ++c) add(c, p + c, level.value[p + c]);
+  } else if (p < end) {
+    // zeros to the end of four: how many numbers are left could not be foreseen
+    for (int c = 0; c < row_chains; ++c) {
+      const int32 at = p + c < end ? p + c : end - 1;
+      add(c, at, p + c < end ? level.value[at] : T(0));
+    }
+  }
+  return join(sum);
+}
+
 // sum -= A x, one row
+template <class Real, class T, class Value>
+PD_HD void subtract_row(const Level<1, T>& level, const Value* x, int row, Value (&sum)[1]) {
+  sum[0] = sum[0] - row_product<Real>(level, x, row);
+}
 template <class Real, int B, class T, class Value>
 PD_HD void subtract_row(const Level<B, T>& level, const Value* x, int row, Value (&sum)[B]) {
   for (int32 p = level.start[row]; p < level.start[row + 1]; ++p) {
@@ -107,6 +143,16 @@ PD_HD void add_lift(const Level<B, T>& level, const Value* x, int row, Value (&s
       for (int j = 0; j < 4; ++j) sum[i] = multiply_add(Real(weight[i * 4 + j]), from[j], sum[i]);
     }
   }
+}
+template <class Real, class T, class Value>
+PD_HD void add_lift(const Level<1, T>& level, const Value* x, int row, Value (&sum)[1]) {
+  Value part[row_chains] = {};
+  for (int32 p = level.lift_start[row]; p < level.lift_start[row + 1]; ++p) {
+    const Value* from = x + std::int64_t(level.lift_node[p]) * 4;
+    const T* weight = level.lift_weight + std::int64_t(p) * 4;
+    for (int j = 0; j < 4; ++j) part[j] = multiply_add(Real(weight[j]), from[j], part[j]);
+  }
+  sum[0] = sum[0] + join(part);
 }
 
 // sum += P^T x, the four functions of one node
