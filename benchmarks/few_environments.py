@@ -1,4 +1,4 @@
-"""Up to how many environments of a small mesh the kernel "cluster" is faster than "block", which `kernel="auto"` takes.
+"""Up to how many environments of a small mesh the kernel "cluster" is faster than "block".
 
 Bars that are held at one end and thrown downwards, float32, 64 guarded iterations. A time is that of a CUDA graph of
 one step, so the start of the graph is in it; medians.

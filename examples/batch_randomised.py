@@ -19,7 +19,8 @@ def main() -> None:
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (13, 3, 3))
     bar = pd.Solid(mesh, youngs=1e5, density=1000.0)
     wall = pd.Pin(bar, mesh.vertices[:, 0] == 0.0)
-    sim = pd.Simulator(pd.Scene(bar, wall, pd.Gravity(), pd.Damping(1.0)), time_step=1 / 60, iterations=64)
+    scene = pd.Scene(bar, wall, pd.Gravity(), pd.Damping(1.0))
+    sim = pd.Simulator(scene, time_step=1 / 60, iterations=64, batch=options.batch)
 
     # any material array may have a leading batch: one value, or one array, for each environment
     generator = torch.Generator().manual_seed(0)

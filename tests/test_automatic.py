@@ -113,6 +113,12 @@ def test_the_batch_decides_where_environments_share_a_device(monkeypatch: pytest
     assert isinstance(many.solver, pd.Chebyshev)
     assert "each as long as 30 in a batch of 1024" in repr(many)
     assert "in a batch" not in repr(unknown)
+    assert "in a batch" not in repr(alone)
+    # which may be said later
+    alone.batch = 1024
+    assert isinstance(alone.solver, pd.Chebyshev)
+    alone.batch = 1
+    assert isinstance(alone.solver, pd.Multilevel)
     # another choice is for the same batch: after a change, in a file, on another precision
     many.prepare_solver()
     assert isinstance(many.solver, pd.Chebyshev)

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -136,6 +137,23 @@ def test_kernel_comes_back_and_older_files_have_none(file: Path) -> None:
     rewrite(file, lambda _, record: record.update(kernel="warp"))
     with pytest.raises(ValueError, match=r"damaged: .*kernel must be"):
         pd.Simulator.load(file)
+
+
+def test_batch_comes_back_and_older_files_have_none(file: Path) -> None:
+    """Files of before simulators had one said it with the choice of "auto"."""
+    body = pd.Solid(pd.shapes.single_tet(), youngs=1e4)
+    pd.Simulator(pd.Scene(body), solver="auto", batch=5).save(file)
+    assert pd.Simulator.load(file).batch == 5
+    for former, batch in ((1024, 1024), (1, None)):
+
+        def age(_: object, record: dict[str, Any], former: int = former) -> None:
+            record.pop("batch", None)
+            record["choice"]["batch"] = former
+
+        rewrite(file, age)
+        loaded = pd.Simulator.load(file)
+        assert loaded.batch == batch
+        assert loaded.choice is not None
 
 
 def test_saving_what_was_loaded_gives_the_same_file(tmp_path: Path) -> None:

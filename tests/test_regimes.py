@@ -12,8 +12,9 @@ import torch
 from cases import box
 
 import torchpd as pd
-from torchpd import _C, placing, regimes
+from torchpd import _C, model, placing, regimes
 from torchpd.gpu import Properties, refuse_full_memory, why_not
+from torchpd.multilevel import precondition_plan
 from torchpd.plan import KERNELS, Plan, compile_plan
 from torchpd.regimes import choose_plan, shared_bytes
 from torchpd.scene import SceneValues
@@ -231,36 +232,76 @@ def test_patches_of_a_multilevel_solver_fit(gpu: Properties, dtype: torch.dtype)
         choose_plan(values, dtype, gpu, "block", levels=True)
 
 
-@pytest.mark.parametrize("gpu", [Properties(1, 232_448), Properties(20, 101_376), H100])
+@pytest.mark.parametrize("gpu", [Properties(8, 232_448), Properties(20, 101_376), H100])
 def test_many_environments_of_a_multilevel_solver_get_larger_patches(gpu: Properties, dtype: torch.dtype) -> None:
     values = values_of((9, 9, 9))  # 3 645 or more tetrahedra
-    least = -(-gpu.multiprocessors // 3)
+    least = -(-gpu.multiprocessors // 4)
     few, many = (choose_plan(values, dtype, gpu, levels=True, batch=batch) for batch in (least - 1, least))
     assert (few.many, many.many) == (False, True)
     assert many.for_levels
-    assert "for many environments" in many.why
     assert shared_bytes(many, 0, 0) <= gpu.shared
     if gpu == H100 and dtype == torch.float32:
         assert (few.patches, many.patches) == (12, 3)
 
 
 def test_blocks_of_a_multilevel_solver_share_a_small_mesh_where_environments_are_few(dtype: torch.dtype) -> None:
-    """Alone in half the time; in large batches, and where nobody knows, one block does it."""
+    """Which is done sooner; in large batches, and where nobody knows, one block does it."""
     values = values_of((5, 5, 5))  # 625 or more tetrahedra
-    assert [choose_plan(values, dtype, H100, levels=True, batch=b).patches for b in (None, 1, 43, 44)] == [1, 2, 2, 1]
+    assert [choose_plan(values, dtype, H100, levels=True, batch=b).patches for b in (None, 1, 32, 33)] == [1, 2, 2, 1]
     assert choose_plan(values_of((3, 3, 3)), dtype, H100, levels=True, batch=1).patches == 1
 
 
+def test_many_environments_of_several_patches_get_levels() -> None:
+    """A direct solve reads more, but has fewer phases: it serves all others of up to 1024 vertices."""
+
+    def is_direct(cells: int, batch: int | None) -> bool:
+        values = values_of((cells, cells, cells))
+        plan = choose_plan(values, torch.float32, H100, levels=True, batch=batch)
+        inertia = torch.ones(plan.vertices, dtype=torch.float64)
+        made = precondition_plan(plan, values, torch.full((len(values.tets),), 1e5, dtype=torch.float64), inertia)
+        return bool(made.level_sizes[6])
+
+    assert [is_direct(7, batch) for batch in (None, 1, 1024)] == [True, True, False]
+    assert is_direct(4, 1024)
+
+
 def test_few_environments_of_a_small_mesh_get_a_cluster(dtype: torch.dtype) -> None:
-    """Which is done sooner; 132 multiprocessors have 44 environments or more before they are many."""
+    """Which is done sooner; 132 multiprocessors have 33 environments or more before they are many."""
     values = values_of((5, 5, 5))
-    kernels = [choose_plan(values, dtype, H100, batch=batch).kernel for batch in (None, 1, 43, 44, 1024)]
+    kernels = [choose_plan(values, dtype, H100, batch=batch).kernel for batch in (None, 1, 32, 33, 1024)]
     assert kernels == ["block", "cluster", "cluster", "block", "block"]
     # what is asked for counts, and what fits
     assert choose_plan(values, dtype, H100, "block", batch=1).kernel == "block"
     assert choose_plan(values, dtype, H100._replace(cluster=1), batch=1).kernel == "block"
     large = values_of((14, 14, 14))
     assert choose_plan(large, dtype, H100, batch=1, progress=False).kernel == "grid"
+
+
+def test_a_simulator_passes_its_batch_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """When it moves, and when either the batch or the solver changes on a GPU."""
+    asked = []
+
+    def chosen(values: SceneValues, *_: object, batch: int | None, **__: object) -> Plan:
+        asked.append(batch)
+        return compile_plan(values, progress=False)
+
+    monkeypatch.setattr(placing, "choose_plan", chosen)
+    monkeypatch.setattr(placing, "properties_of", lambda _: H100)
+    sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e4)), 1 / 60, 8, batch=3)
+    placing.plan_anew(sim, torch.float32, torch.device("cuda"))
+    assert asked == [3]
+    sim.batch = 4
+    assert asked == [3]  # no plan of a CPU knows of it
+    monkeypatch.setattr(Plan, "kernel", "stream")
+    monkeypatch.setattr(model, "plan_anew", lambda sim, *_: chosen(sim.scene.values(), batch=sim.batch))
+    sim.batch = 5
+    assert asked == [3, 5]
+    for wrong in (0, "x"):
+        with pytest.raises(ValueError, match="batch must be a whole number >= 1"):
+            sim.batch = wrong  # type: ignore[assignment]
+    assert sim.batch == 5
+    sim.batch = None
+    assert asked == [3, 5, None]
 
 
 def test_contacts_take_shared_memory() -> None:

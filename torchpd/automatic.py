@@ -67,7 +67,7 @@ class Costs(NamedTuple):
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
     "block": Costs(Cost(2.6, 5.0, 0.033, 0.022), Cost(31.0, 3.0, 0.6, 0.79)),
-    "cluster": Costs(Cost(0.7, 0.9), Cost(29.0, 7.0)),
+    "cluster": Costs(Cost(0.8, 0.5), Cost(28.0, 9.0)),
     "grid": Costs(Cost(1.2, 0.13), Cost(50.0, 2.4)),
     "stream": Costs(Cost(6.0, 0.18), Cost(50.0, 2.4)),
 }

@@ -82,7 +82,7 @@ def run_demo(options: DemoOptions) -> str:
     name = options.mesh.name if options.mesh else "octopus"
     mesh = _place(_load(options.mesh), options.cells)
     scene = Scene(Solid(mesh, youngs=options.youngs, density=1000.0), Gravity(), Ground(friction=0.5))
-    sim = Simulator(scene, TIME_STEP, iterations=options.iterations).to(device)
+    sim = Simulator(scene, TIME_STEP, iterations=options.iterations, batch=1).to(device)
     options.out.mkdir(parents=True, exist_ok=True)
 
     motion = _simulate(sim, mesh, options.steps)

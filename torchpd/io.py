@@ -200,6 +200,8 @@ def _record(path: Path, metadata: Mapping[str, str] | None) -> Record:
 
 
 def _build(record: Record, tensors: _Tensors) -> Simulator:
+    choice = dict(record.get("choice") or {})
+    former = choice.pop("batch", 1)  # of files of before simulators had one
     meshes = [_mesh(number, mesh, tensors) for number, mesh in enumerate(record["meshes"])]
     sim = Simulator(
         Scene(*_parts(record["parts"], meshes, tensors)),
@@ -209,7 +211,7 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
         dtype=_DTYPES[record["dtype"]],
         tolerance=record["tolerance"],
         kernel=record.get("kernel", "auto"),  # files of before there was a choice
-        batch=record.get("batch"),
+        batch=record.get("batch", former if former > 1 else None),
     )
     sim.set_material(**{name: tensors[f"material.{name}"] for name, *_ in MATERIAL_TABLE})
     for name in record["trained"]:
@@ -218,8 +220,8 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
         stiffness, inertia = (tensors[f"solver.{name}"] for name in _REFERENCE)
         if not all(map(torch.equal, (stiffness, inertia), reference_of_levels(sim.plan.arrays))):
             sim.plan = precondition_plan(sim.plan, sim.scene.values(), stiffness, inertia)
-    if record.get("choice") is not None:  # of "auto", which chooses anew on another device
-        sim.choice = Choice(**record["choice"])
+    if choice:  # of "auto", which chooses anew on another device
+        sim.choice = Choice(**choice)
     return sim
 
 

@@ -13,7 +13,7 @@ from .checks import check_whole
 from .forecast import warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_batches, check_material, material_of
 from .multilevel import has_levels
-from .placing import check_wanted_device, plan_for_solver, plan_on
+from .placing import check_wanted_device, plan_anew, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
@@ -69,7 +69,7 @@ class Model(nn.Module):
             raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
         self.promise: Promise | None = None  # of `tune`
         self.kernel = check_kernel(kernel)
-        self.batch = None if batch is None else check_whole("batch", batch, minimum=1)
+        self._batch = _check_batch(batch)
         values = scene.values()
         self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
         self.anchors = Anchors(scene, self.time_step)
@@ -98,6 +98,24 @@ class Model(nn.Module):
     def device(self) -> torch.device:
         """Where states have to be."""
         return self.plan.device
+
+    @property
+    def batch(self) -> int | None:
+        """Environments that a step will have; setting it makes the plan of a GPU and the choice of "auto" anew."""
+        return self._batch
+
+    @batch.setter
+    def batch(self, batch: int | None) -> None:
+        before = self._batch, self.plan
+        self._batch = _check_batch(batch)
+        try:
+            if self.plan.kernel is not None:
+                self.plan = plan_anew(self, self.dtype, self.device).to(self.device)
+            if self.choice is not None:
+                self._choose_again(self.choice)
+        except BaseException:
+            self._batch, self.plan = before
+            raise
 
     @property
     def solver(self) -> Solver:
@@ -300,6 +318,10 @@ class Model(nn.Module):
             positions = self.scene.values().rest_positions
             self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
         return self
+
+
+def _check_batch(batch: int | None) -> int | None:
+    return None if batch is None else check_whole("batch", batch, minimum=1)
 
 
 def _is_auto(solver: object) -> bool:

@@ -20,7 +20,7 @@ from .tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE
 __all__ = ["has_levels", "precondition_plan", "reference_of", "reference_of_levels", "without_levels"]
 
 # Two dense products there take less time than the many short phases of a cycle: each of those waits for all blocks.
-# With many environments, of a block or two each, the cycle's fewer numbers take less.
+# With many environments, of a block or two each, the cycle's fewer numbers take less, but for a mesh of one patch.
 MOST_DIRECT = 1024
 
 Reference = tuple[Tensor, Tensor]  # stiffness [E] Pa, and inertia a [V] N/m in the user's order, inf where held
@@ -79,14 +79,15 @@ def precondition_plan(
         values: of the scene that the plan was compiled from.
         stiffness: [E] Pa.
         inertia: a of each vertex [V] N/m in the user's order, inf where held.
-        most_direct: up to so many vertices M is A^-1, without levels. None: `MOST_DIRECT` on a GPU that has few
-            environments, else 0.
+        most_direct: up to so many vertices M is A^-1, without levels. None: `MOST_DIRECT` on a GPU, but for many
+            environments of a mesh of several patches; 0 there and on a CPU.
         progress: show a bar when the mesh is large.
     """
     plan = without_levels(plan)
     order = plan.vertex_order.cpu().numpy()
     if most_direct is None:
-        most_direct = MOST_DIRECT if plan.kernel is not None and not plan.many else 0
+        cycles = plan.kernel is None or (plan.many and plan.patches > 1)
+        most_direct = 0 if cycles else MOST_DIRECT
 
     def rounded(values: Tensor) -> NDArray[np.float64]:
         """In the plan's precision, which the arrays will have: it decides the bits."""

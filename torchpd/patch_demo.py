@@ -200,7 +200,7 @@ def run_patch_demo(options: DemoOptions) -> str:
 def _simulate(scene: PatchScene, options: DemoOptions, device: torch.device, level: int) -> _Run:
     subject = scene.subject(stiffness=0.5 * options.youngs, steps=options.steps, device=device)
     body = subject.body
-    sim = Simulator(subject.scene, TIME_STEP, options.iterations).to(device)
+    sim = Simulator(subject.scene, TIME_STEP, options.iterations, batch=1).to(device)
     start = sim.rest_state()
     sim.rollout(start, 2, targets=subject.targets)  # the first steps also allocate their workspace
     begin = _now(device)

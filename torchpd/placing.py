@@ -19,7 +19,7 @@ from .solvers import Multilevel
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_wanted_device", "plan_for_solver", "plan_on"]
+__all__ = ["check_wanted_device", "plan_anew", "plan_for_solver", "plan_on"]
 
 
 def _reason(device: torch.device | None = None) -> str:
@@ -74,21 +74,25 @@ def plan_for_solver(sim: Model, material: Sequence[Tensor]) -> Plan:
     return plan
 
 
+def plan_anew(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
+    """The plan of a simulator for a precision and a device, on the CPU."""
+    plan = _compile(sim, dtype, device)
+    if not isinstance(sim.solver, Multilevel):
+        return plan
+    # what M was made of goes along, as into a file; coming from "meta" the values are lost
+    if sim.device.type == "meta":
+        arrays = list(material_of(sim.scene.values(), sim.dtype).values())
+        source = compile_plan(sim.scene.values(), dtype=sim.dtype, progress=False)
+        reference = reference_of(source, arrays, sim.time_step)
+    else:
+        reference = reference_of_levels(sim.plan.arrays)
+    return precondition_plan(plan, sim.scene.values(), *reference)
+
+
 def plan_on(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
     """The plan of a simulator for a precision and a device: its own moved there where that will do."""
-    if dtype == sim.dtype and _same_plan(sim.device, device):
-        plan = sim.plan
-    else:
-        plan = _compile(sim, dtype, device)
-        if isinstance(sim.solver, Multilevel):
-            # what M was made of goes along, as into a file; coming from "meta" the values are lost
-            if sim.device.type == "meta":
-                arrays = list(material_of(sim.scene.values(), sim.dtype).values())
-                source = compile_plan(sim.scene.values(), dtype=sim.dtype, progress=False)
-                reference = reference_of(source, arrays, sim.time_step)
-            else:
-                reference = reference_of_levels(sim.plan.arrays)
-            plan = precondition_plan(plan, sim.scene.values(), *reference)
+    same = dtype == sim.dtype and _same_plan(sim.device, device)
+    plan = sim.plan if same else plan_anew(sim, dtype, device)
     if device.type == "cuda" and device != sim.device:
         material = sum(array.numel() for array in (*sim.material(), sim.rest_positions))
         refuse_full_memory(plan.bytes + material * (torch.finfo(dtype).bits // 8), free_memory(device))

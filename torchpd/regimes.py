@@ -33,17 +33,18 @@ from .plan import KERNELS, Plan, any_of
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE
 
-__all__ = ["are_many", "check_kernel", "choose_plan", "shared_bytes"]
+__all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
 _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
 # "auto" looks at clusters for meshes of so many at most; where there are blocks, a patch of one for every so many
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
 _CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
 # environments are many where they have no more multiprocessors than so many each
-_MANY_SHARE = 3
+_MANY_SHARE = 4
 # with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block, of a mesh of so many at
 # most, fewer for few environments; many take less with fewer patches
 _LEVEL_TETS, _LEVEL_ALONE, _FEW_ALONE, _MANY_TETS = 384, 1152, 384, 1900
+_LEVELS = ("few", "any", "many")  # how many environments it is for
 # a patch at most, six rounds of its threads where all have partners, and how many patches share a multiprocessor of an
 # H100 (csrc/cuda/stream.h)
 _STREAM_TETS = {torch.float32: 2304, torch.float64: 960}
@@ -57,11 +58,6 @@ def check_kernel(kernel: str) -> str:
     if kernel not in names:
         raise ValueError(f"Simulator: kernel must be {any_of(names)}, got {kernel!r}")
     return kernel
-
-
-def are_many(batch: int, gpu: Properties) -> bool:
-    """Whether so many environments are better off with less work in all than with more blocks each."""
-    return _MANY_SHARE * batch >= gpu.multiprocessors
 
 
 def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
@@ -104,6 +100,7 @@ class _Scene(NamedTuple):
         return shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
 
     def patches(self, kernel: str, gpu: Properties) -> int:
+        """By the name of a kernel, or for a multilevel solver "few", "many" or any other number of environments."""
         if kernel == "block":
             return 1
         if kernel == "cluster":
@@ -111,14 +108,14 @@ class _Scene(NamedTuple):
             return min(gpu.cluster, gpu.multiprocessors, wanted, self.vertices, self.tets)
         if kernel == "grid":
             return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
-        if kernel in ("levels", "few", "many") and self.tets <= (_FEW_ALONE if kernel == "few" else _LEVEL_ALONE):
-            return 1
-        if kernel == "many":
-            return max(2, -(-self.tets // _MANY_TETS))
-        if kernel in ("levels", "few"):
+        if kernel in _LEVELS:
+            if self.tets <= (_FEW_ALONE if kernel == "few" else _LEVEL_ALONE):
+                return 1
             # 2.5 entries and at least a third of a slot a tetrahedron, see pass_shared_bytes
             each = (4 * 2.5 + 6 / 3) * self.real
             least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes - _C.corotation_bytes))
+            if kernel == "many":
+                return max(2, int(least), -(-self.tets // _MANY_TETS))
             rounds = -(-int(least) // gpu.multiprocessors)
             return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
         patches = -(-self.tets // _STREAM_TETS[self.dtype])
@@ -175,18 +172,17 @@ def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
     return _plan_that_fits(scene, gpu, "stream", lambda patches: 2 * patches)
 
 
-def _level_plan(scene: _Scene, gpu: Properties, few: bool, many: bool) -> Plan:
+def _level_plan(scene: _Scene, gpu: Properties, name: str) -> Plan:
     """For a multilevel solver: as many patches for every multiprocessor, where one each is not enough."""
 
     def more(patches: int) -> int:
+        if name == "many":
+            return patches + 1 + patches // 4
         rounds = -(-patches // gpu.multiprocessors)
         return (rounds + 1 + rounds // 4) * gpu.multiprocessors
 
-    if not many:
-        plan = _plan_that_fits(scene, gpu, "few" if few else "levels", more)
-        return replace(plan, why="what Multilevel runs with")
-    plan = _plan_that_fits(scene, gpu, "many", lambda patches: patches + 1 + patches // 4)
-    return replace(plan, many=True, why="what Multilevel runs with, of patches for many environments")
+    plan = _plan_that_fits(scene, gpu, name, more)
+    return replace(plan, many=name == "many", why="what Multilevel runs with")
 
 
 def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
@@ -223,19 +219,18 @@ def choose_plan(
         kernel: "auto" takes the first of "block", "cluster", "grid" and "stream" that fits; a "cluster" where the GPU
             has them, and for a small mesh alone, and before a "block" for few environments.
         levels: for a multilevel solver, which runs as "stream" does but for its iterations.
-        batch: environments that a step will have, see `are_many`; None: not known.
+        batch: environments that a step will have; None: not known, which is between few and many.
         progress: show a bar when the mesh is large.
     """
     check_kernel(kernel)
     scene = _Scene(values, dtype, progress)
-    many = batch is not None and are_many(batch, gpu)
-    few = batch is not None and not many
+    size = "any" if batch is None else "many" if _MANY_SHARE * batch >= gpu.multiprocessors else "few"
     if levels:
         if kernel not in ("auto", "stream"):
             raise ValueError(
                 f'Simulator: Multilevel runs with kernel="stream" on a GPU, got kernel={kernel!r}; leave it at "auto"'
             )
-        return _level_plan(scene, gpu, few, many)
+        return _level_plan(scene, gpu, size)
     if kernel == "cluster" and gpu.cluster == 1:
         raise ValueError(
             'Simulator: kernel="cluster" needs thread blocks that reach each other\'s shared memory (NVIDIA compute '
@@ -243,7 +238,7 @@ def choose_plan(
             "first that fits"
         )
     needs = []
-    for name in ("cluster", "block", "grid") if few else ("block", "cluster", "grid"):
+    for name in ("cluster", "block", "grid") if size == "few" else ("block", "cluster", "grid"):
         if kernel != name and not (kernel == "auto" and scene.considers(name, gpu)):
             continue
         plan, needed = _fused_plan(scene, name, gpu)

@@ -50,10 +50,11 @@ class Simulator(Model):
         tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "cluster", "grid" or "stream", see
             `torchpd.regimes`; "auto" takes the first that fits. Changes nothing on the CPU.
-        batch: environments that a step will have, where you know it: a GPU's kernel, the patches and preconditioner of
-            `Multilevel` and the choice of "auto" are for so many. States of any batch may come, and an environment has
-            the same bits in all of them; but what is made for a thousand takes several times as long for one, and the
-            other way round. None: not known; kernels are then for many, the rest for one. Changes nothing on the CPU.
+        batch: environments that a step will have, where you know it: a GPU's kernel for a small mesh, the patches and
+            preconditioner of `Multilevel` and the choice of "auto" are for so many. States of any batch may come, and
+            an environment has the same bits in all of them, but takes longer in some. None: not known: a small mesh
+            gets "block", which is for many, and "auto" chooses for one. `sim.batch` may be set later. Changes nothing
+            on the CPU.
         progress: show a bar while a large scene compiles.
     """
 

@@ -70,7 +70,7 @@ class Bench:
     ) -> Simulator:
         """A new one on the device."""
         scene = self.subject.scene(self.mesh(setting.resolution), setting.youngs)
-        chosen = {"iterations": DEFAULT_ITERATIONS, **options}
+        chosen = {"iterations": DEFAULT_ITERATIONS, "batch": 1, **options}
         sim = Simulator(scene, setting.time_step, solver=solver, dtype=dtype, progress=False, **chosen)
         return sim.to(self.device)
 

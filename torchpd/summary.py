@@ -125,7 +125,8 @@ def _kernel_lines(sim: Simulator) -> list[str]:
     others = any_of([name for name in _LAUNCHES if name != kernel])
     if kernel == "block" and sim.batch is None:
         others = others.replace('"cluster"', '"cluster", sooner done with a few environments (batch=1)')
-    batch = f"; for a batch of {sim.batch}" if sim.batch else ""
+    chosen = sim.kernel == "auto" or plan.for_levels
+    batch = f"; for a batch of {sim.batch}" if sim.batch and chosen else ""
     asked = "" if plan.for_levels else f"; Simulator(..., kernel=...) may ask for {others}"
     return [
         f"kernel {kernel}: {launches}",

@@ -16,7 +16,8 @@ Array = NDArray[np.float64]
 
 
 def _compiled(problem: Problem, device: str, time_step: float, solver: Solver | str) -> tuple[pd.Simulator, pd.State]:
-    sim = pd.Simulator(problem.scene(), time_step, None if solver == "auto" else 64, solver, progress=False).to(device)
+    iterations = None if solver == "auto" else 64
+    sim = pd.Simulator(problem.scene(), time_step, iterations, solver, batch=1, progress=False).to(device)
     state = sim.rest_state()
     state.velocities[:] = torch.from_numpy(problem.velocities).to(state.velocities)
     return sim, state

@@ -57,7 +57,7 @@ class Dense {
         sum[c] = multiply_add(Real(numbers[j + c]), x[j + c], sum[c]);
     }
     for (int c = 0; j + c <= i; ++c) sum[c] = multiply_add(Real(numbers[j + c]), x[j + c], sum[c]);
-    return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+    return join(sum);
   }
 
   // Rows i ... i + 3, i a multiple of four: up to number i a vector holds the chains of a row side by side.

@@ -85,7 +85,7 @@ PD_HD Level<4, T> middle_level(const Levels<T>& l) {
           l.middle_lift_weight, l.middle_node_start, l.middle_node_row,   l.middle_node_lift};
 }
 
-// What a processor without enough to do meanwhile would wait for: chains of sums, which are added up last.
+// Sums of a row in turn, because each waits for its own last addition; they are added up last.
 constexpr int row_chains = 4;
 
 template <class Value>
@@ -93,7 +93,7 @@ PD_HD Value join(const Value (&sum)[row_chains]) {
   return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
-// A x, one row of numbers: number p of it goes to chain p mod 4.
+// A x, one row of numbers: number p of it goes to chain p mod 4. One environment and several get the same bits.
 template <class Real, class T, class Value>
 PD_HD Value row_product(const Level<1, T>& level, const Value* x, int row) {
   const int32 end = level.start[row + 1];
@@ -105,10 +105,11 @@ PD_HD Value row_product(const Level<1, T>& level, const Value* x, int row) {
   for (; p + row_chains < end; p += row_chains) {
     for (int c = 0; c < row_chains; ++c) add(c, p + c, level.value[p + c]);
   }
-  if constexpr (sizeof(Real) > sizeof(T)) {
+  constexpr bool several = sizeof(Real) > sizeof(T);
+  if constexpr (several) {
     for (int c = 0; p + c < end; ++c) add(c, p + c, level.value[p + c]);
   } else if (p < end) {
-    // zeros to the end of four: how many numbers are left could not be foreseen
+    // always four steps, because branches on what is left are mispredicted; zeros change no finite sum
     for (int c = 0; c < row_chains; ++c) {
       const int32 at = p + c < end ? p + c : end - 1;
       add(c, at, p + c < end ? level.value[at] : T(0));
