@@ -234,6 +234,11 @@ def test_plans_for_many_and_for_few_environments(outer: str, batch: int, cells: 
     assert not gpu.plan.many
     gpu.solver = SOLVERS[outer]
     assert same_bits(gpu(state), together)
+    # and another batch and back
+    gpu.batch = None
+    assert gpu.plan.patches == usual.plan.patches
+    gpu.batch = batch
+    assert same_bits(gpu(state), together)
 
 
 def test_solvers_can_be_exchanged() -> None:
