@@ -7,13 +7,28 @@ import itertools
 import pytest
 import torch
 from devices import require_gpu
-from on_gpu import DTYPES, GPU, KERNELS, bar, full_on_gpu, has_clusters, host_waits, moved, on_gpu, poll, small_on_gpu
+from on_gpu import (
+    DTYPES,
+    GPU,
+    KERNELS,
+    bar,
+    device_work,
+    full_on_gpu,
+    has_clusters,
+    host_waits,
+    moved,
+    on_gpu,
+    poll,
+    small_on_gpu,
+)
 from runs import moving, noise, same_bits, state_of
 from test_determinism import assert_same_bits, different_environments, run
 from test_determinism import scene as scene_of_all_effects
 from torch import Tensor
 
 import torchpd as pd
+from torchpd import regimes
+from torchpd.gpu import properties_of
 from torchpd.state import Info
 
 require_gpu()
@@ -47,6 +62,40 @@ def test_runs_and_batches_do_not_matter(kernel: str, tolerance: float, precision
             assert_same_bits([t[item : item + 1] for t in together], alone)
     some = torch.tensor([5, 3, 16, 0], device=GPU)
     assert_same_bits(run(sim, state, forces, some), [t[some] for t in together])
+
+
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize("tolerance", [0.0, 0.1])
+@pytest.mark.parametrize(("cells", "patch"), [((8, 5, 5), 100), ((19, 40, 1), 2304), ((2, 2, 2), 2304)])
+def test_blocks_that_go_from_patch_to_patch(
+    cells: tuple[int, int, int], patch: int, tolerance: float, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without contacts a block of a stream has many patches: small ones, ones of many vertices, less than a warp has.
+
+    With a ground, however far, there is a block for every patch.
+    """
+    dtype = DTYPES[precision]
+    monkeypatch.setitem(regimes._STREAM_TETS, dtype, patch)
+    sim = on_gpu(bar(cells, pd.Gravity()), dtype, "stream", iterations=18, tolerance=tolerance)
+    other = on_gpu(bar(cells, pd.Gravity(), pd.Ground(-50.0)), dtype, "stream", iterations=18, tolerance=tolerance)
+    gpu = properties_of(GPU)
+    batch = 6 * gpu.multiprocessors // sim.plan.patches + 3  # some blocks have seven patches
+    state, forces = unlike(sim, batch)
+    if precision == "float32" and 2 * regimes.shared_bytes(sim.plan, 0, 0) <= gpu.shared:
+        assert any("stream_pipeline" in name for name in device_work(lambda: sim(state, forces)))
+    stiffness = sim.stiffness * torch.linspace(0.5, 20.0, batch, dtype=dtype, device=GPU)[:, None]
+    sim.set_material(stiffness=stiffness)
+    other.set_material(stiffness=stiffness)
+    together = run(sim, state, forces)
+    assert_same_bits(run(sim, state, forces), together)
+    if tolerance:
+        assert len(together[4].unique()) > 1
+    expected = other(state, forces).positions
+    torch.testing.assert_close(together[0], expected, rtol=0.0, atol=16 * torch.finfo(dtype).eps)
+    for item in (0, 1, batch // 2, batch - 1):
+        sim.set_material(stiffness=stiffness[item : item + 1])
+        alone = run(sim, state, forces, slice(item, item + 1))
+        assert_same_bits([t[item : item + 1] for t in together], alone)
 
 
 @pytest.mark.parametrize("kernel", ["cluster", "grid", "far", "stream"])

@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -48,7 +49,12 @@ ops = torch.ops.torchpd
 
 
 # constants of torchpd.regimes that decide how many patches there are
-SIZES = {"cluster": ("_CLUSTER_EACH", 40), "grid": ("_GRID_TETS", 8), "far": ("_GRID_TETS", 1200)}
+SIZES = {
+    "cluster": ("_CLUSTER_EACH", 40),
+    "grid": ("_GRID_TETS", 8),
+    "far": ("_GRID_TETS", 1200),
+    "stream": ("_STREAM_TETS", {torch.float32: 24, torch.float64: 24}),
+}
 CELLS = {"far": (13, 5, 4)}  # of a bar
 
 
@@ -210,9 +216,20 @@ def run(kernels: Sequence[str]) -> int:
             built = scene(contacts=contacts, pieces=pieces, pins=True, cells=cells)
             sim = pd.Simulator(built, 1 / 60, 5, **options).to("cuda")  # type: ignore[arg-type]
             step_all_ways(sim, 3)
+            if kernel == "stream" and dtype == torch.float32 and not contacts:
+                many = pd.Simulator(built, 1 / 60, 5, **options).to("cuda")  # type: ignore[arg-type]
+                # so many patches that blocks go from one to another
+                many(many.rest_state(7 * properties_of(sim.device).multiprocessors // sim.plan.patches))
+                count += 1
             count += 1
         fields(sim, 3)
         options = {"dtype": dtype, "kernel": name, "progress": False}
+        if kernel == "stream":  # patches of several tetrahedra and vertices a thread
+            with mock.patch.object(regimes, "_STREAM_TETS", {torch.float32: 2304, torch.float64: 960}):
+                thin = scene(contacts=False, pieces=False, pins=False, cells=(19, 20, 1))
+                large = pd.Simulator(thin, 1 / 60, 5, **options).to("cuda")  # type: ignore[arg-type]
+            large(large.rest_state(2))
+            count += 1
         built = scene(contacts=True, pieces=True, pins=False, cells=cells)
         free = pd.Simulator(built, 1 / 60, 5, **options)  # type: ignore[arg-type]
         step_all_ways(free.to("cuda"), 2)

@@ -37,12 +37,16 @@ PD_DEVICE double in_register(double value) {
   return value;
 }
 
-// Has the threads of a block bring items into the L2 cache, for whoever reads them later.
+// Has some threads, by default those of the block, bring items into the L2 cache, for whoever reads them later.
+template <class Item>
+PD_DEVICE void bring_near(const Item* items, int count, int thread, int threads) {
+  constexpr int line = 128 / sizeof(Item);
+  for (int i = thread * line; i < count; i += threads * line)
+    asm volatile("prefetch.global.L2 [%0];" ::"l"(items + i));
+}
 template <class Item>
 PD_DEVICE void bring_near(const Item* items, int count) {
-  constexpr int line = 128 / sizeof(Item);
-  for (int i = int(threadIdx.x) * line; i < count; i += int(blockDim.x) * line)
-    asm volatile("prefetch.global.L2 [%0];" ::"l"(items + i));
+  bring_near(items, count, int(threadIdx.x), int(blockDim.x));
 }
 
 template <class T>

@@ -209,16 +209,22 @@ struct ComputedRest {
   }
 };
 
+// Rest positions from some slot on, where the plan has them.
+template <class T>
+PD_DEVICE const RestPoint<T>* rest_positions(const DevicePlan<T>& plan, int first_slot) {
+  const void* positions = plan.slot_rest;
+  if constexpr (sizeof(T) == 4) positions = plan.slot_fixed;
+  return static_cast<const RestPoint<T>*>(positions) + first_slot;
+}
+
 // What the plan knows of a patch's rest shapes: `Computed` where it holds positions.
 template <bool Computed, class T>
 PD_DEVICE auto rest_of(const Patch<T>& patch) {
   if constexpr (!Computed) {
     return StoredRest<T>{reinterpret_cast<const Quad<T>*>(patch.plan.pair_rest)};
   } else {
-    const void* positions = patch.plan.slot_rest;
-    if constexpr (sizeof(T) == 4) positions = patch.plan.slot_fixed;
-    return ComputedRest<T>{static_cast<const RestPoint<T>*>(positions) + patch.first_slot,
-                           patch.plan.pair_factor, patch.plan.patch_unit[patch.index]};
+    return ComputedRest<T>{rest_positions(patch.plan, patch.first_slot), patch.plan.pair_factor,
+                           patch.plan.patch_unit[patch.index]};
   }
 }
 
@@ -272,11 +278,12 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
   return energy;
 }
 
-// w V of every pair of a patch, times l_e when `bounded`.
+// w V of every pair of a patch, times l_e when `bounded`; of the padding of its last block 0.
 template <class T, class Rest>
 PD_DEVICE void weigh_pairs(const Patch<T>& patch, const Rest& rest, const T* stiffness,
                            bool bounded, T* weights) {
-  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
+  const int lanes = (patch.pairs + pair_lanes - 1) / pair_lanes * pair_lanes;
+  for (int number = threadIdx.x; number < lanes; number += blockDim.x) {
     const PairPlace place = place_of(patch, number);
     const typename Rest::Numbers numbers = rest.read(place, read_pair<T>(patch, nullptr, number));
     const T volume[2] = {numbers.template shape<OneOf<T, 0>>().volume,

@@ -3,12 +3,14 @@
 #include "cuda/arena.h"
 #include "cuda/launch.h"
 #include "cuda/outer.h"
+#include "cuda/pipeline.h"
 #include "cuda/runtime.h"
 #include "cuda/stream.h"
 #include "plan/shared_memory.h"
 #include "solver/multilevel.h"
 #include "solver/step.h"
 
+#include <algorithm>
 #include <stdexcept>
 #include <string>
 
@@ -150,10 +152,27 @@ class StreamRunner {
 
   template <Visit What>
   void pass(int k) {
-    launcher_.run(stream_patches<What, T, Touching>, patches_, pass_threads, pass_shared_, call_,
-                  k);
+    if (!pipe<What>(k))
+      launcher_.run(stream_patches<What, T, Touching>, patches_, pass_threads, pass_shared_, call_,
+                    k);
     launcher_.run(stream_shared<What, T, Touching>, call_.step.batch * call_.shared_blocks(),
                   vertex_threads, 0, call_, k);
+  }
+
+  // The patches of an iteration as a pipeline, where a multiprocessor has room for two at once. How many patches there are
+  // does not enter, since sums come in another order: an environment has the same bits in any batch.
+  template <Visit What>
+  bool pipe(int k) {
+    constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
+    if constexpr (updates && !Touching && sizeof(T) == 4) {
+      const auto kernel = stream_pipeline<What, T>;
+      const std::size_t shared = 2 * pass_shared_;
+      const std::int64_t blocks =
+          resident_blocks(reinterpret_cast<const void*>(kernel), pipeline_threads, shared);
+      launcher_.run(kernel, std::min(blocks, patches_), pipeline_threads, shared, call_, k);
+      return blocks > 0;
+    }
+    return false;
   }
 
   template <Decision What>
