@@ -278,12 +278,11 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
   return energy;
 }
 
-// w V of every pair of a patch, times l_e when `bounded`; of the padding of its last block 0.
+// w V of every pair of a patch, times l_e when `bounded`.
 template <class T, class Rest>
 PD_DEVICE void weigh_pairs(const Patch<T>& patch, const Rest& rest, const T* stiffness,
                            bool bounded, T* weights) {
-  const int lanes = (patch.pairs + pair_lanes - 1) / pair_lanes * pair_lanes;
-  for (int number = threadIdx.x; number < lanes; number += blockDim.x) {
+  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const PairPlace place = place_of(patch, number);
     const typename Rest::Numbers numbers = rest.read(place, read_pair<T>(patch, nullptr, number));
     const T volume[2] = {numbers.template shape<OneOf<T, 0>>().volume,

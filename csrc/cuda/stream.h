@@ -311,6 +311,10 @@ __global__ void __launch_bounds__(vertex_threads)
   const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
   weigh_pairs(patch, rest_of<true>(patch), call.step.material.stiffness.of(w.environment), bounded,
               w.weights);
+  // the padding of the last block, which the pipeline reads
+  const int end = (patch.pairs + pair_lanes - 1) / pair_lanes * pair_lanes;
+  const int padding = patch.pairs + int(threadIdx.x);
+  for (int e = 0; e < 2 && padding < end; ++e) w.weights[place_of(patch, padding).in(2, e)] = T(0);
 }
 
 // ---- vertex by vertex
