@@ -2,8 +2,7 @@
 // elements of a patch, while others add up the forces of the patch before and move its vertices, and others bring the slots of
 // the next. Two patches take turns in shared memory. So arithmetic and memory need not wait for each other, as they do where
 // every warp of a block goes through all of it; and a thread has both tetrahedra of a pair, which costs a sixth fewer
-// instructions than one each. A mesh of 1 M vertices (20 patches for each multiprocessor of an H100) takes 0.92 of the time of
-// stream_patches, one of 100 thousand (two patches) 1.1 of it.
+// instructions than one each. It pays where a multiprocessor has many patches one after another, to fill it but once.
 #pragma once
 #include "cuda/stream.h"
 
@@ -186,6 +185,7 @@ class Pipeline {
 #pragma unroll
     for (int r = 0; r < brought; ++r) {
       const int s = bringer() + r * bringer_threads;
+      // not vertex_of, which would keep the vertex that was there where there is no slot
       vertex[r] = at.first_vertex + s;
       if (s >= at.interior && s < at.slots)
         vertex[r] = call_.step.plan.slot_vertex[at.first_slot + s];
@@ -234,10 +234,8 @@ class Pipeline {
 
   // ---- elements
 
-  // What the plan and an environment say of a pair.
-  struct PairInputs {
-    unsigned corner[5];  // 8 times the slot, plus 65536 times the entry
-    T weight[2], factor[2];
+  struct PairInputs : PairNumbers<T> {
+    T factor[2];  // pair_factor
   };
 
   PD_DEVICE const T* weights_of(unsigned block) const {
@@ -308,8 +306,7 @@ class Pipeline {
       rest[c] = RestPoint<T>::of(slots.second(slot, seen));
     };
     const auto leave = [&](int c) {
-      const unsigned entry = now.corner[c] >> 16;
-      if (entry != no_entry) entries[entry] = quad(pair.force[c]);
+      if (now.entry(c) != no_entry) entries[now.entry(c)] = quad(pair.force[c]);
     };
     for (int c = 0; c < 4; ++c) look(c);
     element.template run<1>(PairElement<T, 1, OneOf<T, 0>>{
