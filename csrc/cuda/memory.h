@@ -28,6 +28,10 @@ PD_DEVICE int in_register(int value) {
   asm volatile("" : "+r"(value));
   return value;
 }
+PD_DEVICE unsigned in_register(unsigned value) {
+  asm volatile("" : "+r"(value));
+  return value;
+}
 PD_DEVICE float in_register(float value) {
   asm volatile("" : "+f"(value));
   return value;
@@ -41,6 +45,8 @@ PD_DEVICE double in_register(double value) {
 template <class Item>
 PD_DEVICE void bring_near(const Item* items, int count, int thread, int threads) {
   constexpr int line = 128 / sizeof(Item);
+#pragma unroll 1
+#pragma unroll 1
   for (int i = thread * line; i < count; i += threads * line)
     asm volatile("prefetch.global.L2 [%0];" ::"l"(items + i));
 }

@@ -1,43 +1,21 @@
 // Iterations over many patches as a pipeline, one block on each multiprocessor. Its warps have three tasks: some work on the
 // elements of a patch, while others add up the forces of the patch before and move its vertices, and others bring the slots of
-// the next. Two patches take turns in shared memory. So arithmetic and memory need not wait for each other, as they do where
+// the next and help with the forces. Two patches take turns in shared memory. So arithmetic and memory need not wait for each other, as they do where
 // every warp of a block goes through all of it; and a thread has both tetrahedra of a pair, which costs a sixth fewer
 // instructions than one each. It pays where a multiprocessor has many patches one after another, to fill it but once.
 #pragma once
+#include "cuda/handoff.h"
 #include "cuda/stream.h"
 
 namespace pd::inline PD_TARGET {
 
 // In this order: movers, bringers, elements. So many that each thread may have 96 registers, which elements want. Of the others
 // on an H100: 384, 512, 576 and 640 threads for elements with 64 to 320 for the rest took more time, with or without both
-// tetrahedra of a pair in a thread; and so did anything that spilled registers, since hardly any cache is left for them.
+// tetrahedra of a pair in a thread; movers and bringers as one task took more, and so did anything that spilled registers, since
+// hardly any cache is left for them. A register that is written under a condition is kept from before, all around a loop: so
+// where a thread has no slot, it reads what is the first one's.
 constexpr int mover_threads = 128, bringer_threads = 128, element_threads = 384;
 constexpr int pipeline_threads = mover_threads + bringer_threads + element_threads;
-
-// Barriers of a block beside that of __syncthreads, of either half of shared memory: its slots are there and its entries are
-// free (elements wait), the forces in it are there (movers wait), its slots are free (bringers wait); and one of the movers
-// alone.
-enum Meeting { slots_ready = 1, forces_ready = 3, slots_free = 5, movers_meet = 7 };
-
-// Who comes to each of them.
-template <Meeting Which>
-constexpr int comers = Which == slots_ready    ? pipeline_threads
-                       : Which == forces_ready ? element_threads + mover_threads
-                       : Which == slots_free   ? element_threads + bringer_threads
-                                               : mover_threads;
-
-// Tells those who wait there that this warp's part is done, and goes on.
-template <Meeting Which>
-PD_DEVICE void arrive(unsigned turn) {
-  __syncwarp();
-  asm volatile("bar.arrive %0, %1;" ::"r"(int(Which) + int(turn & 1)), "n"(comers<Which>)
-               : "memory");
-}
-template <Meeting Which>
-PD_DEVICE void meet(unsigned turn) {
-  __syncwarp();
-  asm volatile("bar.sync %0, %1;" ::"r"(int(Which) + int(turn & 1)), "n"(comers<Which>) : "memory");
-}
 
 // The patches of a block, of all environments: item after item, from its own number on as far apart as there are blocks.
 template <class T, Visit What>
@@ -49,17 +27,19 @@ class Pipeline {
   // All threads of the block, each its own task.
   PD_DEVICE void run() const {
     const bool moves = mover() < mover_threads, brings = !moves && bringer() < bringer_threads;
-    Stop first{};
+    if (threadIdx.x == 0) open_signals();
     if (brings) {
-      first = stop(int(blockIdx.x));
+      const Found first = look_for(item_of(int(blockIdx.x)));
+      const Found second = look_for(after({first.environment, first.patch}), first.there);
       tell(0, first);
+      tell(1, second);
     }
     __syncthreads();
     if (told(0).blocks == 0) return;
     if (moves) {
       move_vertices();
     } else if (brings) {
-      bring_slots(first);
+      bring_slots();
     } else {
       work_on_elements();
     }
@@ -72,7 +52,11 @@ class Pipeline {
   static constexpr int element_warps = element_threads / warp_size;
   // Slots that the threads of a task have in registers at once; those of larger patches follow one by one.
   static constexpr int usual_slots = 640;
-  static constexpr int brought = usual_slots / bringer_threads, moved = usual_slots / mover_threads;
+  static constexpr int brought = usual_slots / bringer_threads;
+  // Forces of the slots from here on movers leave to bringers.
+  static constexpr int moved = 3, left_slots = moved * mover_threads;
+  static constexpr int soon =
+      2;  // of moved, so many that are mostly inside a patch: asked for early
 
   PD_DEVICE static int mover() { return int(threadIdx.x); }
   PD_DEVICE static int bringer() { return int(threadIdx.x) - mover_threads; }
@@ -80,67 +64,109 @@ class Pipeline {
     return (int(threadIdx.x) - mover_threads - bringer_threads) / warp_size;
   }
 
-  PD_DEVICE int items() const { return int(call_.step.batch) * call_.step.plan.patches; }
-  PD_DEVICE Work work(int item) const { return Work(call_, item / call_.step.plan.patches); }
-  // this item, or the next one whose environment goes on
-  PD_DEVICE int next(int item) const {
-    while (item < items() && skips<What>(work(item))) item += int(gridDim.x);
-    return item;
+  PD_DEVICE const DevicePlan<T>& plan() const { return call_.step.plan; }
+
+  // ---- who waits for whom, for either half of shared memory
+
+  // Slots are there and entries are free (elements wait); forces are there and slots are free (movers and bringers wait).
+  enum Event { slots_ready, forces_ready, events };
+
+  PD_DEVICE Signal signal(Event event, unsigned n) const {
+    __shared__ std::uint64_t words[2 * events];
+    return Signal(words + 2 * event + (n & 1));
   }
+  PD_DEVICE void open_signals() const {
+    for (unsigned n = 0; n < 2; ++n) {
+      signal(slots_ready, n).open(mover_threads + bringer_threads);
+      signal(forces_ready, n).open(element_threads);
+    }
+  }
+  PD_DEVICE void give(Event event, unsigned n) const { signal(event, n).give(); }
+  PD_DEVICE void await(Event event, unsigned n) const { signal(event, n).await(n / 2); }
+
+  // ---- stops of the block
+
+  struct Item {
+    int environment, patch;
+  };
 
   // Where a patch lies in the arrays.
   struct Stop {
-    int item, first_vertex, interior, first_slot, slots, first_block;
+    int environment, patch, first_vertex, interior, first_slot, slots, first_block;
     int blocks;        // of pairs; 0: there is no such patch
-    unsigned weights;  // first of its blocks there
+    unsigned weights;  // blocks of them before those of its environment
   };
-  PD_DEVICE Stop stop(int from) const {
-    const DevicePlan<T>& plan = call_.step.plan;
-    Stop s{};
-    s.item = next(from);
-    if (s.item >= items()) return s;
-    const Patch<T> patch(plan, s.item % plan.patches);
-    s.first_vertex = patch.first_vertex;
-    s.interior = patch.interior;
-    s.first_slot = patch.first_slot;
-    s.slots = patch.slots;
-    s.first_block = patch.first_block;
-    s.blocks = plan.patch_block[patch.index + 1] - patch.first_block;
-    const bool own = call_.step.material.stiffness.stride != 0;
-    s.weights = unsigned(own ? s.item / plan.patches : 0) * unsigned(plan.blocks) +
-                unsigned(patch.first_block);
-    return s;
-  }
 
-  // Stop `n` of the block, told before the slots of the one before it are ready. Others read it when they want it, since
-  // registers for it would be too many; movers may be four behind the one that is told.
-  PD_DEVICE volatile Stop& told(unsigned n) const {
+  // What the plan says of an item, still on its way: whoever looks at it waits.
+  struct Found {
+    bool there;
+    int environment, patch, vertex[2], slot[2], block[2];
+  };
+
+  // of this item, or the next one whose environment goes on
+  PD_DEVICE Found look_for(Item item, bool there = true) const {
+    while (item.environment < call_.step.batch && skips<What>(work(item.environment)))
+      item = after(item);
+    Found f;
+    f.there = there && item.environment < call_.step.batch;
+    f.environment = f.there ? item.environment : 0;
+    f.patch = f.there ? item.patch : 0;
+    for (int i = 0; i < 2; ++i) {
+      f.vertex[i] = plan().patch_vertex[f.patch + i];
+      f.slot[i] = plan().patch_slot[f.patch + i];
+      f.block[i] = plan().patch_block[f.patch + i];
+    }
+    return f;
+  }
+  PD_DEVICE Found look_for(const Stop& before) const {
+    return look_for(after({before.environment, before.patch}), before.blocks > 0);
+  }
+  PD_DEVICE Item after(Item item) const {
+    item.patch += int(gridDim.x);
+    // a division takes longer, but where there are far more blocks than patches
+    if (item.patch >= 4 * plan().patches)
+      return item_of(item.environment * plan().patches + item.patch);
+    for (; item.patch >= plan().patches; item.patch -= plan().patches) ++item.environment;
+    return item;
+  }
+  PD_DEVICE Item item_of(int number) const {
+    const int environment = number / plan().patches;
+    return {environment, number - environment * plan().patches};
+  }
+  PD_DEVICE Work work(int environment) const { return Work(call_, environment); }
+
+  // Stop `n` of the block, told before the slots of the one before it are ready. Whoever wants to know reads it there, since
+  // registers for it would be too many; movers may be six behind the one that is told.
+  PD_DEVICE Stop& told(unsigned n) const {
     constexpr unsigned kept = 8;
-    __shared__ volatile Stop stops[kept];
+    __shared__ Stop stops[kept];
     return stops[n % kept];
   }
-  PD_DEVICE void tell(unsigned n, const Stop& stop) const {
+  PD_DEVICE void tell(unsigned n, const Found& found) const {
     if (bringer() != 0) return;
-    volatile Stop& to = told(n);
-    to.first_vertex = stop.first_vertex;
-    to.interior = stop.interior;
-    to.first_slot = stop.first_slot;
-    to.slots = stop.slots;
-    to.first_block = stop.first_block;
-    to.blocks = stop.blocks;
-    to.weights = stop.weights;
+    Stop s{};
+    if (found.there) {
+      s.environment = found.environment;
+      s.patch = found.patch;
+      s.first_vertex = found.vertex[0];
+      s.interior = found.vertex[1] - found.vertex[0];
+      s.first_slot = found.slot[0];
+      s.slots = found.slot[1] - found.slot[0];
+      s.first_block = found.block[0];
+      s.blocks = found.block[1] - found.block[0];
+      const bool own = call_.step.material.stiffness.stride != 0;
+      s.weights = own ? unsigned(found.environment) * unsigned(plan().blocks) : 0;
+    }
+    told(n) = s;
   }
 
   PD_DEVICE std::byte* half(unsigned n) const {
-    const DevicePlan<T>& plan = call_.step.plan;
-    return shared_ + (n & 1) * pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, 2);
+    return shared_ +
+           (n & 1) * pass_shared_bytes(sizeof(T), plan().most_slots, plan().most_entries, 2);
   }
-  PD_DEVICE Slots<T> slots_of(unsigned n) const {
-    return Slots<T>(half(n), call_.step.plan.most_slots);
-  }
+  PD_DEVICE Slots<T> slots_of(unsigned n) const { return Slots<T>(half(n), plan().most_slots); }
   PD_DEVICE Quad<T>* entries_of(unsigned n) const {
-    return reinterpret_cast<Quad<T>*>(half(n) +
-                                      slots_bytes(sizeof(T), call_.step.plan.most_slots, 2));
+    return reinterpret_cast<Quad<T>*>(half(n) + slots_bytes(sizeof(T), plan().most_slots, 2));
   }
   // what each warp has met of the elements' energy
   PD_DEVICE double* energies_of(unsigned n) const {
@@ -150,25 +176,38 @@ class Pipeline {
 
   // ---- slots
 
-  PD_DEVICE void bring_slots(Stop at) const {
+  // Past the last stop, too: nothing is brought, but the forces of the two before are there.
+  PD_DEVICE void bring_slots() const {
     int vertex[brought];
-    find(at, vertex);
+    find(told(0), vertex);
 #pragma unroll 1
-    for (unsigned n = 0; at.blocks > 0; ++n) {
+    for (unsigned n = 0; n < 2 || told(n - 2).blocks > 0; ++n) {
+      const Found later = look_for(told(n + 1));
       Held held;
-      ask(at, vertex, held);
-      const Stop later = stop(at.item + int(gridDim.x));
-      find(later, vertex);
-      if (n >= 2) meet<slots_free>(n);
-      put(at, held, n);
-      tell(n + 1, later);
-      arrive<slots_ready>(n);
-      at = later;
-      if (at.blocks > 0) continue;
-      // nobody is left behind who has arrived
-      if (n >= 1) meet<slots_free>(n - 1);
-      meet<slots_free>(n);
+      ask(told(n), vertex, held);
+      find(told(n + 1), vertex);
+      if (n >= 2) await(forces_ready, n - 2);
+      put(told(n), held, n);
+      if (n >= 2) sum_shared(n - 2);
+      tell(n + 2, later);
+      give(slots_ready, n);
+      meet_bringers();
     }
+  }
+  PD_DEVICE static void meet_bringers() {
+    asm volatile("bar.sync 2, %0;" ::"n"(bringer_threads) : "memory");
+  }
+
+  // The forces that movers leave to bringers, who have the time.
+  PD_DEVICE void sum_shared(unsigned n) const {
+    const Stop& at = told(n);
+    const Work w = work(at.environment);
+    const Quad<T>* entries = entries_of(n);
+    const int first_slot = at.first_slot, slots = at.slots;
+#pragma unroll 1
+    for (int s = max(left_slots, at.interior) + bringer(); s < slots; s += bringer_threads)
+      w.shared_force[first_slot + s] =
+          quad(sum_entries_soon(entries, w.plan.slot_row[first_slot + s]));
   }
 
   // What is on its way to the slots.
@@ -178,30 +217,28 @@ class Pipeline {
   };
 
   PD_DEVICE int vertex_of(const Stop& at, int slot) const {
-    return slot < at.interior ? at.first_vertex + slot
-                              : call_.step.plan.slot_vertex[at.first_slot + slot];
+    return slot < at.interior ? at.first_vertex + slot : plan().slot_vertex[at.first_slot + slot];
   }
   PD_DEVICE void find(const Stop& at, int (&vertex)[brought]) const {
 #pragma unroll
     for (int r = 0; r < brought; ++r) {
       const int s = bringer() + r * bringer_threads;
-      // not vertex_of, which would keep the vertex that was there where there is no slot
-      vertex[r] = at.first_vertex + s;
-      if (s >= at.interior && s < at.slots)
-        vertex[r] = call_.step.plan.slot_vertex[at.first_slot + s];
+      vertex[r] = at.first_vertex + (s < at.interior ? s : 0);
+      if (s >= at.interior && s < at.slots) vertex[r] = plan().slot_vertex[at.first_slot + s];
     }
   }
 
   // Also has what others want to read of the patch brought into the L2 cache.
   PD_DEVICE void ask(const Stop& at, const int (&vertex)[brought], Held& held) const {
-    const Work w = work(at.item);
+    const Work w = work(at.environment);
+    const Quad<T>* origin = w.origin + at.first_slot;
     const RestPoint<T>* rest = rest_positions(w.plan, at.first_slot);
 #pragma unroll
     for (int r = 0; r < brought; ++r) {
-      const int s = bringer() + r * bringer_threads;
-      if (s >= at.slots) break;
+      int s = bringer() + r * bringer_threads;
+      if (s >= at.slots) s = 0;
       held.u[r] = vec3(w.v.u[vertex[r]]);
-      held.origin[r] = vec3(w.origin[at.first_slot + s]);
+      held.origin[r] = vec3(origin[s]);
       held.rest[r] = rest[s];
     }
     const auto near = [](const auto* items, int count) {
@@ -213,11 +250,11 @@ class Pipeline {
     constexpr int two = 2 * pair_lanes, five = 5 * pair_lanes;
     near(w.plan.pair_corner + std::size_t(at.first_block) * five, at.blocks * five);
     near(w.plan.pair_factor + std::size_t(at.first_block) * two, at.blocks * two);
-    near(weights_of(at.weights), at.blocks * two);
+    near(w.weights + std::size_t(at.first_block) * two, at.blocks * two);
   }
 
   PD_DEVICE void put(const Stop& at, const Held& held, unsigned n) const {
-    const Work w = work(at.item);
+    const Work w = work(at.environment);
     const RestPoint<T>* rest = rest_positions(w.plan, at.first_slot);
     const Slots<T> slots = slots_of(n);
 #pragma unroll
@@ -238,44 +275,52 @@ class Pipeline {
     T factor[2];  // pair_factor
   };
 
-  PD_DEVICE const T* weights_of(unsigned block) const {
-    return call_.memory.weights + std::size_t(block) * (2 * pair_lanes);
+  // This warp's first block of the pairs of a stop, or the first of all where it has none.
+  PD_DEVICE unsigned first_block(unsigned n) const {
+    const Stop& in = told(n);
+    return unsigned(in.first_block + (element_warp() < in.blocks ? element_warp() : 0));
   }
 
-  // A lane a pair, of a block of stop `n`, or of its first one where it has none of that number.
-  PD_DEVICE PairInputs read(unsigned n, int block) const {
-    const DevicePlan<T>& plan = call_.step.plan;
-    const volatile Stop& in = told(n);
-    if (block >= in.blocks) block = 0;
-    const unsigned lane = threadIdx.x % warp_size, at = unsigned(in.first_block + block);
-    const int32* corner = plan.pair_corner + (at * (5 * pair_lanes) + lane);
-    const T* factor = plan.pair_factor + (at * (2 * pair_lanes) + lane);
-    const T* weight = weights_of(in.weights + unsigned(block)) + lane;
+  // A lane a pair, of a block of stop `n`.
+  PD_DEVICE PairInputs read(unsigned block, unsigned n) const {
+    const unsigned lane = threadIdx.x % warp_size;
+    const int32* corner = plan().pair_corner + (block * (5 * pair_lanes) + lane);
+    const T* factor = plan().pair_factor + (block * (2 * pair_lanes) + lane);
+    const T* weight =
+        call_.memory.weights + (std::size_t(block + told(n).weights) * (2 * pair_lanes) + lane);
     PairInputs pair;
-    for (int c = 0; c < 5; ++c) pair.corner[c] = unsigned(corner[c * pair_lanes]);
-    for (int e = 0; e < 2; ++e) pair.weight[e] = weight[e * pair_lanes];
-    for (int e = 0; e < 2; ++e) pair.factor[e] = factor[e * pair_lanes];
+    // once an iteration: the caches had better keep something else
+    for (int c = 0; c < 5; ++c) pair.corner[c] = unsigned(__ldcs(corner + c * pair_lanes));
+    for (int e = 0; e < 2; ++e) pair.weight[e] = __ldcs(weight + e * pair_lanes);
+    for (int e = 0; e < 2; ++e) pair.factor[e] = __ldcs(factor + e * pair_lanes);
     return pair;
   }
 
   PD_DEVICE void work_on_elements() const {
-    const auto blocks_of = [&](unsigned n) { return told(n).blocks; };
-    PairInputs now = read(0, element_warp());
+    unsigned block = first_block(0);
+    PairInputs now = read(block, 0);
 #pragma unroll 1
     for (unsigned n = 0;; ++n) {
-      meet<slots_ready>(n);
+      await(slots_ready, n);
+      const SharedSlots slots(*this, n);
       T energy = T(0);
-      // else the last block has read the first one of the next stop
-      if (element_warp() >= blocks_of(n)) now = read(n + 1, element_warp());
+      bool more = element_warp() < told(n).blocks;
+      // else the last turn has read the first pairs of the next stop
+      if (!more) {
+        block = first_block(n + 1);
+        now = read(block, n + 1);
+      }
 #pragma unroll 1
-      for (int block = element_warp(); block < blocks_of(n); block += element_warps) {
+      while (more) {
         PairInputs then;
-        work_on_pair(now, n, energy, [&] {
-          const bool last = block + element_warps >= blocks_of(n);
-          then = read(last ? n + 1 : n, last ? element_warp() : block + element_warps);
+        work_on_pair(now, slots, energy, [&] {
+          block += element_warps;
+          more = int(block) < told(n).first_block + told(n).blocks;
+          if (!more) block = first_block(n + 1);
+          then = read(block, more ? n : n + 1);
         });
         // not before its end, since whoever moves a number waits for it
-        for (int c = 0; c < 5; ++c) now.corner[c] = unsigned(in_register(int(then.corner[c])));
+        for (int c = 0; c < 5; ++c) now.corner[c] = in_register(then.corner[c]);
         for (int e = 0; e < 2; ++e) now.weight[e] = in_register(then.weight[e]);
         for (int e = 0; e < 2; ++e) now.factor[e] = in_register(then.factor[e]);
       }
@@ -283,31 +328,57 @@ class Pipeline {
         const double sum = across_warp(double(energy), Add{});
         if (threadIdx.x % warp_size == 0) energies_of(n)[element_warp()] = sum;
       }
-      arrive<slots_free>(n);
-      arrive<forces_ready>(n);
-      if (blocks_of(n + 1) == 0) return;
+      give(forces_ready, n);
+      if (told(n + 1).blocks == 0) return;
     }
   }
+
+  // Slots and entries of a half by a 32-bit address, which stays in a register; by pointers it would be worked out again for each
+  // of them.
+  class SharedSlots {
+   public:
+    PD_DEVICE SharedSlots(const Pipeline& p, unsigned n)
+        : plan_(p.plan()), first_(in_register(shared_address(p.half(n)))) {}
+
+    // `corner`: of PairNumbers
+    PD_DEVICE void look(unsigned corner, Vec3<T>& position, RestPoint<T>& rest) const {
+      const SharedAddress slot_times_8 = corner & 0xffff;
+      Quad<T> seen;
+      Vec3<T> bits;
+      asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
+                   : "=f"(seen.x), "=f"(seen.y), "=f"(seen.z), "=f"(bits.x)
+                   : "r"(first_ + 2 * slot_times_8));
+      asm volatile("ld.shared.v2.f32 {%0, %1}, [%2];"
+                   : "=f"(bits.y), "=f"(bits.z)
+                   : "r"(first_ + 16 * unsigned(plan_.most_slots) + slot_times_8));
+      position = vec3(seen);
+      rest = RestPoint<T>::of(bits);
+    }
+    // unless the corner has no entry
+    PD_DEVICE void leave(unsigned corner, const Vec3<T>& force) const {
+      asm volatile(
+          "{.reg .pred p; setp.lt.u32 p, %0, 0xffff0000; @p st.shared.v4.f32 [%1], {%2, %3, %4, "
+          "%5};}" ::"r"(corner),
+          "r"(first_ + unsigned(slots_bytes(sizeof(T), plan_.most_slots, 2)) + (corner >> 16) * 16),
+          "f"(force.x), "f"(force.y), "f"(force.z), "f"(force.z)
+          : "memory");
+    }
+
+   private:
+    const DevicePlan<T>& plan_;
+    SharedAddress first_;
+  };
 
   // `read_next`: between its tetrahedra, where the fewest registers are in use. Lanes past the last pair leave no force, and
   // what they strain weighs nothing.
   template <class ReadNext>
-  PD_DEVICE void work_on_pair(const PairInputs& now, unsigned n, T& energy,
+  PD_DEVICE void work_on_pair(const PairInputs& now, const SharedSlots& slots, T& energy,
                               const ReadNext& read_next) const {
     const typename ElementOf<What>::type element;
-    const Slots<T> slots = slots_of(n);
-    Quad<T>* const entries = entries_of(n);
     Pair<T, 1> pair;
     RestPoint<T> rest[5];
-    const auto look = [&](int c) {
-      const unsigned slot = now.corner[c] & 0xffff;
-      const Quad<T> seen = slots.look(slot);
-      pair.corner[0][c] = vec3(seen);
-      rest[c] = RestPoint<T>::of(slots.second(slot, seen));
-    };
-    const auto leave = [&](int c) {
-      if (now.entry(c) != no_entry) entries[now.entry(c)] = quad(pair.force[c]);
-    };
+    const auto look = [&](int c) { slots.look(now.corner[c], pair.corner[0][c], rest[c]); };
+    const auto leave = [&](int c) { slots.leave(now.corner[c], pair.force[c]); };
     for (int c = 0; c < 4; ++c) look(c);
     element.template run<1>(PairElement<T, 1, OneOf<T, 0>>{
         pair, ComputedRest<T>::between({rest[0], rest[1], rest[2], rest[3]}, now.factor[0]),
@@ -324,76 +395,77 @@ class Pipeline {
 
   // ---- vertices
 
-  PD_DEVICE int after(int item) const { return next(item + int(gridDim.x)); }
-
   PD_DEVICE void move_vertices() const {
-    int item = next(int(blockIdx.x));
     // the entries of both halves are free
-    arrive<slots_ready>(0);
-    if (after(item) < items()) arrive<slots_ready>(1);
+    for (unsigned n = 0; n < 2; ++n) give(slots_ready, n);
 #pragma unroll 1
-    for (unsigned n = 0; item < items(); ++n, item = after(item)) move_patch(item, n);
+    for (unsigned n = 0; told(n).blocks > 0; ++n) move_patch(n);
   }
 
-  PD_DEVICE void move_patch(int item, unsigned n) const {
-    const Work w = work(item);
+  PD_DEVICE void move_patch(unsigned n) const {
+    const Stop& at = told(n);
+    const Work w = work(at.environment);
     const Quad<T>* entries = entries_of(n);
-    const volatile Stop& at = told(n);
     const int interior = at.interior, first_vertex = at.first_vertex;
     const int slots = at.slots, first_slot = at.first_slot;
     ThreadSums sums = no_sums<What>();
     const auto slot = [](int r) { return mover() + r * mover_threads; };
-    const auto see_slot = [&](int s, Seen& seen) {
-      if (s < interior) seen = see<What>(w, first_vertex + s);
+    const auto see_slot = [&](int s) {
+      return see<What>(w, first_vertex + (s < interior ? s : 0));
     };
-    const auto visit_slot = [&](int s, const Seen& seen, const Vec3<T>& force) {
+    const auto visit_slot = [&](int s, const Vec3<T>& force, const auto& seen_there) {
       if (s < interior) {
-        visit<What>(w, first_vertex + s, seen, force, k_, sums);
+        visit<What>(w, first_vertex + s, seen_there(), force, k_, sums);
       } else if (s < slots) {
         w.shared_force[first_slot + s] = quad(force);
       }
     };
     int row[moved];
     Vec3<T> force[moved];
-    Seen seen[2];
+    Seen seen[soon];
 #pragma unroll
     for (int r = 0; r < moved; ++r)
       row[r] = slot(r) < slots ? w.plan.slot_row[first_slot + slot(r)] : 0;
-    see_slot(slot(0), seen[0]);
-    meet<forces_ready>(n);
+#pragma unroll
+    for (int r = 0; r < soon; ++r) seen[r] = see_slot(slot(r));
+    await(forces_ready, n);
     if (What == Visit::update_guarded && mover() < element_warps)
       sums.value[0] += energies_of(n)[mover()];
     // first what frees the half
 #pragma unroll
-    for (int r = 0; r < moved; ++r) force[r] = sum_entries(entries, row[r]);
+    for (int r = 0; r < moved; ++r) force[r] = sum_entries_soon(entries, row[r]);
+    const auto visit_late = [&](int s, const Vec3<T>& summed) {
+      visit_slot(s, summed, [&] { return see_slot(s); });
+    };
 #pragma unroll 1
-    for (int s = slot(moved); s < slots; s += mover_threads) {
-      Seen late{};
-      see_slot(s, late);
-      visit_slot(s, late, sum_entries(entries, w.plan.slot_row[first_slot + s]));
-    }
-    if (after(after(item)) < items()) arrive<slots_ready>(n);
+    for (int s = slot(moved); s < interior; s += mover_threads)
+      visit_late(s, sum_entries_soon(entries, w.plan.slot_row[first_slot + s]));
+    give(slots_ready, n);
 #pragma unroll
-    for (int r = 0; r < moved; ++r) {
-      if (r + 1 < moved) see_slot(slot(r + 1), seen[(r + 1) % 2]);
-      visit_slot(slot(r), seen[r % 2], force[r]);
-    }
-    if (wants_sums<What>(w)) write_mover_sums(sums, w.sum_row(item % w.plan.patches));
+    for (int r = 0; r < soon; ++r) visit_slot(slot(r), force[r], [&] { return seen[r]; });
+#pragma unroll
+    for (int r = soon; r < moved; ++r) visit_late(slot(r), force[r]);
+    if (wants_sums<What>(w)) write_mover_sums(sums, n, w.sum_row(at.patch));
   }
 
-  PD_DEVICE void write_mover_sums(const ThreadSums& sums, double* row) const {
+  PD_DEVICE void write_mover_sums(const ThreadSums& sums, unsigned n, double* row) const {
     constexpr int warps = mover_threads / warp_size;
-    __shared__ double warp_sum[sums_count][warps];
-    for (int n = 0; n < sums_count; ++n) {
-      const double sum = across_warp(sums.value[n], Add{});
-      if (mover() % warp_size == 0) warp_sum[n][mover() / warp_size] = sum;
+    // those who are ahead write the others while somebody still reads
+    __shared__ double both[2][sums_count][warps];
+    double (&warp_sum)[sums_count][warps] = both[n & 1];
+    for (int i = 0; i < sums_count; ++i) {
+      const double sum = across_warp(sums.value[i], Add{});
+      if (mover() % warp_size == 0) warp_sum[i][mover() / warp_size] = sum;
     }
-    meet<movers_meet>(0);
+    meet_movers();
     if (mover() < sums_count) {
       double sum = 0;
       for (int i = 0; i < warps; ++i) sum += warp_sum[mover()][i];
       row[mover()] = sum;
     }
+  }
+  PD_DEVICE static void meet_movers() {
+    asm volatile("bar.sync 1, %0;" ::"n"(mover_threads) : "memory");
   }
 
   const StreamCall<T>& call_;

@@ -235,18 +235,29 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));
 }
 
-// The force on a vertex that patches share: what they left, in their order.
+// The force on a vertex that patches share: what they left, in their order. Two at once, since few have more, and more would keep
+// other threads out for want of registers.
 template <class T, bool Touching>
 PD_DEVICE Vec3<T> shared_force(const StreamWork<T, Touching>& w, int shared) {
+  constexpr int together = 2;
+  const int end = w.plan.shared_start[shared + 1];
   Vec3<T> force = {T(0), T(0), T(0)};
-  for (int at = w.plan.shared_start[shared]; at < w.plan.shared_start[shared + 1]; ++at)
-    force = force + vec3(w.shared_force[w.plan.shared_slot[at]]);
+#pragma unroll 1
+  for (int at = w.plan.shared_start[shared]; at < end; at += together) {
+    Vec3<T> part[together];
+#pragma unroll
+    for (int i = 0; i < together; ++i)
+      part[i] = vec3(w.shared_force[w.plan.shared_slot[min(at + i, end - 1)]]);
+#pragma unroll
+    for (int i = 0; i < together; ++i)
+      if (at + i < end) force = force + part[i];
+  }
   return force;
 }
 
 // Vertices that patches share.
 template <Visit What, class T, bool Touching>
-__global__ void __launch_bounds__(vertex_threads)
+__global__ void __launch_bounds__(vertex_threads, sizeof(T) == 4 && !Touching ? 8 : 1)
     stream_shared(const __grid_constant__ StreamCall<T> call, int k) {
   const int blocks = call.shared_blocks(), number = int(blockIdx.x % blocks);
   const StreamWork<T, Touching> w(call, blockIdx.x / blocks);

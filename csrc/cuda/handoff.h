@@ -1,0 +1,45 @@
+// What some warps of a block wait for while others go on.
+#pragma once
+#include "cuda/cluster.h"
+
+// waits for a while, from compute capability 9.0 on
+#if PD_HAS_CLUSTERS
+#define PD_TRY "try_wait"
+#else
+#define PD_TRY "test_wait"
+#endif
+
+namespace pd::inline PD_TARGET {
+
+// Turn after turn: a barrier in shared memory (mbarrier of PTX) which those who wait do not come to. Every thread gives its part:
+// one for its whole warp would take as long, and compute-sanitizer would not see what the others have done before.
+class Signal {
+ public:
+  PD_DEVICE explicit Signal(std::uint64_t* word) : at_(shared_address(word)) {}
+
+  // one thread, before __syncthreads
+  PD_DEVICE void open(int threads) const {
+    asm volatile("mbarrier.init.shared.b64 [%0], %1;" ::"r"(at_), "r"(threads) : "memory");
+  }
+
+  PD_DEVICE void give() const {
+    asm volatile("{.reg .b64 turn; mbarrier.arrive.shared.b64 turn, [%0];}" ::"r"(at_) : "memory");
+  }
+
+  // what they did before they gave it can be read after
+  PD_DEVICE void await(unsigned turn) const {
+    unsigned given;
+    do {
+      asm volatile("{.reg .pred p; mbarrier." PD_TRY
+                   ".parity.shared.b64 p, [%1], %2; selp.u32 %0, 1, 0, p;}"
+                   : "=r"(given)
+                   : "r"(at_), "r"(turn & 1)
+                   : "memory");
+    } while (!given);
+  }
+
+ private:
+  SharedAddress at_;
+};
+
+}  // namespace pd::inline PD_TARGET
