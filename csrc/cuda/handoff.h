@@ -2,17 +2,17 @@
 #pragma once
 #include "cuda/cluster.h"
 
-// waits for a while, from compute capability 9.0 on
+// from compute capability 9.0 on the hardware waits for a while
 #if PD_HAS_CLUSTERS
-#define PD_TRY "try_wait"
+#define PD_SIGNAL_WAIT "try_wait"
 #else
-#define PD_TRY "test_wait"
+#define PD_SIGNAL_WAIT "test_wait"
 #endif
 
 namespace pd::inline PD_TARGET {
 
-// Turn after turn: a barrier in shared memory (mbarrier of PTX) which those who wait do not come to. Every thread gives its part:
-// one for its whole warp would take as long, and compute-sanitizer would not see what the others have done before.
+// Turn after turn: a barrier in shared memory (mbarrier of PTX) which those who wait do not come to. Every thread gives its
+// part: one for its whole warp would take as long, and compute-sanitizer would not see what the others have done before.
 class Signal {
  public:
   PD_DEVICE explicit Signal(std::uint64_t* word) : at_(shared_address(word)) {}
@@ -29,13 +29,17 @@ class Signal {
   // what they did before they gave it can be read after
   PD_DEVICE void await(unsigned turn) const {
     unsigned given;
-    do {
-      asm volatile("{.reg .pred p; mbarrier." PD_TRY
+    while (true) {
+      asm volatile("{.reg .pred p; mbarrier." PD_SIGNAL_WAIT
                    ".parity.shared.b64 p, [%1], %2; selp.u32 %0, 1, 0, p;}"
                    : "=r"(given)
                    : "r"(at_), "r"(turn & 1)
                    : "memory");
-    } while (!given);
+      if (given) break;
+#if !PD_HAS_CLUSTERS
+      __nanosleep(20);
+#endif
+    }
   }
 
  private:
@@ -43,3 +47,5 @@ class Signal {
 };
 
 }  // namespace pd::inline PD_TARGET
+
+#undef PD_SIGNAL_WAIT

@@ -46,7 +46,6 @@ template <class Item>
 PD_DEVICE void bring_near(const Item* items, int count, int thread, int threads) {
   constexpr int line = 128 / sizeof(Item);
 #pragma unroll 1
-#pragma unroll 1
   for (int i = thread * line; i < count; i += threads * line)
     asm volatile("prefetch.global.L2 [%0];" ::"l"(items + i));
 }

@@ -1,8 +1,9 @@
-// Iterations over many patches as a pipeline, one block on each multiprocessor. Its warps have three tasks: some work on the
-// elements of a patch, while others add up the forces of the patch before and move its vertices, and others bring the slots of
-// the next and help with the forces. Two patches take turns in shared memory. So arithmetic and memory need not wait for each other, as they do where
-// every warp of a block goes through all of it; and a thread has both tetrahedra of a pair, which costs a sixth fewer
-// instructions than one each. It pays where a multiprocessor has many patches one after another, to fill it but once.
+// Iterations over many patches as a pipeline, in float32, one block on each multiprocessor. Its warps have three tasks: some
+// work on the elements of a patch, while others add up the forces of the patch before and move its vertices, and others bring
+// the slots of the next and help with the forces. Two patches take turns in shared memory. So arithmetic and memory need not
+// wait for each other, as they do where every warp of a block goes through all of it; and a thread has both tetrahedra of a
+// pair, which costs a sixth fewer instructions than one each. It pays where a multiprocessor has many patches one after
+// another, to fill it but once.
 #pragma once
 #include "cuda/handoff.h"
 #include "cuda/stream.h"
@@ -11,15 +12,19 @@ namespace pd::inline PD_TARGET {
 
 // In this order: movers, bringers, elements. So many that each thread may have 96 registers, which elements want. Of the others
 // on an H100: 384, 512, 576 and 640 threads for elements with 64 to 320 for the rest took more time, with or without both
-// tetrahedra of a pair in a thread; movers and bringers as one task took more, and so did anything that spilled registers, since
-// hardly any cache is left for them. A register that is written under a condition is kept from before, all around a loop: so
-// where a thread has no slot, it reads what is the first one's.
+// tetrahedra of a pair in a thread; movers and bringers as one task took more, and so did anything that spilled registers,
+// since hardly any cache is left for them. A register that is written under a condition is kept from before, all around a
+// loop: so where a thread has no slot, it reads what is the first one's.
 constexpr int mover_threads = 128, bringer_threads = 128, element_threads = 384;
 constexpr int pipeline_threads = mover_threads + bringer_threads + element_threads;
 
 // The patches of a block, of all environments: item after item, from its own number on as far apart as there are blocks.
 template <class T, Visit What>
 class Pipeline {
+  static_assert(
+      sizeof(T) == 4,
+      "shared memory holds two patches in float32 alone, and SharedSlots knows no other numbers");
+
  public:
   PD_DEVICE Pipeline(const StreamCall<T>& call, int k, std::byte* shared)
       : call_(call), k_(k), shared_(shared) {}
@@ -50,13 +55,13 @@ class Pipeline {
   using Seen = typename Vertices<T, false>::Seen;
 
   static constexpr int element_warps = element_threads / warp_size;
-  // Slots that the threads of a task have in registers at once; those of larger patches follow one by one.
+  // Slots that bringers have in registers at once; those of larger patches follow one by one.
   static constexpr int usual_slots = 640;
   static constexpr int brought = usual_slots / bringer_threads;
-  // Forces of the slots from here on movers leave to bringers.
+  // From left_slots on bringers add up the forces of slots that are not inside the patch.
   static constexpr int moved = 3, left_slots = moved * mover_threads;
-  static constexpr int soon =
-      2;  // of moved, so many that are mostly inside a patch: asked for early
+  // Of moved, so many are mostly inside a patch: what a visit wants is asked for before it is wanted.
+  static constexpr int soon = 2;
 
   PD_DEVICE static int mover() { return int(threadIdx.x); }
   PD_DEVICE static int bringer() { return int(threadIdx.x) - mover_threads; }
@@ -105,7 +110,7 @@ class Pipeline {
 
   // of this item, or the next one whose environment goes on
   PD_DEVICE Found look_for(Item item, bool there = true) const {
-    while (item.environment < call_.step.batch && skips<What>(work(item.environment)))
+    while (there && item.environment < call_.step.batch && skips<What>(work(item.environment)))
       item = after(item);
     Found f;
     f.there = there && item.environment < call_.step.batch;
@@ -135,8 +140,8 @@ class Pipeline {
   }
   PD_DEVICE Work work(int environment) const { return Work(call_, environment); }
 
-  // Stop `n` of the block, told before the slots of the one before it are ready. Whoever wants to know reads it there, since
-  // registers for it would be too many; movers may be six behind the one that is told.
+  // Stop `n` of the block, told before the slots of the second before it are ready. Whoever wants to know reads it there, since
+  // registers for it would be too many; movers may be six behind the one that is told, so at least seven are kept.
   PD_DEVICE Stop& told(unsigned n) const {
     constexpr unsigned kept = 8;
     __shared__ Stop stops[kept];
@@ -195,6 +200,7 @@ class Pipeline {
     }
   }
   PD_DEVICE static void meet_bringers() {
+    __syncwarp();
     asm volatile("bar.sync 2, %0;" ::"n"(bringer_threads) : "memory");
   }
 
@@ -275,7 +281,7 @@ class Pipeline {
     T factor[2];  // pair_factor
   };
 
-  // This warp's first block of the pairs of a stop, or the first of all where it has none.
+  // This warp's first block of the pairs of a stop, or the stop's first where it has none.
   PD_DEVICE unsigned first_block(unsigned n) const {
     const Stop& in = told(n);
     return unsigned(in.first_block + (element_warp() < in.blocks ? element_warp() : 0));
@@ -289,7 +295,7 @@ class Pipeline {
     const T* weight =
         call_.memory.weights + (std::size_t(block + told(n).weights) * (2 * pair_lanes) + lane);
     PairInputs pair;
-    // once an iteration: the caches had better keep something else
+    // once a patch: the caches had better keep something else
     for (int c = 0; c < 5; ++c) pair.corner[c] = unsigned(__ldcs(corner + c * pair_lanes));
     for (int e = 0; e < 2; ++e) pair.weight[e] = __ldcs(weight + e * pair_lanes);
     for (int e = 0; e < 2; ++e) pair.factor[e] = __ldcs(factor + e * pair_lanes);
@@ -333,14 +339,14 @@ class Pipeline {
     }
   }
 
-  // Slots and entries of a half by a 32-bit address, which stays in a register; by pointers it would be worked out again for each
-  // of them.
+  // Slots and entries of a half by a 32-bit address, which stays in a register; by pointers it would be worked out again for
+  // each of them.
   class SharedSlots {
    public:
     PD_DEVICE SharedSlots(const Pipeline& p, unsigned n)
         : plan_(p.plan()), first_(in_register(shared_address(p.half(n)))) {}
 
-    // `corner`: of PairNumbers
+    // `corner`: of PairNumbers. What is volatile keeps its order, so nothing is looked at before it is awaited.
     PD_DEVICE void look(unsigned corner, Vec3<T>& position, RestPoint<T>& rest) const {
       const SharedAddress slot_times_8 = corner & 0xffff;
       Quad<T> seen;
@@ -354,7 +360,7 @@ class Pipeline {
       position = vec3(seen);
       rest = RestPoint<T>::of(bits);
     }
-    // unless the corner has no entry
+    // Unless the corner has no entry. Nobody reads the fourth number.
     PD_DEVICE void leave(unsigned corner, const Vec3<T>& force) const {
       asm volatile(
           "{.reg .pred p; setp.lt.u32 p, %0, 0xffff0000; @p st.shared.v4.f32 [%1], {%2, %3, %4, "
@@ -465,6 +471,7 @@ class Pipeline {
     }
   }
   PD_DEVICE static void meet_movers() {
+    __syncwarp();
     asm volatile("bar.sync 1, %0;" ::"n"(mover_threads) : "memory");
   }
 

@@ -235,8 +235,8 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));
 }
 
-// The force on a vertex that patches share: what they left, in their order. Two at once, since few have more, and more would keep
-// other threads out for want of registers.
+// The force on a vertex that patches share: what they left, in their order. Two at once, since few have more, and more would
+// keep other threads out for want of registers.
 template <class T, bool Touching>
 PD_DEVICE Vec3<T> shared_force(const StreamWork<T, Touching>& w, int shared) {
   constexpr int together = 2;
@@ -255,7 +255,7 @@ PD_DEVICE Vec3<T> shared_force(const StreamWork<T, Touching>& w, int shared) {
   return force;
 }
 
-// Vertices that patches share.
+// Vertices that patches share. As many threads as there can be where 32 registers are enough, since they wait for memory.
 template <Visit What, class T, bool Touching>
 __global__ void __launch_bounds__(vertex_threads, sizeof(T) == 4 && !Touching ? 8 : 1)
     stream_shared(const __grid_constant__ StreamCall<T> call, int k) {
