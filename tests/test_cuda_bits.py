@@ -66,11 +66,13 @@ def test_runs_and_batches_do_not_matter(kernel: str, tolerance: float, precision
 
 @pytest.mark.usefixtures("poisoned")
 @pytest.mark.parametrize("tolerance", [0.0, 0.1])
-@pytest.mark.parametrize(("cells", "patch"), [((8, 5, 5), 100), ((19, 40, 1), 2304), ((24, 12, 9), 2304), ((2, 2, 2), 2304)])
+@pytest.mark.parametrize(
+    ("cells", "patch"), [((8, 5, 5), 100), ((19, 40, 1), 2304), ((24, 12, 9), 2304), ((2, 2, 2), 2304)]
+)
 def test_blocks_that_go_from_patch_to_patch(
     cells: tuple[int, int, int], patch: int, tolerance: float, precision: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without contacts a block of a stream has many patches: small ones, thin and thick large ones, less than a warp has.
+    """Without contacts a block of a stream has many patches: small, thin, thick ones, less than a warp has.
 
     With a ground, however far, there is a block for every patch.
     """
