@@ -50,7 +50,7 @@ template <class T, bool Touching, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::post_shared() {
   ++round_;
   for (int seat = threadIdx.x; seat < patch_.shared(); seat += blockDim.x)
-    post(seat, sum_entries_soon(entries_, row_of_seat(seat)));
+    post(seat, sum_entries_soon<T>(entries_, row_of_seat(seat)));
   __syncwarp();
 }
 
@@ -89,7 +89,7 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_patch(const Visit& vi
     const Seat at = at_;
     if (i + 1 < all) see(seat_of_visit(i + 1));
     const bool here = seat < patch_.slots, sends = seat < shared;
-    Vec3<T> force = sum_entries_soon(entries_, here && !sends ? at.row : 0);
+    Vec3<T> force = sum_entries_soon<T>(entries_, here && !sends ? at.row : 0);
     if (seat - lane() < shared) {
       const Vec3<T> sum = read(seat);
       if (sends) force = sum;
@@ -110,7 +110,7 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_seat(bool early, cons
   const bool sends = seat < shared;
   Vec3<T> force = {T(0), T(0), T(0)};
   if (here) {
-    force = sum_entries_soon(entries_, row_);
+    force = sum_entries_soon<T>(entries_, row_);
     if (sends) post(seat, force);
     see(seat);
   }

@@ -305,11 +305,11 @@ PD_DEVICE Vec3<T> sum_entries(const Quad<T>* entries, int row) {
   return sum;
 }
 
-// The same where somebody waits for it: eight entries are asked for at once.
-template <class T>
-PD_DEVICE Vec3<T> sum_entries_soon(const Quad<T>* entries, int row) {
+// The same where somebody waits for it: eight entries are asked for at once. `Entries`: a pointer, or like one.
+template <class T, class Entries>
+PD_DEVICE Vec3<T> sum_entries_soon(const Entries& entries, int row) {
   constexpr int together = 8;
-  const Quad<T>* entry = entries + (unsigned(row) & 0xffff);
+  Entries entry = entries + (unsigned(row) & 0xffff);
   const int count = row >> 16 & 0x7fff;
   Vec3<T> sum = {T(0), T(0), T(0)};
 #pragma unroll 1

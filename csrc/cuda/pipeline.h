@@ -167,11 +167,29 @@ class Pipeline {
 
   PD_DEVICE std::byte* half(unsigned n) const {
     return shared_ +
-           (n & 1) * pass_shared_bytes(sizeof(T), plan().most_slots, plan().most_entries, 2);
+           (n & 1) * pipeline_half_bytes(sizeof(T), plan().most_slots, plan().most_entries);
   }
   PD_DEVICE Slots<T> slots_of(unsigned n) const { return Slots<T>(half(n), plan().most_slots); }
-  PD_DEVICE Quad<T>* entries_of(unsigned n) const {
-    return reinterpret_cast<Quad<T>*>(half(n) + slots_bytes(sizeof(T), plan().most_slots, 2));
+
+  // Two numbers of every entry, then the third of every entry.
+  struct Entries {
+    struct alignas(2 * sizeof(T)) Two {
+      T x, y;
+    };
+    const Two* first;
+    const T* third;
+
+    PD_DEVICE Entries operator+(unsigned count) const { return {first + count, third + count}; }
+    PD_DEVICE Entries& operator+=(unsigned count) { return *this = *this + count; }
+    PD_DEVICE Quad<T> operator[](unsigned entry) const {
+      const Two two = first[entry];
+      return {two.x, two.y, third[entry], T(0)};
+    }
+  };
+  PD_DEVICE Entries entries_of(unsigned n) const {
+    const std::byte* entries = half(n) + slots_bytes(sizeof(T), plan().most_slots, 2);
+    const auto* first = reinterpret_cast<const typename Entries::Two*>(entries);
+    return {first, reinterpret_cast<const T*>(first + plan().most_entries)};
   }
   // what each warp has met of the elements' energy
   PD_DEVICE double* energies_of(unsigned n) const {
@@ -208,12 +226,12 @@ class Pipeline {
   PD_DEVICE void sum_shared(unsigned n) const {
     const Stop& at = told(n);
     const Work w = work(at.environment);
-    const Quad<T>* entries = entries_of(n);
+    const Entries entries = entries_of(n);
     const int first_slot = at.first_slot, slots = at.slots;
 #pragma unroll 1
     for (int s = max(left_slots, at.interior) + bringer(); s < slots; s += bringer_threads)
       w.shared_force[first_slot + s] =
-          quad(sum_entries_soon(entries, w.plan.slot_row[first_slot + s]));
+          quad(sum_entries_soon<T>(entries, w.plan.slot_row[first_slot + s]));
   }
 
   // What is on its way to the slots.
@@ -360,13 +378,15 @@ class Pipeline {
       position = vec3(seen);
       rest = RestPoint<T>::of(bits);
     }
-    // Unless the corner has no entry. Nobody reads the fourth number.
+    // Unless the corner has no entry.
     PD_DEVICE void leave(unsigned corner, const Vec3<T>& force) const {
+      const SharedAddress entries = first_ + unsigned(slots_bytes(sizeof(T), plan_.most_slots, 2));
+      const unsigned entry = corner >> 16;
       asm volatile(
-          "{.reg .pred p; setp.lt.u32 p, %0, 0xffff0000; @p st.shared.v4.f32 [%1], {%2, %3, %4, "
-          "%5};}" ::"r"(corner),
-          "r"(first_ + unsigned(slots_bytes(sizeof(T), plan_.most_slots, 2)) + (corner >> 16) * 16),
-          "f"(force.x), "f"(force.y), "f"(force.z), "f"(force.z)
+          "{.reg .pred p; setp.lt.u32 p, %0, 0xffff0000; @p st.shared.v2.f32 [%1], {%3, %4}; "
+          "@p st.shared.f32 [%2], %5;}" ::"r"(corner),
+          "r"(entries + 8 * entry), "r"(entries + 8 * unsigned(plan_.most_entries) + 4 * entry),
+          "f"(force.x), "f"(force.y), "f"(force.z)
           : "memory");
     }
 
@@ -411,7 +431,7 @@ class Pipeline {
   PD_DEVICE void move_patch(unsigned n) const {
     const Stop& at = told(n);
     const Work w = work(at.environment);
-    const Quad<T>* entries = entries_of(n);
+    const Entries entries = entries_of(n);
     const int interior = at.interior, first_vertex = at.first_vertex;
     const int slots = at.slots, first_slot = at.first_slot;
     ThreadSums sums = no_sums<What>();
@@ -439,13 +459,13 @@ class Pipeline {
       sums.value[0] += energies_of(n)[mover()];
     // first what frees the half
 #pragma unroll
-    for (int r = 0; r < moved; ++r) force[r] = sum_entries_soon(entries, row[r]);
+    for (int r = 0; r < moved; ++r) force[r] = sum_entries_soon<T>(entries, row[r]);
     const auto visit_late = [&](int s, const Vec3<T>& summed) {
       visit_slot(s, summed, [&] { return see_slot(s); });
     };
 #pragma unroll 1
     for (int s = slot(moved); s < interior; s += mover_threads)
-      visit_late(s, sum_entries_soon(entries, w.plan.slot_row[first_slot + s]));
+      visit_late(s, sum_entries_soon<T>(entries, w.plan.slot_row[first_slot + s]));
     give(slots_ready, n);
 #pragma unroll
     for (int r = 0; r < soon; ++r) visit_slot(slot(r), force[r], [&] { return seen[r]; });

@@ -166,7 +166,8 @@ class StreamRunner {
     constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
     if constexpr (updates && !Touching && sizeof(T) == 4) {
       const auto kernel = stream_pipeline<What, T>;
-      const std::size_t shared = 2 * pass_shared_;
+      const std::size_t shared =
+          2 * pipeline_half_bytes(sizeof(T), plan_.most_slots, plan_.most_entries);
       const std::int64_t blocks =
           resident_blocks(reinterpret_cast<const void*>(kernel), pipeline_threads, shared);
       launcher_.run(kernel, std::min(blocks, patches_), pipeline_threads, shared, call_, k);

@@ -84,6 +84,13 @@ constexpr std::size_t pass_shared_bytes(std::size_t real, std::size_t slots, std
   return slots_bytes(real, slots, fields) + 4 * real * entries;
 }
 
+// One of the two halves of a pipeline's shared memory (cuda/pipeline.h): position and rest position of every slot, then entries
+// of three numbers, since a fourth would take its room from the cache.
+constexpr std::size_t pipeline_half_bytes(std::size_t real, std::size_t slots,
+                                          std::size_t entries) {
+  return slots_bytes(real, slots, 2) + aligned(3 * real * entries);
+}
+
 // The small problem of the multilevel solver, with the schedule that has one: what it keeps, and the least that it wants of
 // the memory of a pass while it is made. Tetrahedra of which it has so many numbers are faster in more.
 constexpr std::size_t corotation_bytes = 11264;
