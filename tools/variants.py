@@ -1,0 +1,141 @@
+"""Times changes to the kernels of one CUDA source side by side, on a GPU, with the extension built in place:
+
+python tools/variants.py stream_float one-1M --patch wide.patch fewer.patch --tets 2304 2560
+
+Two GPUs of a kind differ by a tenth in clock, so only times of one run compare. Each patch (as `git diff` writes it) is
+applied to a copy of csrc/, and the source compiled anew and linked with the other objects as they are: it may change
+kernels and their launches, but no plan, and nothing that other sources see. The scene is one of
+benchmarks/gpu_scenes.py; --tets are tetrahedra of a patch of kernel "stream". The tree itself comes first and once more
+at the end. A row has microseconds of an iteration, of a step of 64 and from 64 to 128 of them, and a hash of the
+positions after four steps: the same bits or not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import pickle
+import runpy
+import shutil
+import statistics
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils import cpp_extension
+
+ROOT = Path(__file__).resolve().parent.parent
+LIBRARIES = ("c10", "torch", "torch_cpu", "torch_python", "cudart", "c10_cuda", "torch_cuda")
+
+
+def run(*command: object, folder: Path = ROOT) -> None:
+    """Run a command, or end with what it says."""
+    words = [str(word) for word in command]
+    result = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+    if result.returncode != 0:
+        sys.exit(f"{' '.join(words[:3])} ...: {result.stdout}{result.stderr}")
+
+
+def apply(patch: Path, folder: Path) -> None:
+    """Change the copy of csrc/ in a folder as a patch says; what it does elsewhere is left out."""
+    run("git", "apply", "--include=csrc/*", patch.resolve(), folder=folder)
+
+
+def objects() -> list[Path]:
+    """Of the extension that was built in place, for this python and torch."""
+    folder = f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}-torch-{torch.__version__}"
+    found = sorted((ROOT / "build" / folder).rglob("*.o"))
+    if not found:
+        sys.exit(f"build/{folder} has no objects: run `python setup.py build_ext --inplace` first.")
+    return found
+
+
+def make_variant(folder: Path, source: str, patch: Path | None, linked: list[Path]) -> None:
+    """A package with an extension of its own in `folder`."""
+    package = folder / "torchpd"
+    shutil.copytree(ROOT / "torchpd", package, ignore=shutil.ignore_patterns("_C*.so", "__pycache__"))
+    shutil.copytree(ROOT / "csrc", folder / "csrc")
+    if patch is not None:
+        apply(patch, folder)
+    major, minor = torch.cuda.get_device_capability()
+    target = f"-gencode=arch=compute_{major}{minor},code=sm_{major}{minor}"
+    flags = runpy.run_path(str(ROOT / "torchpd" / "toolkit.py"))["NVCC_FLAGS"]
+    made = folder / f"{source}.o"
+    nvcc = Path(str(cpp_extension.CUDA_HOME)) / "bin" / "nvcc"
+    kernels = folder / "csrc" / "cuda" / f"{source}.cu"
+    run(nvcc, "-c", kernels, "-o", made, *flags, target, "-Xcompiler=-fPIC", "-I", folder / "csrc")
+    others = [path for path in linked if path.name != made.name]
+    paths = [word for path in cpp_extension.library_paths("cuda") for word in ("-L", path)]
+    module = package / f"_C{sysconfig.get_config_var('EXT_SUFFIX')}"
+    run("c++", "-shared", "-fopenmp", *others, made, *paths, *(f"-l{name}" for name in LIBRARIES), "-o", module)
+
+
+def measure(name: str, scene_name: str, tets: int | None, plans: Path) -> None:
+    """Print one row; in a process of its own, since torch loads an extension once."""
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    from gpu_scenes import GPU_SCENES
+    from gpu_timing import graph_times
+    from scenes import TIME_STEP
+
+    import torchpd as pd
+    from torchpd import regimes
+
+    if tets is not None:
+        regimes._STREAM_TETS = dict.fromkeys(regimes._STREAM_TETS, tets)
+    scene = next(scene for scene in GPU_SCENES if scene.name == scene_name)
+    kept = plans / f"{scene_name}-{tets}.pickle"
+    if kept.exists():
+        sim: Any = pickle.loads(kept.read_bytes())
+    else:
+        options: Any = {"dtype": torch.float32, "progress": False, "kernel": scene.kernel}
+        sim = pd.Simulator(scene.build(), TIME_STEP, scene.iterations, **options).to("cuda")
+        kept.write_bytes(pickle.dumps(sim))
+    start = scene.start(sim)
+    state = start
+    for _ in range(4):
+        state = sim(state)
+    bits = hashlib.sha256(state.positions.cpu().numpy().tobytes()).hexdigest()[:8]
+    steps = []
+    for iterations in (64, 128):
+        sim.iterations = iterations
+        steps.append(1e6 * statistics.median(graph_times(lambda: sim(start), repetitions=7, seconds=0.3)))
+    each, marginal = steps[0] / 64, (steps[1] - steps[0]) / 64
+    print(f"{name:24} {sim.plan.patches:8} patches {each:9.2f} us {marginal:9.2f} us  {bits}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", help="a source of csrc/cuda without its .cu")
+    parser.add_argument("scene")
+    parser.add_argument("--patch", type=Path, nargs="*", default=[])
+    parser.add_argument("--tets", type=int, nargs="*", default=[None])
+    parser.add_argument("--measure", nargs=2, metavar=("NAME", "PLANS"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.measure:
+        name, plans = options.measure
+        measure(name, options.scene, options.tets[0], Path(plans))
+        return
+    if not torch.cuda.is_available():
+        sys.exit("tools/variants.py times kernels, and torch sees no GPU here.")
+    linked = objects()
+    patches: dict[str, Path | None] = {"as it is": None, **{patch.stem: patch for patch in options.patch}}
+    with tempfile.TemporaryDirectory() as made:
+        folders = {name: Path(made) / str(number) for number, name in enumerate(patches)}
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(lambda name: make_variant(folders[name], options.source, patches[name], linked), patches))
+        for tets in options.tets:
+            for name in [*patches, "as it is"]:
+                environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folders[name]), *sys.path[1:]])}
+                size = [] if tets is None else ["--tets", str(tets)]
+                command = [sys.executable, __file__, options.source, options.scene, *size, "--measure", name, made]
+                subprocess.run(command, env=environment, check=False)
+
+
+if __name__ == "__main__":
+    main()
