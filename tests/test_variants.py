@@ -44,3 +44,11 @@ def test_a_patch_that_does_not_fit_is_refused(tool: dict[str, Any], tmp_path: Pa
     with pytest.raises(SystemExit, match=r"git apply .*one\.h"):
         tool["apply"](patch, tmp_path)
     assert (tmp_path / "csrc" / "one.h").read_text() == "a\n"
+
+
+def test_a_patch_that_changes_no_kernel_is_refused(tool: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "csrc").mkdir()
+    patch = tmp_path / "a.patch"
+    patch.write_text(CHANGE.format(file="two.py", old="a", new="b"))
+    with pytest.raises(SystemExit, match=r"a\.patch changes nothing in csrc/"):
+        tool["apply"](patch, tmp_path)

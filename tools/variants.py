@@ -23,6 +23,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -42,21 +43,30 @@ def run(*command: object, folder: Path = ROOT) -> None:
         sys.exit(f"{' '.join(words[:3])} ...: {result.stdout}{result.stderr}")
 
 
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
 def apply(patch: Path, folder: Path) -> None:
     """Change the copy of csrc/ in a folder as a patch says; what it does elsewhere is left out."""
+    before = contents(folder / "csrc")
     run("git", "apply", "--include=csrc/*", patch.resolve(), folder=folder)
+    if contents(folder / "csrc") == before:
+        sys.exit(f"{patch} changes nothing in csrc/.")
 
 
 def objects() -> list[Path]:
-    """Of the extension that was built in place, for this python and torch."""
+    """Of the extension that was built in place, for this python and torch, one of every source."""
     folder = f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}-torch-{torch.__version__}"
-    found = sorted((ROOT / "build" / folder).rglob("*.o"))
-    if not found:
-        sys.exit(f"build/{folder} has no objects: run `python setup.py build_ext --inplace` first.")
+    sources = [path.relative_to(ROOT) for kind in ("*.cpp", "*.cu") for path in (ROOT / "csrc").rglob(kind)]
+    found = [(ROOT / "build" / folder / path).with_suffix(".o") for path in sorted(sources)]
+    newest = max(path.stat().st_mtime for path in (ROOT / "csrc").rglob("*") if path.is_file())
+    if not all(path.exists() for path in found) or max(path.stat().st_mtime for path in found) < newest:
+        sys.exit(f"build/{folder} is not of this csrc/: run `python setup.py build_ext --inplace` first.")
     return found
 
 
-def make_variant(folder: Path, source: str, patch: Path | None, linked: list[Path]) -> None:
+def make_variant(folder: Path, source: str, patch: Path | None, linked: list[Path], flags: Sequence[str]) -> None:
     """A package with an extension of its own in `folder`."""
     package = folder / "torchpd"
     shutil.copytree(ROOT / "torchpd", package, ignore=shutil.ignore_patterns("_C*.so", "__pycache__"))
@@ -65,7 +75,6 @@ def make_variant(folder: Path, source: str, patch: Path | None, linked: list[Pat
         apply(patch, folder)
     major, minor = torch.cuda.get_device_capability()
     target = f"-gencode=arch=compute_{major}{minor},code=sm_{major}{minor}"
-    flags = runpy.run_path(str(ROOT / "torchpd" / "toolkit.py"))["NVCC_FLAGS"]
     made = folder / f"{source}.o"
     nvcc = Path(str(cpp_extension.CUDA_HOME)) / "bin" / "nvcc"
     kernels = folder / "csrc" / "cuda" / f"{source}.cu"
@@ -123,18 +132,22 @@ def main() -> None:
         return
     if not torch.cuda.is_available():
         sys.exit("tools/variants.py times kernels, and torch sees no GPU here.")
-    linked = objects()
-    patches: dict[str, Path | None] = {"as it is": None, **{patch.stem: patch for patch in options.patch}}
+    linked, flags = objects(), runpy.run_path(str(ROOT / "torchpd" / "toolkit.py"))["NVCC_FLAGS"]
+    patches: dict[str, Path | None] = {"as it is": None, **{str(patch): patch for patch in options.patch}}
+    failed = False
     with tempfile.TemporaryDirectory() as made:
         folders = {name: Path(made) / str(number) for number, name in enumerate(patches)}
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(lambda name: make_variant(folders[name], options.source, patches[name], linked), patches))
+            made_of = [(folders[name], options.source, patch, linked, flags) for name, patch in patches.items()]
+            list(pool.map(lambda arguments: make_variant(*arguments), made_of))
         for tets in options.tets:
             for name in [*patches, "as it is"]:
                 environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folders[name]), *sys.path[1:]])}
                 size = [] if tets is None else ["--tets", str(tets)]
                 command = [sys.executable, __file__, options.source, options.scene, *size, "--measure", name, made]
-                subprocess.run(command, env=environment, check=False)
+                failed |= subprocess.run(command, env=environment, check=False).returncode != 0
+    if failed:
+        sys.exit("not every variant could be measured")
 
 
 if __name__ == "__main__":
