@@ -219,6 +219,32 @@ def test_unsolved_step_warns() -> None:
     assert 0.0 < float(crumpled.grad.norm()) <= 1.1 * crumpled.numel() ** 0.5
 
 
+def test_a_loss_that_is_no_number_has_no_gradient(recwarn: pytest.WarningsRecorder) -> None:
+    """Whoever watches for NaN sees it, in the environment that has it and in what all share."""
+    sim, state = body()
+    x = state.positions.clone().requires_grad_()
+    after = sim(pd.State(x, state.velocities)).positions
+    weight = torch.ones(len(x), 1, 1, dtype=x.dtype)
+    weight[0] = torch.nan
+    stiffness = sim.stiffness.requires_grad_()
+    (weight * sim(pd.State(x, state.velocities)).positions).sum().backward()
+    assert after.isfinite().all()
+    assert x.grad is not None
+    assert x.grad[0].isnan().any()
+    assert x.grad[1:].isfinite().all()
+    assert stiffness.grad is not None
+    assert stiffness.grad.isnan().all()
+    assert not recwarn.list  # more iterations would not help
+
+
+def test_contacts_that_are_not_there_may_want_gradients() -> None:
+    sim, state = body()
+    sim.requires_grad_(True)
+    sim(state).positions.sum().backward()
+    assert sim.stiffness.grad is not None
+    sim.rollout(state, 2).positions.sum().backward()
+
+
 def test_what_has_no_derivative_says_so() -> None:
     sim, state = body(pd.Ground(-10.0))
     start = state.positions.clone().requires_grad_()

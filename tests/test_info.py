@@ -48,6 +48,31 @@ def test_info_is_blank_unless_asked_for(dtype: torch.dtype, device: torch.device
     assert torch.equal(quiet.rho, info.rho.expand(2, 3))
 
 
+@pytest.mark.parametrize(
+    "solver", [pd.Chebyshev(), pd.Jacobi(), pd.Multilevel()], ids=["chebyshev", "jacobi", "levels"]
+)
+def test_what_is_no_number_is_not_solved(dtype: torch.dtype, device: torch.device, solver: pd.Solver) -> None:
+    """Neither by its residual nor by its stop; and other environments do not notice."""
+    case = beam(1e5)
+    sim = simulator(case, dtype, device, iterations=20, tolerance=1e-3)
+    sim.solver = solver
+    rest, vertex = sim.rest_state(3), sim.vertices - 1
+    state = pd.State(rest.positions, moving(sim, 3).velocities)
+    _, expected = sim(state, return_info=True)
+    push = torch.zeros_like(rest.positions)
+    push[0, vertex] = torch.nan
+    state.positions[1, vertex] = torch.nan
+    _, info = sim(state, push, return_info=True)
+    assert info.residual.isnan().tolist() == [True, True, False]
+    assert not bool(info.converged[:2].any())
+    assert torch.equal(info.residual[2], expected.residual[2])
+    # squares that overflow are no change of a thousandth
+    state.positions[1, vertex] = torch.finfo(dtype).max ** 0.75
+    _, info = sim(state, return_info=True)
+    assert not bool(info.converged[1])
+    assert bool(info.residual[1].isnan())
+
+
 def test_rho_of_the_guarded_schedule_is_the_bound(dtype: torch.dtype, device: torch.device) -> None:
     case = beam(1e5)
     sim = simulator(case, dtype, device, iterations=1)

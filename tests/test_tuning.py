@@ -130,6 +130,15 @@ def test_an_audit_finds_the_error() -> None:
     assert sim.iterations == promise.iterations
 
 
+def test_an_audit_is_told_where_pins_are() -> None:
+    sim = bar(dtype=torch.float64)
+    promise = sim.tune(swinging(sim), error=1e-2)
+    state, targets = sim.rest_state(), sim.pin_targets + torch.tensor([0.0, 0.05, 0.0], dtype=torch.float64)
+    after = sim(state, targets=targets)
+    assert float(promise.audit(sim, state, after, targets=targets)) <= promise.error
+    assert float(promise.audit(sim, state, after)) > 1.0  # of another step
+
+
 def test_out_of_reach_is_said_with_the_best_there_is() -> None:
     sim = bar(youngs=1e8, time_step=1 / 30)
     with pytest.warns(TuningWarning, match=r"\(error 0.001 cannot be had\)"):

@@ -199,7 +199,10 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
     tolerance = _TOLERANCE[right.dtype]
     right = allowed(right)
     multiplier, error = conjugate_gradients(product, precondition, right, tolerance)
-    failed = ~(error <= 1e3 * tolerance)
+    # a loss or a state that is no number has a gradient that is none, as those who watch for it expect
+    lost = ~(torch.isfinite(right) & torch.isfinite(call.after)).flatten(1).all(1)
+    multiplier = torch.where(lost[:, None, None], torch.nan, multiplier)
+    failed = ~(error <= 1e3 * tolerance) & ~lost
     if bool(failed.any()):
         warnings.warn(
             f"torchpd: the adjoint of a step has no solution in {int(failed.sum())} of {len(failed)} environments "

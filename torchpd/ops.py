@@ -271,11 +271,11 @@ def _step_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str
 
 def _step_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _: Tensor) -> tuple[Any, ...]:
     wanted = ctx.needs_input_grad
-    _check_differentiable(wanted[4])
     if wanted[3]:
         raise RuntimeError("torchpd: a step has no derivative for its first iterate; detach start")
     positions, velocities, forces, after, *rest = ctx.saved_tensors
     material, plan = rest[: len(MATERIAL_TABLE)], rest[len(MATERIAL_TABLE) :]
+    _check_differentiable(wanted[4], material)
     grads = _ops.step_vjp(
         grad_positions.contiguous(), grad_velocities.contiguous(), after, positions, velocities, forces, material, plan,
         time_step=ctx.time_step,
@@ -284,10 +284,10 @@ def _step_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _:
     return x, v, f if wanted[2] else None, None, values, [None] * len(plan)
 
 
-def _check_differentiable(wanted: Sequence[bool]) -> None:
-    contacts = [
-        row.name for row, needed in zip(MATERIAL_TABLE, wanted, strict=True) if needed and row.name in _CONTACTS
-    ]
+def _check_differentiable(wanted: Sequence[bool], material: Sequence[Tensor]) -> None:
+    arrays = zip(MATERIAL_TABLE, wanted, material, strict=True)
+    # without contacts nothing depends on them
+    contacts = [row.name for row, needed, array in arrays if needed and row.name in _CONTACTS and array.numel()]
     if contacts:
         raise RuntimeError(f"torchpd: a step has no derivative for {' and '.join(contacts)}; detach them")
 
@@ -315,9 +315,9 @@ def _rollout_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor,
     """Backwards through the recorded states, one adjoint a step."""
     if ctx.every != 1:
         raise RuntimeError("torchpd: the rollout op is differentiable with every=1 only, where it records every state")
-    _check_differentiable(ctx.needs_input_grad[3])
     x0, v0, given, positions, velocities, *rest = ctx.saved_tensors
     material, plan = rest[: len(MATERIAL_TABLE)], rest[len(MATERIAL_TABLE) :]
+    _check_differentiable(ctx.needs_input_grad[3], material)
     x, v, forces = torch.zeros_like(x0), torch.zeros_like(x0), torch.zeros_like(x0)
     values = [torch.zeros_like(array) for array in material]
     for step in reversed(range(len(positions))):

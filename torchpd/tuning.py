@@ -29,6 +29,7 @@ from .diagonal import step_diagonal
 from .material import MATERIAL_ROWS
 from .solvers import Chebyshev, Solver
 from .state import Info, State
+from .targets import Targets
 
 if TYPE_CHECKING:
     from .simulator import Simulator
@@ -95,7 +96,14 @@ class Promise:
         return info.residual <= self.residual_limit
 
     @torch.no_grad()
-    def audit(self, sim: Simulator, state: State, after: State, forces: Tensor | None = None) -> Tensor:
+    def audit(
+        self,
+        sim: Simulator,
+        state: State,
+        after: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+    ) -> Tensor:
         """Error of a step [B], from solving it on: |x' - x| / |x' - x_0| with x' three times as many iterations later.
 
         Costs three steps and calibrates nothing: for now and then. Low where even those iterations change little.
@@ -105,12 +113,13 @@ class Promise:
             state: where the step started.
             after: where it ended.
             forces: that the step was given.
+            targets: that it was given.
         """
         further = copy.copy(sim)
         further.iterations, further.tolerance = 3 * self.iterations, 0.0
-        solved: Tensor = further(state, forces, start=after[0])[1]
+        solved: Tensor = further(state, forces, targets, start=after[0])[1]
         further.iterations = 0
-        first: Tensor = further(state, forces)[1]
+        first: Tensor = further(state, forces, targets)[1]
         # displacements over the time step are velocities
         error: Tensor = (solved - after[1]).flatten(1).norm(dim=1) / (solved - first).flatten(1).norm(dim=1)
         return error

@@ -354,8 +354,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   // the soft stop of an environment, by a trial that it went on from
   void stop(int lane, int k, double change, double length) {
     const bool kept = k > 0 && outer_[lane].accepted && !done_[lane];
-    if (kept && change <= set_.tolerance * set_.tolerance * length && set_.tolerance > 0)
-      done_[lane] = true;
+    if (kept && is_still(set_.tolerance, change, length)) done_[lane] = true;
   }
 
   // how far the material is from that of M, per lane

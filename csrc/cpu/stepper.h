@@ -283,7 +283,7 @@ class Stepper {
       if (done_[lane]) continue;
       if (guard) schedule_[lane].check(Lanes::lane(sum.energy, lane));
       const double change = Lanes::lane(sum.first, lane), length = Lanes::lane(sum.second, lane);
-      if (soft && change <= set_.tolerance * set_.tolerance * length) done_[lane] = true;
+      if (is_still(set_.tolerance, change, length)) done_[lane] = true;
     }
   }
 
@@ -300,11 +300,8 @@ class Stepper {
     if (!call_.info || team_.rank != 0) return;
     for (int lane = 0; lane < width && in_.first + lane < call_.batch; ++lane) {
       double* row = call_.info + (first_row + in_.first + lane) * info_count;
-      const double last = Lanes::lane(residual_, lane), course = course_[lane];
-      row[info_residual] = !set_.report ? NAN
-                           : course > 0 ? sqrt(last / course)
-                           : last > 0   ? HUGE_VAL
-                                        : 0.0;
+      const double last = Lanes::lane(residual_, lane);
+      row[info_residual] = set_.report ? relative_residual(last, course_[lane]) : NAN;
       row[info_energy] = set_.report ? Lanes::lane(energy_, lane) : NAN;
       row[info_iterations] = used_[lane];
       row[info_restarts] = schedule_[lane].restarts;

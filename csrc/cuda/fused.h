@@ -404,8 +404,7 @@ class FusedRunner {
     sums_.receive(Add{});
     if (lane() == 0) {
       if (guarding_) control_.progress.schedule.check(sums_.total(0));
-      const double limit = set_.tolerance * set_.tolerance * sums_.total(2);
-      if (set_.tolerance > 0 && sums_.total(1) <= limit) control_.progress.done = true;
+      if (is_still(set_.tolerance, sums_.total(1), sums_.total(2))) control_.progress.done = true;
     }
     __syncwarp();
   }

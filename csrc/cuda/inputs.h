@@ -4,6 +4,7 @@
 #include "effects/contact.h"
 #include "math/chebyshev.h"
 #include "plan/views.h"
+#include "solver/step.h"
 #include "solver/vertex.h"
 
 namespace pd::inline PD_TARGET {
@@ -87,11 +88,7 @@ struct Inputs {
     if (!call->info) return;
     double* to = call->info + (record * call->batch + environment) * info_count;
     const bool report = call->settings.report;
-    const double last = progress.residual, course = progress.course;
-    to[info_residual] = !report      ? NAN
-                        : course > 0 ? sqrt(last / course)
-                        : last > 0   ? HUGE_VAL
-                                     : 0.0;
+    to[info_residual] = report ? relative_residual(progress.residual, progress.course) : NAN;
     to[info_energy] = report ? progress.energy : NAN;
     to[info_iterations] = progress.used;
     to[info_restarts] = progress.schedule.restarts;

@@ -315,9 +315,7 @@ class MultilevelRunner {
 
   // the soft stop, by a trial that it went on from
   PD_DEVICE void stop(int k, double change, double length) {
-    const double tolerance = w_.settings().tolerance;
-    if (k > 0 && c_.accepted && tolerance > 0 && change <= tolerance * tolerance * length)
-      c_.done = true;
+    if (k > 0 && c_.accepted && is_still(w_.settings().tolerance, change, length)) c_.done = true;
   }
 
   PD_DEVICE void remember(int k) {

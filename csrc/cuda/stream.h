@@ -303,7 +303,7 @@ __global__ void __launch_bounds__(vertex_threads)
     const bool soft = set.tolerance > 0;
     if (p.done) return;
     p.used += soft;
-    p.done = soft && total[1] <= set.tolerance * set.tolerance * total[2];
+    p.done = is_still(set.tolerance, total[1], total[2]);
     const auto set_omega = [&](int next) { omega[next % guard_period] = p.schedule.next(next); };
     set_omega(k + 1);
     if (p.schedule.wants_energy(k)) p.schedule.check(total[0]);

@@ -11,9 +11,23 @@
 // several contacts of a vertex are projected on one after another, and a ball acts as a plane within an iteration.
 #pragma once
 #include "math/config.h"
+#include "math/scalar.h"
 #include "plan/views.h"
 
 namespace pd::inline PD_TARGET {
+
+// What is left of the gradient, relative to the gradient on the straight course, of their squares: NaN where one of them is no
+// number.
+PD_HD double relative_residual(double last, double course) {
+  if (course > 0 && course < HUGE_VAL) return sqrt(last / course);
+  if (course == 0 && last > 0) return HUGE_VAL;
+  return course == 0 && last == 0 ? 0.0 : NAN;
+}
+
+// The soft stop, of the squares of an iteration's change and of the displacement; what overflows goes on.
+PD_HD bool is_still(double tolerance, double change, double length) {
+  return tolerance > 0 && change < HUGE_VAL && change <= tolerance * tolerance * length;
+}
 
 // The runner's own functions say where it runs: in a kernel, or on the host.
 #if defined(__CUDACC__)
