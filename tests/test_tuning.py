@@ -184,6 +184,10 @@ def test_candidates_may_be_given() -> None:
         assert sim.tune(swinging(sim), error=0.3, candidates=[pd.Jacobi()]).solver == pd.Jacobi()
     with pytest.raises(ValueError, match="candidates must hold at least one solver"):
         sim.tune(error=0.1, candidates=[])
+    with pytest.raises(TypeError, match=r"candidates must be solvers, .* got 'auto'"):
+        sim.tune(error=0.1, candidates=["auto"])  # type: ignore[list-item]
+    with pytest.raises(ValueError, match=r"positions and velocities alike, got \[2, 63, 3\] and \[3, 63, 3\]"):
+        sim.tune(pd.State(sim.rest_state(2).positions, sim.rest_state(3).velocities), error=0.1)
 
 
 # A step that takes 0.1 ms and 10 us an iteration: (0.95 budget - 0.1) / 0.01 iterations.

@@ -217,6 +217,8 @@ class Simulator(Model):
     ) -> Promise:
         """Choose solver and iterations for an error or a time, from a short study on this scene; sets them.
 
+        No step stops early then: `tolerance` becomes 0. Errors leave out 10 eps |x| of rounding, see `Promise`.
+
         The promise also stays in `self.promise`: `promise.holds(info)` says during a run whether to rely on it. A
         target out of reach gets the best there is, a promise with `attained=False`, and a `TuningWarning`. Files do not
         keep it: times are of the machine that measured them.
@@ -226,7 +228,7 @@ class Simulator(Model):
                 studied over 30 steps, without forces and with the targets of the scene. Times are for its batch.
             error: of a step, |x - x*| / |x_0 - x*|, x* converged and x_0 the first iterate; in (0, 1).
             milliseconds: of `sim(state)` on this machine; the error is then as low as that allows.
-            candidates: solvers to choose from; by default those that cannot diverge.
+            candidates: solvers to choose from, not "auto"; by default those that cannot diverge.
             most: iterations of a step, at most.
             progress: show a bar.
 

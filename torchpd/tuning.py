@@ -181,6 +181,9 @@ def tune(
     _check_request(error, milliseconds)
     if isinstance(candidates, (str, Solver)):
         raise TypeError(f"tune: candidates must be a sequence of solvers, got {candidates!r}; write [{candidates!r}]")
+    for solver in candidates or ():
+        if not isinstance(solver, Solver):
+            raise TypeError(f"tune: candidates must be solvers, such as Chebyshev() and Multilevel(), got {solver!r}")
     start = sim.rest_state() if state is None else state
     _check_start(sim, start)
     study = _prepare(sim, start)
@@ -220,8 +223,11 @@ def _check_request(error: float | None, milliseconds: float | None) -> None:
 
 def _check_start(sim: Simulator, state: State) -> None:
     sim.check_state(state)
-    if state[0].dim() != 3 or not len(state[0]):
-        raise ValueError(f"tune: state must hold environments [B, V, 3], at least one, got {list(state[0].shape)}")
+    if state[0].dim() != 3 or not len(state[0]) or state[1].shape != state[0].shape:
+        raise ValueError(
+            "tune: state must hold environments [B, V, 3], at least one, positions and velocities alike, got "
+            f"{list(state[0].shape)} and {list(state[1].shape)}"
+        )
     for name, part in zip(State._fields, state, strict=True):
         bad = (~part.isfinite()).flatten(1).any(1).nonzero()
         if len(bad):
