@@ -130,6 +130,16 @@ def test_an_audit_finds_the_error() -> None:
     assert sim.iterations == promise.iterations
 
 
+def test_stiff_bodies_almost_at_rest_in_float64() -> None:
+    """The converged steps are as certain as Newton's method makes them, not as |grad E| over inertia bounds them."""
+    sim = bar(youngs=1e8, dtype=torch.float64, iterations=20)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", TuningWarning)
+        promise = sim.tune(error=1e-2)
+    assert promise.attained
+    assert promise.studied_error <= 1e-2
+
+
 def test_an_audit_is_told_where_pins_are() -> None:
     sim = bar(dtype=torch.float64)
     promise = sim.tune(swinging(sim), error=1e-2)

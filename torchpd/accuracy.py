@@ -23,7 +23,7 @@ from torch import Tensor
 from .effects import Ground, Sphere
 from .material import MATERIAL_ROWS
 from .reference import StepProblem, step_problem
-from .reference_solvers import newton
+from .reference_solvers import newton, newton_step
 from .scene import Part, Scene
 from .solvers import Chebyshev
 from .state import Info, State
@@ -181,7 +181,7 @@ def exact_steps(
 
     Guarded Chebyshev in float64 until the residual stops falling, then Newton's method where there is no contact and
     the mesh is small enough. `ExactStep.uncertainty` bounds what is left: |grad E| / min m/h^2 >= |u - u*| where the
-    elements are stable.
+    elements are stable, or twice its next step where Newton's method ended, which stiff bodies have far shorter.
 
     Args:
         sim: scene, time step and material; its solver and precision do not matter.
@@ -227,13 +227,14 @@ def _step(
 def _polished(problem: StepProblem, first: Array, near: Array) -> ExactStep:
     """The solution next to an almost converged displacement, and how certain it is."""
     contacts = len(problem.values.planes) + len(problem.values.spheres)
-    solution = near
+    solution, nearest = near, np.inf
     if not contacts and len(near) <= _NEWTON_VERTICES:
         try:
             solution = newton(problem, near)
+            nearest = 2.0 * float(np.linalg.norm(newton_step(problem, solution)))
         except RuntimeError:  # stalls at a kink of the rotations: the iterate stays
             solution = near
     left = float(np.linalg.norm(problem.residual(solution)))
     scale = float(np.linalg.norm(first - solution))
     weakest = float(problem.weight[problem.free].min(initial=np.inf))
-    return ExactStep(problem, first, solution, left / weakest / scale if scale > 0.0 else 0.0)
+    return ExactStep(problem, first, solution, min(left / weakest, nearest) / scale if scale > 0.0 else 0.0)

@@ -21,6 +21,7 @@ __all__ = [
     "jacobi",
     "local_global",
     "newton",
+    "newton_step",
     "preconditioned_lbfgs",
     "relative_error",
     "solve_with_contact",
@@ -268,6 +269,8 @@ def newton(
 ) -> Array:
     """The minimiser near `first` of a step without contact: |grad E(u)| <= tolerance |grad E(0)|, then on to rounding.
 
+    Stiff bodies almost at rest cannot have such a gradient; a step shorter than positions round ends there too.
+
     Exact Hessian where its direction descends steeply enough, else the positive semidefinite one; backtracking on the
     energy (Armijo, 1e-4), and on |grad E| once energies differ by rounding only.
     """
@@ -275,13 +278,15 @@ def newton(
         raise ValueError("newton solves steps without contact; use solve_with_contact")
     u = problem.first_iterate() if first is None else first
     rows, scale = _free_rows(problem), _force_scale(problem)
+    rounding = float(np.finfo(np.float64).eps * np.linalg.norm(problem.positions))
     energy, gradient = problem.evaluate(u)
     for k in range(iterations):
         size = float(np.linalg.norm(gradient))
         direction = _newton_direction(problem, u, gradient, rows) if size > 0.0 else gradient
         trial, trial_energy, trial_gradient = _descend(problem, u, energy, gradient, direction)
         gain = size - float(np.linalg.norm(trial_gradient))
-        if size <= tolerance * scale and gain < 0.9 * size:
+        solved = size <= tolerance * scale or float(np.linalg.norm(direction)) <= rounding
+        if solved and gain < 0.9 * size:
             return u
         if gain == 0.0:
             break
@@ -289,6 +294,11 @@ def newton(
         if observe is not None:
             observe(k + 1, u)
     raise RuntimeError(f"newton: stopped at |grad E| = {size:.3e} N, wanted {tolerance * scale:.3e} N")
+
+
+def newton_step(problem: StepProblem, displacement: Array) -> Array:
+    """Where the quadratic of E around u has its minimum, from u [V, 3] m: the first order of u* - u near a minimum."""
+    return _newton_direction(problem, displacement, problem.evaluate(displacement)[1], _free_rows(problem))
 
 
 def _descend(
