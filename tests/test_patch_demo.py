@@ -56,7 +56,9 @@ def test_demo_draws_and_times_the_three_scenes(tmp_path: Path, capsys: pytest.Ca
     assert [rows[name][7:9] for name in ("twist", "bend", "drop")] == [["27", "37"], ["26", "38"], ["20", "49"]]
     for row in rows.values():
         simulation, surface, rate = float(row[4]), float(row[5]), float(row[6])
-        assert rate == pytest.approx(1e3 / (simulation + surface), abs=1.0 + 0.02 * rate)
+        # both times are rounded to the last digit that they are printed with
+        slack = sum(0.5 * 10.0 ** -len(word.partition(".")[2]) for word in row[4:6])
+        assert 1e3 / (simulation + surface + slack) - 1.0 <= rate <= 1e3 / (simulation + surface - slack) + 1.0
     assert len(re.findall(r"gap \S+ \S+ m; crease mean", text)) == 3
     listed = {Path(line.strip()) for line in text.split("written:")[1].splitlines() if line.strip()}
     assert listed == set(tmp_path.iterdir())

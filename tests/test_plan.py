@@ -99,6 +99,20 @@ def test_lanes_hold_their_elements(plan: Plan, values: SceneValues) -> None:
     assert bool(plan.tet_bound.isfinite().all())
 
 
+def test_bounds_of_regular_tetrahedra() -> None:
+    """Where the largest eigenvalue is a multiple one, as of shapes with a threefold axis, it is no less certain."""
+    turns = 2.0 * np.pi * np.arange(3)[:, None] / 3.0
+    base = np.concatenate([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
+    corners = [np.concatenate([base, [[0.0, 0.0, height]]]) for height in (0.1, 1.0, np.sqrt(2.0), 1.5, 20.0)]
+    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
+    turn[0] *= np.linalg.det(turn)
+    for vertices in [*corners, *(shape @ turn.T for shape in corners)]:
+        values = pd.Scene(pd.Solid(pd.TetMesh(vertices, [[0, 1, 2, 3]]), 1e5)).values()
+        expected = elements(values.rest_positions, values.tets).spread[0]
+        bounds = compile_plan(values, dtype=torch.float64).tet_bound.numpy().reshape(-1)
+        np.testing.assert_allclose(bounds[0], expected, rtol=1e-13)
+
+
 def test_patches_cover_slots_blocks_and_vertices(plan: Plan, values: SceneValues) -> None:
     blocks, slots, interior = (getattr(plan, name).numpy() for name in ("patch_block", "patch_slot", "patch_vertex"))
     for ends, last in ((blocks, len(plan.tet_order)), (slots, len(plan.slot_vertex))):
