@@ -40,6 +40,8 @@ def test_settings_of_a_simulator_are_checked() -> None:
         ({"tolerance": 1.0}, ValueError, r"tolerance must lie in \[0, 1\), got 1"),
         ({"tolerance": -0.1}, ValueError, r"tolerance must lie in \[0, 1\)"),
         ({"tolerance": math.nan}, ValueError, r"tolerance must lie in \[0, 1\), got nan"),
+        ({"tolerance": None}, ValueError, r"tolerance must lie in \[0, 1\), got None"),
+        ({"tolerance": "low"}, ValueError, r"tolerance must lie in \[0, 1\), got 'low'"),
         (
             {"solver": "jacobi"},
             TypeError,
@@ -53,6 +55,18 @@ def test_settings_of_a_simulator_are_checked() -> None:
         pd.Simulator(body())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"patch_size must lie in 16\.\.8192"):
         compile_plan(parts.values(), patch_size=8)
+
+
+def test_settings_that_are_replaced_are_checked() -> None:
+    sim = small_simulator()
+    before = sim.iterations, sim.tolerance
+    with pytest.raises(ValueError, match=r"iterations must be a whole number >= 0, got None"):
+        sim.iterations = None  # type: ignore[assignment]
+    with pytest.raises(ValueError, match=r"tolerance must lie in \[0, 1\), got None"):
+        sim.tolerance = None  # type: ignore[assignment]
+    with pytest.raises(ValueError, match=r"set_material: stiffness must be of at least one environment, got \[0, "):
+        sim.set_material(stiffness=sim.stiffness.detach().expand(1, -1)[:0])
+    assert (sim.iterations, sim.tolerance) == before
 
 
 def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:

@@ -97,6 +97,7 @@ def test_tetrahedral_mesh_is_taken_as_it_is(tmp_path: Path, capsys: pytest.Captu
         (["demo", "nowhere.obj"], "nowhere.obj"),
         (["demo", "--device", "tpu9"], "tpu9"),
         (["demo", "--device", "meta"], "cpu or cuda"),
+        (["study", "--device", "tpu"], "--device must be cpu or cuda, got tpu"),
     ],
 )
 def test_bad_requests_get_one_sentence(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

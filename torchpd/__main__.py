@@ -95,7 +95,9 @@ def _add_study(commands: Any) -> None:
     study.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
     study.add_argument("--threads", type=_whole, help="of the CPU")
     study.add_argument("--out", type=Path, default=Path("out/study"), help="folder for the files (%(default)s)")
-    study.add_argument("--quick", action="store_true", help="few points, to see that everything runs")
+    study.add_argument(
+        "--quick", action="store_true", help="few points, to see that everything runs: 8 iterations at most"
+    )
 
 
 def _study(arguments: argparse.Namespace) -> str:

@@ -18,13 +18,14 @@ from .convergence import SolvedAlreadyError, compare_solvers, plot_convergence
 from .doctor import OPTIONAL, missing_packages
 from .effects import Gravity, Ground, Solid
 from .mesh import TetMesh, TriMesh
+from .placing import find_device
 from .render import Studio, contact_sheet
 from .scene import Scene
 from .simulator import Simulator
 from .state import State, Track
 from .tetrahedralize import tetrahedralize
 
-__all__ = ["DemoOptions", "check_packages", "find_device", "run_demo"]
+__all__ = ["DemoOptions", "check_packages", "run_demo"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -98,16 +99,6 @@ def check_packages() -> None:
     if missing:
         names = ", ".join(package.pip_name for package in missing)
         raise ModuleNotFoundError(f"the demo draws with {names}, not installed: pip install torchpd[demo]")
-
-
-def find_device(name: str) -> torch.device:
-    """What --device names, if it is there."""
-    kind = name.split(":")[0]
-    if kind not in ("cpu", "cuda"):
-        raise ValueError(f"--device must be cpu or cuda, got {name}")
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: torch sees no CUDA device here; python -m torchpd doctor says more")
-    return torch.device(name)
 
 
 def _load(path: Path | None) -> TetMesh | TriMesh:

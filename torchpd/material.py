@@ -65,6 +65,8 @@ def check_batches(new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None
     for name in MATERIAL_ROWS:
         array, stays = new.get(name, kept[name]), "" if name in new else " (kept)"
         count = len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1
+        if count == 0:
+            raise ValueError(f"set_material: {name} must be of at least one environment, got {list(array.shape)}")
         if first is not None and count not in (1, first[0]):
             raise ValueError(
                 f"set_material: arrays must be of one number of environments, or of all, got those of {first[0]} "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -60,13 +61,11 @@ class Model(nn.Module):
             raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
         self.scene = scene
         self.time_step = _positive("time_step", time_step, "s")
-        self.iterations = DEFAULT_ITERATIONS if iterations is None else check_whole("iterations", iterations, minimum=0)
+        self.iterations = DEFAULT_ITERATIONS if iterations is None else iterations
         self._solver: Solver = Chebyshev()
         automatic = solver is None or _is_auto(solver)
         given = self._solver if automatic else check_solver(solver, torch.device("cpu"))
-        self.tolerance = float(tolerance)
-        if not 0.0 <= self.tolerance < 1.0:
-            raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance}")
+        self.tolerance = tolerance
         self.promise: Promise | None = None  # of `tune`
         self.kernel = check_kernel(kernel)
         self._batch = _check_batch(batch)
@@ -116,6 +115,27 @@ class Model(nn.Module):
         except BaseException:
             self._batch, self.plan = before
             raise
+
+    @property
+    def iterations(self) -> int:
+        """Local and global steps of one time step, at most."""
+        return self._iterations
+
+    @iterations.setter
+    def iterations(self, iterations: int) -> None:
+        self._iterations = check_whole("Simulator: iterations", iterations, minimum=0)
+
+    @property
+    def tolerance(self) -> float:
+        """An environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never."""
+        return self._tolerance
+
+    @tolerance.setter
+    def tolerance(self, tolerance: float) -> None:
+        number = _number_or_nan(tolerance)
+        if not 0.0 <= number < 1.0:
+            raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance!r}")
+        self._tolerance = number
 
     @property
     def solver(self) -> Solver:
@@ -339,11 +359,15 @@ def _held_everywhere(pin_stiffness: Tensor) -> Tensor:
     return hard.all(0) if hard.dim() == 2 else hard
 
 
-def _positive(name: str, value: float, unit: str) -> float:
+def _number_or_nan(value: float) -> float:
     try:
-        number = float(value)
+        return float(value)
     except (TypeError, ValueError):
-        number = 0.0
+        return math.nan
+
+
+def _positive(name: str, value: float, unit: str) -> float:
+    number = _number_or_nan(value)
     if not 0.0 < number < float("inf"):
         raise ValueError(f"{name} must be positive and finite [{unit}], got {value!r}")
     return number

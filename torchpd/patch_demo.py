@@ -14,11 +14,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .animation import write_surface
-from .demo import TIME_STEP, DemoOptions, check_packages, find_device
+from .demo import TIME_STEP, DemoOptions, check_packages
 from .effects import Damping, Gravity, Ground, Pin
 from .mesh import TriMesh
 from .patch_body import PatchBody
 from .patches import FreeFormPatches
+from .placing import find_device
 from .quadrics import Quadrics
 from .render import Picture, Studio, contact_sheet
 from .scene import Scene

@@ -19,12 +19,22 @@ from .solvers import Multilevel
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_wanted_device", "plan_anew", "plan_for_solver", "plan_on"]
+__all__ = ["check_wanted_device", "find_device", "plan_anew", "plan_for_solver", "plan_on"]
 
 
 def _reason(device: torch.device | None = None) -> str:
     capability = None if device is None else torch.cuda.get_device_capability(device)
     return why_not(bool(_C.build_info()["cuda"]), torch.version.cuda, torch.cuda.device_count(), capability)
+
+
+def find_device(name: str) -> torch.device:
+    """What --device names, if it is there."""
+    kind = name.split(":")[0]
+    if kind not in ("cpu", "cuda"):
+        raise ValueError(f"--device must be cpu or cuda, got {name}")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: torch sees no CUDA device here; python -m torchpd doctor says more")
+    return torch.device(name)
 
 
 def check_wanted_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor:

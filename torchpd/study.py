@@ -22,6 +22,7 @@ from .baselines import BASELINES
 from .contenders import CONTENDERS, DEFAULT
 from .doctor import OPTIONAL, missing_packages
 from .ledger import Ledger, Row, write_csv
+from .placing import find_device
 from .provenance import describe_run
 from .study_axes import (
     baseline_rows,
@@ -135,7 +136,7 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
 def study_rows(options: StudyOptions, *, progress: bool = True) -> list[Row]:
     """Measure what is not yet in the ledger of `options.out`, and return all rows."""
     subject = subject_of(options.subject)
-    device = torch.device(options.device)
+    device = find_device(options.device)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     bench = Bench(subject, device, series=1 if options.quick else 6)
