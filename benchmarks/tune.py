@@ -131,6 +131,7 @@ def run_scene(number: int, error: float) -> Row:
     row.update(solver=str(promise.solver), iterations=promise.iterations, attained=promise.attained)
     row.update(promised=promise.error, studied=promise.studied_error, milliseconds=promise.milliseconds)
     row.update(studied_errors=promise.trials[-1].errors, studied_residuals=promise.trials[-1].residuals)
+    row.update(error_per_residual=promise.error_per_residual)
     row.update(judge(sim, other))
     row["held"] = not row["errors"] or max(row["errors"]) <= promise.error
     row["budget"] = judge_budget(sim, start, other)
@@ -163,8 +164,10 @@ def judge_budget(sim: pd.Simulator, start: pd.State, other: pd.State) -> Row:
 
 def suspects(row: Row) -> list[bool]:
     """Whether `Promise.estimate` exceeds the promise, of every judged step."""
+    # rows without one: the least that it can be
     studied = zip(row["studied_errors"], row["studied_residuals"], strict=True)
-    ratio = max((error / residual for error, residual in studied if residual > 0.0), default=0.0)
+    least = max((error / residual for error, residual in studied if residual > 0.0), default=0.0)
+    ratio = row.get("error_per_residual", least)
     return [not ratio * residual <= row["promised"] for residual in row["residuals"]]
 
 

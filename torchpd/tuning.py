@@ -89,9 +89,9 @@ class Promise:
     def holds(self, info: Info) -> Tensor:
         """Whether the error may still be relied on [B] (bool), from the residual that `return_info=True` reports.
 
-        An estimate, calibrated on the studied states: the promise is doubted when the residual is larger than theirs by
-        more than the safety that was kept, and when it is not a number. Residuals weigh short waves and errors long
-        ones, so most steps that break a promise have a residual like any other: see `estimate` and `audit`.
+        An estimate, calibrated on the studied states: the promise is doubted when the residual is larger than they had
+        where their error was the promised one, and when it is not a number. Residuals weigh short waves and errors
+        long ones, so most steps that break a promise have a residual like any other: see `estimate` and `audit`.
         """
         return info.residual <= self.residual_limit
 
@@ -199,7 +199,7 @@ def tune(
         found = [seek(solver) for solver in bar]
     timed = [(trials, _milliseconds(sim, start, trials[-1])) for trials in found]
     trials, cost = _cheapest(timed, error) if error is not None else min(timed, key=lambda pair: pair[0][-1].error)
-    promise = _promise(sim, start, trials, cost, error, milliseconds)
+    promise = _promise(sim, study, start, trials, cost, error, milliseconds)
     sim.solver, sim.iterations, sim.tolerance, sim.promise = promise.solver, promise.iterations, 0.0, promise
     if not promise.attained:
         warnings.warn(f"tune: {promise}", TuningWarning, stacklevel=3)
@@ -387,15 +387,34 @@ def _cheapest(timed: list[tuple[list[Trial], float]], error: float) -> tuple[lis
     return next((trials, cost) for trials, cost in reached if cost <= _NEAR * fastest)
 
 
+def _residual_limit(study: _Study, trials: list[Trial], promised: float) -> tuple[float, float]:
+    """The residual at which the error is the promised one, and the largest error per residual.
+
+    The chosen trial says it if its errors are near the promise. They may be far below, or beyond rounding nothing at
+    all, where few iterations do much; then the nearest trial that breaks the promise says more.
+    """
+    chosen = trials[-1]
+    breaking = [trial for trial in [*trials, study.trial(chosen.solver, 0)] if promised < trial.error < math.inf]
+    asked = [chosen, *sorted(breaking, key=lambda trial: trial.error)[:1]]
+    limits = [max(trial.residuals) * promised / trial.error for trial in asked if trial.error > 0.0]
+    ratios = [e / r for trial in asked for e, r in zip(trial.errors, trial.residuals, strict=True) if r > 0.0]
+    # the studied states themselves keep the promise
+    return max(min(limits, default=0.0), max(chosen.residuals)), max(ratios, default=0.0)
+
+
 def _promise(
-    sim: Simulator, start: State, trials: list[Trial], cost: float, error: float | None, milliseconds: float | None
+    sim: Simulator,
+    study: _Study,
+    start: State,
+    trials: list[Trial],
+    cost: float,
+    error: float | None,
+    milliseconds: float | None,
 ) -> Promise:
     chosen = trials[-1]
     attained = chosen.error <= error / SAFETY if error is not None else cost <= 1.2 * (milliseconds or 0.0)
     promised = error if attained and error is not None else min(SAFETY * chosen.error, 1.0)
-    largest = max(chosen.residuals)
-    # where rounding explains all of the error, the safety that is kept elsewhere
-    room = promised / chosen.error if chosen.error > 0.0 else SAFETY
+    limit, ratio = _residual_limit(study, trials, promised)
     return Promise(
         asked_error=error,
         asked_milliseconds=milliseconds,
@@ -405,10 +424,8 @@ def _promise(
         error=promised,
         studied_error=chosen.error,
         milliseconds=cost,
-        residual_limit=largest * room,
-        error_per_residual=max(
-            (e / r for e, r in zip(chosen.errors, chosen.residuals, strict=True) if r > 0.0), default=0.0
-        ),
+        residual_limit=limit,
+        error_per_residual=ratio,
         time_step=sim.time_step,
         dtype=sim.dtype,
         device=str(sim.device),
