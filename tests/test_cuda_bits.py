@@ -88,6 +88,9 @@ def test_blocks_that_go_from_patch_to_patch(
     if precision == "float32" and 2 * regimes.shared_bytes(sim.plan, 0, 0) <= gpu.shared:
         assert any("stream_pipeline" in name for name in device_work(lambda: sim(state, forces)))
     stiffness = sim.stiffness * torch.linspace(0.5, 20.0, batch, dtype=dtype, device=GPU)[:, None]
+    # patches of one stiffness and of several
+    several = stiffness.shape[1] // 3
+    stiffness[:, :several] *= torch.linspace(1.0, 2.0, several, dtype=dtype, device=GPU)
     sim.set_material(stiffness=stiffness)
     other.set_material(stiffness=stiffness)
     together = run(sim, state, forces)

@@ -45,9 +45,9 @@ _MANY_SHARE = 4
 # most, fewer for few environments; many take less with fewer patches
 _LEVEL_TETS, _LEVEL_ALONE, _FEW_ALONE, _MANY_TETS = 384, 1152, 384, 1900
 _LEVELS = ("few", "any", "many")  # how many environments it is for
-# a patch at most, six rounds of its threads where all have partners, and how many patches share a multiprocessor of an
+# a patch at most, five rounds of its threads where all have partners, and how many patches share a multiprocessor of an
 # H100 (csrc/cuda/stream.h)
-_STREAM_TETS = {torch.float32: 2304, torch.float64: 960}
+_STREAM_TETS = {torch.float32: 1920, torch.float64: 960}
 _STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
 _MOST_FIELDS = 2  # of a pass: the products with a second derivative
 

@@ -136,9 +136,9 @@ PD_DEVICE T FusedRunner<T, Touching, Kind, Near>::weigh_own(const T* stiffness, 
   const int which = int(threadIdx.x) % 2, tet = tet_of(plan_, place, which);
   half_ = read_half<false, T>(patch_, nullptr, threadIdx.x);
   const T bound = bounded ? plan_.pair_bound[place.in(2, which)] : T(1);
-  const T volume = tet < 0 ? T(0) : volume_of(rest.unit, half_.factor);
-  const T plain = tet < 0 ? T(0) : volume * stiffness[tet];
-  half_.weight = tet < 0 ? T(0) : volume * bound * stiffness[tet];
+  const T plain =
+      tet < 0 ? T(0) : tet_weight(patch_weight(rest.unit, stiffness[tet]), half_.factor);
+  half_.weight = bound * plain;
   inverse_ = half_inverse(half_, rest.position);
   counts_ = counts_energy(threadIdx.x);
   return plain;

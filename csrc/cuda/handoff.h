@@ -1,4 +1,4 @@
-// What some warps of a block wait for while others go on.
+// What some warps of a block wait for while others go on, and what a kernel that starts early waits for.
 #pragma once
 #include "cuda/cluster.h"
 
@@ -45,6 +45,23 @@ class Signal {
  private:
   SharedAddress at_;
 };
+
+// In a kernel that Launcher::run_early launched: until the kernel before has ended and what it wrote is there. What kernels of
+// the same step write or read comes after it; a plan may come before, and weights, since kernels that nobody starts early stand
+// between those that write them and the first that is. All blocks wait, so that whoever waits for them waits for all before
+// them.
+PD_DEVICE void await_kernel_before() {
+#if PD_HAS_CLUSTERS
+  asm volatile("griddepcontrol.wait;" ::: "memory");
+#endif
+}
+
+// One thread of every block, once it has waited: the next kernel may start wherever there is room.
+PD_DEVICE void let_next_kernel_start() {
+#if PD_HAS_CLUSTERS
+  asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
+#endif
+}
 
 }  // namespace pd::inline PD_TARGET
 

@@ -55,7 +55,7 @@ PD_DEVICE Misfit measure_misfit(const StreamWork<T, false>& w, Ranges& ranges, B
     bool differ = false;
 #pragma unroll 1
     for (int i = team.thread(); i < w.plan.vertices; i += team.threads()) {
-      const double a = double(w.v.before[i].w);
+      const double a = double(w.v.inertia(i));
       const bool free = levels.fine_inverse[i] > T(0);
       if (a > 0 && free) visit(a / double(levels.reference_inertia[i]));
       differ = differ || (a > 0) != free;

@@ -13,7 +13,7 @@ PD_DEVICE void sum_part(const Vertices<T, Touching>& v, int begin, int end, cons
   for (int c = 0; c < 4; ++c) sum[c] = 0;
   for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size) {
     const int i = index(at);
-    const double a = double(v.before[i].w);
+    const double a = double(v.inertia(i));
     const Vec3<T> lag = vec3(v.target[i]) - vec3(v.u[i]);
     sum[0] += a;
     sum[1] += a * double(lag.x);

@@ -65,7 +65,7 @@ class MultilevelRunner {
     add_up<2>(w_.plan.shared, [&](int i, double (&sum)[2]) {
       ThreadSums sums = {{0, 0, 0}};
       const auto seen = w_.v.see(first + i);
-      look_at(first + i, seen, shared_force(w_, i), sums);
+      look_at(first + i, seen, shared_force(w_, SharedPlaces(w_.plan, i)), sums);
       sum[0] = sums.value[0];
       sum[1] = sums.value[1];
     });
@@ -233,7 +233,7 @@ class MultilevelRunner {
     ++made_;
     doubted_ = c_.outer.restarts;
     corotated_ = true;
-    team_ = make_corotation(CorotationInput<T>{w_.v.x, w_.v.u, w_.v.before, m_.base, w_.weights},
+    team_ = make_corotation(CorotationInput<T>{w_.v.x, w_.v.u, w_.v.target, m_.base, w_.weights},
                             m_.corotation, team_, shared_, call_.shared_corotation, c_.outer.scale,
                             corotation_.with_plan(call_.plan()));
   }
@@ -384,7 +384,7 @@ class MultilevelRunner {
   // whether M knows nothing of a vertex
   PD_DEVICE bool is_stranger(int i) const {
     if (!(w_.plan.levels.fine_inverse[i] > T(0))) return true;
-    return w_.v.before[i].w > T(known_inertia) * w_.plan.levels.reference_inertia[i] * trusted_;
+    return w_.v.inertia(i) > T(known_inertia) * w_.plan.levels.reference_inertia[i] * trusted_;
   }
 
   // the part of a field along which contacts let a vertex go

@@ -107,12 +107,6 @@ PD_DEVICE PairNumbers<T> read_pair(const Patch<T>& patch, const T* weights, int 
   return numbers;
 }
 
-template <class R>
-struct RestShape {
-  Mat3<R> inverse;  // Dm^-1 [1/m]
-  R volume;         // [m^3]
-};
-
 // Rest shapes as the plan of a small mesh has them.
 template <class T>
 struct StoredRest {
@@ -121,13 +115,18 @@ struct StoredRest {
   struct Numbers {
     Quad<T> a, b, c, d, e;
 
+    // Dm^-1 [1/m]
     template <class Take>
-    PD_HD RestShape<typename Take::R> shape() const {
+    PD_HD Mat3<typename Take::R> inverse() const {
       const auto pick = [](T first, T second) { return Take::pick(first, second); };
-      return {{{{pick(a.x, c.y), pick(a.y, c.z), pick(a.z, c.w)},
-                {pick(a.w, d.x), pick(b.x, d.y), pick(b.y, d.z)},
-                {pick(b.z, d.w), pick(b.w, e.x), pick(c.x, e.y)}}},
-              pick(e.z, e.w)};
+      return {{{pick(a.x, c.y), pick(a.y, c.z), pick(a.z, c.w)},
+               {pick(a.w, d.x), pick(b.x, d.y), pick(b.y, d.z)},
+               {pick(b.z, d.w), pick(b.w, e.x), pick(c.x, e.y)}}};
+    }
+    // w V
+    template <class Take>
+    PD_HD T weight(T stiffness) const {
+      return Take::pick(e.z, e.w) * stiffness;
     }
   };
 
@@ -170,10 +169,15 @@ struct alignas(16) RestPoint<double> {
   PD_DEVICE static RestPoint of(const Vec3<double>& bits) { return {bits.x, bits.y, bits.z, 0}; }
 };
 
-// [m^3], given pair_factor and patch_unit
+// w V is what a patch and a stiffness say, over what pair_factor does: w unit^2 / 6 |pair_factor|. Whoever works it out does so
+// here, to the same bits.
 template <class T>
-PD_HD T volume_of(T unit, T factor) {
-  return unit * unit / (T(6) * absolute(factor));
+PD_HD T patch_weight(T unit, T stiffness) {
+  return stiffness * (unit * unit / T(6));
+}
+template <class T>
+PD_HD T tet_weight(T patch_weight, T factor) {
+  return patch_weight * rough_reciprocal(absolute(factor));
 }
 
 // Rest shapes worked out from rest positions: a quarter of the bytes.
@@ -188,10 +192,13 @@ struct ComputedRest {
     T factor[2], unit;
 
     template <class Take>
-    PD_HD RestShape<T> shape() const {
+    PD_HD Mat3<T> inverse() const {
       constexpr int which = Take::which;
-      return {between({corner[0], corner[1], corner[2], corner[3 + which]}, factor[which]),
-              volume_of(unit, factor[which])};
+      return between({corner[0], corner[1], corner[2], corner[3 + which]}, factor[which]);
+    }
+    template <class Take>
+    PD_HD T weight(T stiffness) const {
+      return tet_weight(patch_weight(unit, stiffness), factor[Take::which]);
     }
   };
 
@@ -265,10 +272,10 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
       read(now.slot(c), vectors);
       for (int f = 0; f < Fields; ++f) pair.corner[f][c] = vectors[f];
     }
-    element.template run<1>(PairElement<T, Fields, First>{
-        pair, shape.template shape<First>().inverse, now.weight[0], energy});
-    element.template run<1>(PairElement<T, Fields, Second>{
-        pair, shape.template shape<Second>().inverse, now.weight[1], energy});
+    element.template run<1>(PairElement<T, Fields, First>{pair, shape.template inverse<First>(),
+                                                          now.weight[0], energy});
+    element.template run<1>(PairElement<T, Fields, Second>{pair, shape.template inverse<Second>(),
+                                                           now.weight[1], energy});
     for (int c = 0; c < 4; ++c) entries[now.entry(c)] = quad(pair.force[c]);
     if (now.entry(4) != no_entry) entries[now.entry(4)] = quad(pair.force[4]);
     // here rather than at the top: fewer registers are spilled
@@ -285,14 +292,29 @@ PD_DEVICE void weigh_pairs(const Patch<T>& patch, const Rest& rest, const T* sti
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const PairPlace place = place_of(patch, number);
     const typename Rest::Numbers numbers = rest.read(place, read_pair<T>(patch, nullptr, number));
-    const T volume[2] = {numbers.template shape<OneOf<T, 0>>().volume,
-                         numbers.template shape<OneOf<T, 1>>().volume};
+    const auto weigh = [&](auto take) {
+      using Take = decltype(take);
+      const int at = place.in(2, Take::which), tet = tet_of(patch.plan, place, Take::which);
+      const T bound = bounded ? patch.plan.pair_bound[at] : T(1);
+      weights[at] = tet < 0 ? T(0) : bound * numbers.template weight<Take>(stiffness[tet]);
+    };
+    weigh(OneOf<T, 0>{});
+    weigh(OneOf<T, 1>{});
+  }
+}
+
+// The stiffness of all of a patch, which all threads of the block ask for, or -1 where there are several.
+template <class T>
+PD_DEVICE T one_stiffness(const Patch<T>& patch, const T* stiffness) {
+  const T first = stiffness[tet_of(patch.plan, place_of(patch, 0), 0)];
+  bool same = true;
+  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     for (int e = 0; e < 2; ++e) {
-      const int tet = tet_of(patch.plan, place, e);
-      const T bound = bounded ? patch.plan.pair_bound[place.in(2, e)] : T(1);
-      weights[place.in(2, e)] = tet < 0 ? T(0) : volume[e] * bound * stiffness[tet];
+      const int tet = tet_of(patch.plan, place_of(patch, number), e);
+      same = same && (tet < 0 || stiffness[tet] == first);
     }
   }
+  return __syncthreads_and(same) ? first : T(-1);
 }
 
 template <class T>

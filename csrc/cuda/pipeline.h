@@ -13,10 +13,14 @@ namespace pd::inline PD_TARGET {
 // In this order: movers, bringers, elements. So many that each thread may have 96 registers, which elements want. Of the others
 // on an H100: 384, 512, 576 and 640 threads for elements with 64 to 320 for the rest took more time, with or without both
 // tetrahedra of a pair in a thread; movers and bringers as one task took more, and so did anything that spilled registers,
-// since hardly any cache is left for them. So did movers that also move the vertices that patches share, as soon as their last
-// patch is done: for a million vertices 15 us more than with a kernel of their own. A register that is written under a
-// condition is kept from before, all around a loop: so where a thread has no slot, it reads what is the first one's.
+// since hardly any cache is left for them. So did, for a million vertices, movers that also move the vertices that patches
+// share, as soon as their last patch is done (15 us more than with a kernel of their own); slots that are asked for a whole
+// turn before (3 us); rest positions behind origins, 24 bytes a slot in place of 32 (4 us); and forces on shared vertices that
+// the L2 cache is to let go of last (16 us; u and the iterate before: no difference). What binds now is memory: without any
+// arithmetic an iteration would take 12 % less. A register that is written under a condition is kept from before, all around a
+// loop: so where a thread has no slot, it reads what is the first one's.
 constexpr int mover_threads = 128, bringer_threads = 128, element_threads = 384;
+constexpr int pipeline_slots = 1024;  // of a patch, at most: see SharedSlots
 constexpr int pipeline_threads = mover_threads + bringer_threads + element_threads;
 
 // The patches of a block, of all environments: item after item, from its own number on as far apart as there are blocks.
@@ -35,13 +39,14 @@ class Pipeline {
     const bool moves = mover() < mover_threads, brings = !moves && bringer() < bringer_threads;
     if (threadIdx.x == 0) open_signals();
     if (brings) {
+      if (call_.step.settings.tolerance > 0) await_kernel_before();
       const Found first = look_for(item_of(int(blockIdx.x)));
       const Found second = look_for(after({first.environment, first.patch}), first.there);
       tell(0, first);
       tell(1, second);
     }
     __syncthreads();
-    if (told(0).blocks == 0) return;
+    if (told(0).blocks == 0) return await_kernel_before();
     if (moves) {
       move_vertices();
     } else if (brings) {
@@ -100,6 +105,8 @@ class Pipeline {
   struct Stop {
     int environment, patch, first_vertex, interior, first_slot, slots, first_block;
     int blocks;        // of pairs; 0: there is no such patch
+    int first_warp;    // of the elements' warps, which has the first of them
+    T patch_weight;    // StreamMemory::patch_weight
     unsigned weights;  // blocks of them before those of its environment
   };
 
@@ -107,6 +114,7 @@ class Pipeline {
   struct Found {
     bool there;
     int environment, patch, vertex[2], slot[2], block[2];
+    T patch_weight;
   };
 
   // of this item, or the next one whose environment goes on
@@ -122,6 +130,7 @@ class Pipeline {
       f.slot[i] = plan().patch_slot[f.patch + i];
       f.block[i] = plan().patch_block[f.patch + i];
     }
+    f.patch_weight = work(f.environment).patch_weight[f.patch];
     return f;
   }
   PD_DEVICE Found look_for(const Stop& before) const {
@@ -160,8 +169,12 @@ class Pipeline {
       s.slots = found.slot[1] - found.slot[0];
       s.first_block = found.block[0];
       s.blocks = found.block[1] - found.block[0];
+      // the guard's energies are summed alike in any batch
+      if (What == Visit::update && n > 0)
+        s.first_warp = (told(n - 1).first_warp + told(n - 1).blocks) % element_warps;
       const bool own = call_.step.material.stiffness.stride != 0;
       s.weights = own ? unsigned(found.environment) * unsigned(plan().blocks) : 0;
+      s.patch_weight = found.patch_weight;
     }
     told(n) = s;
   }
@@ -204,6 +217,7 @@ class Pipeline {
   PD_DEVICE void bring_slots() const {
     int vertex[brought];
     find(told(0), vertex);
+    await_kernel_before();
 #pragma unroll 1
     for (unsigned n = 0; n < 2 || told(n - 2).blocks > 0; ++n) {
       const Found later = look_for(told(n + 1));
@@ -253,7 +267,6 @@ class Pipeline {
     }
   }
 
-  // Also has what others want to read of the patch brought into the L2 cache.
   PD_DEVICE void ask(const Stop& at, const int (&vertex)[brought], Held& held) const {
     const Work w = work(at.environment);
     const Quad<T>* origin = w.origin + at.first_slot;
@@ -266,16 +279,6 @@ class Pipeline {
       held.origin[r] = vec3(origin[s]);
       held.rest[r] = rest[s];
     }
-    const auto near = [](const auto* items, int count) {
-      bring_near(items, count, bringer(), bringer_threads);
-    };
-    near(w.v.before + at.first_vertex, at.interior);
-    near(w.v.target + at.first_vertex, at.interior);
-    near(w.plan.slot_row + at.first_slot, at.slots);
-    constexpr int two = 2 * pair_lanes, five = 5 * pair_lanes;
-    near(w.plan.pair_corner + std::size_t(at.first_block) * five, at.blocks * five);
-    near(w.plan.pair_factor + std::size_t(at.first_block) * two, at.blocks * two);
-    near(w.weights + std::size_t(at.first_block) * two, at.blocks * two);
   }
 
   PD_DEVICE void put(const Stop& at, const Held& held, unsigned n) const {
@@ -300,54 +303,95 @@ class Pipeline {
     T factor[2];  // pair_factor
   };
 
-  // This warp's first block of the pairs of a stop, or the stop's first where it has none.
-  PD_DEVICE unsigned first_block(unsigned n) const {
+  // What a warp has of a stop: blocks of pairs, as far apart as there are warps. They go on with the next stop's where the
+  // last one's end, so that none of them has more to do than others.
+  struct Share {
+    unsigned block, end;  // none left: block >= end
+    unsigned weights;     // as of its stop
+    T patch_weight;
+  };
+  PD_DEVICE Share share_of(unsigned n) const {
     const Stop& in = told(n);
-    return unsigned(in.first_block + (element_warp() < in.blocks ? element_warp() : 0));
+    unsigned turn = unsigned(element_warp() + element_warps - in.first_warp);
+    if (turn >= unsigned(element_warps)) turn -= element_warps;
+    const auto first = unsigned(in.first_block);
+    const bool none = turn >= unsigned(in.blocks);
+    return {none ? first : first + turn, none ? first : first + unsigned(in.blocks), in.weights,
+            in.patch_weight};
   }
 
-  // A lane a pair, of a block of stop `n`.
-  PD_DEVICE PairInputs read(unsigned block, unsigned n) const {
-    const unsigned lane = threadIdx.x % warp_size;
+  // A lane a pair, of the next block; where none is left, some of the stop's that nobody wants.
+  PD_DEVICE PairInputs read(const Share& share) const {
+    const unsigned lane = threadIdx.x % warp_size, block = share.block;
     const int32* corner = plan().pair_corner + (block * (5 * pair_lanes) + lane);
     const T* factor = plan().pair_factor + (block * (2 * pair_lanes) + lane);
-    const T* weight =
-        call_.memory.weights + (std::size_t(block + told(n).weights) * (2 * pair_lanes) + lane);
     PairInputs pair;
     // once a patch: the caches had better keep something else
     for (int c = 0; c < 5; ++c) pair.corner[c] = unsigned(__ldcs(corner + c * pair_lanes));
-    for (int e = 0; e < 2; ++e) pair.weight[e] = __ldcs(weight + e * pair_lanes);
     for (int e = 0; e < 2; ++e) pair.factor[e] = __ldcs(factor + e * pair_lanes);
+    for (int e = 0; e < 2; ++e) pair.weight[e] = T(0);
+    if (share.patch_weight < T(0)) {
+      const T* weight = weights_of(share.block, share.weights) + lane;
+      for (int e = 0; e < 2; ++e) pair.weight[e] = __ldcs(weight + e * pair_lanes);
+    }
     return pair;
   }
 
+  // of a block of pairs
+  PD_DEVICE const T* weights_of(unsigned block, unsigned weights) const {
+    return call_.memory.weights + std::size_t(block + weights) * (2 * pair_lanes);
+  }
+
+  // Not before its end is what was read looked at, since whoever moves a number waits for it. `patch_weight`: of its stop.
+  PD_DEVICE static void take(PairInputs& now, const PairInputs& read, T patch_weight) {
+    for (int c = 0; c < 5; ++c) now.corner[c] = in_register(read.corner[c]);
+    for (int e = 0; e < 2; ++e) now.factor[e] = in_register(read.factor[e]);
+    for (int e = 0; e < 2; ++e) {
+      const T found = tet_weight(patch_weight, now.factor[e]);
+      const bool there = now.corner[3 + e] < unsigned(no_entry) << 16;
+      now.weight[e] = in_register(patch_weight < T(0) ? read.weight[e] : there ? found : T(0));
+    }
+  }
+
+  // Has all pairs of a stop brought into the L2 cache.
+  PD_DEVICE void bring_pairs_near(unsigned n) const {
+    const Stop& in = told(n);
+    const auto near = [](const auto* items, int count) {
+      bring_near(items, count, int(threadIdx.x) - mover_threads - bringer_threads, element_threads);
+    };
+    constexpr int two = 2 * pair_lanes, five = 5 * pair_lanes;
+    near(plan().pair_corner + std::size_t(in.first_block) * five, in.blocks * five);
+    near(plan().pair_factor + std::size_t(in.first_block) * two, in.blocks * two);
+    if (in.patch_weight < T(0))
+      near(weights_of(unsigned(in.first_block), in.weights), in.blocks * two);
+  }
+
   PD_DEVICE void work_on_elements() const {
-    unsigned block = first_block(0);
-    PairInputs now = read(block, 0);
+    Share share = share_of(0);
+    PairInputs now;
+    take(now, read(share), share.patch_weight);
 #pragma unroll 1
     for (unsigned n = 0;; ++n) {
+      bring_pairs_near(n + 1);
       await(slots_ready, n);
       const SharedSlots slots(*this, n);
       T energy = T(0);
-      bool more = element_warp() < told(n).blocks;
+      bool more = share.block < share.end;
       // else the last turn has read the first pairs of the next stop
       if (!more) {
-        block = first_block(n + 1);
-        now = read(block, n + 1);
+        share = share_of(n + 1);
+        take(now, read(share), share.patch_weight);
       }
 #pragma unroll 1
       while (more) {
         PairInputs then;
         work_on_pair(now, slots, energy, [&] {
-          block += element_warps;
-          more = int(block) < told(n).first_block + told(n).blocks;
-          if (!more) block = first_block(n + 1);
-          then = read(block, more ? n : n + 1);
+          share.block += element_warps;
+          more = share.block < share.end;
+          if (!more) share = share_of(n + 1);
+          then = read(share);
         });
-        // not before its end, since whoever moves a number waits for it
-        for (int c = 0; c < 5; ++c) now.corner[c] = in_register(then.corner[c]);
-        for (int e = 0; e < 2; ++e) now.weight[e] = in_register(then.weight[e]);
-        for (int e = 0; e < 2; ++e) now.factor[e] = in_register(then.factor[e]);
+        take(now, then, share.patch_weight);
       }
       if constexpr (What == Visit::update_guarded) {
         const double sum = across_warp(double(energy), Add{});
@@ -358,16 +402,21 @@ class Pipeline {
     }
   }
 
-  // Slots and entries of a half by a 32-bit address, which stays in a register; by pointers it would be worked out again for
-  // each of them.
+  // Slots and entries of a half by 32-bit addresses, which stay in registers; by pointers they would be worked out again for
+  // each of them. Three instructions find a slot, and two an entry, since pipeline_slots leaves bits 13 to 15 of a corner 0.
   class SharedSlots {
    public:
-    PD_DEVICE SharedSlots(const Pipeline& p, unsigned n)
-        : plan_(p.plan()), first_(in_register(shared_address(p.half(n)))) {}
+    PD_DEVICE SharedSlots(const Pipeline& p, unsigned n) {
+      const unsigned slots = unsigned(p.plan().most_slots), entries = p.plan().most_entries;
+      first_ = in_register(shared_address(p.half(n)));
+      second_ = in_register(first_ + 16 * slots);
+      entry_ = in_register(first_ + unsigned(slots_bytes(sizeof(T), slots, 2)));
+      third_ = in_register(entry_ + 8 * entries);
+    }
 
     // `corner`: of PairNumbers. What is volatile keeps its order, so nothing is looked at before it is awaited.
     PD_DEVICE void look(unsigned corner, Vec3<T>& position, RestPoint<T>& rest) const {
-      const SharedAddress slot_times_8 = corner & 0xffff;
+      const SharedAddress slot_times_8 = in_register(corner & 0xffff);
       Quad<T> seen;
       Vec3<T> bits;
       asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
@@ -375,25 +424,22 @@ class Pipeline {
                    : "r"(first_ + 2 * slot_times_8));
       asm volatile("ld.shared.v2.f32 {%0, %1}, [%2];"
                    : "=f"(bits.y), "=f"(bits.z)
-                   : "r"(first_ + 16 * unsigned(plan_.most_slots) + slot_times_8));
+                   : "r"(second_ + slot_times_8));
       position = vec3(seen);
       rest = RestPoint<T>::of(bits);
     }
     // Unless the corner has no entry.
     PD_DEVICE void leave(unsigned corner, const Vec3<T>& force) const {
-      const SharedAddress entries = first_ + unsigned(slots_bytes(sizeof(T), plan_.most_slots, 2));
-      const unsigned entry = corner >> 16;
       asm volatile(
           "{.reg .pred p; setp.lt.u32 p, %0, 0xffff0000; @p st.shared.v2.f32 [%1], {%3, %4}; "
           "@p st.shared.f32 [%2], %5;}" ::"r"(corner),
-          "r"(entries + 8 * entry), "r"(entries + 8 * unsigned(plan_.most_entries) + 4 * entry),
-          "f"(force.x), "f"(force.y), "f"(force.z)
+          "r"(entry_ + (corner >> 13)), "r"(third_ + (corner >> 14)), "f"(force.x), "f"(force.y),
+          "f"(force.z)
           : "memory");
     }
 
    private:
-    const DevicePlan<T>& plan_;
-    SharedAddress first_;
+    SharedAddress first_, second_, entry_, third_;
   };
 
   // `read_next`: between its tetrahedra, where the fewest registers are in use. Lanes past the last pair leave no force, and
@@ -425,6 +471,9 @@ class Pipeline {
   PD_DEVICE void move_vertices() const {
     // the entries of both halves are free
     for (unsigned n = 0; n < 2; ++n) give(slots_ready, n);
+    bring_patch_near(0);
+    await_kernel_before();
+    if (mover() == 0) let_next_kernel_start();
 #pragma unroll 1
     for (unsigned n = 0; told(n).blocks > 0; ++n) move_patch(n);
   }
@@ -455,6 +504,7 @@ class Pipeline {
       row[r] = slot(r) < slots ? w.plan.slot_row[first_slot + slot(r)] : 0;
 #pragma unroll
     for (int r = 0; r < soon; ++r) seen[r] = see_slot(slot(r));
+    bring_patch_near(n + 1);
     await(forces_ready, n);
     if (What == Visit::update_guarded && mover() < element_warps)
       sums.value[0] += energies_of(n)[mover()];
@@ -473,6 +523,15 @@ class Pipeline {
 #pragma unroll
     for (int r = soon; r < moved; ++r) visit_late(slot(r), force[r]);
     if (wants_sums<What>(w)) write_mover_sums(sums, n, w.sum_row(at.patch));
+  }
+
+  // Has what movers read of a patch brought into the L2 cache.
+  PD_DEVICE void bring_patch_near(unsigned n) const {
+    const Stop& at = told(n);
+    const Work w = work(at.environment);
+    bring_near(w.v.before + at.first_vertex, at.interior, mover(), mover_threads);
+    bring_near(w.v.target + at.first_vertex, at.interior, mover(), mover_threads);
+    bring_near(w.plan.slot_row + at.first_slot, at.slots, mover(), mover_threads);
   }
 
   PD_DEVICE void write_mover_sums(const ThreadSums& sums, unsigned n, double* row) const {

@@ -70,16 +70,25 @@ struct GroupLaunch {
   GroupLaunch(const GroupLaunch&) = delete;
 };
 
-static int ask_for_resident_clusters(const void* kernel, int device, int threads,
-                                     std::size_t shared_bytes, int blocks) {
-  int major = 0, clusters = 0;
+static bool has_code_for_90(const void* kernel, int device) {
+  int major = 0;
   check(cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device));
   cudaFuncAttributes attributes;
   check(cudaFuncGetAttributes(&attributes, kernel));
-  // code for older devices, translated for this one, has nothing of clusters in it
   constexpr int first = 90;
-  if (major * 10 < first || attributes.ptxVersion < first || attributes.binaryVersion < first)
-    return 0;
+  return major * 10 >= first && attributes.ptxVersion >= first && attributes.binaryVersion >= first;
+}
+
+bool runs_code_for_90(const void* kernel) {
+  constexpr int question = -1;  // no size of a cluster
+  return known_or(kernel, 0, 0, question,
+                  [&](int device) { return int(has_code_for_90(kernel, device)); }) != 0;
+}
+
+static int ask_for_resident_clusters(const void* kernel, int device, int threads,
+                                     std::size_t shared_bytes, int blocks) {
+  int clusters = 0;
+  if (!has_code_for_90(kernel, device)) return 0;
   constexpr int portable = 8;
   if (blocks > portable &&
       cudaFuncSetAttribute(kernel, cudaFuncAttributeNonPortableClusterSizeAllowed, 1) !=

@@ -16,6 +16,9 @@ int resident_blocks(const void* kernel, int threads, std::size_t shared_bytes);
 // Clusters of so many blocks that the current device runs at once, after resident_blocks; 0: it has none, or none so large.
 int resident_clusters(const void* kernel, int threads, std::size_t shared_bytes, int blocks);
 
+// Whether the current device runs a kernel's code for compute capability 9.0: older code, translated for it, lacks what is new.
+bool runs_code_for_90(const void* kernel);
+
 // Launches clusters of `cluster` blocks; with 0 instead blocks that are all there at once.
 void launch(const void* kernel, unsigned blocks, int threads, void** arguments,
             std::size_t shared_bytes, int cluster, cudaStream_t stream);

@@ -13,6 +13,7 @@
 #include <algorithm>
 #include <stdexcept>
 #include <string>
+#include <utility>
 
 namespace pd {
 
@@ -27,6 +28,7 @@ StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
   for (Quad<T>** array : {&m.origin, &m.shared_force}) arena.place(*array, step.batch * plan.slots);
   arena.place(m.weights,
               (material.stiffness.stride ? step.batch : 1) * plan.blocks * 2 * pair_lanes);
+  arena.place(m.patch_weight, (material.stiffness.stride ? step.batch : 1) * plan.patches);
   arena.place(m.sums, step.batch * call.sum_rows() * sums_count);
   arena.place(m.progress, step.batch);
   arena.place(m.omega, step.batch * guard_period);
@@ -51,6 +53,24 @@ class Launcher {
     check(cudaGetLastError());
   }
 
+  // The same for a kernel that waits by itself (cuda/handoff.h), so that it may start before the one before has ended.
+  template <class Call, class... Arguments>
+  void run_early(void (*kernel)(Call, Arguments...), std::int64_t count, int threads,
+                 std::size_t shared, const Call& call, Arguments... arguments) const {
+    if (count == 0) return;
+    cudaLaunchAttribute attribute = {};
+    attribute.id = cudaLaunchAttributeProgrammaticStreamSerialization;
+    attribute.val.programmaticStreamSerializationAllowed = 1;
+    cudaLaunchConfig_t config = {};
+    config.gridDim = dim3(blocks_of(count));
+    config.blockDim = dim3(unsigned(threads));
+    config.dynamicSmemBytes = shared;
+    config.stream = stream_;
+    config.attrs = &attribute;
+    config.numAttrs = runs_code_for_90(reinterpret_cast<const void*>(kernel)) ? 1 : 0;
+    check(cudaLaunchKernelEx(&config, kernel, call, arguments...));
+  }
+
  private:
   cudaStream_t stream_;
 };
@@ -61,14 +81,16 @@ class StreamRunner {
   // `outer`: memory of outer_bytes, for the multilevel solver alone
   StreamRunner(const StreamCall<T>& call, void* outer, cudaStream_t stream)
       : call_(call),
-        set_(call.step.settings),
-        plan_(call.step.plan),
+        set_(call_.step.settings),
+        plan_(call_.step.plan),
         outer_(outer),
         stream_(stream),
         launcher_(stream) {
     patches_ = call.step.batch * plan_.patches;
     pass_shared_ = pass_shared_bytes(sizeof(T), plan_.most_slots, plan_.most_entries, 2);
   }
+
+  StreamRunner(const StreamRunner&) = delete;
 
   void roll() {
     vertices<VertexTask::load>(0);
@@ -112,6 +134,7 @@ class StreamRunner {
     } else {
       pass<Visit::update>(k);
     }
+    if (alternates(set_)) std::swap(call_.memory.u, call_.memory.before);
     if (checks || set_.tolerance > 0) decide<Decision::iterate>(k);
   }
 
@@ -155,8 +178,8 @@ class StreamRunner {
     if (!pipe<What>(k))
       launcher_.run(stream_patches<What, T, Touching>, patches_, pass_threads, pass_shared_, call_,
                     k);
-    launcher_.run(stream_shared<What, T, Touching>, call_.step.batch * call_.shared_blocks(),
-                  vertex_threads, 0, call_, k);
+    launcher_.run_early(stream_shared<What, T, Touching>, call_.step.batch * call_.shared_blocks(),
+                        vertex_threads, 0, call_, k);
   }
 
   // The patches of an iteration as a pipeline, where a multiprocessor has room for two at once. How many patches there are
@@ -166,11 +189,12 @@ class StreamRunner {
     constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
     if constexpr (updates && !Touching && sizeof(T) == 4) {
       const auto kernel = stream_pipeline<What, T>;
+      if (plan_.most_slots > pipeline_slots) return false;
       const std::size_t shared =
           2 * pipeline_half_bytes(sizeof(T), plan_.most_slots, plan_.most_entries);
       const std::int64_t blocks =
           resident_blocks(reinterpret_cast<const void*>(kernel), pipeline_threads, shared);
-      launcher_.run(kernel, std::min(blocks, patches_), pipeline_threads, shared, call_, k);
+      launcher_.run_early(kernel, std::min(blocks, patches_), pipeline_threads, shared, call_, k);
       return blocks > 0;
     }
     return false;
@@ -207,7 +231,7 @@ class StreamRunner {
     return (threads + vertex_threads - 1) / vertex_threads;
   }
 
-  const StreamCall<T>& call_;
+  StreamCall<T> call_;
   const Settings& set_;
   const DevicePlan<T>& plan_;
   void* outer_;

@@ -1,6 +1,7 @@
 // Kernels of one pass each, for meshes of any size: what a step does, patch by patch and vertex by vertex, in global memory.
 #pragma once
 #include "cuda/half.h"
+#include "cuda/handoff.h"
 #include "cuda/momentum.h"
 #include "cuda/vertices.h"
 #include "plan/shared_memory.h"
@@ -16,6 +17,7 @@ struct StreamMemory {
   Quad<T>*x, *velocity, *target, *u, *before;  // [batch, vertices]
   Quad<T>*origin, *shared_force;               // [batch, slots]
   T* weights;                                  // [batch or 1, blocks, 2, 32] w V
+  T* patch_weight;     // [batch or 1, patches] of patches with one stiffness above 0, else -1
   double* sums;        // [batch, patches + blocks of shared vertices, sums_count]
   Progress* progress;  // [batch]
   double* omega;       // [batch, guard_period] of the next iterations
@@ -44,7 +46,7 @@ struct StreamWork {
   std::int64_t environment;
   Vertices<T, Touching> v;
   Quad<T>*origin, *shared_force;
-  T* weights;
+  T *weights, *patch_weight;
   Progress& progress;
   Contacts<T> contacts;
   Inputs<T> in;
@@ -61,6 +63,8 @@ struct StreamWork {
         shared_force(c.memory.shared_force + e * plan.slots),
         weights(c.memory.weights +
                 (c.step.material.stiffness.stride ? e * plan.blocks * 2 * pair_lanes : 0)),
+        patch_weight(c.memory.patch_weight +
+                     (c.step.material.stiffness.stride ? e * plan.patches : 0)),
         progress(c.memory.progress[e]),
         contacts{c.memory.planes + e * c.step.material.planes_count,
                  c.memory.balls + e * c.step.material.spheres_count, c.step.material.planes_count,
@@ -82,6 +86,10 @@ struct StreamWork {
     return call.memory.part_sum + (environment * plan.parts + part) * 4;
   }
 };
+
+// Whether u and the iterate before change places with every iteration, which writes less. Not where environments may stop, each
+// at its own.
+PD_HD bool alternates(const Settings& settings) { return !(settings.tolerance > 0); }
 
 // What a pass does with a vertex once the force of the elements on it is known.
 enum class Visit { weigh, update, update_guarded, measure };
@@ -119,13 +127,15 @@ PD_DEVICE void visit(const StreamWork<T, Touching>& w, int i,
   } else {
     if constexpr (What == Visit::update_guarded) sum[0] += seen.energy();
     const Vec3<T> next = seen.next(w.contacts, force, T(w.settings().relaxation), w.omega(k));
-    if (w.settings().tolerance > 0) {
+    if (alternates(w.settings())) {
+      w.v.set_in_place_of_before(i, seen, next);
+    } else {
       const Vec3<T> change = next - seen.u;
       sum[1] += double(dot(change, change));
       sum[2] += double(dot(next, next));
+      w.v.set_before(i, seen.u);
+      w.v.set(i, next);
     }
-    w.v.set_before(i, seen.u);
-    w.v.set(i, next);
   }
 }
 
@@ -235,24 +245,39 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));
 }
 
-// The force on a vertex that patches share: what they left, in their order. Two at once, since few have more, and more would
-// keep other threads out for want of registers.
+// Where patches leave the forces on a vertex that they share, in their order: two places at once, since few have more, and more
+// would keep other threads out for want of registers.
+struct SharedPlaces {
+  static constexpr int together = 2;
+  int at, end, slot[together];
+
+  template <class Plan>
+  PD_DEVICE SharedPlaces(const Plan& plan, int shared)
+      : at(plan.shared_start[shared]), end(plan.shared_start[shared + 1]) {
+    look(plan);
+  }
+  template <class Plan>
+  PD_DEVICE void look(const Plan& plan) {
+    for (int i = 0; i < together; ++i) slot[i] = plan.shared_slot[min(at + i, end - 1)];
+  }
+};
+
 template <class T, bool Touching>
-PD_DEVICE Vec3<T> shared_force(const StreamWork<T, Touching>& w, int shared) {
-  constexpr int together = 2;
-  const int end = w.plan.shared_start[shared + 1];
+PD_DEVICE Vec3<T> shared_force(const StreamWork<T, Touching>& w, SharedPlaces place) {
+  constexpr int together = SharedPlaces::together;
   Vec3<T> force = {T(0), T(0), T(0)};
 #pragma unroll 1
-  for (int at = w.plan.shared_start[shared]; at < end; at += together) {
+  while (true) {
     Vec3<T> part[together];
 #pragma unroll
-    for (int i = 0; i < together; ++i)
-      part[i] = vec3(w.shared_force[w.plan.shared_slot[min(at + i, end - 1)]]);
+    for (int i = 0; i < together; ++i) part[i] = vec3(w.shared_force[place.slot[i]]);
 #pragma unroll
     for (int i = 0; i < together; ++i)
-      if (at + i < end) force = force + part[i];
+      if (place.at + i < place.end) force = force + part[i];
+    place.at += together;
+    if (place.at >= place.end) return force;
+    place.look(w.plan);
   }
-  return force;
 }
 
 // Vertices that patches share. As many threads as there can be where 32 registers are enough, since they wait for memory.
@@ -261,13 +286,16 @@ __global__ void __launch_bounds__(vertex_threads, sizeof(T) == 4 && !Touching ? 
     stream_shared(const __grid_constant__ StreamCall<T> call, int k) {
   const int blocks = call.shared_blocks(), number = int(blockIdx.x % blocks);
   const StreamWork<T, Touching> w(call, blockIdx.x / blocks);
+  const int i = number * vertex_threads + int(threadIdx.x);
+  const SharedPlaces places(w.plan, min(i, w.plan.shared - 1));
+  await_kernel_before();
+  if (threadIdx.x == 0) let_next_kernel_start();
   if (skips<What>(w)) return;
   ThreadSums sums = no_sums<What>();
-  const int i = number * vertex_threads + int(threadIdx.x);
   if (i < w.plan.shared) {
     const int vertex = w.plan.patch_vertex[w.plan.patches] + i;
     const auto seen = see<What>(w, vertex);
-    visit<What>(w, vertex, seen, shared_force(w, i), k, sums);
+    visit<What>(w, vertex, seen, shared_force(w, places), k, sums);
   }
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(w.plan.patches + number));
 }
@@ -320,8 +348,12 @@ __global__ void __launch_bounds__(vertex_threads)
     stream_weights(const __grid_constant__ StreamCall<T> call, bool bounded) {
   const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
   const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
-  weigh_pairs(patch, rest_of<true>(patch), call.step.material.stiffness.of(w.environment), bounded,
-              w.weights);
+  const T* stiffness = call.step.material.stiffness.of(w.environment);
+  weigh_pairs(patch, rest_of<true>(patch), stiffness, bounded, w.weights);
+  const T one = one_stiffness(patch, stiffness);
+  if (threadIdx.x == 0)
+    w.patch_weight[patch.index] =
+        one > T(0) ? patch_weight(w.plan.patch_unit[patch.index], one) : T(-1);
   // the padding of the last block, which the pipeline reads
   const int end = (patch.pairs + pair_lanes - 1) / pair_lanes * pair_lanes;
   const int padding = patch.pairs + int(threadIdx.x);

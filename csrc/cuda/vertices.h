@@ -6,8 +6,8 @@ namespace pd::inline PD_TARGET {
 
 template <class T, bool Touching>
 struct Vertices {
-  Quad<T>*x, *velocity, *target;  // at the start of the step [m], [m/s], s [m]
-  Quad<T>*u, *before;             // iterate and the one before [m]; w: 1 / D, a
+  Quad<T>*x, *velocity, *target;  // at the start of the step [m], [m/s], s [m] and as its w: a
+  Quad<T>*u, *before;             // iterate and the one before [m]; w: 1 / D
 
   // What a pass knows of a vertex before the force on it.
   struct Seen {
@@ -34,26 +34,29 @@ struct Vertices {
   PD_DEVICE Seen see(int i) const { return {at(i), vec3(u[i]), vec3(before[i])}; }
 
   PD_DEVICE Vertex<Thread<T>, Touching> at(int i) const {
-    return {vec3(x[i]), vec3(target[i]), before[i].w, u[i].w};
+    return {vec3(x[i]), vec3(target[i]), inertia(i), u[i].w};
   }
+
+  PD_DEVICE T inertia(int i) const { return target[i].w; }
 
   PD_DEVICE void load(int i, const Inputs<T>& in, int vertex, T h) const {
     x[i] = quad(in.at_vertex(in.call->positions, vertex));
     velocity[i] = quad(in.at_vertex(in.call->velocities, vertex));
-    before[i] = {T(0), T(0), T(0), in.inertia(vertex, h)};
-    u[i] = {T(0), T(0), T(0), T(0)};
+    target[i] = {T(0), T(0), T(0), in.inertia(vertex, h)};
+    u[i] = before[i] = {T(0), T(0), T(0), T(0)};
   }
 
   // 1 / D; returns a / D, infinite where a pin holds the vertex
   PD_DEVICE double weigh(int i, T elastic) const {
-    const T a = before[i].w;
+    const T a = inertia(i);
     if (!(a > T(0))) return HUGE_VAL;
-    u[i].w = T(1) / (a + elastic);
-    return double(a * u[i].w);
+    const T inverse = T(1) / (a + elastic);
+    u[i].w = before[i].w = inverse;
+    return double(a * inverse);
   }
 
   PD_DEVICE void predict(int i, const Inputs<T>& in, int vertex, T h) const {
-    target[i] = quad(in.target(vertex, vec3(x[i]), vec3(velocity[i]), h));
+    target[i] = quad(in.target(vertex, vec3(x[i]), vec3(velocity[i]), h), inertia(i));
   }
 
   PD_DEVICE Vec3<T> straight(int i, T h) const { return h * vec3(velocity[i]); }
@@ -70,6 +73,10 @@ struct Vertices {
   PD_DEVICE void set(int i, const Vec3<T>& value) const { u[i] = quad(value, u[i].w); }
   PD_DEVICE void set_before(int i, const Vec3<T>& value) const {
     before[i] = quad(value, before[i].w);
+  }
+  // In place of the iterate before, for whoever then lets the two change places.
+  PD_DEVICE void set_in_place_of_before(int i, const Seen& seen, const Vec3<T>& value) const {
+    before[i] = quad(value, seen.vertex.inverse);
   }
 
   PD_DEVICE void finish(int i, T h) const {

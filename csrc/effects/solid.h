@@ -65,13 +65,16 @@ struct SolidGradient {
     for (int s = 0; s < N; ++s) root[s] = largest_root(i[s]);
     for (int s = 0; s < N; ++s) {
       const R weight = elements.weight(s);
-      const Mat3<R> d = f[s] - finish_rotation(f[s], i[s], root[s]);
-      if (Energy && wanted) {
-        elements.sum(s) =
-            multiply_add(R(scalar_of<R>(0.5)) * weight, frobenius(d, d), elements.sum(s));
+      Mat3<R> stress = finish_strain(f[s], i[s], root[s], Energy ? R(scalar_of<R>(1)) : weight);
+      if (Energy) {
+        if (wanted) {
+          elements.sum(s) = multiply_add(R(scalar_of<R>(0.5)) * weight, frobenius(stress, stress),
+                                         elements.sum(s));
+        }
+        stress = weight * stress;
       }
       Vec3<R> g[4];
-      corner_forces(weight * d, elements.rest(s), g);
+      corner_forces(stress, elements.rest(s), g);
       elements.add(s, g);
     }
   }

@@ -50,6 +50,16 @@ PD_HD R frobenius(const Mat3<R>& a, const Mat3<R>& b) {
   return (dot(a.row[0], b.row[0]) + dot(a.row[1], b.row[1])) + dot(a.row[2], b.row[2]);
 }
 
+template <class Mask, class R>
+PD_HD Mat3<R> select(const Mask& take, const Mat3<R>& a, const Mat3<R>& b) {
+  Mat3<R> chosen;
+  for (int r = 0; r < 3; ++r) {
+    chosen.row[r] = {select(take, a.row[r].x, b.row[r].x), select(take, a.row[r].y, b.row[r].y),
+                     select(take, a.row[r].z, b.row[r].z)};
+  }
+  return chosen;
+}
+
 template <class R>
 PD_HD Mat3<R> cofactor(const Mat3<R>& a) {
   return {{cross(a.row[1], a.row[2]), cross(a.row[2], a.row[0]), cross(a.row[0], a.row[1])}};
