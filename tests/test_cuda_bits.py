@@ -141,6 +141,45 @@ def test_rollout_is_repeated_steps(kernel: str, batch: int, precision: str) -> N
             assert all(torch.equal(one, other) for one, other in zip(columns, info, strict=True))
 
 
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize("tolerance", [0.0, 0.1])
+@pytest.mark.parametrize("iterations", [1, 2, 5, 6])
+@pytest.mark.parametrize("contacts", [False, True])
+def test_graphs_and_rollouts_of_many_patches(
+    contacts: bool, iterations: int, tolerance: float, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kernels that start before the one before them has ended do so from step to step and from replay to replay.
+
+    The last iteration writes the state from either of two places that change from one iteration to the next.
+    """
+    dtype = DTYPES[precision]
+    monkeypatch.setitem(regimes._STREAM_TETS, dtype, 50)
+    parts = (pd.Gravity(), pd.Ground(-0.3)) if contacts else (pd.Gravity(),)
+    sim = on_gpu(bar((19, 6, 6), *parts), dtype, "stream", iterations=iterations, tolerance=tolerance)
+    assert sim.plan.patches > 50
+    start, forces = unlike(sim, 13)
+    if precision == "float32":
+        expected = ["stream_shared", "stream_patches" if contacts else "stream_pipeline"]
+        work = device_work(lambda: sim(start, forces))
+        assert all(any(kernel in name for name in work) for kernel in expected)
+    eager, own = (pd.State(*(t.clone() for t in start)) for _ in range(2))
+    track = sim.rollout(start, 6, forces=forces)
+    step = sim.capture(own, forces)
+    for _ in range(6):
+        sim.step_(eager, forces)
+    for _ in range(6):
+        step.replay()
+    state, steps = start, []
+    for _ in range(6):
+        state = sim(state, forces)
+        torch.cuda.synchronize()
+        steps.append(state)
+    assert not same_bits(steps[-1], steps[-2])
+    assert same_bits(eager, state)
+    assert same_bits(own, state)
+    assert all(same_bits(track.state(number), steps[number]) for number in range(6))
+
+
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_start_may_be_the_state_that_is_overwritten(kernel: str, precision: str) -> None:
     sim = full_on_gpu(DTYPES[precision], kernel)
