@@ -255,6 +255,21 @@ def test_what_has_no_derivative_says_so() -> None:
         sim(state).positions.sum().backward()
 
 
+def test_second_derivatives_are_refused() -> None:
+    """Of the op and of a rollout; first ones that could have been differentiated again are the same."""
+    sim, state = body(iterations=50)
+    v = state.velocities.clone().requires_grad_()
+    (once,) = torch.autograd.grad(sim(pd.State(state.positions, v)).positions.square().sum(), v)
+    for step in (sim, lambda state: sim.rollout(state, 1).state(0)):
+        loss = step(pd.State(state.positions, v)).positions.square().sum()
+        (again,) = torch.autograd.grad(loss, v, create_graph=True)
+        assert torch.equal(again, once)
+        with pytest.raises(RuntimeError, match="torchpd: a step has first derivatives only"):
+            again.square().sum().backward()
+    with pytest.raises(RuntimeError, match="torchpd: a step has first derivatives only"):
+        torch.autograd.gradgradcheck(lambda v: sim(pd.State(state.positions, v)).positions, v)
+
+
 def test_compiles_with_its_backward() -> None:
     sim, state = body(iterations=100)
     x = state.positions.clone().requires_grad_()

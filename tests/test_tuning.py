@@ -118,10 +118,7 @@ def test_residuals_are_watched(tuned: tuple[pd.Simulator, Promise]) -> None:
 
 
 def test_an_audit_finds_the_error() -> None:
-    """Three times as many iterations later hardly any error is left, so the way there is the error that was.
-
-    In float64: what rounding adds is no error to a promise, but to an audit it is.
-    """
+    """Three times as many iterations later hardly any error is left, so the way there is the error that was."""
     sim = bar(dtype=torch.float64)
     promise = sim.tune(swinging(sim), error=1e-2)
     state = swinging(sim, batch=2)
@@ -131,6 +128,33 @@ def test_an_audit_finds_the_error() -> None:
     assert found.shape == (2,)
     assert float(found.max()) == pytest.approx(true, rel=0.3)
     assert sim.iterations == promise.iterations
+
+
+@pytest.mark.parametrize("error", [1e-5, 1e-7])
+def test_rounding_is_told_apart_from_error(error: float) -> None:
+    """A float32 step has 10 eps |x| of it: more than such promises, which hold beyond it and are audited beyond it."""
+    sim = bar()
+    state = swinging(sim)
+    promise = sim.tune(state, error=error)
+    (exact,) = exact_steps(sim, state)
+    share = 10.0 * 2.0**-23 * float(state.positions.norm()) / exact.scale
+    assert share > 10.0 * error
+    assert promise.rounding >= 0.999 * share
+    assert str(promise).startswith(f"error {error:.1e} and up to {promise.rounding:.1e} of rounding, ")
+    assert promise.audit(sim, state, sim(state)).tolist() == [0.0]
+    sim.iterations //= 4
+    found = float(promise.audit(sim, state, sim(state)))
+    assert found == pytest.approx(worst_error(sim, state), rel=0.3)
+    assert found > error
+
+
+def test_a_body_at_rest_has_no_error() -> None:
+    sim = bar()
+    promise = sim.tune(swinging(sim), error=1e-2)
+    still = pd.Scene(pd.Solid(pd.shapes.single_tet(), youngs=1e4))
+    other = pd.Simulator(still, sim.time_step, progress=False)
+    state = other.rest_state(2)
+    assert promise.audit(other, state, other(state)).tolist() == [0.0, 0.0]
 
 
 def test_what_few_iterations_more_than_solve_is_watched_too() -> None:

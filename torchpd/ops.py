@@ -183,7 +183,7 @@ def _hessian_product_backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor | No
     return None, _ops.hessian_product(positions, grad, stiffness, ctx.plan), None, _for_plan(ctx)
 
 
-def _diagonal_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
+def _save_nothing(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
     """Nothing to save."""
 
 
@@ -284,6 +284,13 @@ def _step_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _:
     return x, v, f if wanted[2] else None, None, values, [None] * len(plan)
 
 
+def _step_vjp_backward(ctx: Any, *_: Any) -> None:
+    raise RuntimeError(
+        "torchpd: a step has first derivatives only; differentiate without create_graph, or take differences of the "
+        "gradients of two steps"
+    )
+
+
 def _check_differentiable(wanted: Sequence[bool], material: Sequence[Tensor]) -> None:
     arrays = zip(MATERIAL_TABLE, wanted, material, strict=True)
     # without contacts nothing depends on them
@@ -333,9 +340,10 @@ def _rollout_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor,
 
 _CONTACTS = ("planes", "spheres")
 torch.library.register_autograd("torchpd::rollout", _rollout_backward, setup_context=_rollout_setup)
-torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_diagonal_setup)
+torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_save_nothing)
 torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)
 torch.library.register_autograd("torchpd::step", _step_backward, setup_context=_step_setup)
+torch.library.register_autograd("torchpd::step_vjp", _step_vjp_backward, setup_context=_save_nothing)
 
 for _name, _backward, _inputs in (
     ("element_energy", _element_energy_backward, ("positions", "stiffness")),

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .accuracy import ExactStep, exact_steps, frictionless
+from .accuracy import ROUNDINGS, ExactStep, exact_steps, frictionless
 from .checks import check_scalar, check_whole
 from .contenders import safe_solvers
 from .diagonal import step_diagonal
@@ -77,6 +77,7 @@ class Promise:
     iterations: int
     error: float  # promised, of a step
     studied_error: float  # worst of the study
+    rounding: float  # 10 eps |x| / |x_0 - x*|, largest of the study: what may come on top of `error`
     milliseconds: float  # median of sim(state), of the batch that tune saw, on the machine where it ran
     residual_limit: float  # `info.residual` above which the promise is not to be relied on
     error_per_residual: float  # largest ratio in the study
@@ -104,9 +105,10 @@ class Promise:
         forces: Tensor | None = None,
         targets: Targets | None = None,
     ) -> Tensor:
-        """Error of a step [B], from solving it on: |x' - x| / |x' - x_0| with x' three times as many iterations later.
+        """Error of a step [B] beyond rounding, as `error` is, by solving on: x' three times as many iterations later.
 
-        Costs three steps and calibrates nothing: for now and then. Low where even those iterations change little.
+        The least e >= 0 with |x - x'| <= e |x_0 - x'| + 10 eps |x|. Costs three steps and calibrates nothing: for now
+        and then. Low where even those iterations change little.
 
         Args:
             sim: the tuned simulator.
@@ -121,13 +123,17 @@ class Promise:
         further.iterations = 0
         first: Tensor = further(state, forces, targets)[1]
         # displacements over the time step are velocities
-        error: Tensor = (solved - after[1]).flatten(1).norm(dim=1) / (solved - first).flatten(1).norm(dim=1)
-        return error
+        error = (solved - after[1]).flatten(1).norm(dim=1)
+        rounding = ROUNDINGS * torch.finfo(self.dtype).eps * state[0].flatten(1).norm(dim=1) / self.time_step
+        # a body at rest has no error
+        scale = (solved - first).flatten(1).norm(dim=1).clamp(min=torch.finfo(self.dtype).tiny)
+        beyond: Tensor = (error - rounding).clamp(min=0.0) / scale
+        return beyond
 
     def estimate(self, info: Info) -> Tensor:
         """Error of the step [B] that its residual may hide, at the largest ratio of the study; NaN without a report.
 
-        High rather than low: it exceeds `error` on one in four steps that keep the promise; an `audit` tells which.
+        High rather than low: it exceeds `error` on one in three steps that keep the promise; an `audit` tells which.
         """
         return info.residual * self.error_per_residual
 
@@ -139,7 +145,8 @@ class Promise:
     def __str__(self) -> str:
         wanted = f"error {self.asked_error:g}" if self.asked_error is not None else f"{self.asked_milliseconds:g} ms"
         verdict = "" if self.attained else f" ({wanted} cannot be had)"
-        return f"error {self.error:.1e}, {self.milliseconds:.2g} ms a step of {self.batch}{verdict}"
+        rounding = f" and up to {self.rounding:.1e} of rounding" if self.rounding > 0.1 * self.error else ""
+        return f"error {self.error:.1e}{rounding}, {self.milliseconds:.2g} ms a step of {self.batch}{verdict}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,6 +430,7 @@ def _promise(
         iterations=chosen.iterations,
         error=promised,
         studied_error=chosen.error,
+        rounding=max(step.rounding(sim.dtype) / step.scale for step in study.exact),
         milliseconds=cost,
         residual_limit=limit,
         error_per_residual=ratio,
