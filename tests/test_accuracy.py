@@ -10,7 +10,7 @@ from runs import full_scene, moving, simulate, simulator, state_of
 
 import torchpd as pd
 from torchpd.accuracy import exact_steps, frictionless, problem_of, scene_without_friction, select_state
-from torchpd.reference_solvers import newton
+from torchpd.reference_solvers import newton, newton_step
 
 
 def test_the_first_iterate_has_error_one_and_the_solution_none() -> None:
@@ -45,6 +45,21 @@ def test_uncertainty_bounds_the_error() -> None:
     off = 1e-6 * np.where(step.problem.free[:, None], np.random.default_rng(0).standard_normal(step.first.shape), 0.0)
     bound = np.linalg.norm(step.problem.gradient(step.solution + off)) / step.problem.weight[step.problem.free].min()
     assert bound >= np.linalg.norm(off)
+
+
+def test_newtons_next_step_is_near_a_minimum_only() -> None:
+    """There it is the way back, to second order; where the energy curves downwards it says nothing."""
+    case = beam(1e5)
+    sim = simulator(case, torch.float64)
+    step = exact_steps(sim, state_of(case, sim))[0]
+    noise = np.where(step.problem.free[:, None], np.random.default_rng(0).standard_normal(step.first.shape), 0.0)
+    for size in (1e-4, 1e-5):
+        way = newton_step(step.problem, step.solution + size * noise)
+        assert way is not None
+        assert np.linalg.norm(way + size * noise) <= 0.03 * (size / 1e-4) * np.linalg.norm(size * noise)
+    problem = step.problem
+    squeezed = 0.7 * problem.values.rest_positions - problem.positions
+    assert newton_step(problem, np.where(problem.free[:, None], squeezed, 0.0)) is None
 
 
 def test_material_of_every_environment_is_that_of_now() -> None:

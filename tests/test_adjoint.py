@@ -219,6 +219,23 @@ def test_unsolved_step_warns() -> None:
     assert 0.0 < float(crumpled.grad.norm()) <= 1.1 * crumpled.numel() ** 0.5
 
 
+def test_what_is_lost_does_not_hide_what_has_failed() -> None:
+    """One environment of a loss that is no number, one that is far from an equilibrium: each as if it were alone."""
+    sim, state = body(iterations=1)
+    crumpled = 0.02 * torch.randn(state[0].shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+
+    def gradient(weight: list[float]) -> torch.Tensor:
+        x = crumpled.clone().requires_grad_()
+        loss = torch.tensor(weight, dtype=x.dtype)[:, None, None] * sim(pd.State(x, state.velocities)).positions
+        with pytest.warns(UserWarning, match=r"in \d of 2 environments \(relative residual \d\.\de[+-]\d\d\)"):
+            (found,) = torch.autograd.grad(loss.sum(), x)
+        return found
+
+    both, mixed = gradient([1.0, 1.0]), gradient([torch.nan, 1.0])
+    assert mixed[0].isnan().any()
+    assert torch.equal(mixed[1], both[1])
+
+
 def test_a_loss_that_is_no_number_has_no_gradient(recwarn: pytest.WarningsRecorder) -> None:
     """Whoever watches for NaN sees it, in the environment that has it and in what all share."""
     sim, state = body()

@@ -105,6 +105,17 @@ def test_tolerance_stops_each_environment_by_itself(dtype: torch.dtype, device: 
         assert np.array_equal(iterates[-1], displacement(sim, after, item))
 
 
+def test_what_overflows_is_not_still(device: torch.device) -> None:
+    """|u|^2 beyond the numbers says nothing of a change."""
+    sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), youngs=1e4)), 1.0, 20, dtype=torch.float64)
+    sim.tolerance = 1e-3
+    state = sim.to(device).rest_state(2)
+    state.velocities[0], state.velocities[1] = 1.0, 1e160
+    info = sim(state, return_info=True)[1]
+    assert int(info.iterations[0]) < 20
+    assert int(info.iterations[1]) == 20
+
+
 def test_tolerance_that_is_not_met_says_so(device: torch.device) -> None:
     sim = simulate(torch.float64, device, iterations=5, tolerance=1e-12)
     _, info = sim(moving(sim), return_info=True)

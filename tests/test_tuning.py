@@ -172,6 +172,29 @@ def test_what_few_iterations_more_than_solve_is_watched_too() -> None:
     assert float(promise.estimate(info)) > promise.error
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_promise_for_a_time_is_watched_as_well(dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Far more iterations are paid for than are needed: trials of fewer say what a residual means."""
+    monkeypatch.setattr(tuning, "_milliseconds", lambda sim, start, trial: 0.01 * trial.iterations)
+    sim = bar(dtype=dtype)
+    promise = sim.tune(swinging(sim), milliseconds=1.0, candidates=[pd.Chebyshev()])
+    assert 85 <= promise.iterations <= 95
+    assert promise.error >= promise.rounding  # of float32: so many iterations leave nothing else
+    chosen = promise.trials[-1]
+    assert promise.residual_limit >= 1.5 * max(chosen.residuals)
+    broken = min((trial for trial in promise.trials if trial.error > promise.error), key=lambda trial: trial.error)
+    assert 0 < broken.iterations < promise.iterations
+    state = swinging(sim, speed=-2.0)
+    for _ in range(30):
+        state, info = sim(state, return_info=True)
+        assert bool(promise.holds(info))
+        assert float(promise.estimate(info)) < 2.0 * promise.error
+    sim.iterations = broken.iterations // 2
+    info = sim(state, return_info=True)[1]
+    assert not bool(promise.holds(info))
+    assert float(promise.estimate(info)) > promise.error
+
+
 def test_stiff_bodies_almost_at_rest_in_float64() -> None:
     """The converged steps are as certain as Newton's method makes them, not as |grad E| over inertia bounds them."""
     sim = bar(youngs=1e8, dtype=torch.float64, iterations=20)

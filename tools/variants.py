@@ -55,13 +55,23 @@ def apply(patch: Path, folder: Path) -> None:
         sys.exit(f"{patch} changes nothing in csrc/.")
 
 
+def is_up_to_date(folder: Path) -> bool:
+    """Whether ninja, that of this environment first, would make nothing anew in a folder."""
+    places = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    ninja = shutil.which("ninja", path=places)
+    if ninja is None:
+        sys.exit("tools/variants.py needs ninja, with which the extension is built: run `pip install ninja`.")
+    left = subprocess.run([ninja, "-n", "-C", str(folder)], capture_output=True, text=True, check=False)
+    return "no work to do" in left.stdout
+
+
 def objects() -> list[Path]:
     """Of the extension that was built in place, for this python and torch, one of every source."""
     folder = f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}-torch-{torch.__version__}"
     sources = [path.relative_to(ROOT) for kind in ("*.cpp", "*.cu") for path in (ROOT / "csrc").rglob(kind)]
-    found = [(ROOT / "build" / folder / path).with_suffix(".o") for path in sorted(sources)]
-    newest = max(path.stat().st_mtime for path in (ROOT / "csrc").rglob("*") if path.is_file())
-    if not all(path.exists() for path in found) or max(path.stat().st_mtime for path in found) < newest:
+    built = ROOT / "build" / folder
+    found = [(built / path).with_suffix(".o") for path in sorted(sources)]
+    if not all(path.exists() for path in found) or not is_up_to_date(built):
         sys.exit(f"build/{folder} is not of this csrc/: run `python setup.py build_ext --inplace` first.")
     return found
 

@@ -231,7 +231,8 @@ def _polished(problem: StepProblem, first: Array, near: Array) -> ExactStep:
     if not contacts and len(near) <= _NEWTON_VERTICES:
         try:
             solution = newton(problem, near)
-            nearest = 2.0 * float(np.linalg.norm(newton_step(problem, solution)))
+            step = newton_step(problem, solution)
+            nearest = np.inf if step is None else 2.0 * float(np.linalg.norm(step))
         except RuntimeError:  # stalls at a kink of the rotations: the iterate stays
             solution = near
     left = float(np.linalg.norm(problem.residual(solution)))

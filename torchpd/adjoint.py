@@ -206,11 +206,12 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
     if bool(failed.any()):
         warnings.warn(
             f"torchpd: the adjoint of a step has no solution in {int(failed.sum())} of {len(failed)} environments "
-            f"(relative residual {float(error.max()):.1e}): their states are far from an equilibrium (more iterations "
-            "in the step help) or at an unstable one. Their gradients take the rotations as constant.",
+            f"(relative residual {float(error[failed].max()):.1e}): their states are far from an equilibrium (more "
+            "iterations in the step help) or at an unstable one. Their gradients take the rotations as constant.",
             stacklevel=2,
         )
-        instead, _ = conjugate_gradients(majoriser, precondition, right * failed[:, None, None], tolerance)
+        wanted = torch.where(failed[:, None, None], right, 0.0)
+        instead, _ = conjugate_gradients(majoriser, precondition, wanted, tolerance)
         multiplier = torch.where(failed[:, None, None], instead, multiplier)
     return multiplier.contiguous(), held
 

@@ -282,7 +282,7 @@ def newton(
     energy, gradient = problem.evaluate(u)
     for k in range(iterations):
         size = float(np.linalg.norm(gradient))
-        direction = _newton_direction(problem, u, gradient, rows) if size > 0.0 else gradient
+        direction = _newton_direction(problem, u, gradient, rows)[0] if size > 0.0 else gradient
         trial, trial_energy, trial_gradient = _descend(problem, u, energy, gradient, direction)
         gain = size - float(np.linalg.norm(trial_gradient))
         solved = size <= tolerance * scale or float(np.linalg.norm(direction)) <= rounding
@@ -296,9 +296,14 @@ def newton(
     raise RuntimeError(f"newton: stopped at |grad E| = {size:.3e} N, wanted {tolerance * scale:.3e} N")
 
 
-def newton_step(problem: StepProblem, displacement: Array) -> Array:
-    """Where the quadratic of E around u has its minimum, from u [V, 3] m: the first order of u* - u near a minimum."""
-    return _newton_direction(problem, displacement, problem.evaluate(displacement)[1], _free_rows(problem))
+def newton_step(problem: StepProblem, displacement: Array) -> Array | None:
+    """Where the quadratic of E around u has its minimum, from u [V, 3] m: the first order of u* - u near a minimum.
+
+    None where that is no way down.
+    """
+    gradient = problem.evaluate(displacement)[1]
+    direction, own = _newton_direction(problem, displacement, gradient, _free_rows(problem))
+    return direction if own else None
 
 
 def _descend(
@@ -319,7 +324,10 @@ def _descend(
     return displacement, energy, gradient
 
 
-def _newton_direction(problem: StepProblem, displacement: Array, gradient: Array, rows: NDArray[np.int64]) -> Array:
+def _newton_direction(
+    problem: StepProblem, displacement: Array, gradient: Array, rows: NDArray[np.int64]
+) -> tuple[Array, bool]:
+    """The step to the minimum of the quadratic; where that is no way down, to that of one that curves upwards, and False."""
     flat = gradient.reshape(-1)[rows]
     direction = np.zeros(gradient.size)
     for positive in (False, True):
@@ -327,7 +335,7 @@ def _newton_direction(problem: StepProblem, displacement: Array, gradient: Array
         direction[rows] = -splu(reduced).solve(flat)
         if direction[rows] @ flat <= -1e-6 * np.linalg.norm(direction) * np.linalg.norm(flat):
             break
-    return direction.reshape(-1, 3)
+    return direction.reshape(-1, 3), not positive
 
 
 def local_global(problem: StepProblem, first: Array, *, iterations: int, observe: Observer | None = None) -> Array:

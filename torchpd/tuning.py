@@ -75,7 +75,7 @@ class Promise:
     attained: bool  # whether what was asked for can be had; if not, error and milliseconds say what can
     solver: Solver
     iterations: int
-    error: float  # promised, of a step
+    error: float  # promised, of a step; no finer than `rounding`, unless that was asked for
     studied_error: float  # worst of the study
     rounding: float  # 10 eps |x| / |x_0 - x*|, largest of the study: what may come on top of `error`
     milliseconds: float  # median of sim(state), of the batch that tune saw, on the machine where it ran
@@ -394,14 +394,26 @@ def _cheapest(timed: list[tuple[list[Trial], float]], error: float) -> tuple[lis
     return next((trials, cost) for trials, cost in reached if cost <= _NEAR * fastest)
 
 
-def _residual_limit(study: _Study, trials: list[Trial], promised: float) -> tuple[float, float]:
+def _with_broken(study: _Study, trials: list[Trial], promised: float) -> list[Trial]:
+    """The trials, the chosen one last, and where none of them breaks the promise some of fewer iterations that do."""
+    if any(trial.error > promised for trial in trials):
+        return trials
+    solver, low, high = trials[-1].solver, 0, min(trial.iterations for trial in trials)
+    added = [study.trial(solver, low)]
+    while high - low > max(1, high // 8):
+        added.append(study.trial(solver, (low + high) // 2))
+        low, high = (added[-1].iterations, high) if added[-1].error > promised else (low, added[-1].iterations)
+    return [*added, *trials]
+
+
+def _residual_limit(trials: list[Trial], promised: float) -> tuple[float, float]:
     """The residual at which the error is the promised one, and the largest error per residual.
 
     The chosen trial says it if its errors are near the promise. They may be far below, or beyond rounding nothing at
     all, where few iterations do much; then the nearest trial that breaks the promise says more.
     """
     chosen = trials[-1]
-    breaking = [trial for trial in [*trials, study.trial(chosen.solver, 0)] if promised < trial.error < math.inf]
+    breaking = [trial for trial in trials if promised < trial.error < math.inf]
     asked = [chosen, *sorted(breaking, key=lambda trial: trial.error)[:1]]
     limits = [max(trial.residuals) * promised / trial.error for trial in asked if trial.error > 0.0]
     ratios = [e / r for trial in asked for e, r in zip(trial.errors, trial.residuals, strict=True) if r > 0.0]
@@ -420,8 +432,11 @@ def _promise(
 ) -> Promise:
     chosen = trials[-1]
     attained = chosen.error <= error / SAFETY if error is not None else cost <= 1.2 * (milliseconds or 0.0)
-    promised = error if attained and error is not None else min(SAFETY * chosen.error, 1.0)
-    limit, ratio = _residual_limit(study, trials, promised)
+    rounding = max(step.rounding(sim.dtype) / step.scale for step in study.exact)
+    # no finer than rounding, unless that was asked for
+    promised = error if attained and error is not None else min(max(SAFETY * chosen.error, rounding), 1.0)
+    trials = _with_broken(study, trials, promised)
+    limit, ratio = _residual_limit(trials, promised)
     return Promise(
         asked_error=error,
         asked_milliseconds=milliseconds,
@@ -430,7 +445,7 @@ def _promise(
         iterations=chosen.iterations,
         error=promised,
         studied_error=chosen.error,
-        rounding=max(step.rounding(sim.dtype) / step.scale for step in study.exact),
+        rounding=rounding,
         milliseconds=cost,
         residual_limit=limit,
         error_per_residual=ratio,

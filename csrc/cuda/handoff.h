@@ -47,9 +47,9 @@ class Signal {
 };
 
 // In a kernel that Launcher::run_early launched: until the kernel before has ended and what it wrote is there. What kernels of
-// the same step write or read comes after it; a plan may come before, and weights, since kernels that nobody starts early stand
-// between those that write them and the first that is. All blocks wait, so that whoever waits for them waits for all before
-// them.
+// the same step write or read comes after it, but for prefetches into L2, which sees all writes. A plan may come before, and
+// weights, of pairs and of patches, as long as kernels that nobody starts early stand between those that write them and the
+// first that is. All blocks wait, so that whoever waits for them waits for all before them.
 PD_DEVICE void await_kernel_before() {
 #if PD_HAS_CLUSTERS
   asm volatile("griddepcontrol.wait;" ::: "memory");

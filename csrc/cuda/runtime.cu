@@ -28,7 +28,7 @@ static int ask_for_resident_blocks(const void* kernel, int device, int threads,
   return blocks * multiprocessors;
 }
 
-// What a launch is and how many fit, asked for once.
+// What a kernel, launched so, gets, asked for once; every `Ask` has answers of its own.
 template <class Ask>
 static int known_or(const void* kernel, int threads, std::size_t shared_bytes, int cluster,
                     const Ask& ask) {
@@ -80,9 +80,9 @@ static bool has_code_for_90(const void* kernel, int device) {
 }
 
 bool runs_code_for_90(const void* kernel) {
-  constexpr int question = -1;  // no size of a cluster
-  return known_or(kernel, 0, 0, question,
-                  [&](int device) { return int(has_code_for_90(kernel, device)); }) != 0;
+  return known_or(kernel, 0, 0, 0, [&](int device) {
+           return int(has_code_for_90(kernel, device));
+         }) != 0;
 }
 
 static int ask_for_resident_clusters(const void* kernel, int device, int threads,

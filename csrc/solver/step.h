@@ -24,9 +24,9 @@ PD_HD double relative_residual(double last, double course) {
   return course == 0 && last == 0 ? 0.0 : NAN;
 }
 
-// The soft stop, of the squares of an iteration's change and of the displacement; what overflows goes on.
+// The soft stop, of the squares of an iteration's change and of the displacement; where either overflows it goes on.
 PD_HD bool is_still(double tolerance, double change, double length) {
-  return tolerance > 0 && change < HUGE_VAL && change <= tolerance * tolerance * length;
+  return tolerance > 0 && length < HUGE_VAL && change <= tolerance * tolerance * length;
 }
 
 // The runner's own functions say where it runs: in a kernel, or on the host.
