@@ -327,7 +327,7 @@ def _descend(
 def _newton_direction(
     problem: StepProblem, displacement: Array, gradient: Array, rows: NDArray[np.int64]
 ) -> tuple[Array, bool]:
-    """The step to the minimum of the quadratic; where that is no way down, to that of one that curves upwards, and False."""
+    """The step to the minimum of the quadratic; where that is no way down, of one that curves upwards, and False."""
     flat = gradient.reshape(-1)[rows]
     direction = np.zeros(gradient.size)
     for positive in (False, True):
