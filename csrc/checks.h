@@ -39,7 +39,7 @@ inline void check_storage(const Tensor& t, at::ScalarType type, const Place& pla
   TORCH_CHECK_VALUE(t.device() == place.device, name, " must be on ", place.device.str(), " like ",
                     place.like, " (", meaning, "), got ", describe(t));
   TORCH_CHECK_VALUE(t.is_contiguous(), name, " must be contiguous (", meaning, "), got strides ",
-                    t.strides());
+                    t.strides(), "; call contiguous()");
 }
 
 #define X(name, type, width, rows, meaning) +1

@@ -262,6 +262,21 @@ def test_contacts_that_are_not_there_may_want_gradients() -> None:
     sim.rollout(state, 2).positions.sum().backward()
 
 
+def test_material_that_is_copied_loses_its_history_aloud() -> None:
+    sim, state = body(iterations=50)
+    factor = torch.ones((), dtype=torch.float64, requires_grad=True)
+    with pytest.warns(UserWarning, match=r'torch\.func\.functional_call\(sim, \{"stiffness": \.\.\.\}, \(state,\)\)'):
+        sim.set_material(stiffness=factor * sim.stiffness)
+    assert not sim.stiffness.requires_grad
+    after = torch.func.functional_call(sim, {"stiffness": factor * sim.stiffness}, (state,))
+    (slope,) = torch.autograd.grad(after[0].square().sum(), factor)
+    sim.stiffness.requires_grad_()
+    (gradient,) = torch.autograd.grad(sim(state).positions.square().sum(), sim.stiffness)
+    assert float(slope) == pytest.approx(float((gradient * sim.stiffness).sum()), rel=1e-12)
+    with torch.no_grad():
+        sim.set_material(stiffness=factor * sim.stiffness)  # there is no history to lose
+
+
 def test_what_has_no_derivative_says_so() -> None:
     sim, state = body(pd.Ground(-10.0))
     start = state.positions.clone().requires_grad_()

@@ -62,8 +62,9 @@ def test_what_is_no_number_is_not_solved(dtype: torch.dtype, device: torch.devic
     push = torch.zeros_like(rest.positions)
     push[0, vertex] = torch.nan
     state.positions[1, vertex] = torch.nan
-    _, info = sim(state, push, return_info=True)
+    after, info = sim(state, push, return_info=True)
     assert info.residual.isnan().tolist() == [True, True, False]
+    assert after.positions.isfinite().flatten(1).all(1).tolist() == [False, False, True]
     assert not bool(info.converged[:2].any())
     assert torch.equal(info.residual[2], expected.residual[2])
     # squares that overflow are no change of a thousandth
@@ -103,6 +104,29 @@ def test_tolerance_stops_each_environment_by_itself(dtype: torch.dtype, device: 
         assert changes[1] <= 1e-3 * (1 + slack)
         assert changes[0] > 1e-3 * (1 - slack)
         assert np.array_equal(iterates[-1], displacement(sim, after, item))
+
+
+@pytest.mark.parametrize("name", ["stiffness", "masses"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -2e4, -1.0])
+@pytest.mark.parametrize(
+    "solver", [pd.Chebyshev(), pd.Jacobi(), pd.Multilevel()], ids=["chebyshev", "jacobi", "levels"]
+)
+def test_wrong_material_is_not_solved(
+    dtype: torch.dtype, device: torch.device, solver: pd.Solver, value: float, name: str
+) -> None:
+    """That an optimiser wrote in place, which no check sees."""
+    case = beam(1e5)
+    sim = simulator(case, dtype, device, iterations=20, tolerance=1e-3)
+    sim.solver = solver
+    state = moving(sim, 3)
+    _, expected = sim(state, return_info=True)
+    own = getattr(sim, name).expand(3, -1).clone()
+    sim.set_material(**{name: own})
+    getattr(sim, name)[1] = value
+    _, info = sim(state, return_info=True)
+    assert info.residual.isnan().tolist() == [False, True, False]
+    assert not bool(info.converged[1])
+    assert torch.equal(info.residual[::2], expected.residual[::2])
 
 
 def test_what_overflows_is_not_still(device: torch.device) -> None:

@@ -137,7 +137,7 @@ def problem_of(
     material = {}
     for name, array in zip(MATERIAL_ROWS, arrays, strict=True):
         shared = array.dim() == MATERIAL_ROWS[name].dims
-        material[name] = _double(array if shared else array[item])
+        material[name] = _double(array if shared else array[item if len(array) > 1 else 0])
     planes, spheres = material["planes"], material["spheres"]
     planes[:, 4] = 0.0
     spheres[:, 4] = 0.0

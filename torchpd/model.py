@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -197,13 +198,22 @@ class Model(nn.Module):
     def set_material(self, **arrays: Tensor | float) -> None:
         """Replace differentiable arrays, for all environments or with a leading batch for each; all of them, or none.
 
-        An array of the same shape is overwritten, so that optimisers keep it; another batch makes a new parameter.
+        An array of the same shape is overwritten, so that optimisers keep it; another batch makes a new parameter. What
+        the numbers were made of gets no gradient, which a warning says: for that `torch.func.functional_call` gives the
+        simulator other arrays for one call.
 
         Args:
             arrays: by name, see `Simulator`. Shapes and values are checked here, once, and that batches agree with each
                 other and with those of the arrays that stay.
         """
         checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
+        for name, value in arrays.items():
+            if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
+                warnings.warn(
+                    f"set_material copies the numbers of {name}, so no gradient gets to what they were made of: give it "
+                    f'to single calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it',
+                    stacklevel=2,
+                )
         check_batches(checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
         parameters = {
             name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)

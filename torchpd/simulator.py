@@ -224,10 +224,12 @@ class Simulator(Model):
         keep it: times are of the machine that measured them.
 
         Args:
-            state: where typical motions start [B, V, 3], the rest state by default; up to four environments are
-                studied over 30 steps, without forces and with the targets of the scene. Times are for its batch.
+            state: where typical motions start [B, V, 3], the rest state by default, once for each environment of the
+                material; up to four environments are studied over 30 steps, without forces and with the targets of the
+                scene. Times are for its batch.
             error: of a step, |x - x*| / |x_0 - x*|, x* converged and x_0 the first iterate; in (0, 1).
-            milliseconds: of `sim(state)` on this machine; the error is then as low as that allows.
+            milliseconds: of `sim(state)` on this machine; the error is then as low as that allows, with no more
+                iterations than it takes to get below rounding.
             candidates: solvers to choose from, not "auto"; by default those that cannot diverge.
             most: iterations of a step, at most.
             progress: show a bar.

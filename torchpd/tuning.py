@@ -157,6 +157,11 @@ class _Study:
     state: State
     exact: list[ExactStep]
 
+    @property
+    def rounding(self) -> float:
+        """Largest share of a step's way that rounding may be."""
+        return max(step.rounding(self.sim.dtype) / step.scale for step in self.exact)
+
     @torch.no_grad()
     def trial(self, solver: Solver, iterations: int) -> Trial:
         """Worst error of some iterations."""
@@ -191,7 +196,7 @@ def tune(
     for solver in candidates or ():
         if not isinstance(solver, Solver):
             raise TypeError(f"tune: candidates must be solvers, such as Chebyshev() and Multilevel(), got {solver!r}")
-    start = sim.rest_state() if state is None else state
+    start = sim.rest_state(_environments_of_material(sim)) if state is None else state
     _check_start(sim, start)
     study = _prepare(sim, start)
     named: Mapping[str, Solver] = (
@@ -205,7 +210,7 @@ def tune(
     with tqdm(named.values(), desc="tuning", unit="solver", disable=not progress, leave=False) as bar:
         found = [seek(solver) for solver in bar]
     timed = [(trials, _milliseconds(sim, start, trials[-1])) for trials in found]
-    trials, cost = _cheapest(timed, error) if error is not None else min(timed, key=lambda pair: pair[0][-1].error)
+    trials, cost = _cheapest(timed, error) if error is not None else _most_accurate(timed, study.rounding)
     promise = _promise(sim, study, start, trials, cost, error, milliseconds)
     sim.solver, sim.iterations, sim.tolerance, sim.promise = promise.solver, promise.iterations, 0.0, promise
     if not promise.attained:
@@ -228,6 +233,11 @@ def _check_request(error: float | None, milliseconds: float | None) -> None:
         raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
 
 
+def _environments_of_material(sim: Simulator) -> int:
+    arrays = {name: getattr(sim, name) for name in MATERIAL_ROWS}
+    return max(len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1 for name, array in arrays.items())
+
+
 def _check_start(sim: Simulator, state: State) -> None:
     sim.check_state(state)
     if state[0].dim() != 3 or not len(state[0]) or state[1].shape != state[0].shape:
@@ -235,6 +245,9 @@ def _check_start(sim: Simulator, state: State) -> None:
             "tune: state must hold environments [B, V, 3], at least one, positions and velocities alike, got "
             f"{list(state[0].shape)} and {list(state[1].shape)}"
         )
+    count = _environments_of_material(sim)
+    if count not in (1, len(state[0])):
+        raise ValueError(f"tune: state must have the {count} environments of the material, got {len(state[0])}")
     for name, part in zip(State._fields, state, strict=True):
         bad = (~part.isfinite()).flatten(1).any(1).nonzero()
         if len(bad):
@@ -339,7 +352,10 @@ def _for_error(study: _Study, error: float, most: int) -> Seek:
 
 
 def _for_time(sim: Simulator, study: _Study, start: State, budget: float | None, most: int) -> Seek:
-    """The most iterations of a solver that a budget [ms] pays for, from the times of two counts."""
+    """The most iterations of a solver that a budget [ms] pays for, from the times of two counts.
+
+    Fewer where that leaves nothing but rounding: as many as bring the error below it.
+    """
     assert budget is not None
     spend = _HEADROOM * budget
 
@@ -353,7 +369,8 @@ def _for_time(sim: Simulator, study: _Study, start: State, budget: float | None,
             if count == 1 or (measured <= budget and (count == most or measured > 0.85 * budget)):
                 break
             count = int(np.clip(round(count * spend / measured), 1, most))
-        return [study.trial(solver, count)]
+        paid = study.trial(solver, count)
+        return [paid] if paid.error > study.rounding / SAFETY else _for_error(study, study.rounding, count)(solver)
 
     return seek
 
@@ -406,6 +423,11 @@ def _with_broken(study: _Study, trials: list[Trial], promised: float) -> list[Tr
     return [*added, *trials]
 
 
+def _most_accurate(timed: list[tuple[list[Trial], float]], rounding: float) -> tuple[list[Trial], float]:
+    """The candidate with the lowest error; of those whose errors rounding hides the fastest."""
+    return min(timed, key=lambda pair: (max(pair[0][-1].error, rounding / SAFETY), pair[1]))
+
+
 def _residual_limit(trials: list[Trial], promised: float) -> tuple[float, float]:
     """The residual at which the error is the promised one, and the largest error per residual.
 
@@ -432,7 +454,7 @@ def _promise(
 ) -> Promise:
     chosen = trials[-1]
     attained = chosen.error <= error / SAFETY if error is not None else cost <= 1.2 * (milliseconds or 0.0)
-    rounding = max(step.rounding(sim.dtype) / step.scale for step in study.exact)
+    rounding = study.rounding
     # no finer than rounding, unless that was asked for
     promised = error if attained and error is not None else min(max(SAFETY * chosen.error, rounding), 1.0)
     trials = _with_broken(study, trials, promised)

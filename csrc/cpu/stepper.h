@@ -215,8 +215,9 @@ class Stepper {
     team_.barrier();
     sweep_.run(0, SolidDiagonal{}, [&](std::int64_t i, const Value& force, Sum& sums) {
       const Real a = w_.inertia[i];
-      w_.inverse[i] = inverse_diagonal(a, Lanes::vec3(force).x);
-      sums.least = lesser(sums.least, select(a > none, a * w_.inverse[i], sums.least));
+      const Real elastic = Lanes::vec3(force).x;
+      w_.inverse[i] = inverse_diagonal(a, elastic);
+      sums.least = lesser(sums.least, share_of_inertia(a, elastic, w_.inverse[i]));
     });
     Real least = Real(T(HUGE_VAL));
     for (int part = 0; part < w_.part_count; ++part) least = lesser(least, w_.parts[0][part].least);
@@ -301,11 +302,13 @@ class Stepper {
     for (int lane = 0; lane < width && in_.first + lane < call_.batch; ++lane) {
       double* row = call_.info + (first_row + in_.first + lane) * info_count;
       const double last = Lanes::lane(residual_, lane);
-      row[info_residual] = set_.report ? relative_residual(last, course_[lane]) : NAN;
-      row[info_energy] = set_.report ? Lanes::lane(energy_, lane) : NAN;
+      const double energy = Lanes::lane(energy_, lane);
+      row[info_residual] =
+          set_.report ? relative_residual(last, course_[lane], energy, least_[lane]) : NAN;
+      row[info_energy] = set_.report ? energy : NAN;
       row[info_iterations] = used_[lane];
       row[info_restarts] = schedule_[lane].restarts;
-      row[info_converged] = done_[lane];
+      row[info_converged] = done_[lane] && least_[lane] >= 0;
       row[info_rho] = schedule_[lane].rho;
     }
   }

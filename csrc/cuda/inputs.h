@@ -88,11 +88,13 @@ struct Inputs {
     if (!call->info) return;
     double* to = call->info + (record * call->batch + environment) * info_count;
     const bool report = call->settings.report;
-    to[info_residual] = report ? relative_residual(progress.residual, progress.course) : NAN;
+    to[info_residual] = report ? relative_residual(progress.residual, progress.course,
+                                                   progress.energy, progress.least)
+                               : NAN;
     to[info_energy] = report ? progress.energy : NAN;
     to[info_iterations] = progress.used;
     to[info_restarts] = progress.schedule.restarts;
-    to[info_converged] = progress.done;
+    to[info_converged] = progress.done && progress.least >= 0;
     to[info_rho] = progress.schedule.rho;
   }
 };

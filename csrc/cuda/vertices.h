@@ -46,13 +46,11 @@ struct Vertices {
     u[i] = before[i] = {T(0), T(0), T(0), T(0)};
   }
 
-  // 1 / D; returns a / D, infinite where a pin holds the vertex
+  // 1 / D; returns share_of_inertia
   PD_DEVICE double weigh(int i, T elastic) const {
-    const T a = inertia(i);
-    if (!(a > T(0))) return HUGE_VAL;
-    const T inverse = T(1) / (a + elastic);
+    const T a = inertia(i), inverse = inverse_diagonal(a, elastic);
     u[i].w = before[i].w = inverse;
-    return double(a * inverse);
+    return double(share_of_inertia(a, elastic, inverse));
   }
 
   PD_DEVICE void predict(int i, const Inputs<T>& in, int vertex, T h) const {

@@ -16,9 +16,10 @@
 
 namespace pd::inline PD_TARGET {
 
-// What is left of the gradient, relative to the gradient on the straight course, of their squares: NaN where one of them is no
-// number.
-PD_HD double relative_residual(double last, double course) {
+// What is left of the gradient, relative to the gradient on the straight course, of their squares: NaN where one of them or the
+// energy is no number, or `least` a / D below 0, as of negative stiffness or mass.
+PD_HD double relative_residual(double last, double course, double energy, double least) {
+  if (least < 0 || !(absolute(energy) < HUGE_VAL)) return NAN;
   if (course > 0 && course < HUGE_VAL) return sqrt(last / course);
   if (course == 0 && last > 0) return HUGE_VAL;
   return course == 0 && last == 0 ? 0.0 : NAN;

@@ -27,6 +27,14 @@ PD_HD R inverse_diagonal(const R& inertia, const R& elastic) {
   return select(inertia > R(0), R(1) / (inertia + elastic), R(0));
 }
 
+// a / D of a vertex that moves; infinite where a pin holds it, -1 where mass or stiffness is negative
+template <class R>
+PD_HD R share_of_inertia(const R& inertia, const R& elastic, const R& inverse) {
+  const R none(0), wrong(-1), held(HUGE_VAL);
+  const R share = select(inertia > none, inertia * inverse, held);
+  return select(inertia < none, wrong, select(elastic < none, wrong, share));
+}
+
 // x_{k+1} = x_{k-1} + omega (x_k - theta D^-1 grad E - x_{k-1})            (Wang 2015, eq. 16; descent = theta / D)
 template <class V, class R>
 PD_HD V accelerate(const V& u, const V& before, const V& gradient, const R& descent,
@@ -63,7 +71,8 @@ struct Vertex {
 
   // the iterate to begin with, from a guess
   PD_HD Value first(const Contacts<Real>& contacts, const Value& guess) const {
-    const Value u = hold(target, guess);
+    // a target that is no number shows, also where no iterate is better than this
+    const Value u = hold(target, guess + (target - target));
     return project(contacts, u, u);
   }
 
