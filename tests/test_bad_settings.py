@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -59,14 +60,19 @@ def test_settings_of_a_simulator_are_checked() -> None:
 
 def test_settings_that_are_replaced_are_checked() -> None:
     sim = small_simulator()
-    before = sim.iterations, sim.tolerance
+    before = sim.iterations, sim.tolerance, sim.time_step, sim.kernel
+    for value in ("a", None, -1, math.nan):
+        with pytest.raises(ValueError, match=rf"time_step must be positive and finite \[s\], got {value!r}"):
+            sim.time_step = value  # type: ignore[assignment]
+    with pytest.raises(ValueError, match=r'kernel must be "auto", "block", .*, got \'foo\''):
+        sim.kernel = "foo"
     with pytest.raises(ValueError, match=r"iterations must be a whole number >= 0, got None"):
         sim.iterations = None  # type: ignore[assignment]
     with pytest.raises(ValueError, match=r"tolerance must lie in \[0, 1\), got None"):
         sim.tolerance = None  # type: ignore[assignment]
     with pytest.raises(ValueError, match=r"set_material: stiffness must be of at least one environment, got \[0, "):
         sim.set_material(stiffness=sim.stiffness.detach().expand(1, -1)[:0])
-    assert (sim.iterations, sim.tolerance) == before
+    assert (sim.iterations, sim.tolerance, sim.time_step, sim.kernel) == before
 
 
 def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
@@ -80,12 +86,22 @@ def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
         ({pin: torch.zeros(1, 3)}, ValueError, r"targets of a Pin must be \[2, 3\]"),
         ({soft: torch.zeros(3)}, ValueError, r"targets of a Pin must be \[1, 3\]"),
         ({sphere: torch.zeros(4)}, ValueError, r"targets of a Sphere must be \[3\] or \[6\]"),
+        ({sphere: torch.tensor(0.0)}, ValueError, r"targets of a Sphere must be \[3\] or \[6\], .* got \[\]"),
+        ({sphere: torch.zeros(3).long()}, TypeError, r"targets of a Sphere must be torch\.float32 .* got torch\.int64"),
+        ({sphere: (0, 0, 0)}, TypeError, r"targets of a Sphere must be a tensor of torch\.float32 on cpu, got tuple"),
+        ({sphere: np.zeros(3)}, TypeError, r"targets of a Sphere must be a tensor .*, got ndarray; torch\.as_tensor"),
+        ({pin: np.zeros((2, 3), np.float32)}, TypeError, r"targets of a Pin must be a tensor .*, got ndarray"),
+        ({pin: [[0.0, 0.0, 0.0]] * 2}, TypeError, r"targets of a Pin must be a tensor .*, got list"),
+        ({pin: None}, TypeError, r"targets of a Pin must be a tensor .*, got NoneType"),
+        (np.zeros((3, 3)), TypeError, r"targets must be a tensor or a mapping from parts to tensors, got ndarray"),
         ({pd.Sphere((0, 0, 0), 1.0): torch.zeros(3)}, ValueError, r"this Sphere is not a Pin or Sphere of the scene"),
         ({sim.scene.solids[0]: torch.zeros(3)}, ValueError, r"this Solid is not a Pin or Sphere of the scene"),
     ]
     for target, kind, message in targets:
         with pytest.raises(kind, match=message):
             sim(state, targets=target)
+        with pytest.raises(kind, match=message):
+            sim.rollout(state, 2, targets=lambda _, now=target: now)
     for call in (lambda: sim(state, start="rest"), lambda: sim.rollout(state, 2, start="rest")):
         with pytest.raises(ValueError, match=r'start must be "velocity"(, | or )"inertial"'):
             call()
@@ -99,6 +115,92 @@ def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
     for batch in (-1, 1.5):
         with pytest.raises(ValueError, match="batch must be a whole number >= 0"):
             sim.rest_state(batch)  # type: ignore[arg-type]
+
+
+FIELDS: dict[str, tuple[Any, str]] = {
+    "a list": ([0.0], r"a tensor \[2, 27, 3\] like positions \({}\), got list"),
+    "a number": (1.0, r"a tensor \[2, 27, 3\] like positions \({}\), got float"),
+    "an array": (np.zeros((2, 27, 3), np.float32), r"a tensor \[2, 27, 3\] like positions \({}\), got ndarray"),
+    "doubles": (torch.zeros(2, 27, 3).double(), r"torch\.float32 on cpu like positions \({}\), got torch\.float64 on"),
+    "no batch": (torch.zeros(27, 3), r"\[2, 27, 3\] like positions \({}\), got \[27, 3\]"),
+    "another batch": (torch.zeros(1, 27, 3), r"\[2, 27, 3\] like positions \({}\), got \[1, 27, 3\]"),
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_forces_and_starts_are_checked(name: str, sim: pd.Simulator) -> None:
+    value, words = FIELDS[name]
+    state = sim.rest_state(2)
+    calls: list[Callable[[], object]] = [
+        lambda: sim(state, value),
+        lambda: sim.step_(state, value),
+        lambda: sim.rollout(state, 2, forces=value),
+        lambda: sim.rollout(state, 2, forces=lambda _: value),
+        lambda: sim.step_gradient(state, state, value),
+    ]
+    for call in calls:
+        with pytest.raises((TypeError, ValueError), match="forces must be " + words.format("N")):
+            call()
+    if isinstance(value, torch.Tensor):
+        for step in (sim, sim.step_):
+            with pytest.raises((TypeError, ValueError), match="start must be " + words.format("first iterate, m")):
+                step(state, start=value)
+
+
+@pytest.mark.parametrize("start", [None, 1.0, [0.0], np.zeros((2, 27, 3)), pd.State(torch.zeros(1), torch.zeros(1))])
+def test_what_is_no_start_is_refused(start: Any, sim: pd.Simulator) -> None:
+    state = sim.rest_state(2)
+    for call in (lambda: sim(state, start=start), lambda: sim.step_(state, start=start)):
+        with pytest.raises(
+            ValueError, match=rf"start must be .* or positions \[B, V, 3\], got {type(start).__name__}$"
+        ):
+            call()
+    for other in (start, state.positions):
+        with pytest.raises(ValueError, match=rf'must be "velocity" or "inertial", got {type(other).__name__}$'):
+            sim.rollout(state, 2, start=other)
+
+
+ENERGIES: dict[str, Callable[[pd.Simulator, Any], torch.Tensor]] = {
+    "state": lambda sim, x: sim.energy(x),
+    "positions": lambda sim, x: sim.gradient(x),
+    "after": lambda sim, x: sim.step_gradient(sim.rest_state(2), x),
+}
+
+
+@pytest.mark.parametrize("call", ENERGIES.values(), ids=["energy", "gradient", "step_gradient"])
+def test_positions_of_energies_and_gradients_are_checked(
+    call: Callable[[pd.Simulator, Any], torch.Tensor], sim: pd.Simulator
+) -> None:
+    x = sim.rest_state(2).positions
+    name = next(key for key, value in ENERGIES.items() if value is call)
+    for given, message in (
+        (None, r"a State, positions and velocities \[B, 27, 3\], .* got NoneType"),
+        (x.numpy(), r"a State, positions and velocities \[B, 27, 3\], .* got ndarray"),
+        (x.double(), r"torch\.float32 on cpu like the simulator, got torch\.float64"),
+        (x.half(), r"torch\.float32 on cpu like the simulator, got torch\.float16"),
+        (x[0], r"\[B, 27, 3\], got \[27, 3\]"),
+        (x[:, :5], r"\[B, 27, 3\], got \[2, 5, 3\]"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=f"^{name} must be {message}"):
+            call(sim, given)
+        if isinstance(given, torch.Tensor):
+            with pytest.raises((TypeError, ValueError), match=f"^{name} must be {message}"):
+                call(sim, pd.State(given, given))
+    with pytest.raises(ValueError, match=r"velocities must be \[2, 27, 3\] like positions \(m/s\), got \[1, 27, 3\]"):
+        call(sim, pd.State(x, x[:1]))
+    assert torch.equal(call(sim, pd.State(x, torch.zeros_like(x))), call(sim, x))
+
+
+def test_step_gradient_does_not_broadcast(sim: pd.Simulator) -> None:
+    one, two = sim.rest_state(1), sim.rest_state(2)
+    for state, after, message in (
+        (two, one, r"after must be \[2, 27, 3\] like positions \(m\), got \[1, 27, 3\]"),
+        (one, two.positions, r"after must be \[1, 27, 3\] like positions \(m\), got \[2, 27, 3\]"),
+        (pd.State(two.positions, one.velocities), two, r"velocities must be \[2, 27, 3\] like positions"),
+        (pd.State(*(t[:, :5] for t in two)), two, r"state must be \[B, 27, 3\], got \[2, 5, 3\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            sim.step_gradient(state, after)
 
 
 def test_set_material_is_checked(sim: pd.Simulator) -> None:
@@ -180,12 +282,12 @@ def test_what_is_no_state_is_refused(state: Any, sim: pd.Simulator) -> None:
     calls: list[Callable[[], object]] = [
         lambda: sim(state),
         lambda: sim.step_(state),
-        lambda: sim.energy(3 if isinstance(state, torch.Tensor) else state),  # type: ignore[arg-type]
+        lambda: sim.step_gradient(state, sim.rest_state().positions),
         lambda: sim.rollout(state, steps=2),
         lambda: sim.tune(state, error=0.1) if state is not None else sim(state),
     ]
     for call in calls:
-        with pytest.raises(TypeError, match=r"state must be a State, positions and velocities \[B, 27, 3\], got"):
+        with pytest.raises(TypeError, match=r"state must be a State, positions and velocities \[B, 27, 3\], .*got"):
             call()
 
 
@@ -240,13 +342,34 @@ def test_scenes_are_checked() -> None:
         ((solid, pd.Gravity(), pd.Gravity()), ValueError, "at most one Gravity, got 2"),
         ((solid, pd.Damping(1.0), pd.Damping(1.0)), ValueError, "at most one Damping, got 2"),
         ((solid, pd.Pin(other, [0])), ValueError, "holds a Solid that is not a part of this scene"),
+        ((solid, pd.Pin(solid, [0, 1]), pd.Pin(solid, [1, 2])), ValueError, "two pins hold the same vertex"),
+        ((solid, other, pd.Pin(other, [3]), pd.Pin(other, [3])), ValueError, "two pins hold the same vertex"),
     ):
         with pytest.raises(kind, match=message):
             pd.Scene(*parts)  # type: ignore[arg-type]
-    twice = pd.Scene(solid, pd.Pin(solid, [0, 1]), pd.Pin(solid, [1, 2]))
-    with pytest.raises(ValueError, match="two pins hold the same vertex"):
-        pd.Simulator(twice)
+    both = pd.Scene(solid, other, pd.Pin(solid, [0, 1]), pd.Pin(other, [1, 2]))  # numbers are those of a body
     with pytest.raises(ValueError, match="not a part of the scene"):
-        twice.vertex_range(other)
+        both.vertex_range(body())
     with pytest.raises(ValueError, match="not a part of the scene"):
-        twice.pin_range(pd.Pin(solid, [3]))
+        both.pin_range(pd.Pin(solid, [3]))
+
+
+def test_parts_keep_their_values() -> None:
+    solid = body()
+    for part, name in ((pd.Pin(solid, [0]), "stiffness"), (pd.Sphere((0, 0, 0), 1.0), "radius"), (solid, "youngs")):
+        before = getattr(part, name)
+        with pytest.raises(dataclasses.FrozenInstanceError, match=f"cannot assign to field '{name}'"):
+            setattr(part, name, 3.0)
+        with pytest.raises(dataclasses.FrozenInstanceError, match=f"cannot delete field '{name}'"):
+            delattr(part, name)
+        assert getattr(part, name) is before
+
+
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+def test_short_floats_are_numbers_too(kind: torch.dtype) -> None:
+    solid = body()
+    short = torch.tensor([0.5, -2.0, 0.25], dtype=kind)
+    assert pd.Gravity(short).vector.tolist() == [0.5, -2.0, 0.25]
+    assert pd.Solid(solid.mesh, torch.tensor(1024.0, dtype=kind)).youngs.tolist() == [1024.0] * 48
+    grid = torch.tensor(solid.mesh.vertices * 40, dtype=kind)  # 0, 4, 8
+    assert np.array_equal(pd.TetMesh(grid, solid.mesh.tets).vertices, grid.double().numpy())

@@ -6,7 +6,7 @@ from typing import Literal, cast
 
 import pytest
 import torch
-from runs import ULP, noise, small
+from runs import ULP, noise, same_bits, small
 from torch import Tensor
 
 import torchpd as pd
@@ -55,6 +55,56 @@ def test_compiled_rollout_is_the_rollout(solver: Solver) -> None:
         return sim.rollout(pd.State(x, v), 6, every=2).positions.mean(dim=2)
 
     assert torch.equal(torch.compile(play, fullgraph=True, backend="aot_eager")(*state), play(*state))
+
+
+def test_compiled_step_takes_pins_and_spheres_as_keys() -> None:
+    """Named in the function, given to it, and in a mapping; another part is no other step by mistake."""
+    body = pd.Solid(pd.shapes.box((1.0, 0.2, 0.2), (5, 1, 1)), youngs=1e5)
+    first, second = pd.Pin(body, [0, 1]), pd.Pin(body, [5, 6])
+    ball, other = pd.Sphere((0.5, -0.5, 0.1), 0.52, friction=0.5), pd.Sphere((2.0, 0.0, 0.0), 0.1)
+    sim = pd.Simulator(pd.Scene(body, first, second, ball, other, pd.Gravity()), iterations=4)
+    state, goal = sim.rest_state(), torch.zeros(2, 3)
+    row = torch.tensor([0.5, -0.49, 0.1, 0.6, 0.0, 0.0])
+
+    def named(s: pd.State, t: Tensor, r: Tensor) -> pd.State:
+        return cast(pd.State, sim(s, targets={first: t, ball: r}))
+
+    def given(s: pd.State, part: pd.Pin | pd.Sphere, t: Tensor) -> pd.State:
+        return cast(pd.State, sim(s, targets={part: t}))
+
+    def mapped(s: pd.State, targets: dict[pd.Pin | pd.Sphere, Tensor]) -> pd.State:
+        return cast(pd.State, sim(s, targets=targets))
+
+    for function, calls in (
+        (named, [(goal, row), (goal + 0.1, row - 0.01)]),
+        (given, [(first, goal), (second, goal), (ball, row), (other, row[:3])]),
+        (mapped, [({first: goal, ball: row},), ({second: goal},), ({other: row},)]),
+    ):
+        compiled = torch.compile(function, fullgraph=True, backend="aot_eager")
+        for arguments in calls:
+            assert same_bits(compiled(state, *arguments), function(state, *arguments))
+
+
+def test_compiled_gradients_are_the_gradients() -> None:
+    sim, state = small(torch.float64)
+
+    def both(s: pd.State, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return sim.gradient(s), sim.step_gradient(s, x), sim.energy(s)
+
+    found = torch.compile(both, fullgraph=True, backend="aot_eager")(state, 1.1 * state.positions)
+    for one, other in zip(found, both(state, 1.1 * state.positions), strict=True):
+        assert float((one - other).abs().max()) <= 64 * ULP[torch.float64] * float(other.abs().max())
+
+
+def test_compiled_states_move_and_copy() -> None:
+    sim, state = small(torch.float32)
+
+    def wide(s: pd.State) -> tuple[pd.State, Tensor]:
+        return s.clone().detach().to(torch.float64), sim(s.clone()).positions
+
+    moved, after = torch.compile(wide, fullgraph=True, backend="aot_eager")(state)
+    assert same_bits(moved, pd.State(*(t.double() for t in state)))
+    assert torch.equal(after, sim(state).positions)
 
 
 def test_compiled_energy_has_its_gradient() -> None:

@@ -184,6 +184,8 @@ def rewrite(file: Path, change: Callable[..., object]) -> None:
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no such simulation file: .*nothing"):
         pd.Simulator.load(tmp_path / "nothing")
+    with pytest.raises(IsADirectoryError, match=f"save: path must name a file, got the folder {tmp_path}"):
+        pd.Simulator(everything()).save(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"no folder .*nowhere"):
         pd.Simulator(everything()).save(tmp_path / "nowhere" / "sim")
 

@@ -414,6 +414,14 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     meshio.Mesh(CORNERS[:3], [("triangle", [[0, 1, 2]])]).write(surface_file)
     with pytest.raises(ValueError, match=r"must hold tetrahedra .*got triangle; .*torchpd\.tetrahedralize"):
         TetMesh.from_file(surface_file)
+    # texture coordinates that are not one a vertex stop meshio
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS[:3]) + "vt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\n"
+    (tmp_path / "textured.obj").write_text(corners + "f 1/1 2/2 3/4\n")
+    assert len(TriMesh.from_file(tmp_path / "textured.obj").triangles) == 1
+    with pytest.raises(
+        ValueError, match=r"textured\.obj must hold tetrahedra .*got a surface; .*torchpd\.tetrahedralize"
+    ):
+        TetMesh.from_file(tmp_path / "textured.obj")
     shapes.single_tet().to_file(tmp_path / "tets.vtk")
     with pytest.raises(ValueError, match="holds no triangles"):
         TriMesh.from_file(tmp_path / "tets.vtk")

@@ -41,6 +41,8 @@ def test_errors(tmp_path: Path) -> None:
     patches = patches_on()
     with pytest.raises(FileNotFoundError, match="there is no folder"):
         patches.save(tmp_path / "none" / "patches")
+    with pytest.raises(IsADirectoryError, match="save: path must name a file, got the folder"):
+        patches.save(tmp_path)
     with pytest.raises(FileNotFoundError, match="no such file of patches"):
         pd.FreeFormPatches.load(file)
     file.write_bytes(b"nothing")

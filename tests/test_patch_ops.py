@@ -214,6 +214,8 @@ def test_jacobian_by_vmap(device: torch.device) -> None:
     h = patches.with_quadrics(pd.Quadrics(a, q.centres, q.factors), keep_lists=True).heights(where)[0]
     rows = torch.eye(len(h), dtype=F64, device=device)
     jacobian = torch.func.vmap(lambda row: torch.autograd.grad(h, a, row, retain_graph=True)[0])(rows)
+    (older,) = torch.autograd.grad(h, a, rows, retain_graph=True, is_grads_batched=True)
+    assert torch.equal(older, jacobian)
     bare = patches.with_quadrics(pd.Quadrics.none(F64, device))
     torch.testing.assert_close(jacobian, q.values(bare.surface(where).points) / q.amplitudes, rtol=1e-12, atol=1e-15)
 

@@ -104,6 +104,25 @@ def test_moving_sphere_drags_in_a_rollout(dtype: torch.dtype, device: torch.devi
     assert float((own.positions - moved.positions).abs().max()) <= 1e4 * torch.finfo(dtype).eps
 
 
+def test_moving_sphere_takes_the_present_time_step(dtype: torch.dtype, device: torch.device) -> None:
+    """A simulator whose time step was replaced drags as one that was made with it."""
+    ball = pd.Sphere((0.15, -1.0, 0.15), 1.0, friction=20.0)
+    case = contact_block(ball)
+    replaced, fresh = (pd.Simulator(case.scene, h, 30, dtype=dtype).to(device) for h in (1 / 60, 1 / 120))
+    replaced.time_step = 1 / 120
+    state = fresh.rollout(state_of(case, fresh), 10, 10).state()
+    row = tensor_of(np.array([0.151, -1.0, 0.15, 0.12, 0.0, 0.0]), fresh)
+
+    def centres(step: int) -> dict[pd.Sphere, torch.Tensor]:
+        return {ball: row[:3] * (1 + 0.001 * step)}
+
+    expected = fresh(state, targets={ball: row})
+    assert not same_bits(expected, fresh(state, targets={ball: row[:3]}))
+    assert same_bits(replaced(state, targets={ball: row}), expected)
+    for targets in ({ball: row}, centres):
+        assert same_bits(*(sim.rollout(state, 4, targets=targets).state() for sim in (replaced, fresh)))
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
 @pytest.mark.parametrize("batch", [3, 9])
 def test_a_broken_environment_breaks_alone(value: float, batch: int, dtype: torch.dtype, device: torch.device) -> None:

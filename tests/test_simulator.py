@@ -83,6 +83,31 @@ def test_copies_are_independent(dtype: torch.dtype) -> None:
     assert not same_bits(twin(state), before)
 
 
+def test_copies_know_their_pins_and_spheres() -> None:
+    """A copy shares the scene, whose parts have values only; what was pickled has its own."""
+    sim = simulate(torch.float64)
+    state = moving(sim)
+    (pin, *_), batch = sim.scene.pins, state.positions[:, : len(sim.scene.pins[0].vertices)]
+    expected = sim(state, targets={pin: batch})
+    for twin in (copy.copy(sim), copy.deepcopy(sim), pickle.loads(pickle.dumps(sim))):
+        assert same_bits(twin(state, targets={twin.scene.pins[0]: batch}), expected)
+    assert same_bits(copy.deepcopy(sim)(state, targets={pin: batch}), expected)
+
+
+def test_states_move_copy_and_detach() -> None:
+    state = pd.State(torch.ones(1, 2, 3, requires_grad=True), torch.zeros(1, 2, 3))
+    wide = state.to(torch.float64)
+    assert isinstance(wide, pd.State)
+    assert (wide.positions.dtype, wide.velocities.dtype) == (torch.float64, torch.float64)
+    assert state.to(dtype=torch.float32).positions is state.positions
+    copied = state.clone()
+    assert copied.positions.requires_grad
+    assert copied.velocities.data_ptr() != state.velocities.data_ptr()
+    loose = state.detach()
+    assert not loose.positions.requires_grad
+    assert loose.positions.data_ptr() == state.positions.data_ptr()
+
+
 def test_parameters_are_there_to_be_trained_on_request() -> None:
     sim = simulate(torch.float64)
     assert all(not parameter.requires_grad for parameter in sim.parameters())

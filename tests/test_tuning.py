@@ -228,7 +228,7 @@ def test_out_of_reach_is_said_with_the_best_there_is() -> None:
 def test_doubt_about_the_converged_step_counts_as_error(monkeypatch: pytest.MonkeyPatch) -> None:
     sim = bar()
     unsure = [dataclasses.replace(step, uncertainty=0.2) for step in exact_steps(sim, swinging(sim))]
-    monkeypatch.setattr(tuning, "exact_steps", lambda *_: unsure * 7)
+    monkeypatch.setattr(tuning, "exact_steps", lambda *_, **__: unsure * 7)
     with pytest.warns(TuningWarning, match="cannot be had"):
         promise = sim.tune(swinging(sim), error=0.1, most=256)
     assert promise.studied_error >= 0.2
@@ -259,6 +259,35 @@ def test_material_of_environments(count: int) -> None:
     if count == 3:
         with pytest.raises(ValueError, match="state must have the 3 environments of the material, got 2"):
             sim.tune(swinging(sim, 2), error=1e-2)
+
+
+@pytest.mark.parametrize("by", ["forces", "targets"])
+def test_motion_by_forces_or_targets(by: str) -> None:
+    """Of a body that would rest without: each environment has its own, which the promise is about."""
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (6, 2, 2))
+    body = pd.Solid(mesh, youngs=1e5)
+    pin = pd.Pin(body, mesh.vertices[:, 0] == 0.0)
+    sim = pd.Simulator(pd.Scene(body, pin), 1 / 60, progress=False)
+    state = sim.rest_state(2)
+    with pytest.raises(ValueError, match="no motion"):
+        sim.tune(state, error=1e-3)
+    forces = targets = None
+    if by == "forces":
+        forces = torch.tensor([0.0, 1.0])[:, None, None] * state.positions
+    else:
+        shift = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.1, 0.05]])[:, None]
+        targets = {pin: state.positions[:, pin.vertices] + shift}
+    promise = sim.tune(state, error=1e-3, forces=forces, targets=targets)
+    assert promise.attained
+    after = sim(state, forces, targets).velocities.double().numpy() * sim.time_step
+    exact = exact_steps(sim, state, forces=forces, targets=targets)
+    assert exact[1].error_beyond_rounding(after[1], sim.dtype) <= 1e-3
+    sim.iterations //= 8
+    after = sim(state, forces, targets).velocities.double().numpy() * sim.time_step
+    assert exact[1].error_beyond_rounding(after[1], sim.dtype) > 1e-3
+    assert torch.equal(sim.pin_targets, pd.Simulator(pd.Scene(body, pin), 1 / 60, progress=False).pin_targets)
+    with pytest.raises(ValueError, match=r"forces"):
+        sim.tune(state, error=1e-3, forces=torch.zeros(3, sim.vertices, 3))
 
 
 def test_without_a_state_the_motion_starts_at_rest() -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -163,6 +164,12 @@ def problem_of(
     )
 
 
+def _doubled(targets: Mapping[Part, Tensor] | None) -> Mapping[Part, Tensor] | None:
+    if targets is None:
+        return None
+    return {part: place.double() for part, place in targets.items()}
+
+
 def _double(tensor: Tensor) -> Array:
     return tensor.detach().double().cpu().numpy().copy()
 
@@ -195,11 +202,12 @@ def exact_steps(
     twin.solver, twin.iterations = Chebyshev(), _CHUNK
     wide = State(state[0].double(), state[1].double())
     force = None if forces is None else forces.double()
+    places = targets.double() if isinstance(targets, Tensor) else _doubled(targets)
     best: Tensor | None = None
     lowest = torch.full((len(wide.positions),), torch.inf)
     guess: str | Tensor = start
     for _ in range(0, iterations, _CHUNK):
-        after, info = _step(twin, wide, force, targets, guess)
+        after, info = _step(twin, wide, force, places, guess)
         residual = info.residual.cpu()
         if best is None:
             best = after.velocities.clone()

@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-__all__ = ["as_array", "check_finite", "check_positive", "check_scalar", "check_shape", "check_vector", "check_whole"]
+__all__ = [
+    "as_array",
+    "check_finite",
+    "check_like",
+    "check_positive",
+    "check_scalar",
+    "check_shape",
+    "check_target_file",
+    "check_vector",
+    "check_whole",
+]
 
 
 def as_array(name: str, value: Any, dtype: Any = None) -> NDArray[Any]:
     """A private contiguous copy of numbers, sequences, arrays or tensors as a NumPy array."""
     if isinstance(value, torch.Tensor):
-        value = value.detach().cpu().numpy()
+        value = value.detach().cpu()
+        if value.is_floating_point() and value.element_size() < 4:
+            value = value.float()  # NumPy has no bfloat16; nothing is lost
+        value = value.numpy()
     try:
         array = np.array(value)
     except (ValueError, TypeError) as error:
@@ -32,6 +46,19 @@ def check_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...], m
     if not matches:
         want = ", ".join("n" if length is None else str(length) for length in shape)
         raise ValueError(f"{name} must be [{want}] ({meaning}), got {list(array.shape)}")
+
+
+def check_like(name: str, value: Any, positions: torch.Tensor, meaning: str) -> None:
+    """A tensor of the shape, precision and device of positions; reads no value, so that nothing waits for a GPU."""
+    like = f"like positions ({meaning}), got"
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{name} must be a tensor {list(positions.shape)} {like} {type(value).__name__}")
+    if value.dtype != positions.dtype or value.device != positions.device:
+        raise TypeError(
+            f"{name} must be {positions.dtype} on {positions.device} {like} {value.dtype} on {value.device}"
+        )
+    if value.shape != positions.shape:
+        raise ValueError(f"{name} must be {list(positions.shape)} {like} {list(value.shape)}")
 
 
 def check_finite(name: str, array: NDArray[Any]) -> None:
@@ -80,3 +107,13 @@ def check_whole(name: str, value: Any, *, minimum: int) -> int:
     if isinstance(value, bool) or number < minimum or number != value:
         raise ValueError(f"{name} must be a whole number >= {minimum}, got {value!r}")
     return number
+
+
+def check_target_file(path: str | Path) -> Path:
+    """A file that can be written, or written over."""
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"save: there is no folder {target.parent} for {target.name}")
+    if target.is_dir():
+        raise IsADirectoryError(f"save: path must name a file, got the folder {target}")
+    return target

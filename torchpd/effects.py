@@ -6,7 +6,7 @@ All quantities are in SI units. Scalars and per-element tensors are accepted ali
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import FrozenInstanceError, dataclass
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,19 @@ def _set(part: object, **values: Any) -> None:
     """Store checked values in a frozen part."""
     for name, value in values.items():
         object.__setattr__(part, name, value)
+
+
+class _Key:
+    """Parts that `targets` name: frozen, but not by `dataclass(frozen=True)`.
+
+    torch.compile hashes a key of that kind by its fields, arrays here, whatever `eq` says.
+    """
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise FrozenInstanceError(f"cannot assign to field {name!r}")
+
+    def __delattr__(self, name: str) -> None:
+        raise FrozenInstanceError(f"cannot delete field {name!r}")
 
 
 def _per_element(name: str, value: ArrayLike, count: int, *, unit: str) -> Array:
@@ -71,8 +84,8 @@ class Solid:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Pin:
+@dataclass(eq=False)
+class Pin(_Key):
     """Holds vertices of a solid at targets: at their rest positions, or where `targets` of a step puts them.
 
     Args:
@@ -160,8 +173,8 @@ class Ground:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Sphere:
+@dataclass(eq=False)
+class Sphere(_Key):
     """A ball that vertices cannot enter, with Coulomb friction. `targets` of a step may move its centre.
 
     Args:

@@ -21,6 +21,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from .automatic import Choice
+from .checks import check_target_file
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .embedding import Embedding
 from .mesh import TetMesh, TriMesh
@@ -52,9 +53,7 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         sim: to be written, on any device.
         path: of the file; an existing one is replaced. Any ending will do, `.safetensors` is usual.
     """
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"save: there is no folder {target.parent} for {target.name}")
+    target = check_target_file(path)
     meshes = _distinct_meshes(sim.scene)
     tensors: dict[str, Tensor] = {}
     for number, mesh in enumerate(meshes):

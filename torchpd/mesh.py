@@ -46,6 +46,7 @@ TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 
 _MESHIO_SUFFIXES = {".mesh", ".msh", ".vtk", ".vtu"}
+_SURFACE_SUFFIXES = {".glb", ".gltf", ".obj", ".off", ".stl"}  # formats without tetrahedra; not all that meshio reads
 
 
 def _existing(path: PathLike) -> Path:
@@ -61,11 +62,18 @@ def _read_cells(owner: str, file: Path) -> tuple[NDArray[Any], dict[str, NDArray
 
     try:
         content = meshio.read(file)
-    except (meshio.ReadError, SystemExit) as error:  # meshio exits the process on files that it cannot read
+    except (meshio.ReadError, ValueError, SystemExit) as error:  # meshio exits the process on files that it cannot read
         raise ValueError(f"{owner} cannot read {file.name} through meshio: {error}") from error
     types = {block.type for block in content.cells if len(block.data)}
     cells = {kind: np.concatenate([b.data for b in content.cells if b.type == kind and len(b.data)]) for kind in types}
     return content.points, cells
+
+
+def _without_tets(file: Path, came: str) -> ValueError:
+    return ValueError(
+        f"TetMesh.from_file: {file.name} must hold tetrahedra (cells of type tetra), got {came}; "
+        "turn a surface into tetrahedra with torchpd.tetrahedralize(path, cells=...)"
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -265,13 +273,11 @@ class TetMesh:
         from .embedding import embed_triangles
 
         file = _existing(path)
+        if file.suffix.lower() in _SURFACE_SUFFIXES:
+            raise _without_tets(file, "a surface")
         points, cells = _read_cells("TetMesh.from_file", file)
         if "tetra" not in cells:
-            raise ValueError(
-                f"TetMesh.from_file: {file.name} must hold tetrahedra (cells of type tetra), "
-                f"got {', '.join(sorted(cells)) or 'nothing'}; "
-                "turn a surface into tetrahedra with torchpd.tetrahedralize(path, cells=...)"
-            )
+            raise _without_tets(file, ", ".join(sorted(cells)) or "nothing")
         mesh = cls(points, cells["tetra"], drop_unreferenced=True, drop_degenerate=drop_degenerate)
         triangles = cells.get("triangle", np.empty((0, 3), dtype=np.int64)).astype(np.int64)
         triangles = triangles[~has_repeated_corner(triangles)]

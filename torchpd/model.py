@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from .automatic import Choice, choose_solver
-from .checks import check_whole
+from .checks import check_like, check_whole
 from .forecast import warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_batches, check_material, material_of
 from .multilevel import has_levels
@@ -61,18 +61,18 @@ class Model(nn.Module):
         if not isinstance(scene, Scene):
             raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
         self.scene = scene
-        self.time_step = _positive("time_step", time_step, "s")
+        self.time_step = time_step
         self.iterations = DEFAULT_ITERATIONS if iterations is None else iterations
         self._solver: Solver = Chebyshev()
         automatic = solver is None or _is_auto(solver)
         given = self._solver if automatic else check_solver(solver, torch.device("cpu"))
         self.tolerance = tolerance
         self.promise: Promise | None = None  # of `tune`
-        self.kernel = check_kernel(kernel)
+        self.kernel = kernel
         self._batch = _check_batch(batch)
         values = scene.values()
         self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
-        self.anchors = Anchors(scene, self.time_step)
+        self.anchors = Anchors(scene)
         self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
         for name, value in material_of(values, dtype).items():
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
@@ -116,6 +116,24 @@ class Model(nn.Module):
         except BaseException:
             self._batch, self.plan = before
             raise
+
+    @property
+    def kernel(self) -> str:
+        """How a GPU is to step the scene: what its plan is made for, when the simulator moves there or gets a batch."""
+        return self._kernel
+
+    @kernel.setter
+    def kernel(self, kernel: str) -> None:
+        self._kernel = check_kernel(kernel)
+
+    @property
+    def time_step(self) -> float:
+        """h [s]."""
+        return self._time_step
+
+    @time_step.setter
+    def time_step(self, time_step: float) -> None:
+        self._time_step = _positive("time_step", time_step, "s")
 
     @property
     def iterations(self) -> int:
@@ -210,8 +228,8 @@ class Model(nn.Module):
         for name, value in arrays.items():
             if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
                 warnings.warn(
-                    f"set_material copies the numbers of {name}, so no gradient gets to what they were made of: give it "
-                    f'to single calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it',
+                    f"set_material copies the numbers of {name}, so no gradient gets to what they were made of: give "
+                    f'it to calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it',
                     stacklevel=2,
                 )
         check_batches(checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
@@ -288,18 +306,40 @@ class Model(nn.Module):
         self.set_material(**{name: state_dict[prefix + name] for name in MATERIAL_ROWS if prefix + name in state_dict})
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
-    def check_state(self, state: State) -> None:
-        """Refuse what is no state, and one of another precision or on another device."""
+    def check_state(self, state: State, *, forces: Tensor | None = None) -> None:
+        """Refuse what is no state, one of another precision or on another device, and forces unlike its positions."""
         if not _is_pair(state):
             raise TypeError(
                 f"state must be a State, positions and velocities [B, {self.vertices}, 3], got "
                 f"{type(state).__name__}; rest_state() makes one"
             )
-        if state[0].dtype != self.dtype or state[0].device != self.device:
+        self._check_kind("state", state[0])
+        if forces is not None:
+            check_like("forces", forces, state[0], "N")
+
+    def _check_kind(self, name: str, positions: Tensor) -> None:
+        own = self.rest_positions
+        if positions.dtype != own.dtype or positions.device != own.device:
             raise TypeError(
-                f"state must be {self.dtype} on {self.device} like the simulator, got {state[0].dtype} on "
-                f"{state[0].device}; sim.to(...) changes the simulator"
+                f"{name} must be {own.dtype} on {own.device} like the simulator, got {positions.dtype} on "
+                f"{positions.device}; sim.to(...) changes the simulator"
             )
+
+    def positions_of(self, state: State | Tensor, name: str = "state") -> Tensor:
+        """Positions of a state, or positions alone, after all checks: for what is not left to one op."""
+        alone = isinstance(state, Tensor)
+        if not (alone or _is_pair(state)):
+            raise TypeError(
+                f"{name} must be a State, positions and velocities [B, {self.vertices}, 3], or positions alone, got "
+                f"{type(state).__name__}"
+            )
+        positions = state if isinstance(state, Tensor) else state[0]
+        self._check_kind(name, positions)
+        if positions.dim() != 3 or positions.shape[1:] != self.rest_positions.shape:
+            raise ValueError(f"{name} must be [B, {self.vertices}, 3], got {list(positions.shape)}")
+        if not alone:
+            check_like("velocities", state[1], positions, "m/s")
+        return positions
 
     def numbers(self, *, inertial: bool, report: bool) -> dict[str, Any]:
         """The settings as keyword arguments of the ops."""
@@ -316,7 +356,9 @@ class Model(nn.Module):
         """The material with pins and spheres where `targets` puts them."""
         if targets is None:
             return self.material()
-        pins, spheres = self.anchors.place(targets, self.pin_targets, self.spheres, batch)
+        pins, spheres = self.anchors.place(
+            targets, self.pin_targets, self.spheres, batch=batch, time_step=self.time_step
+        )
         replaced = {"pin_targets": pins, "spheres": spheres}
         return [replaced.get(name, getattr(self, name)).contiguous() for name in MATERIAL_ROWS]
 

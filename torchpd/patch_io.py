@@ -9,6 +9,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from .checks import check_target_file
 from .patches import FreeFormPatches
 from .quadrics import Quadrics
 from .version import __version__
@@ -21,9 +22,7 @@ _KEY = "torchpd.patches"  # of the metadata, beside which others may write their
 
 def save_patches(patches: FreeFormPatches, path: str | Path) -> None:
     """Write base, quadrics and options; the lists are found again when the file is read."""
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"save: there is no folder {target.parent} for {target.name}")
+    target = check_target_file(path)
     quadrics = patches.quadrics
     tensors = {
         "vertices": patches.vertices,

@@ -52,7 +52,7 @@ class Rollout:
 
 def roll(sim: Simulator, call: Rollout, *, progress: bool) -> Track:
     """The recorded states."""
-    sim.check_state(call.state)
+    sim.check_state(call.state, forces=None if callable(call.forces) else call.forces)
     varies = callable(call.forces) or callable(call.targets)
     # the op has a derivative where it records every state
     one_by_one = varies or (call.every > 1 and call.tracks_gradient(sim.material()))
@@ -105,10 +105,13 @@ def _one_by_one(sim: Simulator, call: Rollout, bar: Any) -> Track:
         if callable(call.targets):
             now = call.targets(step)
             if isinstance(now, Mapping):
-                now, centres = sim.anchors.with_velocities(now, centres)
+                now, centres = sim.anchors.with_velocities(now, centres, batch=batch, time_step=sim.time_step)
             material = sim.material_at(now, batch)
         recorded = (step + 1) % call.every == 0
-        forces = call.forces(step) if callable(call.forces) else call.forces
+        forces = call.forces
+        if callable(forces):
+            forces = forces(step)
+            sim.check_state(state, forces=forces)
         state, row = sim.advance(state, forces, material, call.start, report=call.report and recorded)
         material = _moved_on(material, 1)
         if recorded:

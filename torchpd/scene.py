@@ -76,6 +76,18 @@ class Scene:
         for pin in self.pins:
             if id(pin.solid) not in solids:
                 raise ValueError("Scene: a Pin holds a Solid that is not a part of this scene; pass both")
+        pinned = self._pinned()
+        if len(np.unique(pinned)) != len(pinned):
+            raise ValueError("Scene: two pins hold the same vertex")
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
+        """Values only: a copied simulator knows the same parts."""
+        return self
+
+    def _pinned(self) -> Index:
+        """Numbers of the pinned vertices among those of all bodies [P]."""
+        pinned = [self.vertex_range(pin.solid).start + pin.vertices for pin in self.pins]
+        return np.concatenate([np.zeros(0, dtype=np.int64), *pinned])
 
     def _all(self, kind: type) -> tuple[Any, ...]:
         return tuple(part for part in self.parts if isinstance(part, kind))
@@ -120,10 +132,7 @@ class Scene:
         starts = [self.vertex_range(solid).start for solid in self.solids]
         tets = np.concatenate([s.mesh.tets + start for s, start in zip(self.solids, starts, strict=True)])
         density = np.concatenate([solid.density for solid in self.solids])
-        pinned = [self.vertex_range(pin.solid).start + pin.vertices for pin in self.pins]
-        pin_vertices = np.concatenate([np.zeros(0, dtype=np.int64), *pinned])
-        if len(np.unique(pin_vertices)) != len(pin_vertices):
-            raise ValueError("Scene: two pins hold the same vertex")
+        pin_vertices = self._pinned()
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         gravity, damping = self._all(Gravity), self._all(Damping)
         return SceneValues(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .adjoint import AdjointCall, step_gradient
 from .capture import CapturedStep
-from .checks import check_whole
+from .checks import check_like, check_whole
 from .material import MATERIAL_ROWS
 from .model import Model
 from .ops import INFO_WIDTH, refuse_tangents
@@ -95,7 +95,7 @@ class Simulator(Model):
             The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
             error follows the residual). Forward mode and `torch.func.grad` are not provided.
         """
-        self.check_state(state)
+        self.check_state(state, forces=forces)
         material = self.material_at(targets, state[0].shape[0])
         after, rows = self.advance(state, forces, material, start, report=return_info)
         return (after, Info.from_rows(rows)) if return_info else after
@@ -103,9 +103,9 @@ class Simulator(Model):
     def advance(
         self, state: State, forces: Tensor | None, material: list[Tensor], start: str | Tensor, *, report: bool
     ) -> tuple[State, Tensor]:
-        """One step of a checked state with a given material, see `material_at`: the next state, and rows for
+        """One step of a checked state and forces with a given material, see `material_at`: the next state, and rows for
         `Info.from_rows`."""
-        given, inertial = _first_iterate(start)
+        given, inertial = _first_iterate(start, state[0])
         refuse_tangents(*state, forces, *material)
         positions, velocities, rows = _ops.step(
             state[0],
@@ -134,12 +134,12 @@ class Simulator(Model):
         Args:
             info: rows [B, 6] float64 to fill in, see `Info.from_rows`; None leaves out residual and energy.
         """
-        self.check_state(state)
+        self.check_state(state, forces=forces)
         if state[0].requires_grad or state[1].requires_grad:
             raise ValueError(
                 "step_ overwrites the state, so it must not require gradients; detach it or call the simulator"
             )
-        given, inertial = _first_iterate(start)
+        given, inertial = _first_iterate(start, state[0])
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(
             state[0],
@@ -181,8 +181,8 @@ class Simulator(Model):
             Track of the recorded states.
         """
         steps, every = check_whole("steps", steps, minimum=0), check_whole("every", every, minimum=1)
-        if start not in ("velocity", "inertial"):
-            raise ValueError(f'rollout: start must be "velocity" or "inertial", got {start!r}')
+        if not _is_start(start):
+            raise ValueError(f'rollout: start must be "velocity" or "inertial", got {_in_short(start)}')
         return roll(self, Rollout(state, steps, every, forces, targets, start, return_info), progress=progress)
 
     def capture(
@@ -211,6 +211,8 @@ class Simulator(Model):
         *,
         error: float | None = None,
         milliseconds: float | None = None,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
         candidates: Sequence[Solver] | None = None,
         most: int = 2048,
         progress: bool = False,
@@ -225,11 +227,12 @@ class Simulator(Model):
 
         Args:
             state: where typical motions start [B, V, 3], the rest state by default, once for each environment of the
-                material; up to four environments are studied over 30 steps, without forces and with the targets of the
-                scene. Times are for its batch.
+                material; up to four environments are studied over 30 steps. Times are for its batch.
             error: of a step, |x - x*| / |x_0 - x*|, x* converged and x_0 the first iterate; in (0, 1).
             milliseconds: of `sim(state)` on this machine; the error is then as low as that allows, with no more
                 iterations than it takes to get below rounding.
+            forces: on the vertices during these steps [B, V, 3] [N].
+            targets: where pins and spheres are during them, as in `forward`; by default where the scene has them.
             candidates: solvers to choose from, not "auto"; by default those that cannot diverge.
             most: iterations of a step, at most.
             progress: show a bar.
@@ -244,6 +247,8 @@ class Simulator(Model):
             state,
             error=error,
             milliseconds=milliseconds,
+            forces=forces,
+            targets=targets,
             candidates=candidates,
             most=most,
             progress=progress,
@@ -260,9 +265,7 @@ class Simulator(Model):
             state: a `State`, or positions [B, V, 3] alone.
             targets: of pins, as in `forward`.
         """
-        if not isinstance(state, Tensor):
-            self.check_state(state)
-        positions = state if isinstance(state, Tensor) else state[0]
+        positions = self.positions_of(state)
         refuse_tangents(positions)
         material = dict(zip(MATERIAL_ROWS, self.material_at(targets, positions.shape[0]), strict=True))
         energy = cast(Tensor, _ops.element_energy(positions, material["stiffness"], list(self.plan.arrays))).sum(-1)
@@ -279,8 +282,13 @@ class Simulator(Model):
         soft = torch.where(torch.isinf(stiffness), torch.zeros_like(stiffness), stiffness)
         return 0.5 * (soft * (positions[:, vertices] - targets).square().sum(-1)).sum(-1)
 
-    def gradient(self, positions: Tensor) -> Tensor:
-        """Gradient of the elastic energy [B, V, 3] [N]: minus the elastic forces."""
+    def gradient(self, positions: State | Tensor) -> Tensor:
+        """Gradient of the elastic energy [B, V, 3] [N]: minus the elastic forces.
+
+        Args:
+            positions: [B, V, 3], or a `State`.
+        """
+        positions = self.positions_of(positions, "positions")
         result: Tensor = _ops.gradient(positions, self.stiffness, list(self.plan.arrays))
         return result
 
@@ -293,14 +301,15 @@ class Simulator(Model):
 
         Args:
             state: where the step starts.
-            after: the positions to judge, for example the next state.
+            after: the positions [B, V, 3] to judge, or a `State`, for example the next one.
             forces: as in `forward`.
             targets: as in `forward`.
         """
-        self.check_state(state)
-        positions = after if isinstance(after, Tensor) else after[0]
+        self.check_state(state, forces=forces)
+        before, positions = self.positions_of(state), self.positions_of(after, "after")
+        check_like("after", positions, before, "m")
         material = self.material_at(targets, state[0].shape[0])
-        call = AdjointCall(state[0], state[1], forces, positions, material, list(self.plan.arrays), self.time_step)
+        call = AdjointCall(before, state[1], forces, positions, material, list(self.plan.arrays), self.time_step)
         return step_gradient(call)
 
     # ---- files
@@ -319,9 +328,18 @@ class Simulator(Model):
         return load_simulation(path)
 
 
-def _first_iterate(start: str | Tensor) -> tuple[Tensor | None, bool]:
+def _first_iterate(start: str | Tensor, positions: Tensor) -> tuple[Tensor | None, bool]:
     if isinstance(start, Tensor):
+        check_like("start", start, positions, "first iterate, m")
         return start, False
-    if start not in ("velocity", "inertial"):
-        raise ValueError(f'start must be "velocity", "inertial" or positions [B, V, 3], got {start!r}')
+    if not _is_start(start):
+        raise ValueError(f'start must be "velocity", "inertial" or positions [B, V, 3], got {_in_short(start)}')
     return None, start == "inertial"
+
+
+def _is_start(start: object) -> bool:
+    return isinstance(start, str) and start in ("velocity", "inertial")
+
+
+def _in_short(value: object) -> str:
+    return repr(value) if isinstance(value, str) else type(value).__name__

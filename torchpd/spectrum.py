@@ -80,6 +80,15 @@ def _two_stage(sim: Simulator, state: State, iterations: int) -> float:
     return best[1]
 
 
+def _check_state(sim: Simulator, state: State) -> None:
+    positions = sim.positions_of(state)
+    if not len(positions):
+        raise ValueError(f"estimate_rho: state must hold at least one environment, got {list(positions.shape)}")
+    for name, part in zip(State._fields, state, strict=True):
+        if not bool(part.isfinite().all()):
+            raise ValueError(f"estimate_rho: state.{name} must be finite, got NaN or infinity")
+
+
 @torch.no_grad()
 def estimate_rho(
     sim: Simulator,
@@ -104,6 +113,7 @@ def estimate_rho(
 
     Source: Vyatkin and Dolgovesov 2023; Wang 2015, section 4.
     """
+    _check_state(sim, state)
     if iterations < 20:
         raise ValueError(f"estimate_rho: iterations must be >= 20, so that trials can accelerate; got {iterations}")
     if method == "bound":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -14,6 +14,18 @@ class State(NamedTuple):
 
     positions: Tensor  # [B, V, 3] m
     velocities: Tensor  # [B, V, 3] m/s
+
+    def to(self, *args: Any, **kwargs: Any) -> State:
+        """The same on another device or in another precision, as `Tensor.to`."""
+        return State(self.positions.to(*args, **kwargs), self.velocities.to(*args, **kwargs))
+
+    def clone(self) -> State:
+        """A copy that `step_` may overwrite, as `Tensor.clone`."""
+        return State(self.positions.clone(), self.velocities.clone())
+
+    def detach(self) -> State:
+        """The same numbers without their history, as `Tensor.detach`."""
+        return State(self.positions.detach(), self.velocities.detach())
 
 
 class Info(NamedTuple):

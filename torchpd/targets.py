@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .effects import Sphere
 from .scene import Scene
 
 __all__ = ["Anchors", "Targets"]
@@ -24,20 +23,26 @@ def _overwrite(array: Tensor, rows: slice, value: Tensor) -> Tensor:
 
 
 class Anchors:
-    """The pins and spheres of a scene, found by identity: parts hold arrays, which torch.compile cannot hash."""
+    """The pins and spheres of a scene, found by `id`, which torch.compile guards."""
 
-    def __init__(self, scene: Scene, time_step: float) -> None:
-        self.time_step = time_step
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
         self.pins = {id(pin): scene.pin_range(pin) for pin in scene.pins}
         self.spheres = {id(sphere): number for number, sphere in enumerate(scene.spheres)}
         self.pinned = sum(len(pin.vertices) for pin in scene.pins)
 
-    def place(self, targets: Targets | None, pins: Tensor, spheres: Tensor, batch: int) -> tuple[Tensor, Tensor]:
+    def __reduce__(self) -> tuple[type[Anchors], tuple[Scene]]:
+        """What is pickled has parts of its own."""
+        return Anchors, (self.scene,)
+
+    def place(
+        self, targets: Targets | None, pins: Tensor, spheres: Tensor, *, batch: int, time_step: float
+    ) -> tuple[Tensor, Tensor]:
         """`pin_targets` [.., P, 3] and `spheres` [.., S, 8] where `targets` puts them."""
         if targets is None:
             return pins, spheres
         if isinstance(targets, Tensor):
-            return self._checked("targets", targets, batch, self.pinned, (3,), pins), spheres
+            return self._checked("targets", targets, batch, [(self.pinned, 3)], pins), spheres
         if not isinstance(targets, Mapping):
             raise TypeError(
                 f"targets must be a tensor or a mapping from parts to tensors, got {type(targets).__name__}"
@@ -45,46 +50,54 @@ class Anchors:
         for part, value in targets.items():
             if id(part) in self.pins:
                 rows = self.pins[id(part)]
-                value = self._checked("targets of a Pin", value, batch, rows.stop - rows.start, (3,), pins)
+                value = self._checked("targets of a Pin", value, batch, [(rows.stop - rows.start, 3)], pins)
                 pins = _overwrite(pins, rows, value)
             elif id(part) in self.spheres:
                 number = self.spheres[id(part)]
-                value = self._checked("targets of a Sphere", value.unsqueeze(-2), batch, 1, (3, 6), spheres)
-                spheres = _overwrite(spheres, slice(number, number + 1), self._row(spheres, number, value))
+                value = self._checked("targets of a Sphere", value, batch, [(3,), (6,)], spheres).unsqueeze(-2)
+                row = self._row(spheres, number, value, time_step)
+                spheres = _overwrite(spheres, slice(number, number + 1), row)
             else:
                 raise ValueError(
                     f"targets: this {type(part).__name__} is not a Pin or Sphere of the scene; parts go by identity: "
-                    "a copied or loaded simulator has its own in sim.scene.pins and sim.scene.spheres"
+                    "a pickled or loaded simulator has its own in sim.scene.pins and sim.scene.spheres"
                 )
         return pins, spheres
 
-    def _checked(
-        self, name: str, value: Tensor, batch: int, rows: int, widths: tuple[int, ...], like: Tensor
-    ) -> Tensor:
-        shape = tuple(value.shape)
-        if shape[-2:-1] != (rows,) or shape[-1] not in widths or shape[:-2] not in ((), (1,), (batch,)):
-            lead = "" if "Sphere" in name else f"{rows}, "
-            wanted = " or ".join(f"[{lead}{width}]" for width in widths)
-            raise ValueError(f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(shape)}")
+    def _checked(self, name: str, value: Tensor, batch: int, shapes: Sequence[tuple[int, ...]], like: Tensor) -> Tensor:
+        if not isinstance(value, Tensor):
+            raise TypeError(
+                f"{name} must be a tensor of {like.dtype} on {like.device}, got {type(value).__name__}; "
+                "torch.as_tensor(..., dtype=sim.dtype, device=sim.device) makes one"
+            )
+        came, front = tuple(value.shape), ((), (1,), (batch,))
+        if not any(came[-len(shape) :] == shape and came[: -len(shape)] in front for shape in shapes):
+            wanted = " or ".join(str(list(shape)) for shape in shapes)
+            raise ValueError(
+                f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}"
+            )
         if value.dtype != like.dtype or value.device != like.device:
             raise TypeError(f"{name} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}")
         return value
 
-    def _row(self, spheres: Tensor, number: int, value: Tensor) -> Tensor:
+    def _row(self, spheres: Tensor, number: int, value: Tensor, time_step: float) -> Tensor:
         """Centre at the end of the step, radius, friction, motion during the step."""
         own = spheres[..., number : number + 1, 3:5]
-        motion = value[..., 3:] * self.time_step if value.shape[-1] == 6 else torch.zeros_like(value)
+        motion = value[..., 3:] * time_step if value.shape[-1] == 6 else torch.zeros_like(value)
         lead = torch.broadcast_shapes(own.shape[:-1], value.shape[:-1])
         return torch.cat([value[..., :3].expand(*lead, 3), own.expand(*lead, 2), motion.expand(*lead, 3)], dim=-1)
 
     def with_velocities(
-        self, targets: Mapping[Any, Tensor], last: dict[int, Tensor]
+        self, targets: Mapping[Any, Tensor], last: dict[int, Tensor], *, batch: int, time_step: float
     ) -> tuple[dict[Any, Tensor], dict[int, Tensor]]:
         """Adds to the centres of spheres how fast they came there since the last step."""
         filled, last = dict(targets), dict(last)
         for part, value in targets.items():
-            if isinstance(part, Sphere) and id(part) in last and value.shape[-1] == 3:
-                velocity = (value - last[id(part)]) / self.time_step
+            if id(part) not in self.spheres:
+                continue
+            value = self._checked("targets of a Sphere", value, batch, [(3,), (6,)], last[id(part)])
+            if value.shape[-1] == 3:
+                velocity = (value - last[id(part)]) / time_step
                 filled[part] = torch.cat([value.expand(velocity.shape), velocity], dim=-1)
                 last[id(part)] = value
         return filled, last

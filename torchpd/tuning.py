@@ -155,6 +155,7 @@ class _Study:
 
     sim: Simulator  # frictionless, its batch the studied states
     state: State
+    forces: Tensor | None
     exact: list[ExactStep]
 
     @property
@@ -166,7 +167,7 @@ class _Study:
     def trial(self, solver: Solver, iterations: int) -> Trial:
         """Worst error of some iterations."""
         self.sim.solver, self.sim.iterations = solver, iterations
-        after, info = self.sim(self.state, return_info=True)
+        after, info = self.sim(self.state, self.forces, return_info=True)
         displacements = after.velocities.double().cpu().numpy() * self.sim.time_step
         pairs = zip(self.exact, displacements, strict=True)
         # what the converged steps themselves may be wrong by counts as error
@@ -182,6 +183,8 @@ def tune(
     *,
     error: float | None = None,
     milliseconds: float | None = None,
+    forces: Tensor | None = None,
+    targets: Targets | None = None,
     candidates: Sequence[Solver] | None = None,
     most: int = MOST_ITERATIONS,
     progress: bool = False,
@@ -197,8 +200,8 @@ def tune(
         if not isinstance(solver, Solver):
             raise TypeError(f"tune: candidates must be solvers, such as Chebyshev() and Multilevel(), got {solver!r}")
     start = sim.rest_state(_environments_of_material(sim)) if state is None else state
-    _check_start(sim, start)
-    study = _prepare(sim, start)
+    _check_start(sim, start, forces)
+    study = _prepare(_with_targets(sim, targets, len(start[0])), start, forces)
     named: Mapping[str, Solver] = (
         safe_solvers(study.sim, study.state)
         if candidates is None
@@ -238,8 +241,8 @@ def _environments_of_material(sim: Simulator) -> int:
     return max(len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1 for name, array in arrays.items())
 
 
-def _check_start(sim: Simulator, state: State) -> None:
-    sim.check_state(state)
+def _check_start(sim: Simulator, state: State, forces: Tensor | None) -> None:
+    sim.check_state(state, forces=forces)
     if state[0].dim() != 3 or not len(state[0]) or state[1].shape != state[0].shape:
         raise ValueError(
             "tune: state must hold environments [B, V, 3], at least one, positions and velocities alike, got "
@@ -266,14 +269,26 @@ def _check_start(sim: Simulator, state: State) -> None:
 
 
 @torch.no_grad()
-def _prepare(sim: Simulator, start: State) -> _Study:
+def _with_targets(sim: Simulator, targets: Targets | None, batch: int) -> Simulator:
+    """The simulator with pins and spheres where `targets` puts them."""
+    if targets is None:
+        return sim
+    places = dict(zip(MATERIAL_ROWS, sim.material_at(targets, batch), strict=True))
+    placed = copy.deepcopy(sim)
+    placed.set_material(**{name: places[name].detach() for name in ("pin_targets", "spheres")})
+    return placed
+
+
+def _prepare(sim: Simulator, start: State, forces: Tensor | None) -> _Study:
     """States of the motion from `start`, with their converged steps; those that only fall are left out."""
     items = _environments(sim, len(start[0]))
     smooth = _of_environments(frictionless(sim), items, len(start[0]))
-    states = _motion(smooth, State(start[0][items], start[1][items]))
+    given = None if forces is None else forces.detach()[items]
+    states = _motion(smooth, State(start[0][items], start[1][items]), given)
     everyone = _of_environments(smooth, list(range(len(items))) * len(states), len(items))
     state = State(*(torch.cat(parts) for parts in zip(*states, strict=True)))
-    exact = exact_steps(everyone, state)
+    repeated = None if given is None else given.repeat(len(states), 1, 1)
+    exact = exact_steps(everyone, state, forces=repeated)
     moving = [number for number, step in enumerate(exact) if step.moves(sim.dtype)]
     if not moving:
         raise ValueError(
@@ -281,7 +296,8 @@ def _prepare(sim: Simulator, start: State) -> _Study:
             "pass a state of the motion that matters, for example sim.tune(state, error=1e-2)"
         )
     chosen = _of_environments(everyone, moving, len(exact))
-    return _Study(chosen, State(state[0][moving], state[1][moving]), [exact[number] for number in moving])
+    pushed = None if repeated is None else repeated[moving]
+    return _Study(chosen, State(state[0][moving], state[1][moving]), pushed, [exact[number] for number in moving])
 
 
 def _environments(sim: Simulator, batch: int) -> list[int]:
@@ -294,7 +310,7 @@ def _environments(sim: Simulator, batch: int) -> list[int]:
     return sorted(items)
 
 
-def _motion(sim: Simulator, start: State) -> list[State]:
+def _motion(sim: Simulator, start: State, forces: Tensor | None) -> list[State]:
     """The states before the steps `_STEPS`, solved well enough to be those of the true motion, and a few turned ones.
 
     These have the same shape and speeds in other directions: as likely a motion, whose steps err in other modes.
@@ -307,7 +323,7 @@ def _motion(sim: Simulator, start: State) -> list[State]:
             states.append(state)
         if step in _TURNED:
             states.append(State(state[0], state[1].roll(1, -1)))
-        state = mover(state)
+        state = mover(state, forces)
         if not bool(state[0].isfinite().all()):
             break
     return states
