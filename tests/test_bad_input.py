@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from devices import missing_gpu
@@ -228,6 +229,8 @@ def test_rotations_are_checked() -> None:
     ):
         with pytest.raises(kind, match=message):
             pd.nearest_rotation(bad)
+    with pytest.raises(TypeError, match=r"nearest_rotation: F must be a tensor \[\.\.\., 3, 3\], got ndarray"):
+        pd.nearest_rotation(np.eye(3))  # type: ignore[arg-type]
     for other in (torch.zeros(1, 3, 3), torch.zeros(2, 3, 3, dtype=torch.float64)):
         with pytest.raises(ValueError, match=r"direction must be .* like matrices, got"):
             ops.rotation_differential(torch.zeros(2, 3, 3), other)

@@ -134,6 +134,14 @@ def test_table_says_what_is_not_reached() -> None:
     assert lines[2].split() == ["y", "float64", *["not", "reached"] * 3]
 
 
+def test_table_tells_refusals_from_what_is_not_reached() -> None:
+    """A method that could not be run is not one that ran in vain."""
+    row = Row("solver", "z", status="refused: knows no contacts; others do")
+    assert row.refusal == "knows no contacts"
+    assert Row("solver", "z", status="diverged").refusal is None
+    assert study_table([row]).splitlines()[1].split() == ["z", "float64", "refused:", "knows", "no", "contacts"]
+
+
 def test_the_cost_of_an_error_is_tabled() -> None:
     rows = [
         Row(
@@ -246,16 +254,67 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert {row["axis"] for row in json.loads((tmp_path / "study.json").read_text())["rows"]} == {"paper", "time step"}
     assert main(["study", "beam", "--axes", "colour", "--out", str(tmp_path)]) == 2
     assert "no axis colour; there are solver, stiffness" in capsys.readouterr().err
+    assert main(["study", "--out", str(tmp_path), "--axes", "float", "spot.obj"]) == 2
+    assert "no axis spot.obj; there are solver, stiffness" in (said := capsys.readouterr().err)
+    assert "--axes takes all words after it: SUBJECT comes before it" in said
     assert main(["study", "nothing.obj", "--out", str(tmp_path)]) == 2
     assert "neither a file of a mesh nor one of beam, octopus" in capsys.readouterr().err
 
 
-def test_a_tetrahedral_mesh_lands(tmp_path: Path) -> None:
+@pytest.fixture
+def bar(tmp_path: Path) -> str:
+    """The file of a tetrahedral mesh that stands upright."""
     import meshio
 
-    mesh = box((2.0, 0.5, 0.5), (4, 1, 1))
+    mesh = box((0.5, 2.0, 0.5), (1, 4, 1))
     meshio.write_points_cells(tmp_path / "bar.mesh", mesh.vertices, {"tetra": mesh.tets})
-    subject = subject_of(str(tmp_path / "bar.mesh"))
+    return str(tmp_path / "bar.mesh")
+
+
+_NO_CONTACTS = ("Gauss-Seidel", "PCG global step", "direct global step", "Newton", "Newton-PCG with M", "L-BFGS")
+
+
+def test_a_body_that_lands_is_refused_by_methods_without_contacts(bar: str, tmp_path: Path) -> None:
+    """The table and the report say so, and how they can be had."""
+    said = run_study(StudyOptions(bar, quick=True, axes=("solver",), out=tmp_path), progress=False)
+    report = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for name in _NO_CONTACTS:
+        (line,) = [line for line in said.splitlines() if line.startswith(f"{name}  ")]
+        assert line.split("float64")[1].strip() == "refused: this method knows no contacts"
+        assert f"{name} (refused: this method knows no contacts)" in report
+    assert "--scene held" in said
+
+
+def test_a_body_that_is_held_is_for_every_method(bar: str, tmp_path: Path) -> None:
+    options = StudyOptions(bar, scene="held", quick=True, axes=("solver",), out=tmp_path)
+    said = run_study(options, progress=False)
+    rows = [Row.from_json(row) for row in json.loads((tmp_path / "study.json").read_text())["rows"]]
+    assert not [row for row in rows if row.refusal]
+    assert "refused" not in said
+    # nearer to the converged step than the first iterate, whose error is 1, and Newton, which is quadratic, there
+    for name in _NO_CONTACTS:
+        assert min(row.error for row in rows if row.method == name) < (1e-6 if name == "Newton" else 1.0)
+    assert options.command() == f"python -m torchpd study {bar} --scene held --out {tmp_path} --axes solver --quick"
+    assert json.loads((tmp_path / "study.json").read_text())["subject"] == "bar.mesh, held"
+
+
+def test_held_are_the_vertices_of_the_lowest_tenth(bar: str) -> None:
+    subject = subject_of(bar, "held")
+    sim = Bench(subject, CPU).simulator(Setting(1e6, 1 / 60, 14), torch.float64)
+    mesh = subject.mesh(14)
+    (pin,) = sim.scene.pins
+    assert sorted(pin.vertices) == np.flatnonzero(mesh.vertices[:, 1] == mesh.bounds[0][1]).tolist()
+    speeds = subject.start(sim).velocities.norm(dim=-1)[0]
+    assert not speeds[pin.vertices].any()
+    assert speeds.max() > 1.0
+    with pytest.raises(ValueError, match=r"scene is for bodies .*, the beam is always held"):
+        subject_of("beam", "held")
+    with pytest.raises(ValueError, match="no scene 'flies'; there are lands, held"):
+        subject_of(bar, "flies")
+
+
+def test_a_tetrahedral_mesh_lands(bar: str) -> None:
+    subject = subject_of(bar)
     assert subject.name == "bar.mesh"
     low, high = subject.mesh(14).bounds
     assert (high - low).max() == pytest.approx(1.0)

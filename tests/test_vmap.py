@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from typing import Any, cast
 
 import pytest
@@ -104,3 +106,148 @@ def test_vmap_over_the_plan_is_refused() -> None:
 
     with pytest.raises(ValueError, match="the plan cannot be mapped"):
         torch.vmap(energy)(torch.stack([sim.plan.tet_volume] * 2))
+
+
+def test_one_map_is_refused_as_it_is_alone(device: torch.device) -> None:
+    """What comes without a batch, or with another one: rules see the shapes of a map, not of all maps together."""
+    sim, state = small(torch.float64, device, solver=pd.Multilevel())
+    x, v = state
+    plan, material, w = plan_of(sim), sim.material(), sim.stiffness
+    numbers = numbers_of(sim)
+    maps = torch.ones(3, 1, 1, 1, dtype=x.dtype, device=device)
+    cases: list[tuple[Callable[..., Any], tuple[Tensor, ...]]] = [
+        (lambda a, b: sim((a, b)), (x, v)),
+        (lambda a, b: sim.rollout((a, b), 2), (x, v)),
+        (sim.energy, (x,)),
+        (lambda a: ops.gradient(a, w, plan), (x,)),
+        (lambda a: ops.element_energy(a, w, plan), (x,)),
+        (lambda a: ops.hessian_product(a, x, w, plan), (x,)),
+        (lambda a: ops.precondition(a, plan), (x,)),
+        (lambda s: ops.elastic_diagonal(s, plan, weighted=False), (w.expand(2, 1, 1, -1),)),
+        (lambda s: ops.element_energy(x, s, plan), (w.expand(2, 2, -1),)),
+        (lambda a: ops.step(x, a, None, None, material, plan, **numbers), (maps * v[:1],)),
+        (lambda a: ops.step(x, v, a, None, material, plan, **numbers), (maps * v[:2],)),
+        (ops.nearest_rotation, (torch.eye(3, dtype=x.dtype, device=device),)),
+        (ops.rotation_differential, (torch.eye(3, dtype=x.dtype, device=device),) * 2),
+    ]
+    for function, given in cases:
+        with pytest.raises((ValueError, RuntimeError)) as alone:
+            function(*(t[0] for t in given))
+        first = str(alone.value).splitlines()[0]
+        with pytest.raises(type(alone.value), match=re.escape(first)):
+            torch.vmap(function)(*given)
+
+
+# ---- derivatives of many at once
+
+
+def _match(found: Tensor, expected: Tensor) -> None:
+    """The same bits on the CPU. On a GPU torch may add up another batch in another order, so that the adjoint's solve,
+    which ends at 1e-5 or 1e-10, ends elsewhere within that; a hundred times as much for the condition of the system.
+    """
+    assert found.shape == expected.shape
+    if not found.is_cuda:
+        assert torch.equal(found, expected)
+    elif found.numel():
+        bound = {torch.float32: 1e-3, torch.float64: 1e-8}[found.dtype]
+        assert float((found - expected).abs().max()) <= bound * float(expected.abs().max())
+
+
+def _same(mapped: Any, single: list[Any]) -> None:
+    """Each of the mapped results is that of its turn in the loop."""
+    for m, one in enumerate(single):
+        for every, alone in zip(mapped, one, strict=True):
+            _match(every[m], alone)
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_vmap_of_the_adjoint_of_a_step(batch: int, dtype: torch.dtype, device: torch.device) -> None:
+    """Any argument mapped, material shared by all environments, by one, and of each."""
+    sim, (x, v) = small(dtype, device, batch)
+    maps, plan, shared = 3, plan_of(sim), [array.detach() for array in sim.material()]
+    factor = torch.linspace(0.5, 2.0, maps, dtype=dtype, device=device)
+    w = shared[0]
+    after = ops.step(x, v, None, None, shared, plan, **numbers_of(sim, iterations=64))[0]
+    grads = noise(torch.empty(maps, *x.shape, dtype=dtype, device=device))
+    of_each = [array.expand(batch, *array.shape).clone() for array in shared]
+
+    def adjoint(g: Tensor, y: Tensor, stiffness: Tensor, forces: Tensor | None, material: list[Tensor]) -> Any:
+        arrays = [stiffness, *material[1:]]
+        return ops.step_vjp(g, 0.1 * g, y, x, v, forces, arrays, plan, time_step=sim.time_step)
+
+    moved = after + 1e-3 * factor[:, None, None, None] * x
+    own = w * torch.linspace(0.5, 1.5, batch, dtype=dtype, device=device)[:, None]
+    cases: list[tuple[tuple[int | None, ...], tuple[Any, ...], list[Tensor]]] = [
+        ((0, None, None, None), (grads, after, w, None), shared),
+        ((0, None, None, None), (grads, after, own, None), of_each),
+        ((0, None, None, None), (grads, after, w[None], grads[0]), shared),
+        ((None, 0, None, 0), (grads[0], moved, w, grads), shared),
+        ((None, None, 0, None), (grads[0], after, factor[:, None] * w, None), shared),
+        ((None, None, 0, None), (grads[0], after, factor[:, None, None] * own, None), of_each),
+    ]
+    for dims, given, material in cases:
+        call = lambda *args, m=material: adjoint(*args, m)  # noqa: E731
+        mapped = torch.vmap(call, in_dims=dims)(*given)
+        _same(mapped, [call(*(t if d is None else t[m] for t, d in zip(given, dims, strict=True))) for m in range(3)])
+
+
+def test_batched_gradients_of_every_op(dtype: torch.dtype, device: torch.device) -> None:
+    """`is_grads_batched`, which is an older vmap, is a loop over the gradients."""
+    sim, (x, v) = small(dtype, device)
+    plan, numbers = plan_of(sim), numbers_of(sim, iterations=256)
+    levels = plan_of(small(dtype, device, solver=pd.Multilevel())[0])
+    w, d = sim.stiffness.detach(), noise(x, 1)
+    own = w * torch.linspace(0.5, 1.5, BATCH, dtype=dtype, device=device)[:, None]
+    rest = sim.material()[1:]
+    F = noise(torch.empty(5, 3, 3, dtype=dtype, device=device))
+    cases: list[tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = [
+        (lambda x, w: ops.element_energy(x, w, plan), (x, w)),
+        (lambda x, w: ops.gradient(x, w, plan), (x, own)),
+        (lambda d: ops.hessian_product(x, d, w, plan), (d,)),
+        (lambda x, d, w: ops.element_energy_product(x, d, w, plan), (x, d, w)),
+        (lambda d: ops.precondition(d, levels), (d,)),
+        (ops.nearest_rotation, (F,)),
+        (ops.rotation_differential, (F, F.flip(0))),
+        (lambda x, v, f, w: ops.step(x, v, f, None, [w, *rest], plan, **numbers)[0], (x, v, d, w)),
+        (lambda x, f, w: ops.rollout(x, v, f, [w, *rest], plan, **numbers, steps=3, every=1)[1], (x, d, own)),
+    ]
+    for function, given in cases:
+        inputs = [t.detach().clone().requires_grad_() for t in given]
+        out = function(*inputs)
+        many = noise(torch.empty(4, *out.shape, dtype=dtype, device=device), 2)
+        batched = torch.autograd.grad(out, inputs, many, retain_graph=True, is_grads_batched=True)
+        single = [torch.autograd.grad(out, inputs, g, retain_graph=True) for g in many]
+        _same(batched, single)
+        # its backward runs autograd itself, which torch.vmap does not allow
+        if function is not ops.rotation_differential:
+            newer = torch.vmap(lambda g, o=out, i=inputs: torch.autograd.grad(o, i, g, retain_graph=True))(many)
+            _same(newer, single)
+
+
+def test_vectorized_jacobians_and_hessians(device: torch.device) -> None:
+    """Of a step for forces and stiffness, and of an energy, the loop's."""
+    sim, state = small(torch.float64, device)
+    x, rest, numbers = state.positions, sim.material()[1:], numbers_of(sim, iterations=64)
+
+    def step(forces: Tensor, stiffness: Tensor) -> Tensor:
+        material = [stiffness, *rest]
+        return cast(Tensor, ops.step(*state, forces, None, material, plan_of(sim), **numbers)[0][:, ::9, 1])
+
+    given = (torch.zeros_like(x), sim.stiffness.detach())
+    jacobians = [torch.autograd.functional.jacobian(step, given, vectorize=fast) for fast in (True, False)]
+    for fast, slow in zip(*jacobians, strict=True):
+        _match(fast, slow)
+    assert jacobians[0][1].abs().max() > 0
+    hessians = [
+        torch.autograd.functional.hessian(lambda y: sim.energy(y).sum(), x[:2], vectorize=fast)
+        for fast in (True, False)
+    ]
+    _match(*hessians)
+    # and differentiated once more, as where a penalty on gradients is trained
+    y = x.clone().requires_grad_()
+    many = noise(torch.empty(2, BATCH, dtype=x.dtype, device=device))
+    (g,) = torch.autograd.grad(sim.energy(y), y, many, is_grads_batched=True, create_graph=True)
+    alone = [torch.autograd.grad(sim.energy(y), y, row, create_graph=True)[0] for row in many]
+    for batched, single in zip(g, alone, strict=True):
+        bits = [torch.autograd.grad(t.square().sum(), y, retain_graph=True)[0] for t in (batched, single)]
+        torch.testing.assert_close(*bits, rtol=1e-12, atol=1e-12 * float(bits[1].abs().max()))

@@ -26,8 +26,10 @@ _STUDY = """\
 Measures what accuracy costs: the error of the solver against iterations, milliseconds and memory, beside methods of
 the literature; the errors of the time step, of the mesh and of float32; and what unfinished solves do to a motion.
 
-SUBJECT is beam, octopus, or the file of a mesh, which lands on the ground. Results go to --out: study.json, study.csv,
-pictures and report.html. A study that was stopped goes on where it was."""
+SUBJECT is beam, octopus, or the file of a mesh, which lands on the ground. There methods that know no contacts (Newton,
+L-BFGS, Gauss-Seidel, conjugate gradients, a factorised step) are refused; --scene held is for all of them.
+
+Results go to --out: study.json, study.csv, pictures and report.html. A study that was stopped goes on where it was."""
 
 
 _CELLS = 24
@@ -87,6 +89,7 @@ def _add_study(commands: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     study.add_argument("subject", nargs="?", default="beam", metavar="SUBJECT", help="beam, octopus or a mesh")
+    study.add_argument("--scene", help="of a body: lands (the default), or held by its lowest tenth, without contacts")
     study.add_argument("--youngs", type=_positive, help="Young's modulus in Pa")
     study.add_argument("--time-step", type=_positive, help="in s")
     study.add_argument("--resolution", type=_whole, help="cells across the beam, or along the longest side of a body")

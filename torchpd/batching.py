@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from .tables import MATERIAL_TABLE
+from .vmap_rules import Rule, register_rule
 
-__all__: list[str] = []
+__all__ = ["step_vjp_rule"]
 
 _ops = torch.ops.torchpd
+_OWN = [row.dims for row in MATERIAL_TABLE]  # dimensions of an array without a batch; stiffness is the first
+
+
+def _shape_of_one(tensor: Tensor, dim: int | None) -> torch.Size:
+    """The shape that the mapped function sees."""
+    return torch.Size(length for place, length in enumerate(tensor.shape) if place != dim)
+
+
+def _check_one(fits: bool, op: Any, in_dims: Any, args: Any, **numbers: Any) -> None:
+    """What does not fit is refused by the op itself, of one map: in all together it may fit by chance."""
+    if not fits:
+        op(*pytree.tree_map(lambda t, dim: t if dim is None else t.select(dim, 0), args, in_dims), **numbers)
 
 
 def _join(tensor: Tensor, dim: int | None, size: int, batch: int, own: int) -> Tensor:
@@ -29,49 +43,90 @@ def _join(tensor: Tensor, dim: int | None, size: int, batch: int, own: int) -> T
     return tensor.expand(size, batch, *tensor.shape[2:]).flatten(0, 1)
 
 
-def _split(tensor: Tensor, size: int, dim: int = 0) -> Tensor:
-    result: Tensor = tensor.unflatten(dim, (size, -1))
-    return result
-
-
 def _check_plan(dims: Any) -> None:
     if any(dim is not None for dim in dims):
         raise ValueError("torchpd: the plan cannot be mapped by vmap; it is the same for all environments")
 
 
-def _field_vmap(op: Any) -> Callable[..., tuple[Tensor, int]]:
-    def rule(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
-        *tensors, plan = args
-        *dims, plan_dims = in_dims
-        _check_plan(plan_dims)
-        size = info.batch_size
-        batch = tensors[0].shape[1 if dims[0] == 0 else 0]
-        own = (*[2] * (len(tensors) - 1), 1)
-        joined = [_join(t, d, size, batch, n) for t, d, n in zip(tensors, dims, own, strict=True)]
-        return _split(op(*joined, plan), size), 0
+def _listed(material: Any) -> list[Any]:
+    """All arrays, or the stiffness alone."""
+    return material if isinstance(material, list) else [material]
+
+
+def _fits(state: Sequence[torch.Size], material: Sequence[torch.Size]) -> bool:
+    """Whether arrays of a state are [batch, V, 3], and those of the material for that batch or for all."""
+    batch, *_ = *state[0], 0
+    return all(len(shape) == 3 and shape == state[0] for shape in state) and all(
+        len(shape) == own or (len(shape) == own + 1 and shape[0] in (1, batch))
+        for shape, own in zip(material, _OWN, strict=False)
+    )
+
+
+def _join_all(op: Any, info: Any, in_dims: Any, args: Any, **numbers: Any) -> tuple[list[Any], tuple[int, int]]:
+    """The arguments (arrays of a state, material, plan) of all maps in one call; how many maps and environments."""
+    *state, material, plan = args
+    *state_dims, material_dims, plan_dims = in_dims
+    _check_plan(plan_dims)
+    arrays, array_dims = _listed(material), _listed(material_dims)
+    shapes = [_shape_of_one(t, d) for t, d in zip(state, state_dims, strict=True) if t is not None]
+    _check_one(
+        _fits(shapes, [_shape_of_one(t, d) for t, d in zip(arrays, array_dims, strict=True)]),
+        op, in_dims, args, **numbers,
+    )  # fmt: skip
+    size, batch = info.batch_size, shapes[0][0]
+    joined = [None if t is None else _join(t, d, size, batch, 2) for t, d in zip(state, state_dims, strict=True)]
+    values = [_join(t, d, size, batch, own) for t, d, own in zip(arrays, array_dims, _OWN, strict=False)]
+    return [*joined, values if isinstance(material, list) else values[0], plan], (size, batch)
+
+
+def _batch_rule(name: str, dim: int = 0) -> Rule:
+    """For an op that has its batch at `dim` of everything that it returns."""
+    op = getattr(_ops, name)
+
+    def rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[Any, int]:
+        joined, maps = _join_all(op, info, in_dims, args, **numbers)
+        return pytree.tree_map(lambda t: t.unflatten(dim, maps), op(*joined, **numbers)), dim
 
     return rule
 
 
-@torch.library.register_vmap("torchpd::elastic_diagonal")
-def _diagonal_vmap(
-    info: Any, in_dims: tuple[Any, ...], stiffness: Tensor, plan: list[Tensor], *, weighted: bool
-) -> tuple[Tensor, int]:
+def step_vjp_rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[list[Tensor], int]:
+    """The adjoint of a step. An array that environments share has a gradient for each map, the sum over its own."""
+    op = _ops.step_vjp
+    (*state, values, plan), maps = _join_all(op, info, in_dims, args, **numbers)
+    each = [
+        t.expand(maps[0] * maps[1], *t.shape[t.dim() - n :]).contiguous() for t, n in zip(values, _OWN, strict=True)
+    ]
+    grads = [t.unflatten(0, maps) for t in op(*state, each, plan, **numbers)]
+    shapes = [_shape_of_one(t, d) for t, d in zip(args[-2], in_dims[-2], strict=True)]
+    summed = [
+        grad.sum(1, keepdim=len(shape) > own) if len(shape) == own or shape[0] < maps[1] else grad
+        for grad, shape, own in zip(grads[3:], shapes, _OWN, strict=True)
+    ]
+    return [*grads[:3], *summed], 0
+
+
+def _diagonal_rule(info: Any, in_dims: Any, stiffness: Tensor, plan: list[Tensor], **options: Any) -> Any:
     _check_plan(in_dims[1])
     mapped = stiffness.movedim(in_dims[0], 0)
-    rows = _ops.elastic_diagonal(mapped.flatten(0, -2), plan, weighted=weighted)
+    _check_one(mapped.dim() in (2, 3), _ops.elastic_diagonal, in_dims, (stiffness, plan), **options)
+    rows = _ops.elastic_diagonal(mapped.flatten(0, -2), plan, **options)
     return rows.unflatten(0, mapped.shape[:-1]), 0
 
 
-@torch.library.register_vmap("torchpd::precondition")
-def _precondition_vmap(info: Any, in_dims: tuple[Any, ...], field: Tensor, plan: list[Tensor]) -> tuple[Tensor, int]:
+def _precondition_rule(info: Any, in_dims: Any, field: Tensor, plan: list[Tensor]) -> tuple[Tensor, int]:
     _check_plan(in_dims[1])
     mapped = field.movedim(in_dims[0], 0)
-    return _split(_ops.precondition(mapped.flatten(0, 1), plan), info.batch_size), 0
+    _check_one(mapped.dim() == 4, _ops.precondition, in_dims, (field, plan))
+    return _ops.precondition(mapped.flatten(0, 1), plan).unflatten(0, mapped.shape[:2]), 0
 
 
-def _rotation_vmap(op: Any) -> Callable[..., tuple[Tensor, int]]:
-    def rule(info: Any, in_dims: tuple[int | None, ...], *matrices: Tensor) -> tuple[Tensor, int]:
+def _rotation_rule(name: str) -> Rule:
+    op = getattr(_ops, name)
+
+    def rule(info: Any, in_dims: Any, *matrices: Tensor) -> tuple[Tensor, int]:
+        shapes = [_shape_of_one(m, d) for m, d in zip(matrices, in_dims, strict=True)]
+        _check_one(all(len(shape) > 1 and shape == shapes[0] for shape in shapes), op, in_dims, matrices)
         moved = [
             m.movedim(d, 0) if d is not None else m.expand(info.batch_size, *m.shape)
             for m, d in zip(matrices, in_dims, strict=True)
@@ -81,55 +136,10 @@ def _rotation_vmap(op: Any) -> Callable[..., tuple[Tensor, int]]:
     return rule
 
 
-def _join_step(info: Any, dims: Sequence[Any], tensors: Sequence[Any]) -> tuple[list[Any], list[Tensor]]:
-    """Joined (positions, velocities, forces, start) and material."""
-    *state, material = tensors
-    *state_dims, material_dims = dims
-    size = info.batch_size
-    batch = state[0].shape[1 if state_dims[0] == 0 else 0]
-    joined = [None if t is None else _join(t, d, size, batch, 2) for t, d in zip(state, state_dims, strict=True)]
-    values = [
-        _join(t, d, size, batch, row.dims) for t, d, row in zip(material, material_dims, MATERIAL_TABLE, strict=True)
-    ]
-    return joined, values
-
-
-@torch.library.register_vmap("torchpd::step")
-def _step_vmap(
-    info: Any,
-    in_dims: tuple[Any, ...],
-    positions: Tensor,
-    velocities: Tensor,
-    forces: Tensor | None,
-    start: Tensor | None,
-    material: list[Tensor],
-    plan: list[Tensor],
-    **numbers: Any,
-) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    _check_plan(in_dims[5])
-    state, values = _join_step(info, in_dims[:5], (positions, velocities, forces, start, material))
-    out = _ops.step(*state, values, plan, **numbers)
-    return tuple(_split(t, info.batch_size) for t in out), (0, 0, 0)
-
-
-@torch.library.register_vmap("torchpd::rollout")
-def _rollout_vmap(
-    info: Any,
-    in_dims: tuple[Any, ...],
-    positions: Tensor,
-    velocities: Tensor,
-    forces: Tensor | None,
-    material: list[Tensor],
-    plan: list[Tensor],
-    **numbers: Any,
-) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    _check_plan(in_dims[4])
-    state, values = _join_step(info, in_dims[:4], (positions, velocities, forces, material))
-    out = _ops.rollout(*state, values, plan, **numbers)
-    return tuple(_split(t, info.batch_size, 1) for t in out), (1, 1, 1)
-
-
-for _name in ("gradient", "hessian_product", "element_energy", "element_energy_product"):
-    torch.library.register_vmap(f"torchpd::{_name}", _field_vmap(getattr(_ops, _name)))
+for _name in ("step", "gradient", "hessian_product", "element_energy", "element_energy_product"):
+    register_rule(_name, _batch_rule(_name))
+register_rule("rollout", _batch_rule("rollout", 1))
+register_rule("elastic_diagonal", _diagonal_rule)
+register_rule("precondition", _precondition_rule)
 for _name in ("nearest_rotation", "rotation_differential"):
-    torch.library.register_vmap(f"torchpd::{_name}", _rotation_vmap(getattr(_ops, _name)))
+    register_rule(_name, _rotation_rule(_name))

@@ -43,6 +43,12 @@ class Row:
     default: bool = False  # what `Simulator(scene)` does
     more: dict[str, float] = dataclasses.field(default_factory=dict)
 
+    @property
+    def refusal(self) -> str | None:
+        """Why nothing was run, in a few words; None for what ran, however badly."""
+        verdict, _, why = self.status.partition(": ")
+        return why.split(";")[0] if verdict == "refused" else None
+
     def to_json(self) -> dict[str, Any]:
         """Plain values; JSON has no infinity, which becomes null."""
         return {name: _without_infinity(value) for name, value in dataclasses.asdict(self).items()}

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from . import batching  # noqa: F401  (registers the rules for vmap)
 from .adjoint import AdjointCall, step_adjoint
+from .batching import step_vjp_rule
 from .tables import MATERIAL_TABLE
+from .vmap_rules import register_rule
 
 __all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_tangents"]
 
@@ -35,6 +36,8 @@ def nearest_rotation(F: Tensor) -> Tensor:
     Returns:
         [..., 3, 3].
     """
+    if not isinstance(F, Tensor):
+        raise TypeError(f"nearest_rotation: F must be a tensor [..., 3, 3], got {type(F).__name__}")
     refuse_tangents(F)
     result: Tensor = _ops.nearest_rotation(F)
     return result
@@ -261,6 +264,9 @@ def _(
 ) -> list[Tensor]:
     state = [positions.new_empty(positions.shape) for _ in range(3)]
     return [*state, *(array.new_empty(array.shape) for array in material)]
+
+
+register_rule("step_vjp", step_vjp_rule)
 
 
 def _step_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:

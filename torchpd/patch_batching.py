@@ -12,6 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .vmap_rules import Rule, register_rule
+
 __all__: list[str] = []
 
 _ops = torch.ops.torchpd
@@ -22,8 +24,8 @@ def _refuse_mapped_lists(dims: Any) -> None:
         raise ValueError("torchpd: the lists of patches cannot be mapped by vmap; they are the same for all")
 
 
-def _one_by_one(op: Any) -> Callable[..., tuple[Any, Any]]:
-    def rule(info: Any, in_dims: tuple[Any, ...], *args: Any, **options: Any) -> tuple[Any, Any]:
+def _one_by_one(op: Any) -> Rule:
+    def rule(info: Any, in_dims: tuple[Any, ...], *args: Any, **options: Any) -> tuple[Any, int]:
         *tensors, lists = args
         *dims, list_dims = in_dims
         _refuse_mapped_lists(list_dims)
@@ -33,7 +35,7 @@ def _one_by_one(op: Any) -> Callable[..., tuple[Any, Any]]:
             found.append(op(*picked, lists, **options))
         if isinstance(found[0], Tensor):
             return torch.stack(found), 0
-        return tuple(torch.stack(parts) for parts in zip(*found, strict=True)), (0,) * len(found[0])
+        return tuple(torch.stack(parts) for parts in zip(*found, strict=True)), 0
 
     return rule
 
@@ -46,11 +48,11 @@ def _joined(tensor: Tensor | None, dim: int | None, size: int) -> Tensor | None:
     return whole.flatten(0, 1)
 
 
-def _with_batch(op: Any, batched: Sequence[int], *, grown: Callable[..., Any] | None = None) -> Callable[..., Any]:
+def _with_batch(op: Any, batched: Sequence[int], *, grown: Callable[..., Any] | None = None) -> Rule:
     """A rule for an op whose arguments number `batched` have a batch; one by one where another one is mapped."""
     single = _one_by_one(op)
 
-    def rule(info: Any, in_dims: tuple[Any, ...], *args: Any, **options: Any) -> tuple[Any, Any]:
+    def rule(info: Any, in_dims: tuple[Any, ...], *args: Any, **options: Any) -> tuple[Any, int]:
         others = [d for n, d in enumerate(in_dims[:-1]) if n not in batched]
         if any(d is not None for d in others):
             return single(info, in_dims, *args, **options)
@@ -64,7 +66,7 @@ def _with_batch(op: Any, batched: Sequence[int], *, grown: Callable[..., Any] | 
         out = op(*joined, **options)
         if isinstance(out, Tensor):
             return out.unflatten(0, (info.batch_size, -1)), 0
-        return tuple(t.unflatten(0, (info.batch_size, -1)) for t in out), (0,) * len(out)
+        return tuple(t.unflatten(0, (info.batch_size, -1)) for t in out), 0
 
     return rule
 
@@ -86,7 +88,7 @@ for _name, _batched, _grown in (
     ("frames", (0,), None),
 ):
     _op = getattr(_ops, f"patch_{_name}")
-    torch.library.register_vmap(f"torchpd::patch_{_name}", _with_batch(_op, _batched, grown=_grown))
-    torch.library.register_vmap(f"torchpd::patch_{_name}_vjp", _one_by_one(getattr(_ops, f"patch_{_name}_vjp")))
+    register_rule(f"patch_{_name}", _with_batch(_op, _batched, grown=_grown))
+    register_rule(f"patch_{_name}_vjp", _one_by_one(getattr(_ops, f"patch_{_name}_vjp")))
 for _name in ("height", "height_vjp", "surface_rays", "field_rays"):
-    torch.library.register_vmap(f"torchpd::patch_{_name}", _one_by_one(getattr(_ops, f"patch_{_name}")))
+    register_rule(f"patch_{_name}", _one_by_one(getattr(_ops, f"patch_{_name}")))

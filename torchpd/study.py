@@ -53,6 +53,7 @@ class StudyOptions:
     """What `python -m torchpd study` takes."""
 
     subject: str = "beam"  # or "octopus", or the file of a mesh
+    scene: str | None = None  # of a body: "lands" on the ground, which is the default, or "held"
     youngs: float | None = None  # Pa; that of the subject by default
     time_step: float | None = None  # s
     resolution: int | None = None  # cells across the beam, or lattice cells along the longest side
@@ -63,11 +64,15 @@ class StudyOptions:
     out: Path = Path("out/study")
     quick: bool = False  # few points: shows that everything runs
 
+    def title(self) -> str:
+        """What figures are headed with."""
+        return ", ".join([Path(self.subject).name, *([self.scene] if self.scene else [])])
+
     def command(self) -> str:
         """That does this study again."""
         words = ["python -m torchpd study", self.subject]
         plain = StudyOptions()
-        for name in ("youngs", "time_step", "resolution", "iterations", "device", "threads", "out"):
+        for name in ("scene", "youngs", "time_step", "resolution", "iterations", "device", "threads", "out"):
             value = getattr(self, name)
             if value != getattr(plain, name):
                 words.append(f"--{name.replace('_', '-')} {value}")
@@ -135,7 +140,7 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
 
 def study_rows(options: StudyOptions, *, progress: bool = True) -> list[Row]:
     """Measure what is not yet in the ledger of `options.out`, and return all rows."""
-    subject = subject_of(options.subject)
+    subject = subject_of(options.subject, options.scene)
     device = find_device(options.device)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
@@ -143,8 +148,9 @@ def study_rows(options: StudyOptions, *, progress: bool = True) -> list[Row]:
     setting = _setting(subject, options)
     options.out.mkdir(parents=True, exist_ok=True)
     settings = {
-        "schema": SCHEMA, "subject": options.subject, **asdict(setting), "iterations": options.iterations,
-        "device": options.device, "threads": torch.get_num_threads(), "quick": options.quick,
+        "schema": SCHEMA, "subject": options.subject, "scene": options.scene, **asdict(setting),
+        "iterations": options.iterations, "device": options.device, "threads": torch.get_num_threads(),
+        "quick": options.quick,
     }  # fmt: skip
     ledger = Ledger(options.out / "study.jsonl", settings)
     rows: list[Row] = []
@@ -169,7 +175,7 @@ def run_study(options: StudyOptions, *, progress: bool = True) -> str:
         "schema": SCHEMA,
         **describe_run(options.command(), torch.device(options.device), threads),
         "clock": "processor time" if clock_of(torch.device(options.device)) is time.process_time else "wall time",
-        "subject": Path(options.subject).name,
+        "subject": options.title(),
         "rows": [row.to_json() for row in rows],
     }
     written = [options.out / "study.json"]
@@ -190,7 +196,10 @@ def _lines_of(record: dict[str, Any]) -> str:
 def _check(options: StudyOptions) -> None:
     unknown = set(options.axes) - set(AXES)
     if unknown:
-        raise ValueError(f"study: no axis {', '.join(sorted(unknown))}; there are {', '.join(AXES)}")
+        raise ValueError(
+            f"study: no axis {', '.join(sorted(unknown))}; there are {', '.join(AXES)} "
+            "(--axes takes all words after it: SUBJECT comes before it)"
+        )
     missing = missing_packages(package for package in OPTIONAL if package.module in _PACKAGES)
     if missing:  # said before the work, not after it
         names = ", ".join(package.pip_name for package in missing)
@@ -206,8 +215,17 @@ def study_table(rows: list[Row]) -> str:
     lines = [f"{'solver':<28}{'precision':<11}" + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)]
     for name, precision in dict.fromkeys((row.method, row.precision) for row in solver):
         own = [row for row in solver if (row.method, row.precision) == (name, precision)]
-        lines.append(f"{name:<28}{precision:<11}" + "".join(f"{_first_at(own, goal):>22}" for goal in _GOALS))
+        lines.append(f"{name:<28}{precision:<11}{_costs(own)}")
+    if any(row.refusal for row in solver):
+        lines.append("with --scene held a body has no contacts, and every method runs")
     return "\n".join(lines) if solver else ""
+
+
+def _costs(rows: list[Row]) -> str:
+    """The cells of one solver."""
+    if rows[0].refusal:
+        return f"  refused: {rows[0].refusal}"
+    return "".join(f"{_first_at(rows, goal):>22}" for goal in _GOALS)
 
 
 def _first_at(rows: list[Row], goal: float) -> str:

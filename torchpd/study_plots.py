@@ -129,12 +129,12 @@ def _draw_solvers(rows: list[Row], path: Path, subject: str) -> Path:
         2, f"{subject}: {max(row.tets for row in rows):,} tetrahedra, Young's modulus {_pascals(first.youngs)}, "
         f"time step {first.time_step:.3g} s. One step.", width=6.6,
     )  # fmt: skip
-    curves, refused = _shown(rows), []
+    curves, refused = _shown(rows), dict[str, list[str]]()
     for name, own in curves.items():
         color, width, dash = STYLES.get(name, _OTHER)
         timed = [row for row in own if row.milliseconds is not None]
-        if not timed:
-            refused.append(name)
+        if own[0].refusal:
+            refused.setdefault(own[0].refusal, []).append(name)
             continue
         label = f"{name}, C++ float32" if own[0].compiled else name if "NumPy" in name else f"{name}, NumPy"
         label = _LABELS.get(name, label)
@@ -157,7 +157,8 @@ def _draw_solvers(rows: list[Row], path: Path, subject: str) -> Path:
         axis.axhline(1.0, color=_INK, linewidth=0.8, linestyle=(0, (2, 3)))
     figure.legend(frameon=False, loc="outside right upper", fontsize=9)
     if refused:
-        figure.text(0.995, 0.02, "no contacts, not drawn:\n" + "\n".join(refused), ha="right", va="bottom", fontsize=8)
+        words = (f"refused, so not drawn\n({why}):\n" + "\n".join(names) for why, names in refused.items())
+        figure.text(0.995, 0.02, "\n".join(words), ha="right", va="bottom", fontsize=8)
     figure.savefig(path)
     return path
 

@@ -69,8 +69,9 @@ def _header(record: dict[str, Any]) -> str:
     return (
         f"<p>Errors are |x &minus; x*| / |x<sub>0</sub> &minus; x*| of one time step: 1 is the first iterate, 0 the "
         f"converged step. Full lines are the compiled solvers of this library; dashed ones are NumPy and SciPy, whose "
-        f"iterations compare exactly and whose milliseconds are indications. Failures are crosses at the top. Click a "
-        f"name in a legend to hide it.</p>\n<pre>{html.escape(record['command'])}</pre>\n"
+        f"iterations compare exactly and whose milliseconds are indications. Failures are crosses at the top; what "
+        f"is refused has not run. Click a name in a legend to hide it.</p>\n"
+        f"<pre>{html.escape(record['command'])}</pre>\n"
         f"<p>{html.escape(where)}<br>{html.escape(what)}<br>commit {html.escape(record['commit'][:12])}, "
         f"{html.escape(record['created'])}</p>"
     )
@@ -167,11 +168,11 @@ def _solver_figure(rows: list[Row], place: Callable[[Row], float | None], axis: 
         color, width, dash = STYLES.get(name, _OTHER)
         if compiled:
             width, name = (width, f"{name}, float32") if precision == "float32" else (1.0, f"{name}, float64")
-        if any(place(row) for row in own):
-            figure.add_trace(_trace(own, place, name, (color, width, dash)))
-        else:
+        if own[0].refusal:
             figure.add_scatter(x=[None], y=[None], mode="markers", marker={"symbol": "x", "color": color},
-                               name=f"{name} ({own[0].status.split(':')[0]}: no contacts)")  # fmt: skip
+                               name=f"{name} (refused: {own[0].refusal})")  # fmt: skip
+        else:
+            figure.add_trace(_trace(own, place, name, (color, width, dash)))
     return _layout(figure, axis_label(axis), rows)
 
 

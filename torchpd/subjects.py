@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from .simulator import Simulator
 from .state import State
 from .tetrahedralize import tetrahedralize
 
-__all__ = ["SUBJECTS", "Subject", "subject_of"]
+__all__ = ["SCENES", "SUBJECTS", "Subject", "subject_of"]
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,8 @@ DENSITY = 1000.0  # kg/m^3
 _TETRAHEDRAL = (".mesh", ".msh", ".vtk", ".vtu")
 _GAP = 0.002  # m between the ground and a body that is about to land
 _LANDING = (0.3, -2.0, 0.0)  # m/s
+_HELD = 0.1  # of the height of a body
+_SWING = 2.0  # m/s at its top
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def _beam_probes(mesh: TetMesh, positions: Array) -> Array:
     return positions[found[order]]
 
 
-# ---- a body that lands
+# ---- a body that lands, or is held
 
 
 def _landing_scene(mesh: TetMesh, youngs: float) -> Scene:
@@ -89,6 +92,30 @@ def _landing_start(sim: Simulator) -> State:
     return state
 
 
+def _held_scene(mesh: TetMesh, youngs: float) -> Scene:
+    body = Solid(mesh, youngs=youngs, density=DENSITY)
+    return Scene(body, Pin(body, _above_held(mesh.vertices[:, 1]) <= 0.0), Gravity((0.0, -9.8, 0.0)))
+
+
+def _held_start(sim: Simulator) -> State:
+    state = sim.rest_state()
+    state.velocities[..., 0] = _SWING * _above_held(state.positions[..., 1]).clip(0.0) ** 2
+    return state
+
+
+def _above_held(heights: Any) -> Any:
+    """0 where the part that is held ends, 1 at the top, of an array or a tensor."""
+    low = heights.min()
+    return ((heights - low) / (heights.max() - low) - _HELD) / (1.0 - _HELD)
+
+
+# how a body moves; stiff enough to stand where it is held
+SCENES: dict[str, dict[str, Any]] = {
+    "lands": {"scene": _landing_scene, "start": _landing_start, "youngs": 3e4, "steps_before": 4},
+    "held": {"scene": _held_scene, "start": _held_start, "youngs": 1e6},
+}
+
+
 def _above_ground(mesh: TetMesh) -> TetMesh:
     low, high = mesh.bounds
     return mesh.translated((0.0, _GAP - float(low[1]), 0.0)) if high[1] > low[1] else mesh
@@ -98,8 +125,10 @@ def _surface_points(mesh: TetMesh, positions: Array) -> Array:
     return positions if mesh.embedding is None else mesh.embedding.apply(positions)
 
 
-def _landing(name: str, shape: TetMesh | TriMesh, time_step: float) -> Subject:
+def _body(name: str, shape: TetMesh | TriMesh, scene: str | None) -> Subject:
     """A metre long, just above the ground."""
+    if scene not in (None, *SCENES):
+        raise ValueError(f"study: no scene {scene!r}; there are {', '.join(SCENES)}")
     low, high = shape.bounds
     placed = shape.translated(-(low + high) / 2.0).scaled(1.0 / float((high - low).max()))
     lattice = isinstance(placed, TriMesh)
@@ -110,13 +139,15 @@ def _landing(name: str, shape: TetMesh | TriMesh, time_step: float) -> Subject:
         return _above_ground(tetrahedralize(placed, cells=resolution, progress=False))
 
     return Subject(
-        name, mesh, _landing_scene, _landing_start, _surface_points, resolution=14,
-        resolutions=(8, 11, 16, 22) if lattice else (14,), youngs=3e4, time_step=time_step, steps_before=4,
+        name, mesh, probes=_surface_points, resolution=14, resolutions=(8, 11, 16, 22) if lattice else (14,),
+        time_step=1 / 60, **SCENES[scene or "lands"],
     )  # fmt: skip
 
 
-SUBJECTS: dict[str, Callable[[], Subject]] = {
-    "beam": lambda: Subject(
+def _beam(scene: str | None = None) -> Subject:
+    if scene is not None:
+        raise ValueError("study: the scene is for bodies (octopus or a mesh), the beam is always held")
+    return Subject(
         "beam",
         _beam_mesh,
         _beam_scene,
@@ -126,17 +157,21 @@ SUBJECTS: dict[str, Callable[[], Subject]] = {
         resolutions=(1, 2, 3, 4, 5, 8),
         youngs=1e6,
         time_step=1 / 30,
-    ),
-    "octopus": lambda: _landing("octopus", shapes.octopus(), 1 / 60),
+    )
+
+
+SUBJECTS: dict[str, Callable[..., Subject]] = {  # of a scene
+    "beam": _beam,
+    "octopus": lambda scene=None: _body("octopus", shapes.octopus(), scene),
 }
 
 
-def subject_of(name: str) -> Subject:
-    """A subject by its name, or one that lands from the file of a mesh (surface or tetrahedral)."""
+def subject_of(name: str, scene: str | None = None) -> Subject:
+    """A subject by its name, or from the file of a mesh (surface or tetrahedral); bodies move as one of `SCENES`."""
     if name in SUBJECTS:
-        return SUBJECTS[name]()
+        return SUBJECTS[name](scene)
     path = Path(name)
     if not path.is_file():
         raise FileNotFoundError(f"study: {name} is neither a file of a mesh nor one of {', '.join(SUBJECTS)}")
     shape = TetMesh.from_file(path) if path.suffix.lower() in _TETRAHEDRAL else TriMesh.from_file(path)
-    return _landing(path.name, shape, 1 / 60)
+    return _body(path.name, shape, scene)
