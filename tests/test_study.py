@@ -24,7 +24,7 @@ from torchpd.shapes import box
 from torchpd.study import AXES, StudyOptions, cost_table, paper_table, run_study, study_rows, study_table
 from torchpd.study_axes import baseline_rows, contender_rows, float_rows, mesh_rows, paper_rows, time_step_rows
 from torchpd.study_bench import Bench, Setting, Timing, count_kernels, time_calls
-from torchpd.study_plots import STYLES, pareto_front
+from torchpd.study_plots import STYLES, float32_floor, pareto_front
 from torchpd.subjects import SUBJECTS, subject_of
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -132,6 +132,21 @@ def test_table_says_what_is_not_reached() -> None:
     lines = study_table(rows).splitlines()
     assert lines[1].split() == ["x", "float64", "4", "it.,", "2", "ms", *["not", "reached"] * 2]
     assert lines[2].split() == ["y", "float64", *["not", "reached"] * 3]
+
+
+def test_float32_levels_off_where_float64_goes_on() -> None:
+    def rows(single: list[float], double: list[float]) -> list[Row]:
+        return [
+            Row("solver", DEFAULT, precision=precision, iterations=2**number, error=error)
+            for precision, errors in (("float32", single), ("float64", double))
+            for number, error in enumerate(errors)
+        ]
+
+    assert float32_floor(rows([0.5, 1e-5, 8e-6], [0.5, 1e-6, 1e-9])) == 8e-6
+    # too few iterations for either, and one that did not go as far
+    assert float32_floor(rows([0.5, 0.4, 0.3], [0.5, 0.4, 0.3])) is None
+    assert float32_floor(rows([0.5, 1e-5], [0.5, 1e-5, 1e-9])) is None
+    assert float32_floor(rows([0.5, 1e-5], [])) is None
 
 
 def test_table_tells_refusals_from_what_is_not_reached() -> None:

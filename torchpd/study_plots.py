@@ -12,7 +12,7 @@ import numpy as np
 from .contenders import DEFAULT
 from .ledger import Row
 
-__all__ = ["STYLES", "TOP", "axis_label", "curves_of", "draw_study", "pareto_front"]
+__all__ = ["STYLES", "TOP", "axis_label", "curves_of", "draw_study", "float32_floor", "pareto_front"]
 
 TOP = 2.0  # where a failure is drawn: above the first iterate, whose error is 1
 _LOWEST = 1e-7
@@ -175,13 +175,22 @@ def _mark_default(left: Any, right: Any, rows: list[Row]) -> None:
         )  # fmt: skip
 
 
+def float32_floor(rows: list[Row]) -> float | None:
+    """Error that the default has in float32 after the most iterations, where float64 has less than half of it."""
+    last = {row.precision: row for row in sorted(rows, key=lambda row: row.iterations) if row.method == DEFAULT}
+    single, double = last.get("float32"), last.get("float64")
+    if single is None or double is None or single.iterations != double.iterations:
+        return None
+    return single.error if single.error > 2.0 * double.error else None
+
+
 def _mark_floor(axis: Any, rows: list[Row]) -> None:
     """Where float32 levels off, if it does within the study."""
-    own = sorted((r for r in rows if r.method == DEFAULT and r.precision == "float32"), key=lambda r: r.iterations)
-    if len(own) > 1 and own[-1].error > 0.5 * own[-2].error > 0.0:
-        axis.axhline(own[-1].error, color="#d55e00", linewidth=0.8, linestyle="dotted")
+    floor = float32_floor(rows)
+    if floor is not None:
+        axis.axhline(floor, color="#d55e00", linewidth=0.8, linestyle="dotted")
         axis.annotate(
-            "float32 levels off", (0.02, own[-1].error), xycoords=("axes fraction", "data"), xytext=(0, 3),
+            "float32 levels off", (0.02, floor), xycoords=("axes fraction", "data"), xytext=(0, 3),
             textcoords="offset points", fontsize=8, color="#d55e00",
         )  # fmt: skip
 
