@@ -170,7 +170,7 @@ def _solver_figure(rows: list[Row], place: Callable[[Row], float | None], axis: 
             width, name = (width, f"{name}, float32") if precision == "float32" else (1.0, f"{name}, float64")
         if own[0].refusal:
             figure.add_scatter(x=[None], y=[None], mode="markers", marker={"symbol": "x", "color": color},
-                               name=f"{name} (refused: {own[0].refusal})")  # fmt: skip
+                               name=f"{name} (refused: {own[0].refusal})", legendrank=1001)  # fmt: skip
         else:
             figure.add_trace(_trace(own, place, name, (color, width, dash)))
     return _layout(figure, axis_label(axis), rows)
