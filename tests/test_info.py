@@ -129,6 +129,23 @@ def test_wrong_material_is_not_solved(
     assert torch.equal(info.residual[::2], expected.residual[::2])
 
 
+@pytest.mark.parametrize("name", ["stiffness", "masses", "pin_stiffness"])
+@pytest.mark.parametrize("value", [np.nan, -1e5])
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["chebyshev", "levels"])
+def test_one_wrong_number_is_enough(
+    dtype: torch.dtype, device: torch.device, solver: pd.Solver, value: float, name: str
+) -> None:
+    """Of one tetrahedron, vertex or spring, whose neighbours make up for it."""
+    sim = simulate(dtype, device, iterations=40, tolerance=1e-2, solver=solver)
+    state = moving(sim)
+    sim.set_material(pin_stiffness=torch.full_like(sim.pin_stiffness, 1e7))
+    assert bool(sim(state, return_info=True)[1].residual.isfinite().all())
+    getattr(sim, name)[..., 3] = value
+    info = sim(state, return_info=True)[1]
+    assert bool(info.residual.isnan().all())
+    assert not bool(info.converged.any())
+
+
 def test_what_overflows_is_not_still(device: torch.device) -> None:
     """|u|^2 beyond the numbers says nothing of a change."""
     sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), youngs=1e4)), 1.0, 20, dtype=torch.float64)

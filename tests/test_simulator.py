@@ -92,6 +92,9 @@ def test_copies_know_their_pins_and_spheres() -> None:
     for twin in (copy.copy(sim), copy.deepcopy(sim), pickle.loads(pickle.dumps(sim))):
         assert same_bits(twin(state, targets={twin.scene.pins[0]: batch}), expected)
     assert same_bits(copy.deepcopy(sim)(state, targets={pin: batch}), expected)
+    task = copy.deepcopy({"scene": sim.scene, "pin": pin})
+    other = pd.Simulator(task["scene"], sim.time_step, sim.iterations, dtype=torch.float64)
+    assert same_bits(other(state, targets={task["pin"]: batch}), expected)
 
 
 def test_states_move_copy_and_detach() -> None:

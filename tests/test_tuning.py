@@ -179,7 +179,7 @@ def test_a_promise_for_a_time_is_watched_as_well(dtype: torch.dtype, monkeypatch
     sim = bar(dtype=dtype)
     promise = sim.tune(swinging(sim), milliseconds=1.0, candidates=[pd.Chebyshev()])
     assert promise.iterations <= 95
-    assert promise.error >= promise.rounding  # of float32: so many iterations leave nothing else
+    assert promise.error <= promise.rounding  # so many iterations leave nothing else
     chosen = promise.trials[-1]
     assert promise.residual_limit >= 1.5 * max(chosen.residuals)
     broken = min((trial for trial in promise.trials if trial.error > promise.error), key=lambda trial: trial.error)
@@ -188,7 +188,8 @@ def test_a_promise_for_a_time_is_watched_as_well(dtype: torch.dtype, monkeypatch
     for _ in range(30):
         state, info = sim(state, return_info=True)
         assert bool(promise.holds(info))
-        assert float(promise.estimate(info)) < 2.0 * promise.error
+        # of such a residual rounding is the larger part
+        assert float(promise.estimate(info)) <= promise.error + promise.rounding
     sim.iterations = broken.iterations // 2
     info = sim(state, return_info=True)[1]
     assert not bool(promise.holds(info))
@@ -334,11 +335,25 @@ def test_no_more_than_rounding_is_paid_for(dtype: torch.dtype, monkeypatch: pyte
     promise = sim.tune(swinging(sim), milliseconds=1e6)
     assert promise.attained
     assert promise.solver == pd.Chebyshev()
-    assert promise.error == promise.rounding
-    assert promise.studied_error <= 0.5 * promise.rounding
+    assert promise.error <= promise.rounding
     assert worst_error(sim, swinging(sim)) <= promise.error
     sim.iterations = 2 * promise.iterations // 3
-    assert worst_error(sim, swinging(sim)) > 0.5 * promise.rounding
+    assert worst_error(sim, swinging(sim)) > 0.5 * promise.error
+
+
+def test_a_state_almost_at_rest_does_not_excuse_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounding hides all of its error after few iterations, and nothing of what a livelier one has left."""
+    monkeypatch.setattr(tuning, "_milliseconds", lambda sim, start, trial: 0.01 * trial.iterations)
+    sim = bar(1e6)
+    sim.set_material(gravity=torch.zeros(3))
+    state = swinging(sim, 2)
+    state.velocities[1] *= 1e-3
+    together = sim.tune(state, milliseconds=20.0, candidates=[pd.Chebyshev()])
+    alone = sim.tune(swinging(sim), milliseconds=20.0, candidates=[pd.Chebyshev()])
+    assert together.rounding > 30.0 * alone.rounding
+    assert together.iterations >= 0.9 * alone.iterations
+    assert together.error <= 2.0 * alone.rounding
+    assert worst_error(sim, state) <= together.error
 
 
 def test_a_real_budget_is_near() -> None:

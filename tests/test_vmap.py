@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, cast
 
 import pytest
@@ -222,6 +223,34 @@ def test_batched_gradients_of_every_op(dtype: torch.dtype, device: torch.device)
         if function is not ops.rotation_differential:
             newer = torch.vmap(lambda g, o=out, i=inputs: torch.autograd.grad(o, i, g, retain_graph=True))(many)
             _same(newer, single)
+
+
+def test_batched_gradients_in_another_thread() -> None:
+    """As autograd has for a GPU: what torch counts for its older vmap is not known there."""
+    sim, (x, _) = small(torch.float64, torch.device("cpu"))
+    plan, w = plan_of(sim), sim.stiffness.detach()
+
+    class Elsewhere(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, field: Tensor) -> Tensor:
+            return field.clone()
+
+        @staticmethod
+        def backward(ctx: Any, *grads: Tensor) -> Any:
+            with ThreadPoolExecutor(1) as pool:
+                return pool.submit(ops.hessian_product, x, grads[0], w, plan).result()
+
+    field = x.clone().requires_grad_()
+    many = noise(torch.empty(4, *x.shape, dtype=x.dtype), 2)
+    (found,) = torch.autograd.grad(Elsewhere.apply(field), field, many, is_grads_batched=True)
+    assert torch.equal(found, torch.stack([ops.hessian_product(x, one, w, plan) for one in many]))
+
+
+def test_the_older_vmap_is_not_nested() -> None:
+    sim, (x, _) = small(torch.float64, torch.device("cpu"))
+    twice = torch._vmap_internals._vmap(torch._vmap_internals._vmap(sim.gradient))
+    with pytest.raises(RuntimeError, match=r"torchpd: torch's older vmap, .* cannot be nested"):
+        twice(x.expand(2, 3, *x.shape))
 
 
 def test_vectorized_jacobians_and_hessians(device: torch.device) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import FrozenInstanceError, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from .checks import as_array, check_finite, check_positive, check_scalar, check_shape, check_vector
 from .mesh import TetMesh
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = ["Damping", "Gravity", "Ground", "Pin", "Solid", "Sphere"]
 
@@ -28,7 +31,14 @@ def _set(part: object, **values: Any) -> None:
         object.__setattr__(part, name, value)
 
 
-class _Key:
+class _Part:
+    """Values only, so that a copy knows the same parts."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self
+
+
+class _Key(_Part):
     """Parts that `targets` name: frozen, but not by `dataclass(frozen=True)`.
 
     torch.compile hashes a key of that kind by its fields, arrays here, whatever `eq` says.
@@ -53,7 +63,7 @@ def _per_element(name: str, value: ArrayLike, count: int, *, unit: str) -> Array
 
 
 @dataclass(frozen=True, eq=False)
-class Solid:
+class Solid(_Part):
     """An elastic body: tetrahedra that resist every departure from their rest shape.
 
     Energy per tetrahedron, with F the deformation gradient and R its nearest rotation:
@@ -132,7 +142,7 @@ class Pin(_Key):
 
 
 @dataclass(frozen=True, eq=False)
-class Gravity:
+class Gravity(_Part):
     """A uniform acceleration [m/s^2] of everything."""
 
     vector: Array
@@ -142,7 +152,7 @@ class Gravity:
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class Ground(_Part):
     """A plane that vertices cannot pass: normal . x >= height, with Coulomb friction.
 
     Contacts act one after another: in the wedge of two planes a vertex may end somewhat inside the earlier one.
@@ -200,7 +210,7 @@ class Sphere(_Key):
 
 
 @dataclass(frozen=True, eq=False)
-class Damping:
+class Damping(_Part):
     """Drag proportional to mass: every velocity decays as dv/dt = -rate v.
 
     Implicit: energy rate m / (2 h) |x - x_t|^2, so that a free motion is divided by 1 + rate h in a step.

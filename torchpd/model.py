@@ -303,7 +303,8 @@ class Model(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Checks values, and takes arrays of every environment where this simulator had shared ones."""
-        self.set_material(**{name: state_dict[prefix + name] for name in MATERIAL_ROWS if prefix + name in state_dict})
+        with torch.no_grad():
+            self.set_material(**{n: state_dict[prefix + n] for n in MATERIAL_ROWS if prefix + n in state_dict})
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def check_state(self, state: State, *, forces: Tensor | None = None) -> None:

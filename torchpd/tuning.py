@@ -75,7 +75,7 @@ class Promise:
     attained: bool  # whether what was asked for can be had; if not, error and milliseconds say what can
     solver: Solver
     iterations: int
-    error: float  # promised, of a step; no finer than `rounding`, unless that was asked for
+    error: float  # promised, of a step; no finer than the rounding of any, unless that was asked for
     studied_error: float  # worst of the study
     rounding: float  # 10 eps |x| / |x_0 - x*|, largest of the study: what may come on top of `error`
     milliseconds: float  # median of sim(state), of the batch that tune saw, on the machine where it ran
@@ -159,9 +159,18 @@ class _Study:
     exact: list[ExactStep]
 
     @property
-    def rounding(self) -> float:
-        """Largest share of a step's way that rounding may be."""
-        return max(step.rounding(self.sim.dtype) / step.scale for step in self.exact)
+    def roundings(self) -> list[float]:
+        """Of every state, the share of its step's way that rounding may be."""
+        return [step.rounding(self.sim.dtype) / step.scale for step in self.exact]
+
+    def visible(self, trial: Trial) -> list[float]:
+        """Errors of the states, 0 where rounding hides them."""
+        pairs = zip(trial.errors, self.roundings, strict=True)
+        return [0.0 if error <= rounding / SAFETY else error for error, rounding in pairs]
+
+    def worst(self, trial: Trial) -> float:
+        """The largest error that rounding does not hide."""
+        return max(self.visible(trial))
 
     @torch.no_grad()
     def trial(self, solver: Solver, iterations: int) -> Trial:
@@ -209,11 +218,15 @@ def tune(
     )
     if not named:
         raise ValueError("tune: candidates must hold at least one solver, got none")
-    seek = _for_error(study, error, most) if error is not None else _for_time(sim, study, start, milliseconds, most)
+    seek = (
+        _fewest(study, lambda trial: trial.error <= error / SAFETY, most)
+        if error is not None
+        else _for_time(sim, study, start, milliseconds, most)
+    )
     with tqdm(named.values(), desc="tuning", unit="solver", disable=not progress, leave=False) as bar:
         found = [seek(solver) for solver in bar]
     timed = [(trials, _milliseconds(sim, start, trials[-1])) for trials in found]
-    trials, cost = _cheapest(timed, error) if error is not None else _most_accurate(timed, study.rounding)
+    trials, cost = _cheapest(timed, error) if error is not None else _most_accurate(study, timed)
     promise = _promise(sim, study, start, trials, cost, error, milliseconds)
     sim.solver, sim.iterations, sim.tolerance, sim.promise = promise.solver, promise.iterations, 0.0, promise
     if not promise.attained:
@@ -344,24 +357,23 @@ def _of_environments(sim: Simulator, items: list[int], batch: int) -> Simulator:
 Seek = Callable[[Solver], list[Trial]]
 
 
-def _for_error(study: _Study, error: float, most: int) -> Seek:
-    """The fewest iterations that bring the worst state below error / SAFETY, and some more; the chosen trial last.
+def _fewest(study: _Study, suffices: Callable[[Trial], bool], most: int) -> Seek:
+    """The fewest iterations that suffice, and some more; the chosen trial last.
 
     The additional ones cost little where few are needed, which is where another state is most likely to need more.
     """
 
     def seek(solver: Solver) -> list[Trial]:
-        goal = error / SAFETY
         trials = [study.trial(solver, 1)]
-        while trials[-1].error > goal and trials[-1].iterations < most:
+        while not suffices(trials[-1]) and trials[-1].iterations < most:
             trials.append(study.trial(solver, min(2 * trials[-1].iterations, most)))
-        if trials[-1].error > goal:
+        if not suffices(trials[-1]):
             return [*trials, min(trials, key=lambda trial: trial.error)]
         low, high = trials[-2].iterations if len(trials) > 1 else 0, trials[-1]
         while high.iterations - low > max(1, high.iterations // 32):
             middle = study.trial(solver, (low + high.iterations) // 2)
             trials.append(middle)
-            low, high = (low, middle) if middle.error <= goal else (middle.iterations, high)
+            low, high = (low, middle) if suffices(middle) else (middle.iterations, high)
         return [*trials, study.trial(solver, min(high.iterations + 2 + high.iterations // 8, most))]
 
     return seek
@@ -370,7 +382,7 @@ def _for_error(study: _Study, error: float, most: int) -> Seek:
 def _for_time(sim: Simulator, study: _Study, start: State, budget: float | None, most: int) -> Seek:
     """The most iterations of a solver that a budget [ms] pays for, from the times of two counts.
 
-    Fewer where that leaves nothing but rounding: as many as bring the error below it.
+    Fewer where that leaves nothing but rounding in any state: as many as bring all errors below it.
     """
     assert budget is not None
     spend = _HEADROOM * budget
@@ -386,7 +398,7 @@ def _for_time(sim: Simulator, study: _Study, start: State, budget: float | None,
                 break
             count = int(np.clip(round(count * spend / measured), 1, most))
         paid = study.trial(solver, count)
-        return [paid] if paid.error > study.rounding / SAFETY else _for_error(study, study.rounding, count)(solver)
+        return [paid] if study.worst(paid) > 0.0 else _fewest(study, lambda t: study.worst(t) == 0.0, count)(solver)
 
     return seek
 
@@ -429,34 +441,35 @@ def _cheapest(timed: list[tuple[list[Trial], float]], error: float) -> tuple[lis
 
 def _with_broken(study: _Study, trials: list[Trial], promised: float) -> list[Trial]:
     """The trials, the chosen one last, and where none of them breaks the promise some of fewer iterations that do."""
-    if any(trial.error > promised for trial in trials):
+    if any(promised < study.worst(trial) < math.inf for trial in trials):
         return trials
     solver, low, high = trials[-1].solver, 0, min(trial.iterations for trial in trials)
     added = [study.trial(solver, low)]
     while high - low > max(1, high // 8):
         added.append(study.trial(solver, (low + high) // 2))
-        low, high = (added[-1].iterations, high) if added[-1].error > promised else (low, added[-1].iterations)
+        breaks = study.worst(added[-1]) > promised
+        low, high = (added[-1].iterations, high) if breaks else (low, added[-1].iterations)
     return [*added, *trials]
 
 
-def _most_accurate(timed: list[tuple[list[Trial], float]], rounding: float) -> tuple[list[Trial], float]:
+def _most_accurate(study: _Study, timed: list[tuple[list[Trial], float]]) -> tuple[list[Trial], float]:
     """The candidate with the lowest error; of those whose errors rounding hides the fastest."""
-    return min(timed, key=lambda pair: (max(pair[0][-1].error, rounding / SAFETY), pair[1]))
+    return min(timed, key=lambda pair: (study.worst(pair[0][-1]), pair[1]))
 
 
-def _residual_limit(trials: list[Trial], promised: float) -> tuple[float, float]:
+def _residual_limit(study: _Study, trials: list[Trial], promised: float) -> tuple[float, float]:
     """The residual at which the error is the promised one, and the largest error per residual.
 
     The chosen trial says it if its errors are near the promise. They may be far below, or beyond rounding nothing at
     all, where few iterations do much; then the nearest trial that breaks the promise says more.
     """
     chosen = trials[-1]
-    breaking = [trial for trial in trials if promised < trial.error < math.inf]
-    asked = [chosen, *sorted(breaking, key=lambda trial: trial.error)[:1]]
-    limits = [max(trial.residuals) * promised / trial.error for trial in asked if trial.error > 0.0]
-    ratios = [e / r for trial in asked for e, r in zip(trial.errors, trial.residuals, strict=True) if r > 0.0]
-    # the studied states themselves keep the promise
-    return max(min(limits, default=0.0), max(chosen.residuals)), max(ratios, default=0.0)
+    breaking = [trial for trial in trials if promised < study.worst(trial) < math.inf]
+    asked = [chosen, *sorted(breaking, key=study.worst)[:1]]
+    limits = [max(trial.residuals) * promised / study.worst(trial) for trial in asked if study.worst(trial) > 0.0]
+    ratios = [e / r for trial in asked for e, r in zip(study.visible(trial), trial.residuals, strict=True) if r > 0.0]
+    # the studied states themselves keep the promise, and so do others like them
+    return max(min(limits, default=0.0), SAFETY * max(chosen.residuals)), max(ratios, default=0.0)
 
 
 def _promise(
@@ -470,11 +483,11 @@ def _promise(
 ) -> Promise:
     chosen = trials[-1]
     attained = chosen.error <= error / SAFETY if error is not None else cost <= 1.2 * (milliseconds or 0.0)
-    rounding = study.rounding
-    # no finer than rounding, unless that was asked for
-    promised = error if attained and error is not None else min(max(SAFETY * chosen.error, rounding), 1.0)
+    # no finer than rounding of the liveliest state, unless that was asked for
+    reachable = min(max(SAFETY * study.worst(chosen), min(study.roundings)), 1.0)
+    promised = error if attained and error is not None else reachable
     trials = _with_broken(study, trials, promised)
-    limit, ratio = _residual_limit(trials, promised)
+    limit, ratio = _residual_limit(study, trials, promised)
     return Promise(
         asked_error=error,
         asked_milliseconds=milliseconds,
@@ -483,7 +496,7 @@ def _promise(
         iterations=chosen.iterations,
         error=promised,
         studied_error=chosen.error,
-        rounding=rounding,
+        rounding=max(study.roundings),
         milliseconds=cost,
         residual_limit=limit,
         error_per_residual=ratio,

@@ -209,7 +209,7 @@ class Stepper {
     team_.barrier();
     if (team_.rank == 0)
       in_.each_pin([&](std::int64_t i, Real spring, Value) {
-        w_.inertia[i] = select(spring < Real(T(HUGE_VAL)), w_.inertia[i] + spring, none);
+        w_.inertia[i] = held_inertia(w_.inertia[i] + spring, spring);
       });
     set_weights(set_.weighted);
     team_.barrier();
@@ -303,12 +303,13 @@ class Stepper {
       double* row = call_.info + (first_row + in_.first + lane) * info_count;
       const double last = Lanes::lane(residual_, lane);
       const double energy = Lanes::lane(energy_, lane);
-      row[info_residual] =
-          set_.report ? relative_residual(last, course_[lane], energy, least_[lane]) : NAN;
+      const double residual = relative_residual(last, course_[lane], energy, least_[lane]);
+      row[info_residual] = set_.report ? residual : NAN;
       row[info_energy] = set_.report ? energy : NAN;
       row[info_iterations] = used_[lane];
       row[info_restarts] = schedule_[lane].restarts;
-      row[info_converged] = done_[lane] && least_[lane] >= 0;
+      row[info_converged] =
+          done_[lane] && least_[lane] >= 0 && !(set_.report && residual != residual);
       row[info_rho] = schedule_[lane].rho;
     }
   }

@@ -48,8 +48,7 @@ struct Inputs {
   // a, zero where a pin holds the vertex exactly
   PD_DEVICE T inertia(int vertex, T h) const {
     const T stiffness = spring(pin(vertex));
-    if (!(stiffness < T(HUGE_VAL))) return T(0);
-    return inertia_weight(mass(vertex), damping(), stiffness, h);
+    return held_inertia(inertia_weight(mass(vertex), damping(), stiffness, h), stiffness);
   }
 
   // s, the displacement that everything but elasticity wants
@@ -88,13 +87,13 @@ struct Inputs {
     if (!call->info) return;
     double* to = call->info + (record * call->batch + environment) * info_count;
     const bool report = call->settings.report;
-    to[info_residual] = report ? relative_residual(progress.residual, progress.course,
-                                                   progress.energy, progress.least)
-                               : NAN;
+    const double residual =
+        relative_residual(progress.residual, progress.course, progress.energy, progress.least);
+    to[info_residual] = report ? residual : NAN;
     to[info_energy] = report ? progress.energy : NAN;
     to[info_iterations] = progress.used;
     to[info_restarts] = progress.schedule.restarts;
-    to[info_converged] = progress.done && progress.least >= 0;
+    to[info_converged] = progress.done && progress.least >= 0 && !(report && residual != residual);
     to[info_rho] = progress.schedule.rho;
   }
 };

@@ -114,7 +114,8 @@ struct SolidHessian {
   }
 };
 
-// Diagonal of the majoriser on the four corners, l_e w V |grad N_c|^2 in every component, the weight being l_e w V.
+// Diagonal of the majoriser on the four corners, l_e w V |grad N_c|^2 in every component, the weight being l_e w V. Minus infinity
+// where that is negative, which no neighbours make up for.
 struct SolidDiagonal {
   static constexpr int strip = 1;
 
@@ -125,7 +126,8 @@ struct SolidDiagonal {
       Vec3<R> n[4], d[4];
       shape_gradients(elements.rest(s), n);
       for (int c = 0; c < 4; ++c) {
-        const R entry = elements.weight(s) * dot(n[c], n[c]);
+        const R weight = elements.weight(s);
+        const R entry = select(weight < R(0), R(-HUGE_VAL), weight * dot(n[c], n[c]));
         d[c] = {entry, entry, entry};
       }
       elements.add(s, d);

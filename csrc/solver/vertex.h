@@ -3,6 +3,8 @@
 #include "effects/contact.h"
 #include "math/vec.h"
 
+#include <limits>
+
 namespace pd::inline PD_TARGET {
 
 // Inertia, drag, forces and springs are quadratics of one vertex, so they fold into a single one, a / 2 |u - s|^2:
@@ -11,6 +13,13 @@ namespace pd::inline PD_TARGET {
 template <class R>
 PD_HD R inertia_weight(const R& mass, const R& damping, const R& spring, const R& h) {
   return multiply_add(mass / (h * h), multiply_add(damping, h, R(1)), spring);
+}
+
+// The same, 0 where the spring is infinite, so that a pin holds the vertex exactly, and -1 where it is negative.
+template <class R>
+PD_HD R held_inertia(const R& inertia, const R& spring) {
+  const R none(0), wrong(-1), most(std::numeric_limits<scalar_of<R>>::max());
+  return select(spring < none, wrong, select(spring > most, none, inertia));
 }
 
 template <class V, class R>
@@ -27,7 +36,7 @@ PD_HD R inverse_diagonal(const R& inertia, const R& elastic) {
   return select(inertia > R(0), R(1) / (inertia + elastic), R(0));
 }
 
-// a / D of a vertex that moves; infinite where a pin holds it, -1 where mass or stiffness is negative
+// a / D of a vertex that moves; infinite where a pin holds it, -1 where mass, spring or stiffness are negative
 template <class R>
 PD_HD R share_of_inertia(const R& inertia, const R& elastic, const R& inverse) {
   const R none(0), wrong(-1), held(HUGE_VAL);
