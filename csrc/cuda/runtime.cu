@@ -80,9 +80,8 @@ static bool has_code_for_90(const void* kernel, int device) {
 }
 
 bool runs_code_for_90(const void* kernel) {
-  return known_or(kernel, 0, 0, 0, [&](int device) {
-           return int(has_code_for_90(kernel, device));
-         }) != 0;
+  return known_or(kernel, 0, 0, 0,
+                  [&](int device) { return int(has_code_for_90(kernel, device)); }) != 0;
 }
 
 static int ask_for_resident_clusters(const void* kernel, int device, int threads,
