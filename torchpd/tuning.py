@@ -483,8 +483,9 @@ def _promise(
 ) -> Promise:
     chosen = trials[-1]
     attained = chosen.error <= error / SAFETY if error is not None else cost <= 1.2 * (milliseconds or 0.0)
-    # no finer than rounding of the liveliest state, unless that was asked for
-    reachable = min(max(SAFETY * study.worst(chosen), min(study.roundings)), 1.0)
+    # no finer than rounding of the liveliest state, unless that was asked for; where one error shows all of them count
+    left = SAFETY * chosen.error if study.worst(chosen) > 0.0 else 0.0
+    reachable = min(max(left, min(study.roundings)), 1.0)
     promised = error if attained and error is not None else reachable
     trials = _with_broken(study, trials, promised)
     limit, ratio = _residual_limit(study, trials, promised)
