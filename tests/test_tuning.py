@@ -14,7 +14,8 @@ import torchpd as pd
 from torchpd import tuning
 from torchpd.accuracy import exact_steps, frictionless
 from torchpd.contenders import safe_solvers
-from torchpd.tuning import Promise, Trial, TuningWarning
+from torchpd.promise import Promise, Trial
+from torchpd.tuning import TuningWarning
 
 CANDIDATES = ["guarded Chebyshev", "damped Jacobi", "Multilevel"]  # of `tune`, in its order
 

@@ -26,7 +26,7 @@ from .targets import Anchors, Targets
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from .tuning import Promise
+    from .promise import Promise
 
 __all__ = ["Model"]
 

@@ -22,7 +22,7 @@ from .summary import describe
 from .targets import Targets
 
 if TYPE_CHECKING:
-    from .tuning import Promise
+    from .promise import Promise
 
 __all__ = ["Simulator", "Targets"]
 

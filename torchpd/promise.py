@@ -1,0 +1,117 @@
+"""What `Simulator.tune` promises, and how a run is watched by it."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .accuracy import ROUNDINGS
+from .solvers import Solver
+from .state import Info, State
+from .targets import Targets
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+__all__ = ["Promise", "Trial"]
+
+
+class Trial(NamedTuple):
+    """One candidate at one iteration count."""
+
+    solver: Solver
+    iterations: int
+    error: float  # worst over the states, beyond rounding
+    residuals: tuple[float, ...]  # of the states
+    errors: tuple[float, ...] = ()  # of the states
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What `Simulator.tune` chose and what may be expected of it, for motions like the studied one.
+
+    |x - x*| <= error |x_0 - x*| + 10 eps |x|: x* the converged step, x_0 the first iterate, friction left out, eps of
+    the precision. The last term matters to steps that hardly change anything, as of a body that comes to rest.
+    """
+
+    asked_error: float | None
+    asked_milliseconds: float | None
+    attained: bool  # whether what was asked for can be had; if not, error and milliseconds say what can
+    solver: Solver
+    iterations: int
+    error: float  # promised, of a step; no finer than the rounding of any, unless that was asked for
+    studied_error: float  # worst of the study
+    rounding: float  # 10 eps |x| / |x_0 - x*|, largest of the study: what may come on top of `error`
+    milliseconds: float  # median of sim(state), of the batch that tune saw, on the machine where it ran
+    residual_limit: float  # `info.residual` above which the promise is not to be relied on
+    error_per_residual: float  # largest ratio in the study
+    time_step: float  # s
+    dtype: torch.dtype
+    device: str
+    batch: int
+    trials: tuple[Trial, ...]
+
+    def holds(self, info: Info) -> Tensor:
+        """Whether the error may still be relied on [B] (bool), from the residual that `return_info=True` reports.
+
+        An estimate, calibrated on the studied states: the promise is doubted when the residual is larger than they had
+        where their error was the promised one, and when it is not a number. Residuals weigh short waves and errors
+        long ones, so most steps that break a promise have a residual like any other: see `estimate` and `audit`.
+        """
+        return info.residual <= self.residual_limit
+
+    @torch.no_grad()
+    def audit(
+        self,
+        sim: Simulator,
+        state: State,
+        after: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+    ) -> Tensor:
+        """Error of a step [B] beyond rounding, as `error` is, by solving on: x' three times as many iterations later.
+
+        The least e >= 0 with |x - x'| <= e |x_0 - x'| + 10 eps |x|. Costs three steps and calibrates nothing: for now
+        and then. Low where even those iterations change little.
+
+        Args:
+            sim: the tuned simulator.
+            state: where the step started.
+            after: where it ended.
+            forces: that the step was given.
+            targets: that it was given.
+        """
+        further = copy.copy(sim)
+        further.iterations, further.tolerance = 3 * self.iterations, 0.0
+        solved: Tensor = further(state, forces, targets, start=after[0])[1]
+        further.iterations = 0
+        first: Tensor = further(state, forces, targets)[1]
+        # displacements over the time step are velocities
+        error = (solved - after[1]).flatten(1).norm(dim=1)
+        rounding = ROUNDINGS * torch.finfo(self.dtype).eps * state[0].flatten(1).norm(dim=1) / self.time_step
+        # a body at rest has no error
+        scale = (solved - first).flatten(1).norm(dim=1).clamp(min=torch.finfo(self.dtype).tiny)
+        beyond: Tensor = (error - rounding).clamp(min=0.0) / scale
+        return beyond
+
+    def estimate(self, info: Info) -> Tensor:
+        """Error of the step [B] that its residual may hide, at the largest ratio of the study; NaN without a report.
+
+        High rather than low: it exceeds `error` on one in three steps that keep the promise; an `audit` tells which.
+        """
+        return info.residual * self.error_per_residual
+
+    def covers(self, sim: Simulator) -> bool:
+        """Whether the simulator still has the settings that were promised for; the material is not compared."""
+        now = (sim.solver, sim.iterations, sim.time_step, sim.dtype, str(sim.device), sim.tolerance)
+        return now == (self.solver, self.iterations, self.time_step, self.dtype, self.device, 0.0)
+
+    def __str__(self) -> str:
+        wanted = f"error {self.asked_error:g}" if self.asked_error is not None else f"{self.asked_milliseconds:g} ms"
+        verdict = "" if self.attained else f" ({wanted} cannot be had)"
+        rounding = f" and up to {self.rounding:.1e} of rounding" if self.rounding > 0.1 * self.error else ""
+        return f"error {self.error:.1e}{rounding}, {self.milliseconds:.2g} ms a step of {self.batch}{verdict}"
