@@ -152,8 +152,12 @@ class Rest:
     def of(cls, plan: Arrays, lanes: Lanes) -> Rest:
         """As the kernels read or compute them, StoredRest and ComputedRest of csrc/cuda/patch.h, but in float64."""
         if plan.sizes[SIZES.index("kernel")] == BLOCK:
-            rest = plan.pair_rest.reshape(-1, 5, LANES, 4).transpose(0, 2, 1, 3).reshape(-1, 20).astype(np.float64)
-            return cls(rest[:, :18].reshape(-1, 2, 3, 3), rest[:, 18:], np.zeros(len(rest)))
+            rest = plan.pair_rest.reshape(-1, 18 * LANES).astype(np.float64)
+            quads, volume = np.split(rest, [16 * LANES], axis=1)
+            shapes = quads.reshape(-1, 4, LANES, 4).transpose(0, 2, 1, 3).reshape(-1, 16)
+            rows = np.concatenate([shapes[:, :15], shapes[:, 15:] * shapes[:, 6:9]], axis=1)
+            volumes = volume.reshape(-1, 2, LANES).transpose(0, 2, 1).reshape(-1, 2)
+            return cls(rows.reshape(-1, 2, 3, 3), volumes, np.zeros(len(rows)))
         slot, unit = plan.patch_slot[lanes.patch][:, None] + lanes.slot, plan.patch_unit[lanes.patch].astype(np.float64)
         if len(plan.slot_fixed):
             x, rounding = plan.slot_fixed[slot, :3].astype(np.float64), 0.75**0.5 * unit  # half a unit along each axis

@@ -71,7 +71,7 @@ def test_rest_shapes_are_there_once(kernel: int, case: tuple[str, int]) -> None:
     blocks, slots, patches = len(double.pair_tet), len(double.slot_vertex), len(double.patch_pairs)
     stored, computed = kernel == BLOCK, kernel != BLOCK
     for plan, fixed in ((double, False), (single, True)):
-        assert plan.pair_rest.shape == (stored * blocks, 640)
+        assert plan.pair_rest.shape == (stored * blocks, 576)
         assert plan.pair_factor.shape == (computed * blocks, 64)
         assert plan.slot_rest.shape == ((computed and not fixed) * slots, 4)
         assert plan.slot_fixed.shape == ((computed and fixed) * slots, 4)

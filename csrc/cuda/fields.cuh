@@ -84,14 +84,15 @@ struct PatchFields {
     __syncthreads();
   }
 
-  // of a slot, for elements
-  __device__ void operator()(int slot, Vec3<T> (&vectors)[Fields]) const {
+  // of the slot of a corner, as pair_corner has it, for elements
+  __device__ void operator()(unsigned corner, Vec3<T> (&vectors)[Fields]) const {
     if constexpr (Fields == 2) {
-      const Quad<T> seen = both.look(8 * slot);
+      const unsigned slot_times_8 = corner & 0xffff;
+      const Quad<T> seen = both.look(slot_times_8);
       vectors[0] = vec3(seen);
-      vectors[1] = both.second(8 * slot, seen);
+      vectors[1] = both.second(slot_times_8, seen);
     } else {
-      vectors[0] = vec3(position[slot]);
+      vectors[0] = at_corner(position, corner);
     }
   }
 };
@@ -151,13 +152,12 @@ __global__ void __launch_bounds__(field_threads)
     const Mat3<T> rest[2] = {numbers.template inverse<OneOf<T, 0>>(),
                              numbers.template inverse<OneOf<T, 1>>()};
     for (int e = 0; e < 2; ++e) {
-      const int tet = plan.pair_tet[place.in(2, e)];
+      const int tet = plan.pair_tet[place.in(2) + e * pair_lanes];
       if (tet < 0) continue;  // none, or written by another patch
       Vec3<T> x[4], dx[4];
       for (int c = 0; c < 4; ++c) {
-        const int at = pair.slot(c < 3 ? c : 3 + e);
         Vec3<T> vectors[wanted];
-        fields(at, vectors);
+        fields(pair.corner[c < 3 ? c : 3 + e], vectors);
         x[c] = vectors[0];
         if constexpr (Product) dx[c] = vectors[1];
       }

@@ -12,6 +12,7 @@
 #include <algorithm>
 #include <stdexcept>
 #include <string>
+#include <tuple>
 
 namespace pd {
 
@@ -25,8 +26,14 @@ constexpr int most_grid_threads = int(most_patch_threads(sizeof(T)));
 template <class T>
 constexpr int far_threads = sizeof(T) == 4 ? 384 : 192;
 
-template <class T, bool Touching, Blocks Kind, bool Near, int Threads, int Together>
-__global__ void __launch_bounds__(Threads, Together)
+// Threads that a multiprocessor has registers for, of blocks that have an environment each; shared memory that the device
+// keeps of every block.
+template <class T>
+constexpr int resident_threads = sizeof(T) == 4 ? 640 : 320;
+constexpr std::size_t reserved_shared_bytes = 1024;
+
+template <class T, bool Touching, Blocks Kind, bool Near, int Threads>
+__global__ void __launch_bounds__(Threads, 1)
     fused_step(const __grid_constant__ FusedCall<T> call) {
   extern __shared__ __align__(16) std::byte shared[];
   FusedRunner<T, Touching, Kind, Near> runner(call, shared);
@@ -46,25 +53,18 @@ FusedKernel<T> fused_kernel_for(Blocks kind, bool near, int threads) {
   if (kind == Blocks::cluster) {
     constexpr int few = most * 5 / 8;  // have more registers each
     if (threads <= few) {
-      if (near) return fused_step<T, Touching, Blocks::cluster, true, few, 1>;
-      return fused_step<T, Touching, Blocks::cluster, false, few, 1>;
+      if (near) return fused_step<T, Touching, Blocks::cluster, true, few>;
+      return fused_step<T, Touching, Blocks::cluster, false, few>;
     }
-    if (near) return fused_step<T, Touching, Blocks::cluster, true, most, 1>;
-    return fused_step<T, Touching, Blocks::cluster, false, most, 1>;
+    if (near) return fused_step<T, Touching, Blocks::cluster, true, most>;
+    return fused_step<T, Touching, Blocks::cluster, false, most>;
   }
   if (kind == Blocks::grid) {
-    if (near) return fused_step<T, Touching, Blocks::grid, true, most, 1>;
-    return fused_step<T, Touching, Blocks::grid, false, far_threads<T>, 1>;
+    if (near) return fused_step<T, Touching, Blocks::grid, true, most>;
+    return fused_step<T, Touching, Blocks::grid, false, far_threads<T>>;
   }
-  if constexpr (sizeof(T) == 8) {
-    if (threads <= 128) return fused_step<T, Touching, Blocks::one, true, 128, 2>;
-    return fused_step<T, Touching, Blocks::one, true, 256, 1>;
-  } else {
-    if (threads <= 128) return fused_step<T, Touching, Blocks::one, true, 128, 5>;
-    if (threads <= 192) return fused_step<T, Touching, Blocks::one, true, 192, 3>;
-    if (threads <= 320) return fused_step<T, Touching, Blocks::one, true, 320, 2>;
-    return fused_step<T, Touching, Blocks::one, true, most_threads, 1>;
-  }
+  if (near) return fused_step<T, Touching, Blocks::one, true, resident_threads<T>>;
+  return fused_step<T, Touching, Blocks::one, false, resident_threads<T>>;
 }
 
 template <class T>
@@ -88,20 +88,36 @@ struct FusedLaunch {
   const void* function() const { return reinterpret_cast<const void*>(kernel); }
 
  private:
+  void form_block(const DeviceStep<T>& step);
   void form_clusters(const DeviceStep<T>& step);
   void keep_vertices(const DeviceStep<T>& step);
 };
 
-// A multiprocessor has registers for some 640 threads of float32: they are dealt out to as many environments as its shared
-// memory holds. The batch does not enter, so that an environment gives the same bits alone and in any batch.
-inline int block_threads(std::size_t real, std::size_t shared) {
-  const std::size_t together = shared_memory_per_multiprocessor() / (shared + 1024);
-  const int threads = together >= 9   ? 64
-                      : together >= 4 ? 128
-                      : together == 3 ? 192
-                      : together == 2 ? 320
-                                      : 640;
-  return real == 4 ? threads : std::min(threads, 256);
+// A block that has an environment to itself: its threads, and how many such blocks a multiprocessor runs.
+struct BlockShape {
+  int threads = warp_size, together = 0;
+  double pairs = 0;  // that the multiprocessor works on at a time
+
+  int resident() const { return threads * together; }
+  // Threads hide the time that memory takes; then few of them should be idle in the last round of pairs, and few wait for each
+  // other.
+  auto rank() const { return std::tuple(resident(), pairs, together); }
+};
+
+// The best one for a mesh, given the shared memory that it wants. The batch does not enter, so that an environment gives the
+// same bits alone and in any batch.
+template <class T>
+BlockShape block_shape(const DevicePlan<T>& plan, std::size_t shared) {
+  BlockShape best;
+  if (shared > shared_memory_per_block()) return best;
+  const int fit = int(shared_memory_per_multiprocessor() / (shared + reserved_shared_bytes));
+  for (int threads = warp_size; threads <= resident_threads<T>; threads += warp_size) {
+    const int together = std::min(fit, resident_threads<T> / threads);
+    const int rounds = (plan.most_pairs + threads - 1) / threads;
+    const BlockShape shape = {threads, together, double(together) * plan.most_pairs / rounds};
+    if (shape.rank() > best.rank()) best = shape;
+  }
+  return best;
 }
 
 // One patch a block: a thread for every tetrahedron and slot, as far as there are, and a warp without any to lead.
@@ -127,11 +143,15 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
     return;
   }
   shared = fused_shared_bytes(step);
-  threads = kind == Blocks::grid ? patch_threads(step.plan) : block_threads(sizeof(T), shared);
-  if (kind == Blocks::grid) keep_vertices(step);
-  const bool near = kept == vertex_arrays && near_with(step.plan, threads);
-  if (kind == Blocks::grid && !near) threads = far_threads<T>;
-  kernel = fused_kernel(step, kind, near, threads);
+  if (kind == Blocks::one) {
+    form_block(step);
+  } else {
+    threads = patch_threads(step.plan);
+    keep_vertices(step);
+    const bool near = kept == vertex_arrays && near_with(step.plan, threads);
+    if (!near) threads = far_threads<T>;
+    kernel = fused_kernel(step, kind, near, threads);
+  }
   const int resident = resident_blocks(function(), threads, shared);
   if (resident < patches)
     throw std::runtime_error(
@@ -139,6 +159,25 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
         std::to_string(shared) + " bytes of shared memory at once, and the plan has " +
         std::to_string(patches) + " patches; build the simulator with kernel=\"stream\"");
   teams = int(std::min<std::int64_t>(step.batch, resident / patches));
+}
+
+// As many arrays in shared memory as leave a multiprocessor no less busy.
+template <class T>
+void FusedLaunch<T>::form_block(const DeviceStep<T>& step) {
+  const std::size_t each = sizeof(Quad<T>) * step.plan.most_slots;
+  const std::size_t begin = vertices_begin(step, false);
+  const BlockShape least = block_shape(step.plan, shared);
+  threads = least.threads;
+  kept = 1;
+  for (int arrays = 2; least.together > 0 && arrays <= block_arrays; ++arrays) {
+    const BlockShape shape = block_shape(step.plan, begin + (arrays - 1) * each);
+    if (std::tuple(shape.resident(), shape.pairs) < std::tuple(least.resident(), least.pairs))
+      break;
+    threads = shape.threads;
+    kept = arrays;
+    shared = begin + (arrays - 1) * each;
+  }
+  kernel = fused_kernel(step, kind, kept == block_arrays, threads);
 }
 
 // Few patches, whose blocks reach each other's shared memory. The batch does not enter here either.
@@ -194,8 +233,7 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaun
   arena.place(s.letters, grid ? teams * 2 * plan.slots * Letter<T>::words : 0);
   arena.place(s.sums, grid ? teams * 2 * plan.patches * sums_count : 0);
   for (int a = 0; a < vertex_arrays; ++a) {
-    const bool shared = a < launch.kept || (a == array_u && launch.kind == Blocks::one);
-    arena.place(s.vertex[a], shared ? 0 : teams * plan.slots);
+    arena.place(s.vertex[a], a < launch.kept ? 0 : teams * plan.slots);
   }
   // with one tetrahedron a thread has its weight itself
   const bool own = launch.kind == Blocks::cluster && near_once(sizeof(T));

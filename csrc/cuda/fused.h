@@ -301,7 +301,9 @@ class FusedRunner {
         post_shared();
       }
     } else {
-      const auto read = [&](int s, Vec3<T>(&x)[1]) { x[0] = vec3(position_[s]); };
+      const auto read = [&](unsigned corner, Vec3<T>(&x)[1]) {
+        x[0] = at_corner(position_, corner);
+      };
       return each_pair<1>(patch_, read, rest_of<Many>(patch_), weights(), entries_, element);
     }
   }

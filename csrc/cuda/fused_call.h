@@ -8,10 +8,12 @@
 
 namespace pd::inline PD_TARGET {
 
-// What a team knows of every slot and elements do not need, in the order of how often iterations ask for it. A block that has
-// one of several patches keeps as many as fit in its shared memory, a cluster's those of its own vertices.
+// What a team knows of every slot and elements do not need, in the order of how often iterations ask for it. A block of a grid
+// keeps as many as fit in its shared memory, a cluster's those of its own vertices.
 enum VertexArray { array_u, array_before, array_target, array_origin, array_x, array_velocity };
 constexpr int vertex_arrays = 6;
+constexpr int block_arrays =
+    4;  // that a block without others keeps at most: those that every iteration asks for
 
 // Device memory of the teams.
 template <class T>

@@ -13,7 +13,7 @@ PD_DEVICE bool FusedRunner<T, Touching, Kind, Near>::counts(int number, T met) c
 template <class T, bool Touching, Blocks Kind, bool Near>
 PD_DEVICE bool FusedRunner<T, Touching, Kind, Near>::counts_energy(int number) const {
   const PairPlace place = place_of(patch_, min(number / 2, patch_.pairs - 1));
-  return plan_.pair_tet[place.in(2, number % 2)] >= 0;
+  return plan_.pair_tet[place.in(2) + number % 2 * pair_lanes] >= 0;
 }
 
 // What positions are relative to: for all patches of a cluster the same, since they tell each other their own.

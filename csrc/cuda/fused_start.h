@@ -24,7 +24,12 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::lay_out(const FusedCall<T>&
     Quad<T>* const kept = reinterpret_cast<Quad<T>*>(shared + vertices_begin(call.step, Clustered));
     if constexpr (Clustered) return kept + a * plan_.most_interior;
     Quad<T>* const far = call.scratch.vertex[a] + first_slot();
-    if constexpr (Kind == Blocks::one) return a == array_u ? position_ + plan_.most_slots : far;
+    if constexpr (Kind == Blocks::one) {
+      if (a == array_u) return position_ + plan_.most_slots;
+      Quad<T>* const near = kept + (a - 1) * plan_.most_slots;
+      if constexpr (Near) return a < block_arrays ? near : far;
+      return a < call.kept ? near : far;
+    }
     if constexpr (Near) return kept + a * plan_.most_slots;
     return a < call.kept ? kept + a * plan_.most_slots : far;
   };
@@ -135,7 +140,7 @@ PD_DEVICE T FusedRunner<T, Touching, Kind, Near>::weigh_own(const T* stiffness, 
   const PairPlace place = place_of(patch_, min(int(threadIdx.x) / 2, patch_.pairs - 1));
   const int which = int(threadIdx.x) % 2, tet = tet_of(plan_, place, which);
   half_ = read_half<false, T>(patch_, nullptr, threadIdx.x);
-  const T bound = bounded ? plan_.pair_bound[place.in(2, which)] : T(1);
+  const T bound = bounded ? plan_.pair_bound[place.in(2) + which * pair_lanes] : T(1);
   const T plain =
       tet < 0 ? T(0) : tet_weight(patch_weight(rest.unit, stiffness[tet]), half_.factor);
   half_.weight = bound * plain;

@@ -15,8 +15,6 @@ enum class DeviceKernel : int {
   stream = 3,  // kernels for every iteration
 };
 
-constexpr int most_threads = 640;  // of a block
-
 using Stream = void*;  // cudaStream_t
 
 // Bytes of device memory that a run wants, aligned to 256. Fused: kernels block, cluster and grid.

@@ -32,6 +32,11 @@ PD_DEVICE unsigned in_register(unsigned value) {
   asm volatile("" : "+r"(value));
   return value;
 }
+template <class Item>
+PD_DEVICE const Item* in_register(const Item* value) {
+  asm volatile("" : "+l"(value));
+  return value;
+}
 PD_DEVICE float in_register(float value) {
   asm volatile("" : "+f"(value));
   return value;
@@ -39,6 +44,18 @@ PD_DEVICE float in_register(float value) {
 PD_DEVICE double in_register(double value) {
   asm volatile("" : "+d"(value));
   return value;
+}
+
+// Any number, for no instruction.
+template <class T>
+PD_DEVICE T unwritten() {
+  T any;
+  if constexpr (sizeof(T) == 4) {
+    asm volatile("" : "=f"(any));
+  } else {
+    asm volatile("" : "=d"(any));
+  }
+  return any;
 }
 
 // Has some threads, by default those of the block, bring items into the L2 cache, for whoever reads them later.

@@ -65,26 +65,26 @@ struct OneOf {
   }
 };
 
-// Where a pair's numbers lie in the plan and in the weights of an environment.
+// Where a pair's numbers lie in the plan and in the weights of an environment. 32 bits count the numbers of all pairs, of which
+// there are fewer than 2^29.
 struct PairPlace {
-  std::int64_t block;
-  int lane;
+  unsigned pair;  // of all patches, the last block of each filled up
 
-  PD_HD std::int64_t in(int width, int row) const {
-    return (block * width + row) * pair_lanes + lane;
-  }
+  PD_HD unsigned before() const { return pair & ~unsigned(pair_lanes - 1); }  // in earlier blocks
+  // The first of its numbers in an array that has `width` of every pair; the others follow pair_lanes apart.
+  PD_HD unsigned in(unsigned width) const { return pair + (width - 1) * before(); }
 };
 
 // A pair's tetrahedron by the user's number, -1: none; where several patches have it, all say so.
 template <class T>
 PD_DEVICE int tet_of(const DevicePlan<T>& plan, PairPlace place, int which) {
-  const int tet = plan.pair_tet[place.in(2, which)];
+  const int tet = plan.pair_tet[place.in(2) + which * pair_lanes];
   return tet < -1 ? -2 - tet : tet;
 }
 
 template <class T>
 PD_DEVICE PairPlace place_of(const Patch<T>& patch, int pair) {
-  return {patch.first_block + pair / pair_lanes, pair % pair_lanes};
+  return {unsigned(patch.first_block) * pair_lanes + unsigned(pair)};
 }
 
 // What the plan and an environment say of a pair, but for its rest shape.
@@ -97,42 +97,66 @@ struct PairNumbers {
   PD_HD int entry(int c) const { return int(corner[c] >> 16); }
 };
 
-// `weights`: null before there are any.
-template <class T>
+// Without `Weighed` the weights are not known yet.
+template <bool Weighed = true, class T>
 PD_DEVICE PairNumbers<T> read_pair(const Patch<T>& patch, const T* weights, int pair) {
   PairNumbers<T> numbers;
   const PairPlace place = place_of(patch, pair);
-  for (int c = 0; c < 5; ++c) numbers.corner[c] = unsigned(patch.plan.pair_corner[place.in(5, c)]);
-  for (int e = 0; e < 2; ++e) numbers.weight[e] = weights ? weights[place.in(2, e)] : T(0);
+  const int32* const corner = patch.plan.pair_corner + place.in(5);
+  for (int c = 0; c < 5; ++c) numbers.corner[c] = unsigned(corner[c * pair_lanes]);
+  for (int e = 0; e < 2; ++e) {
+    numbers.weight[e] = T(0);
+    if constexpr (Weighed) numbers.weight[e] = (weights + place.in(2))[e * pair_lanes];
+  }
   return numbers;
+}
+
+// Of an array in shared memory of a vector a slot: that of a corner as pair_corner has it.
+template <class T>
+PD_DEVICE Vec3<T> at_corner(const Quad<T>* vectors, unsigned corner) {
+  const auto* bytes = reinterpret_cast<const std::byte*>(vectors);
+  const unsigned slot_times_8 = in_register(corner & 0xffff);
+  return vec3(*reinterpret_cast<const Quad<T>*>(bytes + slot_times_8 * (sizeof(Quad<T>) / 8)));
 }
 
 // Rest shapes as the plan of a small mesh has them.
 template <class T>
 struct StoredRest {
-  const Quad<T>* quads;
+  const T* rests;  // pair_rest
 
   struct Numbers {
-    Quad<T> a, b, c, d, e;
+    Quad<T> a, b, c, d;
+    T volume[2];
 
     // Dm^-1 [1/m]
     template <class Take>
     PD_HD Mat3<typename Take::R> inverse() const {
-      const auto pick = [](T first, T second) { return Take::pick(first, second); };
-      return {{{pick(a.x, c.y), pick(a.y, c.z), pick(a.z, c.w)},
-               {pick(a.w, d.x), pick(b.x, d.y), pick(b.y, d.z)},
-               {pick(b.z, d.w), pick(b.w, e.x), pick(c.x, e.y)}}};
+      const Vec3<T> third = {b.z, b.w, c.x};
+      if constexpr (Take::which == 0) {
+        return {{{a.x, a.y, a.z}, {a.w, b.x, b.y}, {third.x, third.y, third.z}}};
+      } else {
+        const Vec3<T> own = d.w * third;
+        return {{{c.y, c.z, c.w}, {d.x, d.y, d.z}, {own.x, own.y, own.z}}};
+      }
     }
     // w V
     template <class Take>
     PD_HD T weight(T stiffness) const {
-      return Take::pick(e.z, e.w) * stiffness;
+      return volume[Take::which] * stiffness;
     }
   };
 
   PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>&) const {
-    return {quads[place.in(5, 0)], quads[place.in(5, 1)], quads[place.in(5, 2)],
-            quads[place.in(5, 3)], quads[place.in(5, 4)]};
+    constexpr unsigned width = 18;
+    // quads of a lane side by side
+    const unsigned own = 4 * place.pair + (width - 4) * place.before();
+    const auto* const quad = reinterpret_cast<const Quad<T>*>(rests + own);
+    const T* const volume = rests + place.in(width) + 16 * pair_lanes;
+    return {quad[0],
+            quad[pair_lanes],
+            quad[2 * pair_lanes],
+            quad[3 * pair_lanes],
+            {volume[0], volume[pair_lanes]}};
   }
 };
 
@@ -205,7 +229,7 @@ struct ComputedRest {
   PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>& pair) const {
     Numbers numbers;
     for (int c = 0; c < 5; ++c) numbers.corner[c] = position[pair.slot(c)];
-    for (int e = 0; e < 2; ++e) numbers.factor[e] = factor[place.in(2, e)];
+    for (int e = 0; e < 2; ++e) numbers.factor[e] = (factor + place.in(2))[e * pair_lanes];
     numbers.unit = unit;
     return numbers;
   }
@@ -228,7 +252,7 @@ PD_DEVICE const RestPoint<T>* rest_positions(const DevicePlan<T>& plan, int firs
 template <bool Computed, class T>
 PD_DEVICE auto rest_of(const Patch<T>& patch) {
   if constexpr (!Computed) {
-    return StoredRest<T>{reinterpret_cast<const Quad<T>*>(patch.plan.pair_rest)};
+    return StoredRest<T>{patch.plan.pair_rest};
   } else {
     return ComputedRest<T>{rest_positions(patch.plan, patch.first_slot), patch.plan.pair_factor,
                            patch.plan.patch_unit[patch.index]};
@@ -254,8 +278,14 @@ struct PairElement {
   PD_HD void add(int, const Vec3<R> (&g)[4]) const { Take::add(pair, g); }
 };
 
+// A force in its entry, whose fourth number nobody reads: whatever stands in the register.
+template <class T>
+PD_DEVICE void leave(const Vec3<T>& force, Quad<T>& entry) {
+  entry = quad(force, unwritten<T>());
+}
+
 // Runs an effect on every pair of a patch, a thread a pair; returns the sum of energies that this thread has met.
-// `read(slot, vectors)`: those that elements want of a slot.
+// `read(corner, vectors)`: those that elements want of the slot of a corner, as pair_corner has it.
 template <int Fields, class T, class Read, class Rest, class Element>
 PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest, const T* weights,
                       Quad<T>* entries, const Element& element) {
@@ -263,24 +293,23 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
   using Second = OneOf<T, 1>;
   Pair<T, Fields> pair;
   T energy = T(0);
-  PairNumbers<T> now{};
-  if (int(threadIdx.x) < patch.pairs) now = read_pair(patch, weights, int(threadIdx.x));
+  weights = in_register(weights);
+  PairNumbers<T> now = read_pair(patch, weights, min(int(threadIdx.x), patch.pairs - 1));
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const typename Rest::Numbers shape = rest.read(place_of(patch, number), now);
     for (int c = 0; c < 5; ++c) {
       Vec3<T> vectors[Fields];
-      read(now.slot(c), vectors);
+      read(now.corner[c], vectors);
       for (int f = 0; f < Fields; ++f) pair.corner[f][c] = vectors[f];
     }
     element.template run<1>(PairElement<T, Fields, First>{pair, shape.template inverse<First>(),
                                                           now.weight[0], energy});
     element.template run<1>(PairElement<T, Fields, Second>{pair, shape.template inverse<Second>(),
                                                            now.weight[1], energy});
-    for (int c = 0; c < 4; ++c) entries[now.entry(c)] = quad(pair.force[c]);
-    if (now.entry(4) != no_entry) entries[now.entry(4)] = quad(pair.force[4]);
+    for (int c = 0; c < 4; ++c) leave(pair.force[c], entries[now.entry(c)]);
+    if (now.entry(4) != no_entry) leave(pair.force[4], entries[now.entry(4)]);
     // here rather than at the top: fewer registers are spilled
-    const int next = number + int(blockDim.x);
-    if (next < patch.pairs) now = read_pair(patch, weights, next);
+    now = read_pair(patch, weights, min(number + int(blockDim.x), patch.pairs - 1));
   }
   return energy;
 }
@@ -291,10 +320,12 @@ PD_DEVICE void weigh_pairs(const Patch<T>& patch, const Rest& rest, const T* sti
                            bool bounded, T* weights) {
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const PairPlace place = place_of(patch, number);
-    const typename Rest::Numbers numbers = rest.read(place, read_pair<T>(patch, nullptr, number));
+    const typename Rest::Numbers numbers =
+        rest.read(place, read_pair<false, T>(patch, nullptr, number));
     const auto weigh = [&](auto take) {
       using Take = decltype(take);
-      const int at = place.in(2, Take::which), tet = tet_of(patch.plan, place, Take::which);
+      const unsigned at = place.in(2) + Take::which * pair_lanes;
+      const int tet = tet_of(patch.plan, place, Take::which);
       const T bound = bounded ? patch.plan.pair_bound[at] : T(1);
       weights[at] = tet < 0 ? T(0) : bound * numbers.template weight<Take>(stiffness[tet]);
     };

@@ -202,7 +202,7 @@ class StreamRunner {
 
   template <Decision What>
   void decide(int k) {
-    launcher_.run(stream_decide<What, T>, call_.step.batch, vertex_threads, 0, call_, k);
+    launcher_.run_early(stream_decide<What, T>, call_.step.batch, decide_threads, 0, call_, k);
   }
 
   template <VertexTask What>

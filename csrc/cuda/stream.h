@@ -11,6 +11,7 @@ namespace pd::inline PD_TARGET {
 constexpr int vertex_threads = 256;  // of a block of the kernels over vertices
 constexpr int pass_threads =
     384;  // of a block of the kernels over patches, two on a multiprocessor
+constexpr int decide_threads = 1024;  // of the one block that adds up an environment's sums
 
 template <class T>
 struct StreamMemory {
@@ -304,11 +305,13 @@ __global__ void __launch_bounds__(vertex_threads, sizeof(T) == 4 && !Touching ? 
 enum class Decision { start, weigh, iterate, course, measure };
 
 template <Decision What, class T>
-__global__ void __launch_bounds__(vertex_threads)
+__global__ void __launch_bounds__(decide_threads)
     stream_decide(const __grid_constant__ StreamCall<T> call, int k) {
   using Op = std::conditional_t<What == Decision::weigh, Least, Add>;
   const StreamWork<T, false> w(call, blockIdx.x);
   __shared__ double total[sums_count];
+  await_kernel_before();
+  if (threadIdx.x == 0) let_next_kernel_start();
   if constexpr (What != Decision::start) {
     ThreadSums sums = {{Op::none, Op::none, Op::none}};
     for (int row = threadIdx.x; row < call.sum_rows(); row += blockDim.x) {
@@ -357,7 +360,8 @@ __global__ void __launch_bounds__(vertex_threads)
   // the padding of the last block, which the pipeline reads
   const int end = (patch.pairs + pair_lanes - 1) / pair_lanes * pair_lanes;
   const int padding = patch.pairs + int(threadIdx.x);
-  for (int e = 0; e < 2 && padding < end; ++e) w.weights[place_of(patch, padding).in(2, e)] = T(0);
+  for (int e = 0; e < 2 && padding < end; ++e)
+    (w.weights + place_of(patch, padding).in(2))[e * pair_lanes] = T(0);
 }
 
 // ---- vertex by vertex

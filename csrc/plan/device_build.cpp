@@ -20,6 +20,7 @@ namespace pd {
 namespace {
 
 constexpr int lanes = 32, slice = 8;
+constexpr int rest_width = 18;                            // numbers of a pair in pair_rest
 constexpr int small_pairs = 512;                          // of a patch
 constexpr std::int64_t none = 65535;                      // entries of a patch count up to one less
 constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
@@ -184,7 +185,7 @@ void number_patches(DeviceMeshPlan& plan, const std::vector<Patch>& patches, boo
   const std::size_t blocks = plan.patch_block.back(), slots = plan.patch_slot.back();
   plan.pair_tet.resize(blocks * 2 * lanes);
   plan.pair_bound.resize(blocks * 2 * lanes);
-  if (stored) plan.pair_rest.resize(blocks * 20 * lanes);
+  if (stored) plan.pair_rest.resize(blocks * rest_width * lanes);
   if (!stored && !fixed) plan.slot_rest.resize(slots * 4);
   plan.pair_corner.resize(blocks * 5 * lanes);
   plan.slot_vertex.resize(slots);
@@ -202,19 +203,26 @@ std::int32_t packed(std::int64_t low, std::int64_t high) {
 // Rest shapes and bounds of a pair in lane `lane` of `block`.
 void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, const Pair& pair,
                double unit, std::int64_t block, std::int64_t lane) {
-  const auto quad = [&](int i) -> double& {
-    return plan.pair_rest[((5 * block + i / 4) * lanes + lane) * 4 + i % 4];
+  const auto number = [&](int i) -> double& {
+    const std::int64_t first = block * rest_width * lanes;
+    return plan.pair_rest[first + (i < 16 ? (i / 4 * lanes + lane) * 4 + i % 4 : i * lanes + lane)];
   };
   const auto vertex = [&](int c) { return std::int64_t(patch.vertex[pair.corner[c]]); };
+  const auto shape = [&](int which) {
+    return rest_of(mesh.positions, {vertex(0), vertex(1), vertex(2), vertex(3 + which)});
+  };
+  const Rest shapes[2] = {shape(0), shape(1)};
   for (int which = 0; which < 2; ++which) {
-    const Rest rest = rest_of(mesh.positions, {vertex(0), vertex(1), vertex(2), vertex(3 + which)});
+    const Rest& rest = shapes[which];
     plan.pair_bound[(2 * block + which) * lanes + lane] = rest.bound;
     if (!plan.pair_factor.empty())
       plan.pair_factor[(2 * block + which) * lanes + lane] = unit * unit / (6 * rest.volume);
     if (plan.pair_rest.empty()) continue;
-    for (int i = 0; i < 9; ++i) quad(9 * which + i) = rest.inverse[i];
-    quad(18 + which) = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
+    // both third rows are normal to the shared face
+    for (int i = 0; i < (which == 0 ? 9 : 6); ++i) number(9 * which + i) = rest.inverse[i];
+    number(16 + which) = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
   }
+  if (!plan.pair_rest.empty()) number(15) = shapes[0].volume / shapes[1].volume;
 }
 
 void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number,
