@@ -6,7 +6,7 @@
     grid     a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
     stream   launches for every iteration: any mesh
 
-A few environments of a small mesh are done in a quarter of the time with "cluster" as with "block", which is for many
+A few environments of a small mesh are done in a third of the time with "cluster" as with "block", which is for many
 (`Simulator(batch=...)` says which they are).
 Every vertex belongs to one patch of a cluster, and a patch has every tetrahedron that touches one of its own vertices:
 those at the borders are worked out by several. So no forces are exchanged, and once an iteration the new position of a

@@ -29,7 +29,7 @@ constexpr int far_threads = sizeof(T) == 4 ? 384 : 192;
 // Threads that a multiprocessor has registers for, of blocks that have an environment each; shared memory that the device
 // keeps of every block.
 template <class T>
-constexpr int resident_threads = sizeof(T) == 4 ? 640 : 320;
+constexpr int resident_threads = sizeof(T) == 4 ? 640 : 256;
 constexpr std::size_t reserved_shared_bytes = 1024;
 
 template <class T, bool Touching, Blocks Kind, bool Near, int Threads>
@@ -46,7 +46,6 @@ __global__ void __launch_bounds__(Threads, 1)
 template <class T>
 using FusedKernel = void (*)(FusedCall<T>);
 
-// One environment a multiprocessor has its registers to itself; several small ones share them.
 template <class T, bool Touching>
 FusedKernel<T> fused_kernel_for(Blocks kind, bool near, int threads) {
   constexpr int most = most_grid_threads<T>;

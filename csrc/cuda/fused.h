@@ -15,9 +15,9 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: the scene has contacts. `Near`: of several patches, which are so small that vertex arrays fit shared memory
-// and that no thread has more than one slot, nor in float32 more than one tetrahedron; of a cluster, where all are as small, with
-// so few own vertices that each has eight lanes and not four.
+// `Touching`: the scene has contacts. `Near`: of one patch, whose vertex arrays fit shared memory, as far as iterations ask for
+// them; of several, which are so small that theirs fit and that no thread has more than one slot, nor in float32 more than one
+// tetrahedron; of a cluster, where all are as small, with so few own vertices that each has eight lanes and not four.
 template <class T, bool Touching, Blocks Kind, bool Near>
 class FusedRunner {
   static constexpr bool Many = Kind != Blocks::one;  // patches an environment
@@ -41,7 +41,7 @@ class FusedRunner {
   };
 
  public:
-  // `shared`: as many bytes as fused_shared_bytes (plan/shared_memory.h) says, or cluster_shared_bytes
+  // `shared`: as many bytes as FusedLaunch says
   PD_DEVICE FusedRunner(const FusedCall<T>& call, std::byte* shared)
       : call_(call.step),
         plan_(call.step.plan),

@@ -12,8 +12,8 @@ namespace pd::inline PD_TARGET {
 // keeps as many as fit in its shared memory, a cluster's those of its own vertices.
 enum VertexArray { array_u, array_before, array_target, array_origin, array_x, array_velocity };
 constexpr int vertex_arrays = 6;
-constexpr int block_arrays =
-    4;  // that a block without others keeps at most: those that every iteration asks for
+// Those that a block without others keeps at most: what iterations ask for, but for x where there are contacts.
+constexpr int block_arrays = 4;
 
 // Device memory of the teams.
 template <class T>

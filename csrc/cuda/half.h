@@ -16,14 +16,13 @@ struct HalfNumbers {
   PD_HD unsigned slot_times_8(int c) const { return corner[c] & 0xffff; }
 };
 
-// `number`: of the tetrahedron. 32 bits count the numbers of all pairs, of which there are fewer than 2^29. Without `Weighed` the
-// weight is not known yet.
+// `number`: of the tetrahedron. Without `Weighed` the weight is not known yet.
 template <bool Weighed = true, class T>
 PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int number) {
   HalfNumbers<T> numbers;
   // lanes past the end repeat the last pair
   const unsigned pair = unsigned(min(number / 2, patch.pairs - 1)), which = unsigned(number) & 1;
-  // places of width 5 and 2, see PairPlace
+  // as of PairPlace, but by what the block of the patch knows
   const unsigned before = pair & ~unsigned(pair_lanes - 1);
   const unsigned of_five = unsigned(patch.first_block) * (5 * pair_lanes) + pair + 4 * before;
   const unsigned of_two = unsigned(patch.first_block) * (2 * pair_lanes) + pair + before;

@@ -53,7 +53,6 @@ struct OneOf {
   using R = T;
   static constexpr int which = Which;
 
-  PD_HD static T pick(T first, T second) { return Which ? second : first; }
   PD_HD static Vec3<T> pick(const Vec3<T>& first, const Vec3<T>& second) {
     return Which ? second : first;
   }
@@ -65,8 +64,8 @@ struct OneOf {
   }
 };
 
-// Where a pair's numbers lie in the plan and in the weights of an environment. 32 bits count the numbers of all pairs, of which
-// there are fewer than 2^29.
+// Where a pair's numbers lie in the plan and in the weights of an environment. 32 bits count them: a mesh has at most 2^28
+// tetrahedra.
 struct PairPlace {
   unsigned pair;  // of all patches, the last block of each filled up
 
@@ -147,7 +146,7 @@ struct StoredRest {
   };
 
   PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>&) const {
-    constexpr unsigned width = 18;
+    constexpr unsigned width = pair_rest_numbers;
     // quads of a lane side by side
     const unsigned own = 4 * place.pair + (width - 4) * place.before();
     const auto* const quad = reinterpret_cast<const Quad<T>*>(rests + own);

@@ -202,7 +202,10 @@ class StreamRunner {
 
   template <Decision What>
   void decide(int k) {
-    launcher_.run_early(stream_decide<What, T>, call_.step.batch, decide_threads, 0, call_, k);
+    // a thread a row of sums
+    const int rows = What == Decision::start ? 1 : std::min(call_.sum_rows(), decide_threads);
+    const int threads = (rows + warp_size - 1) / warp_size * warp_size;
+    launcher_.run_early(stream_decide<What, T>, call_.step.batch, threads, 0, call_, k);
   }
 
   template <VertexTask What>

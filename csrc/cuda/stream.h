@@ -11,7 +11,7 @@ namespace pd::inline PD_TARGET {
 constexpr int vertex_threads = 256;  // of a block of the kernels over vertices
 constexpr int pass_threads =
     384;  // of a block of the kernels over patches, two on a multiprocessor
-constexpr int decide_threads = 1024;  // of the one block that adds up an environment's sums
+constexpr int decide_threads = 1024;  // at most, of the block that adds up an environment's sums
 
 template <class T>
 struct StreamMemory {

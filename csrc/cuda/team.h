@@ -15,7 +15,7 @@ struct TeamTotals {
   double total[sums_count];
 };
 
-// The last warp leads: it is the one that a last round of pairs leaves idle.
+// The last warp leads: it is the one that a last round of pairs leaves idle, where there are several.
 PD_DEVICE bool leads() { return threadIdx.x + warp_size >= blockDim.x; }
 PD_DEVICE bool is_leader() { return threadIdx.x + warp_size == blockDim.x; }
 PD_DEVICE int lane() { return int(threadIdx.x) % warp_size; }

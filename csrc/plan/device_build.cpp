@@ -20,7 +20,6 @@ namespace pd {
 namespace {
 
 constexpr int lanes = 32, slice = 8;
-constexpr int rest_width = 18;                            // numbers of a pair in pair_rest
 constexpr int small_pairs = 512;                          // of a patch
 constexpr std::int64_t none = 65535;                      // entries of a patch count up to one less
 constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
@@ -185,7 +184,7 @@ void number_patches(DeviceMeshPlan& plan, const std::vector<Patch>& patches, boo
   const std::size_t blocks = plan.patch_block.back(), slots = plan.patch_slot.back();
   plan.pair_tet.resize(blocks * 2 * lanes);
   plan.pair_bound.resize(blocks * 2 * lanes);
-  if (stored) plan.pair_rest.resize(blocks * rest_width * lanes);
+  if (stored) plan.pair_rest.resize(blocks * pair_rest_numbers * lanes);
   if (!stored && !fixed) plan.slot_rest.resize(slots * 4);
   plan.pair_corner.resize(blocks * 5 * lanes);
   plan.slot_vertex.resize(slots);
@@ -204,7 +203,7 @@ std::int32_t packed(std::int64_t low, std::int64_t high) {
 void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, const Pair& pair,
                double unit, std::int64_t block, std::int64_t lane) {
   const auto number = [&](int i) -> double& {
-    const std::int64_t first = block * rest_width * lanes;
+    const std::int64_t first = block * pair_rest_numbers * lanes;
     return plan.pair_rest[first + (i < 16 ? (i / 4 * lanes + lane) * 4 + i % 4 : i * lanes + lane)];
   };
   const auto vertex = [&](int c) { return std::int64_t(patch.vertex[pair.corner[c]]); };

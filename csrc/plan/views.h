@@ -64,6 +64,9 @@ struct Plan {
   Levels<T> levels;
 };
 
+// Of a pair of tetrahedra in pair_rest, see device.def.
+constexpr int pair_rest_numbers = 18;
+
 // Numbers of DevicePlan::sizes, as DevicePlan itself has them too.
 enum DeviceSize : int {
 #define X(name, meaning) size_##name,
