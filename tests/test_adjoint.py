@@ -312,3 +312,42 @@ def test_compiles_with_its_backward() -> None:
     (expected,) = torch.autograd.grad(step(x), x)
     (compiled,) = torch.autograd.grad(torch.compile(step, fullgraph=True, backend="aot_eager")(x), x)
     assert torch.equal(compiled, expected)
+
+
+def test_contacts_on_both_sides_leave_their_common_direction() -> None:
+    """In a valley of two slopes a vertex moves along it alone, whatever their angle."""
+    tip = pd.TetMesh([[0.0, 0.0, 0.0], [0.1, 0.2, -0.05], [-0.1, 0.2, -0.06], [0.01, 0.2, 0.1]], [[0, 1, 2, 3]])
+    body = pd.Solid(tip, 1e5)
+    slopes = [pd.Ground(0.0, (side, 1.0, 0.0)) for side in (0.5, -0.5)]
+    scene = pd.Scene(body, pd.Pin(body, [1, 2, 3], stiffness=300.0), pd.Gravity(), pd.Damping(20.0), *slopes)
+    sim = pd.Simulator(scene, 1 / 60, 5000, dtype=torch.float64)
+    state = sim.rest_state()
+    for _ in range(20):
+        state = sim(state)
+    forces = torch.zeros_like(state.positions).requires_grad_()
+    weights = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    (gradient,) = torch.autograd.grad((sim(state, forces).positions[0, 0] * weights).sum(), forces)
+    assert gradient[0, 0, :2].abs().max() < 1e-12 * gradient[0, 0, 2].abs()
+    size = 1e-4
+    pull = torch.zeros_like(state.positions)
+    pull[0, 0, 2] = size
+    above, below = (sim(state, sign * pull).positions[0, 0, 2] for sign in (1.0, -1.0))
+    assert float(gradient[0, 0, 2]) == pytest.approx(3.0 * float(above - below) / (2 * size), rel=5e-3)
+
+
+def test_autocast_does_not_touch_the_adjoint() -> None:
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (8, 2, 2))
+    bar = pd.Solid(mesh, 5e4)
+    scene = pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] == 0.0), pd.Gravity(), pd.Sphere((0.5, -0.3, 0.13), 0.3, 0.3))
+    sim = pd.Simulator(scene, 1 / 60, 200)
+    sim.stiffness.requires_grad_()
+
+    def gradient(lower: bool) -> torch.Tensor:
+        state = sim.rest_state(2)
+        with torch.autocast("cpu", torch.bfloat16, enabled=lower):
+            for _ in range(6):
+                state = sim(state)
+            (result,) = torch.autograd.grad(state.positions.square().sum(), sim.stiffness)
+        return result
+
+    torch.testing.assert_close(gradient(True), gradient(False), rtol=0, atol=0)

@@ -198,3 +198,22 @@ def test_capture_wants_a_gpu() -> None:
     sim = simulate(torch.float32)
     with pytest.raises(RuntimeError, match=r'capture: .* this one is on cpu: move it with \.to\("cuda"\)'):
         sim.capture(moving(sim))
+
+
+def test_inference_mode_leaves_a_simulator_that_learns() -> None:
+    """What it keeps is made as outside, so that it can be changed and differentiated later."""
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (4, 1, 1))
+    body = pd.Solid(mesh, 1e5)
+    scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+    with torch.inference_mode():
+        sim = pd.Simulator(scene, 1 / 60, 8).double()
+        sim.set_material(stiffness=sim.stiffness * torch.rand(4, 1, dtype=torch.float64).add(0.5))
+        sim.solver = pd.Multilevel()
+        after = sim(sim.rest_state(4))
+    assert after.positions.is_inference()
+    assert not any(p.is_inference() for p in (*sim.parameters(), *sim.buffers(), *sim.plan.arrays))
+    sim.set_material(stiffness=torch.full_like(sim.stiffness, 5e4))
+    sim.stiffness.requires_grad_()
+    sim(sim.rest_state(4)).positions.sum().backward()
+    assert sim.stiffness.grad is not None
+    assert sim.stiffness.grad.abs().sum() > 0

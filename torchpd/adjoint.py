@@ -33,6 +33,7 @@ _MOST_ITERATIONS = 2000
 _ASKED_EVERY = 10  # iterations: asking whether any environment goes on waits for a GPU
 # A body stretched this much turns so little that its Hessian is the constant, positive majoriser but for 1e-4.
 _STRETCH = 1e4
+_SPANNED = 1e-6  # square of what earlier normals leave of one that they span
 _STICKING = 1e-3  # of what friction could take back: slip below it counts as none
 
 
@@ -96,7 +97,7 @@ class _Held:
 
     def off_normals(self, field: Tensor) -> Tensor:
         """The part of a field [B, V, 3] that contacts let through."""
-        return (self.projector @ field.unsqueeze(-1)).squeeze(-1)
+        return (self.projector * field.unsqueeze(-2)).sum(-1)
 
 
 def _surfaces(material: dict[str, Tensor], x: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
@@ -128,8 +129,12 @@ def _held_by_contacts(call: AdjointCall, residual: Tensor, diagonal: Tensor) -> 
         slip = (slip - (slip * normal).sum(-1, keepdim=True) * normal).norm(dim=-1)
         # what friction can take back in one iteration is more than what has slipped
         stuck = stuck | (holds & (friction > 0) & (slip * diagonal.squeeze(-1) < _STICKING * friction * push))
-        outer = normal.unsqueeze(-1) * normal.unsqueeze(-2)
-        projector = torch.where(holds[..., None, None], projector - outer @ projector, projector)
+        # what earlier contacts leave of the normal, so that all together are a projector: take_directions in C++
+        left = (projector * normal.unsqueeze(-2)).sum(-1)
+        size = (left * left).sum(-1)
+        takes = holds & (size > _SPANNED)
+        share = torch.where(takes, 1.0 / torch.where(takes, size, 1.0), 0.0)[..., None, None]
+        projector = projector - share * left.unsqueeze(-1) * left.unsqueeze(-2)
         total = total + torch.where(holds, push * curvature, torch.zeros_like(push))
     return _Held(projector, stuck.unsqueeze(-1), total.unsqueeze(-1))
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from .forecast import Forecast, Spectrum, forecast, spectrum_of
+from .forecast import Forecast, Spectrum, forecast, has_friction, spectrum_of
 from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
 
 if TYPE_CHECKING:
@@ -100,6 +100,10 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
     if spectrum is None:
         return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
+    if has_friction(sim):
+        plain = _known(forecast(sim, chebyshev, spectrum))
+        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and friction may lead Multilevel astray"
+        return chebyshev, chosen(_enough(plain), why)
     plain, lasting, short = (_known(forecast(sim, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
     saves = short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
     multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)

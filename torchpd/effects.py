@@ -155,7 +155,8 @@ class Gravity(_Part):
 class Ground(_Part):
     """A plane that vertices cannot pass: normal . x >= height, with Coulomb friction.
 
-    Contacts act one after another: in the wedge of two planes a vertex may end somewhat inside the earlier one.
+    Contacts act one after another: in the wedge of two planes that are not at right angles a vertex ends somewhat
+    inside the earlier one, or, where they are flatter than 45 degrees, above it. Its gradient is that of the edge.
 
     Args:
         height: of the plane along its normal [m].
@@ -186,6 +187,9 @@ class Ground(_Part):
 @dataclass(eq=False)
 class Sphere(_Key):
     """A ball that vertices cannot enter, with Coulomb friction. `targets` of a step may move its centre.
+
+    For friction to carry a body along a step has to be told the centre's velocity too, `targets={ball: [..., 6]}`;
+    `rollout` works it out of the centres.
 
     Args:
         center: [3] in m.

@@ -24,7 +24,15 @@ from .solvers import Chebyshev, Multilevel, Solver
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["Forecast", "Spectrum", "UnsolvedWarning", "forecast", "spectrum_of", "warn_of_few_iterations"]
+__all__ = [
+    "Forecast",
+    "Spectrum",
+    "UnsolvedWarning",
+    "forecast",
+    "has_friction",
+    "spectrum_of",
+    "warn_of_few_iterations",
+]
 
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
 # iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
@@ -113,7 +121,7 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     numbers = solver.numbers()
     if spectrum is None or not numbers["weighted"]:
         return None
-    if isinstance(solver, Multilevel):
+    if isinstance(solver, Multilevel) and not has_friction(sim):
         body = max(len(solid.mesh.vertices) for solid in sim.scene.solids)
         reach = min(spectrum.slow * body ** (2.0 / 3.0), 1.0)
         decade = _LEVELS_LEAST + _LEVELS_SLOPE[solver.outer] * math.log10(1.0 / reach)
@@ -122,12 +130,17 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     theta, rho = numbers["relaxation"], numbers["rho"]
     slowest = 1.0 - theta * spectrum.slow
     limit = 0.0
-    if isinstance(solver, Chebyshev):
+    if isinstance(solver, (Chebyshev, Multilevel)):  # with friction Multilevel ends as accelerated Jacobi
         limit = _limit(rho if rho > 0.0 else slowest)
     # the error has little of the modes at the upper end of the spectrum, [mu, 1], but half of it of the middle
     middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0
     left = max(_decay(slowest, limit), _decay(middle, limit), 1e-3)
     return Forecast(-math.log(min(left, 1.0 - 1e-15)))
+
+
+def has_friction(sim: Model) -> bool:
+    """Whether any contact may hold a vertex by friction."""
+    return any(bool((getattr(sim, name)[..., 4] > 0.0).any()) for name in ("planes", "spheres"))
 
 
 def warn_of_few_iterations(sim: Model) -> None:

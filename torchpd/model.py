@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -71,11 +72,12 @@ class Model(nn.Module):
         self.kernel = kernel
         self._batch = _check_batch(batch)
         values = scene.values()
-        self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
         self.anchors = Anchors(scene)
-        self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
-        for name, value in material_of(values, dtype).items():
-            self.register_parameter(name, nn.Parameter(value, requires_grad=False))
+        with _ordinary():
+            self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
+            self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
+            for name, value in material_of(values, dtype).items():
+                self.register_parameter(name, nn.Parameter(value, requires_grad=False))
         self.choice: Choice | None = None  # of "auto"
         if _is_auto(solver):
             self._choose_solver(None if iterations is None else self.iterations)
@@ -207,7 +209,8 @@ class Model(nn.Module):
             self._prepare()
 
     def _prepare(self) -> None:
-        self.plan = plan_for_solver(self, self.material())
+        with _ordinary():
+            self.plan = plan_for_solver(self, self.material())
 
     def material(self) -> list[Tensor]:
         """The differentiable arrays in the order of the ops."""
@@ -233,14 +236,14 @@ class Model(nn.Module):
                     stacklevel=2,
                 )
         check_batches(checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
-        parameters = {
-            name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)
-            for name, tensor in checked.items()
-            if tensor.shape != getattr(self, name).shape
-        }
-        # before anything is replaced, because it may fail
-        plan = self._plan_with(checked)
-        with torch.no_grad():
+        with _ordinary():
+            parameters = {
+                name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)
+                for name, tensor in checked.items()
+                if tensor.shape != getattr(self, name).shape
+            }
+            # before anything is replaced, because it may fail
+            plan = self._plan_with(checked)
             for name, tensor in checked.items():
                 if name in parameters:
                     setattr(self, name, parameters[name])
@@ -381,16 +384,24 @@ class Model(nn.Module):
         if wanted.device.type == "cuda":
             check_solver(self.solver, wanted.device)
         changes_precision = wanted.dtype != self.dtype
-        # first, because it may refuse
-        plan = plan_on(self, wanted.dtype, wanted.device)
-        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-        self.plan = plan
-        if changes_precision:
-            # digits that float32 has lost do not come back by widening. The material may have been trained, and keeps
-            # the digits it has.
-            positions = self.scene.values().rest_positions
-            self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
+        with _ordinary():
+            # first, because it may refuse
+            plan = plan_on(self, wanted.dtype, wanted.device)
+            super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+            self.plan = plan
+            if changes_precision:
+                # digits that float32 has lost do not come back by widening. The material may have been trained, and
+                # keeps the digits it has.
+                positions = self.scene.values().rest_positions
+                self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
         return self
+
+
+@contextmanager
+def _ordinary() -> Iterator[None]:
+    """For what a simulator keeps: tensors that are made in inference mode can never be changed or differentiated."""
+    with torch.inference_mode(False), torch.no_grad():
+        yield
 
 
 def _check_batch(batch: int | None) -> int | None:

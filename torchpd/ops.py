@@ -246,7 +246,9 @@ def step_vjp(
 ) -> list[Tensor]:
     """The adjoint of a step: gradients for positions, velocities, forces and every material array."""
     call = AdjointCall(positions, velocities, forces, after, list(material), list(plan), time_step)
-    return step_adjoint(call, grad_positions, grad_velocities)
+    # in the precision of the step, also where autocast asks for less
+    with torch.autocast(after.device.type, enabled=False):
+        return step_adjoint(call, grad_positions, grad_velocities)
 
 
 @step_vjp.register_fake

@@ -189,19 +189,21 @@ class RigidPieces:
 
     def _moved(self, state: State, positions: Tensor, forces: Tensor | None, targets: Targets | None) -> Tensor:
         """`move`, of arguments that were checked."""
-        gradient = self.sim.step_gradient(state, positions, forces, targets)
-        batch, nodes = len(positions), len(self.pieces)
-        pull = (self._functions.T @ gradient).double().view(batch, nodes, 4, 3)
-        fitted = torch.einsum("cas,bcsx->bcax", self._fits, positions[:, self._rows]).double()
-        shape = (self._owners @ fitted.flatten(2)).view(batch, nodes, 4, 3)[:, :, 1:]
-        motion = _newton(pull, shape, self._coarse)
-        turned = shape @ _rotation(motion[..., 3:]).mT - shape
-        change = torch.cat([motion[..., None, :3], turned], dim=2).view(batch, 4 * nodes, 3)
-        inertia, _ = step_diagonal(self.sim.plan.arrays, self.sim.material(), self.sim.time_step)
-        inertia = inertia.unsqueeze(-1)
-        moved = torch.where(inertia.isfinite(), self._functions @ change.to(positions.dtype), 0.0)
-        falls = self._falls(positions, moved, gradient, inertia)
-        return torch.where(falls[:, None, None], positions + moved, positions)
+        # in the precision of the step, also where autocast asks for less
+        with torch.autocast(positions.device.type, enabled=False):
+            gradient = self.sim.step_gradient(state, positions, forces, targets)
+            batch, nodes = len(positions), len(self.pieces)
+            pull = (self._functions.T @ gradient).double().view(batch, nodes, 4, 3)
+            fitted = torch.einsum("cas,bcsx->bcax", self._fits, positions[:, self._rows]).double()
+            shape = (self._owners @ fitted.flatten(2)).view(batch, nodes, 4, 3)[:, :, 1:]
+            motion = _newton(pull, shape, self._coarse)
+            turned = shape @ _rotation(motion[..., 3:]).mT - shape
+            change = torch.cat([motion[..., None, :3], turned], dim=2).view(batch, 4 * nodes, 3)
+            inertia, _ = step_diagonal(self.sim.plan.arrays, self.sim.material(), self.sim.time_step)
+            inertia = inertia.unsqueeze(-1)
+            moved = torch.where(inertia.isfinite(), self._functions @ change.to(positions.dtype), 0.0)
+            falls = self._falls(positions, moved, gradient, inertia)
+            return torch.where(falls[:, None, None], positions + moved, positions)
 
     def _falls(self, positions: Tensor, moved: Tensor, gradient: Tensor, inertia: Tensor) -> Tensor:
         """Whether the objective of each environment does not rise [B], but for rounding.

@@ -233,7 +233,8 @@ class Simulator(Model):
                 iterations than it takes to get below rounding.
             forces: on the vertices during these steps [B, V, 3] [N].
             targets: where pins and spheres are during them, as in `forward`; by default where the scene has them.
-            candidates: solvers to choose from, not "auto"; by default those that cannot diverge.
+            candidates: solvers to choose from, not "auto"; by default those that cannot diverge, and no `Multilevel`
+                where there is friction, which the study leaves out.
             most: iterations of a step, at most.
             progress: show a bar.
 

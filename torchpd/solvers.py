@@ -140,7 +140,8 @@ class Multilevel:
     vertices is A^-1 itself unless it comes in batches (`Simulator(batch=...)`). The scene takes longer to compile.
 
     Every iterate is judged by its energy before the next one starts from it. Contacts project every iterate; while they
-    hold vertices M fits less well. With friction, which has no energy, the judgement allows a rise of 1 %.
+    hold vertices M fits less well. With friction, which has no energy, the first iterate that fails makes the others of
+    its step accelerated Jacobi iterations.
     M is made of the material when the simulator is, see `Simulator.prepare_solver`; an environment that differs gets
     M / s, s its largest ratio of inertia or stiffness to that material. `Info.rho` says how unlike the two are.
 

@@ -26,9 +26,10 @@ from .accuracy import ExactStep, exact_steps, frictionless
 from .checks import check_scalar, check_whole
 from .contenders import safe_solvers
 from .diagonal import step_diagonal
+from .forecast import has_friction
 from .material import MATERIAL_ROWS
 from .promise import Promise, Trial
-from .solvers import Chebyshev, Solver
+from .solvers import Chebyshev, Multilevel, Solver
 from .state import State
 from .targets import Targets
 
@@ -116,7 +117,7 @@ def tune(
     _check_start(sim, start, forces)
     study = _prepare(_with_targets(sim, targets, len(start[0])), start, forces)
     named: Mapping[str, Solver] = (
-        safe_solvers(study.sim, study.state)
+        _usual(sim, safe_solvers(study.sim, study.state))
         if candidates is None
         else {str(number): solver for number, solver in enumerate(candidates)}
     )
@@ -136,6 +137,12 @@ def tune(
     if not promise.attained:
         warnings.warn(f"tune: {promise}", TuningWarning, stacklevel=3)
     return promise
+
+
+def _usual(sim: Simulator, solvers: Mapping[str, Solver]) -> dict[str, Solver]:
+    """Those that are studied unless others are named: the study knows no friction, which may lead Multilevel astray."""
+    smooth = not has_friction(sim)
+    return {name: solver for name, solver in solvers.items() if smooth or not isinstance(solver, Multilevel)}
 
 
 # ---- what is refused

@@ -53,7 +53,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       outer_[lane] = {};
       outer_[lane].scale = misfit_[lane].scale;
       outer_[lane].friction = Lanes::lane(friction, lane) > 0;
-      outer_[lane].slack = outer_[lane].friction ? guard_slack_friction : energy_noise<T>();
+      outer_[lane].slack = energy_noise<T>();
       pairs_[lane] = {};
       made_[lane] = doubted_[lane] = 0;
       has_[lane] = false;
@@ -205,9 +205,13 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     });
   }
 
-  // the last trial counts only if it is better than the base
+  // the last trial counts only if it is better than the base, and that only if its energy is a number
   void settle() {
-    each_vertex([&](std::int64_t i) { w_.u[i] = choose(w_.u[i], o_.base[i]); });
+    Real lost;
+    for (int lane = 0; lane < width; ++lane)
+      Lanes::set_lane(lost, lane, outer_[lane].energy < HUGE_VAL ? T(0) : T(NAN));
+    const Value none = Lanes::value({lost, lost, lost});
+    each_vertex([&](std::int64_t i) { w_.u[i] = choose(w_.u[i], o_.base[i]) + none; });
     for (int lane = 0; lane < width; ++lane) schedule_[lane].restarts = outer_[lane].restarts;
   }
 

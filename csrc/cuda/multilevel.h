@@ -30,7 +30,7 @@ class MultilevelRunner {
       c_.outer = {};
       c_.outer.scale = misfit.scale;
       c_.outer.friction = w_.contacts.friction() > T(0);
-      c_.outer.slack = c_.outer.friction ? guard_slack_friction : energy_noise<T>();
+      c_.outer.slack = energy_noise<T>();
       c_.pairs = {};
       c_.done = false;
     }
@@ -210,9 +210,12 @@ class MultilevelRunner {
     });
   }
 
-  // the last trial counts only if it is better than the base
+  // the last trial counts only if it is better than the base, and that only if its energy is a number
   PD_DEVICE void settle() {
-    if (!c_.accepted) each_vertex([&](int i) { w_.v.set(i, vec3(m_.base[i])); });
+    const T lost = c_.outer.energy < HUGE_VAL ? T(0) : T(NAN);
+    const Vec3<T> none = {lost, lost, lost};
+    if (!c_.accepted || !(lost == T(0)))
+      each_vertex([&](int i) { w_.v.set(i, vec3(m_.base[i]) + none); });
     if (is_first()) {
       w_.progress.schedule.restarts = c_.outer.restarts;
       w_.progress.done = c_.done;

@@ -5,8 +5,9 @@
 // A <= s A_0 for the largest ratio s of its inertias and stiffnesses to those M was made for: theta M / s does.
 // What accelerates that step may overshoot, so every trial is judged by its energy before the next one starts from it.
 // Trials that fail go back, and after a few of them a plain Jacobi iteration takes over, which descends by the proof there:
-// once with L-BFGS, which has learnt from the failures; accelerated and for the rest of the step with momentum, which has not,
-// and with friction, whose forces no energy has.
+// once with L-BFGS, which has learnt from the failures; accelerated and for the rest of the step with momentum, which has not.
+// With friction, whose forces no energy has, that happens at the first failure: stiff bodies that stick would be led astray by
+// more (200 times the error of the first iterate).
 //
 // Contacts hold vertices in directions that M does not know of. M is applied to what is out of balance in the others, and
 // its result taken in the others, while the held ones go by the diagonal (two-metric projection, Bertsekas 1982), as does a
@@ -255,7 +256,7 @@ struct Outer {
     }
     plain = failures >= patience;
     // with the momentum gone M alone descends, if it fits; and pairs learn nothing of sliding
-    diagonal = diagonal || (armijo ? friction && restarts > patience : failures > 1);
+    diagonal = diagonal || (armijo ? friction && restarts > 0 : failures > 1);
     return accepted;
   }
 
