@@ -217,3 +217,16 @@ def test_inference_mode_leaves_a_simulator_that_learns() -> None:
     sim(sim.rest_state(4)).positions.sum().backward()
     assert sim.stiffness.grad is not None
     assert sim.stiffness.grad.abs().sum() > 0
+
+
+def test_states_of_some_environments_are_replaced() -> None:
+    sim = simulate(torch.float32)
+    old, new = sim.rest_state(3), pd.State(*(torch.randn(3, *part.shape[1:]) for part in sim.rest_state()))
+    done = torch.tensor([True, False, True])
+    mixed = new.where(done, old)
+    for part, mine, theirs in zip(mixed, new, old, strict=True):
+        assert torch.equal(part[done], mine[done])
+        assert torch.equal(part[~done], theirs[~done])
+    for wrong in (torch.tensor([True]), done.float(), done[None]):
+        with pytest.raises(ValueError, match=r"State.where: condition must be bool \[3\], one for each"):
+            new.where(wrong, old)

@@ -212,7 +212,8 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
         warnings.warn(
             f"torchpd: the adjoint of a step has no solution in {int(failed.sum())} of {len(failed)} environments "
             f"(relative residual {float(error[failed].max()):.1e}): their states are far from an equilibrium (more "
-            "iterations in the step help) or at an unstable one. Their gradients take the rotations as constant.",
+            "iterations in the step help), at an unstable one, or have negative stiffness or masses. Their gradients "
+            "take the rotations as constant.",
             stacklevel=2,
         )
         wanted = torch.where(failed[:, None, None], right, 0.0)

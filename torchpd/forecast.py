@@ -130,7 +130,7 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     theta, rho = numbers["relaxation"], numbers["rho"]
     slowest = 1.0 - theta * spectrum.slow
     limit = 0.0
-    if isinstance(solver, (Chebyshev, Multilevel)):  # with friction Multilevel ends as accelerated Jacobi
+    if isinstance(solver, (Chebyshev, Multilevel)):  # with friction Multilevel is mostly accelerated Jacobi
         limit = _limit(rho if rho > 0.0 else slowest)
     # the error has little of the modes at the upper end of the spectrum, [mu, 1], but half of it of the middle
     middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0

@@ -304,7 +304,10 @@ def _check_differentiable(wanted: Sequence[bool], material: Sequence[Tensor]) ->
     # without contacts nothing depends on them
     contacts = [row.name for row, needed, array in arrays if needed and row.name in _CONTACTS and array.numel()]
     if contacts:
-        raise RuntimeError(f"torchpd: a step has no derivative for {' and '.join(contacts)}; detach them")
+        raise RuntimeError(
+            f"torchpd: a step has no derivative for {' and '.join(contacts)}; detach them, or "
+            f"sim.{contacts[0]}.requires_grad_(False)"
+        )
 
 
 def _rollout_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:

@@ -34,8 +34,9 @@ class Simulator(Model):
 
     The values that training may change are parameters (without gradient until asked), for all environments or, with a
     leading batch, for each: `stiffness` [E] Pa, `masses` [V] kg, `gravity` [3] m/s^2, `damping` [] 1/s,
-    `pin_stiffness` [P] N/m, `pin_targets` [P, 3] m, `planes` [C, 5], `spheres` [S, 8]. `set_material` replaces
-    them.
+    `pin_stiffness` [P] N/m, `pin_targets` [P, 3] m, `planes` [C, 5] (unit normal, height, friction), `spheres` [S, 8]
+    (centre, radius, friction, velocity). `set_material` checks and replaces them. What an optimiser writes no step
+    checks: where stiffness or masses could turn negative, let it learn their logarithm.
 
     Args:
         scene: what there is.

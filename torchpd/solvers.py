@@ -140,8 +140,8 @@ class Multilevel:
     vertices is A^-1 itself unless it comes in batches (`Simulator(batch=...)`). The scene takes longer to compile.
 
     Every iterate is judged by its energy before the next one starts from it. Contacts project every iterate; while they
-    hold vertices M fits less well. With friction, which has no energy, the first iterate that fails makes the others of
-    its step accelerated Jacobi iterations.
+    hold vertices M fits less well. With friction, which has no energy, a dozen accelerated Jacobi iterations follow the
+    first iterate that fails, two dozen the second, and so on.
     M is made of the material when the simulator is, see `Simulator.prepare_solver`; an environment that differs gets
     M / s, s its largest ratio of inertia or stiffness to that material. `Info.rho` says how unlike the two are.
 

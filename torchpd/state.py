@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 __all__ = ["Info", "State", "Track"]
@@ -22,6 +23,17 @@ class State(NamedTuple):
     def clone(self) -> State:
         """A copy that `step_` may overwrite, as `Tensor.clone`."""
         return State(self.positions.clone(), self.velocities.clone())
+
+    def where(self, condition: Tensor, other: State) -> State:
+        """Environments of this state where `condition` [B] holds, of another one elsewhere: resets of some."""
+        if condition.dtype != torch.bool or condition.shape != self.positions.shape[:1]:
+            raise ValueError(
+                f"State.where: condition must be bool [{len(self.positions)}], one for each environment, got "
+                f"{condition.dtype} {list(condition.shape)}"
+            )
+        chosen = condition[:, None, None]
+        pairs = zip(self, other, strict=True)
+        return State(*(torch.where(chosen, mine, theirs) for mine, theirs in pairs))
 
     def detach(self) -> State:
         """The same numbers without their history, as `Tensor.detach`."""

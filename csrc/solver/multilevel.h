@@ -6,8 +6,8 @@
 // What accelerates that step may overshoot, so every trial is judged by its energy before the next one starts from it.
 // Trials that fail go back, and after a few of them a plain Jacobi iteration takes over, which descends by the proof there:
 // once with L-BFGS, which has learnt from the failures; accelerated and for the rest of the step with momentum, which has not.
-// With friction, whose forces no energy has, that happens at the first failure: stiff bodies that stick would be led astray by
-// more (200 times the error of the first iterate).
+// With friction, whose forces no energy has, a dozen accelerated ones follow the first failure, two dozen the second, and so on:
+// while friction has not settled, M leads stiff bodies astray (by 200 times the error of the first iterate).
 //
 // Contacts hold vertices in directions that M does not know of. M is applied to what is out of balance in the others, and
 // its result taken in the others, while the held ones go by the diagonal (two-metric projection, Bertsekas 1982), as does a
@@ -213,7 +213,9 @@ struct Misfit {
 
 // ---- the outer iteration of one environment: numbers only
 
-constexpr int history = 8;                 // pairs that L-BFGS remembers
+constexpr int history = 8;  // pairs that L-BFGS remembers
+// accelerated Jacobi iterations, with friction, after a first failure
+constexpr int detour_length = 12;
 constexpr int patience = 4;                // trials that may fail before a plain iteration
 constexpr double sufficient = 1e-4;        // of the decrease that the slope promises (Armijo)
 constexpr double least_curvature = 1e-12;  // s.y of a pair, in |s| |y|
@@ -230,7 +232,7 @@ struct Outer {
   double scale = 1;              // M / scale serves the material of the step
   double energy = 0, slope = 0;  // at the base; g.d of the direction from there
   double slack = 0;
-  int failures = 0, restarts = 0, momentum = 0;
+  int failures = 0, restarts = 0, momentum = 0, detour = 0;
   bool plain = false, friction = false, accepted = true, known = false;
   bool diagonal = false;  // momentum with 1 / D in place of M, to the end of the step
 
@@ -255,8 +257,14 @@ struct Outer {
       energy = trial;
     }
     plain = failures >= patience;
-    // with the momentum gone M alone descends, if it fits; and pairs learn nothing of sliding
-    diagonal = diagonal || (armijo ? friction && restarts > 0 : failures > 1);
+    if (armijo && friction) {
+      // pairs learn nothing of sliding; where it settles M serves again
+      detour = fell ? detour - (detour > 0) : detour_length << (restarts < 8 ? restarts - 1 : 7);
+      diagonal = detour > 0;
+    } else {
+      // with the momentum gone M alone descends, if it fits
+      diagonal = diagonal || (!armijo && failures > 1);
+    }
     return accepted;
   }
 
