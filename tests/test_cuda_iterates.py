@@ -187,6 +187,28 @@ def test_large_patches_stop_as_the_cpu_does(precision: str) -> None:
 
 
 @pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("contacts", [False, True], ids=["free", "contacts"])
+@pytest.mark.parametrize("cells", [(3, 3, 3), (15, 3, 3), (9, 9, 9)], ids=["64", "256", "1000"])
+def test_blocks_with_room_for_none_all_or_some_of_their_arrays(
+    cells: tuple[int, int, int], contacts: bool, precision: str
+) -> None:
+    """Of what iterations ask for besides u, in shared memory; from a warp to all threads of a multiprocessor."""
+    dtype = DTYPES[precision]
+    if cells == (9, 9, 9) and precision == "float64":
+        pytest.skip("more than the shared memory of a block")
+    case = bar(cells, pd.Gravity(), *([pd.Ground(-0.05)] if contacts else []))
+    sim = on_gpu(case, dtype, "block", iterations=12)
+    plain = simulator(case, torch.float64, iterations=12)
+    state = state_of(case, sim, 3)
+    after, info = sim(state, return_info=True)
+    expected, facts = plain(moved(state, "cpu", torch.float64), return_info=True)
+    assert relative(after.velocities, expected.velocities) <= 2 * TOLERANCE[dtype]
+    assert info.residual.cpu() == pytest.approx(facts.residual, rel=1e3 * TOLERANCE[dtype])
+    alone = sim(pd.State(*(part[:1] for part in state)))
+    assert torch.equal(alone.positions, after.positions[:1])
+
+
+@pytest.mark.parametrize("precision", DTYPES)
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("solver", sorted(set(SOLVERS) - {"guarded"}))
 @pytest.mark.parametrize("name", ["pins, inertial start", "given start", "corner"])
