@@ -234,7 +234,8 @@ struct Outer {
   double slack = 0;
   int failures = 0, restarts = 0, momentum = 0, detour = 0;
   bool plain = false, friction = false, accepted = true, known = false;
-  bool diagonal = false;  // momentum with 1 / D in place of M, to the end of the step
+  // momentum with 1 / D in place of M: to the end of the step, of L-BFGS while a detour lasts
+  bool diagonal = false;
 
   // how much of the direction the next trial takes
   PD_HD double length() const {
@@ -261,9 +262,9 @@ struct Outer {
       // pairs learn nothing of sliding; where it settles M serves again
       detour = fell ? detour - (detour > 0) : detour_length << (restarts < 8 ? restarts - 1 : 7);
       diagonal = detour > 0;
-    } else {
+    } else if (!armijo) {
       // with the momentum gone M alone descends, if it fits
-      diagonal = diagonal || (!armijo && failures > 1);
+      diagonal = diagonal || failures > 1;
     }
     return accepted;
   }
