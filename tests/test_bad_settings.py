@@ -205,28 +205,46 @@ def test_step_gradient_does_not_broadcast(sim: pd.Simulator) -> None:
 
 def test_set_material_is_checked(sim: pd.Simulator) -> None:
     before = [array.clone() for array in sim.material()]
+    masses = sim.masses.detach().clone()
+    masses[4:6] = -0.5
+    sparse, unreal = torch.ones(48).to_sparse(), torch.ones(48, device="meta")
     for arrays, kind, message in (
         ({"youngs": 1e5}, TypeError, r"no array 'youngs'; there are stiffness, masses"),
         ({"stiffness": torch.ones(3)}, ValueError, r"stiffness must be \[48\], or with a batch in front, got \[3\]"),
-        ({"stiffness": 0.0}, ValueError, "stiffness must be positive in torch.float32"),
-        ({"stiffness": 1e-60}, ValueError, "stiffness must be positive in torch.float32"),
-        ({"stiffness": math.inf}, ValueError, "stiffness must be finite"),
-        ({"masses": -1.0}, ValueError, "masses must be positive"),
-        ({"masses": math.nan}, ValueError, "masses must be finite"),
-        ({"pin_stiffness": 0.0}, ValueError, "pin_stiffness must be positive, inf for pins that hold exactly"),
-        ({"gravity": math.nan}, ValueError, "gravity must be finite"),
-        ({"damping": -1.0}, ValueError, "damping must be >= 0"),
+        ({"stiffness": torch.ones(48) > 0}, TypeError, r"stiffness must hold real numbers, got torch\.bool"),
+        ({"stiffness": sparse}, TypeError, r"stiffness must be dense and have values, got torch\.sparse_coo on cpu"),
+        ({"stiffness": unreal}, TypeError, r"stiffness must be dense and have values, got torch\.strided on meta"),
+        ({"stiffness": 0.0}, ValueError, r"stiffness must be positive in torch\.float32, got 0\.0 at \[0\] \(48 in"),
+        ({"stiffness": 1e-60}, ValueError, r"stiffness must be positive in torch\.float32, got 0\.0 at \[0\]"),
+        ({"stiffness": math.inf}, ValueError, "stiffness must be finite in torch.float32, got inf at"),
+        ({"masses": masses}, ValueError, r"masses must be positive .*, got -0\.5 at \[4\] \(2 in all\)"),
+        ({"masses": masses.repeat(2, 1)}, ValueError, r"masses must be positive .*, got -0\.5 at \[0, 4\] \(4 in all"),
+        ({"masses": math.nan}, ValueError, "masses must be finite .*, got nan at"),
+        (
+            {"pin_stiffness": 0.0},
+            ValueError,
+            "pin_stiffness must be positive, inf for pins that hold exactly, .*, got 0",
+        ),
+        ({"gravity": math.nan}, ValueError, "gravity must be finite .*, got nan"),
+        ({"damping": -1.0}, ValueError, r"damping must be >= 0 in torch\.float32, got -1\.0$"),
         (
             {"planes": torch.tensor([[0.0, 2.0, 0.0, 0.0, 0.0]])},
             ValueError,
-            r"planes: the normal .* must be of unit length",
+            r"planes: the normal .* must be of unit length .*, got \[0\. 2\. 0\. 0\. 0\.\] at \[0\]",
         ),
         ({"planes": torch.tensor([[0.0, 1.0, 0.0, 0.0, -1.0]])}, ValueError, r"planes: friction .* must be >= 0"),
         ({"spheres": torch.zeros(1, 8)}, ValueError, r"spheres: the radius .* must be positive"),
     ):
-        with pytest.raises(kind, match=message):
+        with pytest.raises(kind, match=f"^set_material: {message}"):
             sim.set_material(**arrays)  # type: ignore[arg-type]
     assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
+
+
+def test_material_that_rounds_to_nothing_is_refused() -> None:
+    thin = pd.Scene(pd.Solid(body().mesh, youngs=1e-60))
+    with pytest.raises(ValueError, match=r"^Simulator: stiffness must be positive in torch\.float32, got 0\.0 at"):
+        pd.Simulator(thin)
+    pd.Simulator(thin, iterations=1, dtype=torch.float64)
 
 
 def test_batches_of_the_material_must_agree() -> None:

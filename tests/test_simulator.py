@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -173,6 +175,70 @@ def test_meta_and_back_is_compiled_again(solver: Solver, dtype: torch.dtype) -> 
     fresh = simulate(dtype, solver=solver)
     back.load_state_dict(fresh.state_dict())
     assert same_bits(back(state), fresh(state))
+    assert same_bits(back.rest_state(), fresh.rest_state())
+
+
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["Chebyshev", "Multilevel"])
+def test_what_needs_values_says_that_meta_has_none(solver: Solver, tmp_path: Path) -> None:
+    sim = simulate(torch.float32, solver=solver)
+    values = sim.state_dict()
+    sim.to("meta")
+    assert sim(sim.rest_state(2)).positions.shape == (2, sim.vertices, 3)
+    way_out = r'the simulator is on "meta", .*; sim\.to_empty\(device="cpu"\) and then sim\.load_state_dict'
+    assert re.search(way_out, repr(sim))
+    for name, call in (
+        ("set_material", lambda: sim.set_material(stiffness=1e5)),
+        ("set_material", lambda: sim.load_state_dict(values)),
+        ("prepare_solver", sim.prepare_solver),
+        ("tune", lambda: sim.tune(error=0.1)),
+        ("estimate_rho", lambda: pd.estimate_rho(sim, sim.rest_state())),
+        ("save", lambda: sim.save(tmp_path / "bar.safetensors")),
+    ):
+        with pytest.raises(RuntimeError, match=f"^{name}: {way_out}"):
+            call()
+
+
+def test_values_and_meta_are_not_mixed() -> None:
+    """Torch takes the fake kernel of an op as soon as one argument is on "meta": what it returns is never written."""
+    sim = simulate(torch.float32)
+    state = moving(sim)
+    shapes = state.to("meta")
+    with pytest.raises(TypeError, match=r"state must be torch\.float32 on cpu like the simulator, got .* on meta"):
+        sim(shapes)
+    for call in (sim, sim.step_, lambda state: sim.rollout(state, 2)):
+        with pytest.raises(TypeError, match=r"velocities must be torch\.float32 on cpu .*, got torch\.float32 on meta"):
+            call(pd.State(state.positions, shapes.velocities))
+    stiffness = {"stiffness": sim.stiffness.to("meta")}
+    with pytest.raises(RuntimeError, match=r'torchpd::step: .* on cpu and some on "meta"'):
+        torch.func.functional_call(sim, stiffness, (state,))
+
+
+def test_the_default_device_changes_nothing(tmp_path: Path) -> None:
+    expected = simulate(torch.float32)
+    state, rho = moving(expected), pd.estimate_rho(expected, moving(expected), "power")
+    with torch.device("meta"):
+        sim = simulate(torch.float32)
+        assert sim.device.type == "cpu"
+        assert same_bits(sim.rest_state(), expected.rest_state())
+        assert pd.estimate_rho(sim, state, "power") == rho
+        sim.set_material(damping=0.0, gravity=expected.gravity)
+        sim.save(tmp_path / "bar.safetensors")
+        loaded = pd.Simulator.load(tmp_path / "bar.safetensors")
+        sim.tune(state, error=0.5, most=8)
+    expected.set_material(damping=0.0)
+    assert same_bits(loaded(state), expected(state))
+
+
+def test_a_checkpoint_of_torch_holds_states(tmp_path: Path) -> None:
+    sim = simulate(torch.float32)
+    after, info = sim(moving(sim), return_info=True)
+    track = sim.rollout(after, 2)
+    torch.save({"sim": sim.state_dict(), "state": after, "info": info, "track": track}, tmp_path / "run.pt")
+    loaded = torch.load(tmp_path / "run.pt", weights_only=True)
+    sim.load_state_dict(loaded["sim"])
+    assert [type(loaded[name]) for name in ("state", "info", "track")] == [pd.State, pd.Info, pd.Track]
+    assert same_bits(loaded["state"], after)
+    assert same_bits(loaded["track"].state(), track.state())
 
 
 @pytest.mark.skipif(torch.version.cuda is not None, reason="for a CPU build of torch")

@@ -306,7 +306,7 @@ def test_candidates_may_be_given() -> None:
         sim.tune(error=0.1, candidates=[])
     with pytest.raises(TypeError, match=r"candidates must be solvers, .* got 'auto'"):
         sim.tune(error=0.1, candidates=["auto"])  # type: ignore[list-item]
-    with pytest.raises(ValueError, match=r"positions and velocities alike, got \[2, 63, 3\] and \[3, 63, 3\]"):
+    with pytest.raises(ValueError, match=r"velocities must be \[2, 63, 3\] like positions \(m/s\), got \[3, 63, 3\]"):
         sim.tune(pd.State(sim.rest_state(2).positions, sim.rest_state(3).velocities), error=0.1)
 
 

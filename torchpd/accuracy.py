@@ -204,7 +204,7 @@ def exact_steps(
     force = None if forces is None else forces.double()
     places = targets.double() if isinstance(targets, Tensor) else _doubled(targets)
     best: Tensor | None = None
-    lowest = torch.full((len(wide.positions),), torch.inf)
+    lowest = torch.full((len(wide.positions),), torch.inf, device="cpu")
     guess: str | Tensor = start
     for _ in range(0, iterations, _CHUNK):
         after, info = _step(twin, wide, force, places, guess)

@@ -14,7 +14,6 @@ moves with its start. A sliding vertex counts as frictionless: its friction forc
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -24,6 +23,7 @@ from torch import Tensor
 from .diagonal import named_material, pinned_vertices, step_diagonal
 from .multilevel import has_levels, reference_of_levels
 from .tables import MATERIAL_TABLE
+from .warn import warn_user
 
 __all__ = ["AdjointCall", "step_adjoint", "step_gradient"]
 
@@ -209,12 +209,11 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
     multiplier = torch.where(lost[:, None, None], torch.nan, multiplier)
     failed = ~(error <= 1e3 * tolerance) & ~lost
     if bool(failed.any()):
-        warnings.warn(
+        warn_user(
             f"torchpd: the adjoint of a step has no solution in {int(failed.sum())} of {len(failed)} environments "
             f"(relative residual {float(error[failed].max()):.1e}): their states are far from an equilibrium (more "
             "iterations in the step help), at an unstable one, or have negative stiffness or masses. Their gradients "
             "take the rotations as constant.",
-            stacklevel=2,
         )
         wanted = torch.where(failed[:, None, None], right, 0.0)
         instead, _ = conjugate_gradients(majoriser, precondition, wanted, tolerance)

@@ -10,8 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 __all__ = [
+    "NO_VALUES",
     "as_array",
     "check_finite",
+    "check_has_values",
     "check_like",
     "check_positive",
     "check_scalar",
@@ -20,6 +22,17 @@ __all__ = [
     "check_vector",
     "check_whole",
 ]
+
+NO_VALUES = (
+    'the simulator is on "meta", where arrays have no values; sim.to_empty(device="cpu") and then '
+    "sim.load_state_dict(...) give it some"
+)
+
+
+def check_has_values(name: str, device: torch.device) -> None:
+    """Refuse what needs the values of a simulator on "meta"."""
+    if device.type == "meta":
+        raise RuntimeError(f"{name}: {NO_VALUES}")
 
 
 def as_array(name: str, value: Any, dtype: Any = None) -> NDArray[Any]:

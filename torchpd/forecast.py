@@ -13,13 +13,13 @@ Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, ch
 from __future__ import annotations
 
 import math
-import warnings
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from .diagonal import step_diagonal
 from .solvers import Chebyshev, Multilevel, Solver
+from .warn import warn_user
 
 if TYPE_CHECKING:
     from .model import Model
@@ -148,10 +148,9 @@ def warn_of_few_iterations(sim: Model) -> None:
     expected = forecast(sim)
     if expected is None or sim.tolerance > 0.0 or expected.error(sim.iterations) <= FAR_TOO_FEW:
         return
-    warnings.warn(
+    warn_user(
         f"Simulator: the default of {sim.iterations} iterations leaves an error of about "
         f"{expected.error(sim.iterations):.1g} of a step here (1: nothing solved); {expected.words(1e-2)} "
         'reach 1e-2. Give iterations=..., or take solver="auto", or ask sim.tune(error=1e-2)',
         UnsolvedWarning,
-        stacklevel=3,
     )

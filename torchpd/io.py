@@ -21,7 +21,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from .automatic import Choice
-from .checks import check_target_file
+from .checks import check_has_values, check_target_file
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .embedding import Embedding
 from .mesh import TetMesh, TriMesh
@@ -53,6 +53,7 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         sim: to be written, on any device.
         path: of the file; an existing one is replaced. Any ending will do, `.safetensors` is usual.
     """
+    check_has_values("save", sim.device)
     target = check_target_file(path)
     meshes = _distinct_meshes(sim.scene)
     tensors: dict[str, Tensor] = {}
@@ -141,7 +142,7 @@ def _part_record(part: Part, scene: Scene, meshes: list[TetMesh]) -> Record:
 
 def _tensors(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Iterator[tuple[str, Tensor]]:
     for name, array in arrays.items():
-        yield f"{prefix}.{name}", torch.tensor(array)
+        yield f"{prefix}.{name}", torch.tensor(array, device="cpu")
 
 
 # ---- reading

@@ -31,32 +31,37 @@ def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
             f"Pin.stiffness: a spring is too stiff for {dtype}; leave stiffness out to hold vertices exactly"
         )
     for name, tensor in material.items():
-        check_material(name, tensor)
+        check_material("Simulator", name, tensor)
     return material
 
 
 def _require(good: Tensor, name: str, contract: str, tensor: Tensor) -> None:
-    if not bool(good.all()):
-        raise ValueError(f"{name} must be {contract} in {tensor.dtype}")
-
-
-def check_material(name: str, tensor: Tensor) -> None:
-    """Refuse values that no step can work with; shapes are the caller's to check."""
-    if name == "pin_stiffness":
-        _require(tensor > 0, name, "positive, inf for pins that hold exactly,", tensor)
+    if bool(good.all()):
         return
-    _require(tensor.isfinite(), name, "finite", tensor)
+    bad = good.logical_not().nonzero()
+    place = bad[0].tolist()
+    where = f" at {place} ({len(bad)} in all)" if place else ""
+    raise ValueError(f"{name} must be {contract} in {tensor.dtype}, got {tensor[tuple(place)].cpu().numpy()}{where}")
+
+
+def check_material(owner: str, name: str, tensor: Tensor) -> None:
+    """Refuse values that no step can work with; shapes are the caller's to check."""
+    full = f"{owner}: {name}"
+    if name == "pin_stiffness":
+        _require(tensor > 0, full, "positive, inf for pins that hold exactly,", tensor)
+        return
+    _require(tensor.isfinite(), full, "finite", tensor)
     if name in ("stiffness", "masses"):
-        _require(tensor > 0, name, "positive", tensor)
+        _require(tensor > 0, full, "positive", tensor)
     elif name == "damping":
-        _require(tensor >= 0, name, ">= 0", tensor)
+        _require(tensor >= 0, full, ">= 0", tensor)
     elif name == "planes":
         lengths = tensor[..., :3].norm(dim=-1)
-        _require((lengths - 1).abs() <= _UNIT_SLACK, "planes: the normal (columns 0 to 2)", "of unit length", tensor)
-        _require(tensor[..., 4] >= 0, "planes: friction (column 4)", ">= 0", tensor)
+        _require((lengths - 1).abs() <= _UNIT_SLACK, f"{full}: the normal (columns 0 to 2)", "of unit length", tensor)
+        _require(tensor[..., 4] >= 0, f"{full}: friction (column 4)", ">= 0", tensor)
     elif name == "spheres":
-        _require(tensor[..., 3] > 0, "spheres: the radius (column 3)", "positive", tensor)
-        _require(tensor[..., 4] >= 0, "spheres: friction (column 4)", ">= 0", tensor)
+        _require(tensor[..., 3] > 0, f"{full}: the radius (column 3)", "positive", tensor)
+        _require(tensor[..., 4] >= 0, f"{full}: friction (column 4)", ">= 0", tensor)
 
 
 def check_batches(new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from .checks import as_array, check_finite, check_shape
+from .warn import warn_user
 
 __all__ = [
     "MeshWarning",
@@ -41,7 +41,7 @@ class MeshWarning(UserWarning):
 
 
 def warn(message: str) -> None:
-    warnings.warn(message, MeshWarning, stacklevel=4)
+    warn_user(message, MeshWarning)
 
 
 def store(part: object, **values: Any) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from .automatic import Choice, choose_solver
-from .checks import check_like, check_whole
+from .checks import check_has_values, check_like, check_whole
 from .forecast import warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_batches, check_material, material_of
 from .multilevel import has_levels
@@ -23,6 +22,7 @@ from .scene import Scene
 from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
 from .state import State
 from .targets import Anchors, Targets
+from .warn import warn_user
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -202,6 +202,7 @@ class Model(nn.Module):
         `set_material` does it by itself when it pins other vertices hard, or frees some. Takes 0.3 s for 8 thousand
         vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
         """
+        check_has_values("prepare_solver", self.device)
         before = self.plan
         if self.choice is not None:
             self._choose_again(self.choice)
@@ -227,13 +228,13 @@ class Model(nn.Module):
             arrays: by name, see `Simulator`. Shapes and values are checked here, once, and that batches agree with each
                 other and with those of the arrays that stay.
         """
+        check_has_values("set_material", self.device)
         checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
         for name, value in arrays.items():
             if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
-                warnings.warn(
+                warn_user(
                     f"set_material copies the numbers of {name}, so no gradient gets to what they were made of: give "
-                    f'it to calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it',
-                    stacklevel=2,
+                    f'it to calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it'
                 )
         check_batches(checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
         with _ordinary():
@@ -264,11 +265,15 @@ class Model(nn.Module):
             raise TypeError(f"set_material: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}")
         own = getattr(self, name)
         try:
-            tensor = torch.as_tensor(value).detach()
+            tensor = (value if isinstance(value, Tensor) else torch.as_tensor(value, device=self.device)).detach()
         except (TypeError, ValueError, RuntimeError):
             raise TypeError(f"set_material: {name} must be a number or a tensor, got {value!r}") from None
         if tensor.is_complex() or tensor.dtype == torch.bool:
             raise TypeError(f"set_material: {name} must hold real numbers, got {tensor.dtype}")
+        if tensor.layout != torch.strided or tensor.is_meta:
+            raise TypeError(
+                f"set_material: {name} must be dense and have values, got {tensor.layout} on {tensor.device}"
+            )
         tensor = tensor.to(dtype=self.dtype, device=self.device)
         shape = tuple(own.shape[own.dim() - MATERIAL_ROWS[name].dims :])
         tensor = tensor.expand(shape) if tensor.dim() == 0 else tensor
@@ -276,7 +281,7 @@ class Model(nn.Module):
             raise ValueError(
                 f"set_material: {name} must be {list(shape)}, or with a batch in front, got {list(tensor.shape)}"
             )
-        check_material(name, tensor)
+        check_material("set_material", name, tensor)
         return tensor.contiguous()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
@@ -311,13 +316,14 @@ class Model(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def check_state(self, state: State, *, forces: Tensor | None = None) -> None:
-        """Refuse what is no state, one of another precision or on another device, and forces unlike its positions."""
+        """Refuse what is no state, one of another precision or device, velocities and forces unlike its positions."""
         if not _is_pair(state):
             raise TypeError(
                 f"state must be a State, positions and velocities [B, {self.vertices}, 3], got "
                 f"{type(state).__name__}; rest_state() makes one"
             )
         self._check_kind("state", state[0])
+        check_like("velocities", state[1], state[0], "m/s")
         if forces is not None:
             check_like("forces", forces, state[0], "N")
 
@@ -383,15 +389,15 @@ class Model(nn.Module):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
         if wanted.device.type == "cuda":
             check_solver(self.solver, wanted.device)
-        changes_precision = wanted.dtype != self.dtype
+        # digits that float32 has lost do not come back by widening, and "meta" keeps none
+        loses_positions = wanted.dtype != self.dtype or self.device.type == "meta"
         with _ordinary():
             # first, because it may refuse
             plan = plan_on(self, wanted.dtype, wanted.device)
             super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
             self.plan = plan
-            if changes_precision:
-                # digits that float32 has lost do not come back by widening. The material may have been trained, and
-                # keeps the digits it has.
+            if loses_positions:
+                # the material may have been trained, and keeps the digits it has
                 positions = self.scene.values().rest_positions
                 self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
         return self
@@ -399,8 +405,11 @@ class Model(nn.Module):
 
 @contextmanager
 def _ordinary() -> Iterator[None]:
-    """For what a simulator keeps: tensors that are made in inference mode can never be changed or differentiated."""
-    with torch.inference_mode(False), torch.no_grad():
+    """For what a simulator keeps: tensors that are made in inference mode can never be changed or differentiated.
+
+    Those that name no device are for the CPU, whatever torch's default device.
+    """
+    with torch.inference_mode(False), torch.no_grad(), torch.device("cpu"):
         yield
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.utils._pytree import tree_leaves
 
 from .adjoint import AdjointCall, step_adjoint
 from .batching import step_vjp_rule
@@ -55,61 +56,79 @@ def refuse_tangents(*tensors: Tensor | None) -> None:
 # ---- fake kernels: shapes, types and devices only
 
 
-@torch.library.register_fake("torchpd::step")
+def _register_fake(name: str) -> Callable[[Callable[..., Any]], None]:
+    """Torch also takes a fake kernel where one argument of several is on "meta", and would return unwritten memory."""
+
+    def register(kernel: Callable[..., Any]) -> None:
+        def checked(first: Tensor, *others: Any, **settings: Any) -> Any:
+            kinds = {leaf.device.type for leaf in tree_leaves(others) if isinstance(leaf, Tensor)}
+            if first.device.type != "meta" and "meta" in kinds:
+                raise RuntimeError(
+                    f"torchpd::{name}: arguments must be on one device, got some on {first.device} and some on "
+                    '"meta", where tensors have no values'
+                )
+            return kernel(first, *others, **settings)
+
+        torch.library.register_fake(f"torchpd::{name}", checked)
+
+    return register
+
+
+@_register_fake("step")
 def _(positions: Tensor, velocities: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
     info = positions.new_empty((positions.shape[0], INFO_WIDTH), dtype=torch.float64)
     return positions.new_empty(positions.shape), positions.new_empty(velocities.shape), info
 
 
-@torch.library.register_fake("torchpd::step_")
+@_register_fake("step_")
 def _(*_: Any, **__: Any) -> None:
     return None
 
 
-@torch.library.register_fake("torchpd::rollout")
+@_register_fake("rollout")
 def _(positions: Tensor, *_: Any, steps: int, every: int, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
     shape = (steps // every, *positions.shape)
     info = positions.new_empty((*shape[:2], INFO_WIDTH), dtype=torch.float64)
     return positions.new_empty(shape), positions.new_empty(shape), info
 
 
-@torch.library.register_fake("torchpd::gradient")
+@_register_fake("gradient")
 def _(positions: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
     return positions.new_empty(positions.shape)
 
 
-@torch.library.register_fake("torchpd::hessian_product")
+@_register_fake("hessian_product")
 def _(positions: Tensor, direction: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
     return positions.new_empty(positions.shape)
 
 
-@torch.library.register_fake("torchpd::element_energy")
+@_register_fake("element_energy")
 def _(positions: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
     return positions.new_empty((positions.shape[0], stiffness.shape[-1]))
 
 
-@torch.library.register_fake("torchpd::element_energy_product")
+@_register_fake("element_energy_product")
 def _(positions: Tensor, direction: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
     return positions.new_empty((positions.shape[0], stiffness.shape[-1]))
 
 
-@torch.library.register_fake("torchpd::elastic_diagonal")
+@_register_fake("elastic_diagonal")
 def _(stiffness: Tensor, plan: Sequence[Tensor], *, weighted: bool) -> Tensor:
     _, vertex_order, *_ = plan
     return stiffness.new_empty((*stiffness.shape[:-1], vertex_order.shape[0]))
 
 
-@torch.library.register_fake("torchpd::precondition")
+@_register_fake("precondition")
 def _(field: Tensor, plan: Sequence[Tensor]) -> Tensor:
     return field.new_empty(field.shape)
 
 
-@torch.library.register_fake("torchpd::nearest_rotation")
+@_register_fake("nearest_rotation")
 def _(matrices: Tensor) -> Tensor:
     return matrices.new_empty(matrices.shape)
 
 
-@torch.library.register_fake("torchpd::rotation_differential")
+@_register_fake("rotation_differential")
 def _(matrices: Tensor, direction: Tensor) -> Tensor:
     return matrices.new_empty(matrices.shape)
 

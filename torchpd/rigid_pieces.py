@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .checks import check_scalar, check_whole
+from .checks import check_has_values, check_scalar, check_whole
 from .diagonal import step_diagonal
 from .multilevel import reference_of
 from .simulator import Simulator
@@ -74,8 +74,7 @@ class RigidPieces:
         making it. A refusal changes nothing.
         """
         sim = self.sim
-        if sim.device.type == "meta":
-            raise ValueError('RigidPieces: sim is on "meta", where arrays have no values; move it to the CPU or a GPU')
+        check_has_values("RigidPieces", sim.device)
         reference = tuple(array.clone() for array in reference_of(sim.plan, sim.material(), sim.time_step))
         stiffness, inertia = (array.cpu().double().numpy() for array in reference)
         found = find_pieces(sim.scene.values(), stiffness, inertia, self.stiffer_than, sim.dtype, sim.device)

@@ -35,8 +35,11 @@ class Simulator(Model):
     The values that training may change are parameters (without gradient until asked), for all environments or, with a
     leading batch, for each: `stiffness` [E] Pa, `masses` [V] kg, `gravity` [3] m/s^2, `damping` [] 1/s,
     `pin_stiffness` [P] N/m, `pin_targets` [P, 3] m, `planes` [C, 5] (unit normal, height, friction), `spheres` [S, 8]
-    (centre, radius, friction, velocity). `set_material` checks and replaces them. What an optimiser writes no step
-    checks: where stiffness or masses could turn negative, let it learn their logarithm.
+    (centre, radius, friction, velocity). `set_material` checks and replaces them. What an optimiser writes, or
+    `torch.func.functional_call` gives, no step checks, as that would wait for a GPU: where it is NaN, or stiffness,
+    masses or springs are negative, `Info.residual` is NaN. Let an optimiser learn the logarithm of those.
+
+    It is made on the CPU, whatever torch's default device; `.to(...)` moves it.
 
     Args:
         scene: what there is.

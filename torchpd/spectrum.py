@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, cast
 import torch
 from torch import Tensor
 
+from .checks import check_has_values
 from .diagonal import step_diagonal
 from .solvers import Chebyshev, Jacobi
 from .state import State
@@ -41,7 +42,7 @@ def _power(sim: Simulator, state: State, iterations: int) -> float:
     free = torch.isfinite(inertia)
     inertia = torch.where(free, inertia, torch.zeros_like(inertia))
     generator = torch.Generator().manual_seed(0)
-    vector = torch.randn(state[0].shape, generator=generator, dtype=torch.float64).to(state[0])
+    vector = torch.randn(state[0].shape, generator=generator, dtype=torch.float64, device="cpu").to(state[0])
     scale = torch.zeros((), dtype=sim.dtype)
     for _ in range(iterations):
         vector = torch.where(free, vector, torch.zeros_like(vector))
@@ -81,6 +82,7 @@ def _two_stage(sim: Simulator, state: State, iterations: int) -> float:
 
 
 def _check_state(sim: Simulator, state: State) -> None:
+    check_has_values("estimate_rho", sim.device)
     positions = sim.positions_of(state)
     if not len(positions):
         raise ValueError(f"estimate_rho: state must hold at least one environment, got {list(positions.shape)}")

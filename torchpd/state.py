@@ -11,7 +11,10 @@ __all__ = ["Info", "State", "Track"]
 
 
 class State(NamedTuple):
-    """Where everything is and how fast it moves, vertices in the user's order, bodies one after another."""
+    """Where everything is and how fast it moves, vertices in the user's order, bodies one after another.
+
+    `torch.save` takes it, alone or in a checkpoint, and `torch.load` gives it back where torchpd is imported.
+    """
 
     positions: Tensor  # [B, V, 3] m
     velocities: Tensor  # [B, V, 3] m/s
@@ -71,3 +74,7 @@ class Track(NamedTuple):
     def state(self, record: int = -1) -> State:
         """One record as a state to go on from."""
         return State(self.positions[record], self.velocities[record])
+
+
+# torch.load refuses other classes; these hold tensors and run nothing of their own
+torch.serialization.add_safe_globals([Info, State, Track])

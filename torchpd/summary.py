@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from . import _C
+from .checks import NO_VALUES
 from .forecast import FAR_TOO_FEW, forecast
 from .plan import any_of
 from .regimes import shared_bytes
@@ -196,10 +197,14 @@ def describe(sim: Simulator) -> str:
     plan = sim.plan
     material = sum(array.numel() * array.element_size() for array in sim.material())
     real = torch.finfo(sim.dtype).bits // 8
-    where = f"{sim.device} ({_C.build_info()['simd']})" if plan.kernel is None else str(sim.device)
+    where = f"{sim.device} ({_C.build_info()['simd']})" if sim.device.type == "cpu" else str(sim.device)
     lines = [
         f"{plan.vertices} vertices, time step {sim.time_step:.6g} s, {sim.dtype} on {where}",
         _solver_line(sim),
+    ]
+    if sim.device.type == "meta":
+        return "\n  ".join([*lines, NO_VALUES])
+    lines += [
         *_expectation_lines(sim),
         *_promise_lines(sim),
         *_preconditioner_lines(sim),

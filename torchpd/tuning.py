@@ -12,7 +12,6 @@ import copy
 import math
 import statistics
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -23,7 +22,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .accuracy import ExactStep, exact_steps, frictionless
-from .checks import check_scalar, check_whole
+from .checks import check_has_values, check_scalar, check_whole
 from .contenders import safe_solvers
 from .diagonal import step_diagonal
 from .forecast import has_friction
@@ -32,6 +31,7 @@ from .promise import Promise, Trial
 from .solvers import Chebyshev, Multilevel, Solver
 from .state import State
 from .targets import Targets
+from .warn import warn_user
 
 if TYPE_CHECKING:
     from .simulator import Simulator
@@ -104,6 +104,7 @@ def tune(
     progress: bool = False,
 ) -> Promise:
     """See `Simulator.tune`."""
+    check_has_values("tune", sim.device)
     error = None if error is None else check_scalar("tune: error", error)
     milliseconds = None if milliseconds is None else check_scalar("tune: milliseconds", milliseconds)
     most = check_whole("tune: most", most, minimum=1)
@@ -135,7 +136,7 @@ def tune(
     promise = _promise(sim, study, start, trials, cost, error, milliseconds)
     sim.solver, sim.iterations, sim.tolerance, sim.promise = promise.solver, promise.iterations, 0.0, promise
     if not promise.attained:
-        warnings.warn(f"tune: {promise}", TuningWarning, stacklevel=3)
+        warn_user(f"tune: {promise}", TuningWarning)
     return promise
 
 
@@ -167,11 +168,8 @@ def _environments_of_material(sim: Simulator) -> int:
 
 def _check_start(sim: Simulator, state: State, forces: Tensor | None) -> None:
     sim.check_state(state, forces=forces)
-    if state[0].dim() != 3 or not len(state[0]) or state[1].shape != state[0].shape:
-        raise ValueError(
-            "tune: state must hold environments [B, V, 3], at least one, positions and velocities alike, got "
-            f"{list(state[0].shape)} and {list(state[1].shape)}"
-        )
+    if state[0].dim() != 3 or not len(state[0]):
+        raise ValueError(f"tune: state must hold environments [B, V, 3], at least one, got {list(state[0].shape)}")
     count = _environments_of_material(sim)
     if count not in (1, len(state[0])):
         raise ValueError(f"tune: state must have the {count} environments of the material, got {len(state[0])}")
