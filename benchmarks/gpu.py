@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
 import gc
 import statistics
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
-from gpu_scenes import PAPER, GpuScene, PaperTest
+from gpu_scenes import GPU_SCENES, PAPER, GpuScene, PaperTest
 from gpu_timing import Device, describe_device, event_times, graph_times, host_seconds, kernel_seconds
-from machine import milliseconds
+from machine import describe_run, milliseconds
 from scenes import TIME_STEP
 from tqdm import tqdm
 
@@ -23,6 +27,14 @@ from torchpd.plan import KERNELS
 Row = dict[str, Any]
 
 ROLLOUT = 16  # steps in one call
+
+
+@contextmanager
+def turn(device: torch.device) -> Iterator[None]:
+    """Of this process on a GPU: runs side by side prepare their scenes together, and measure one after another."""
+    with (Path(tempfile.gettempdir()) / f"torchpd-benchmark-{device.index or 0}.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def quantities(scene: GpuScene, tets: int, step: float, twice: float) -> Row:
@@ -92,10 +104,21 @@ def compile_on(scene: GpuScene, dtype: torch.dtype, device: torch.device) -> tup
 def measure_scene(scene: GpuScene, dtype: torch.dtype, machine: Device, options: argparse.Namespace) -> Row:
     """One row of the result; rates come from the median."""
     sim, facts = compile_on(scene, dtype, torch.device(options.device))
+    with turn(sim.device):
+        row = measure_steps(scene, sim, facts, machine, options)
+    return {**row, "run": {name: options.run[name] for name in ("command", "created", "commit")}}
+
+
+def measure_steps(scene: GpuScene, sim: pd.Simulator, facts: Row, machine: Device, options: argparse.Namespace) -> Row:
+    """Times and bytes of its steps."""
+    dtype = sim.dtype
     state = scene.start(sim)
     given = {"repetitions": options.repetitions, "seconds": options.seconds}
     eager = event_times(lambda: sim(state), repetitions=options.repetitions, seconds=0.0)
     peak = torch.cuda.max_memory_allocated(sim.device)
+    begin = time.perf_counter()
+    state.positions.cpu()
+    read_back = time.perf_counter() - begin
     times = graph_times(lambda: sim(state), **given)
     rollout = graph_times(lambda: sim.rollout(state, ROLLOUT, ROLLOUT), repetitions=options.repetitions, seconds=0.0)
     sim.iterations = 2 * scene.iterations
@@ -110,6 +133,8 @@ def measure_scene(scene: GpuScene, dtype: torch.dtype, machine: Device, options:
         **facts,
         "peak_bytes": peak,
         "bytes_per_vertex": peak / (sim.vertices * scene.batch),
+        "bytes_per_environment": peak / scene.batch,
+        "read_back_milliseconds": 1e3 * read_back,
         "milliseconds": milliseconds(times),
         "eager_milliseconds": milliseconds(eager),
         "rollout_step_microseconds": 1e6 * statistics.median(rollout) / ROLLOUT,
@@ -205,9 +230,29 @@ def table(rows: list[Row]) -> str:
     return "\n".join("  ".join(c.rjust(width) for c, width in zip(line, widths, strict=True)) for line in lines)
 
 
+def put(rows: list[Row], row: Row) -> None:
+    """A row in its place: that of its scene in GPU_SCENES, instead of an earlier one of that scene and precision."""
+    names = [scene.name for scene in GPU_SCENES]
+    rows[:] = [other for other in rows if (other["scene"], other["dtype"]) != (row["scene"], row["dtype"])]
+    rows.append(row)
+    rows.sort(key=lambda r: (r["dtype"], names.index(r["scene"]) if r["scene"] in names else -1))
+
+
+def with_earlier(result: Row, earlier: Row) -> Row:
+    """A result, and from an earlier one what this run has not measured."""
+    whole = {**result, "results": [*earlier.get("results", [])]}
+    for row in result["results"]:
+        put(whole["results"], row)
+    for name in ("call_microseconds", "paper"):
+        whole[name] = result[name] or earlier.get(name, result[name])
+    return whole
+
+
 def run_on_gpu(options: argparse.Namespace, result: Row, keep: Callable[[], None]) -> None:
     """Everything, into the result and printed."""
     device = torch.device(options.device)
+    options.run = describe_run(device, options.threads)
+    result.update({"call_microseconds": {}, "paper": [], "results": []})
     with torch.no_grad(), torch.cuda.device(device):
         machine = describe_device(device)
         result["device"] = {
@@ -215,17 +260,21 @@ def run_on_gpu(options: argparse.Namespace, result: Row, keep: Callable[[], None
             "lane_instructions_per_second": machine.lane_instructions,
             "cuda": torch.version.cuda,
         }
-        result["call_microseconds"] = measure_calls(options)
-        with_paper = "paper" in (options.only or ["paper"]) and not options.quick
-        result["paper"] = measure_paper(options) if with_paper else []
+        wanted = options.only or ["calls", *(() if options.quick else ("paper",))]
+        with turn(device):
+            if "calls" in wanted:
+                result["call_microseconds"] = measure_calls(options)
+            if "paper" in wanted:
+                result["paper"] = measure_paper(options)
         jobs = [(scene, getattr(torch, name)) for name in options.dtype for scene in options.scenes]
         bar = tqdm(jobs, desc="measuring", unit="scene", leave=False)
-        result["results"] = []
         for scene, dtype in bar:
-            result["results"].append(measure_scene(scene, dtype, machine, options))
-            keep()
+            put(result["results"], measure_scene(scene, dtype, machine, options))
+            with turn(device):
+                keep()
     print(table(result["results"]))
-    print("\nmicroseconds of a call (host, in a graph, kernels alone), one iteration on one tetrahedron:")
+    if result["call_microseconds"]:
+        print("\nmicroseconds of a call (host, in a graph, kernels alone), one iteration on one tetrahedron:")
     for name, parts in result["call_microseconds"].items():
         print(f"  {name}: " + ", ".join(cell(part, 1) for part in parts.values()))
     for row in result["paper"]:

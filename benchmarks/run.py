@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from gpu import run_on_gpu
+from gpu import run_on_gpu, with_earlier
 from gpu_scenes import GPU_SCENES, QUICK_GPU_SCENES
 from machine import describe_run, measure, milliseconds, multiply_adds_per_second
 from scenes import GOAL_MULTIPLY_ADDS_PER_SECOND, GOAL_THREADS, QUICK_SCENES, SCENES, TIME_STEP, BenchScene
@@ -191,6 +191,7 @@ def parse(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="tiny scenes, to see that everything runs")
     parser.add_argument("--heavy", action="store_true", help="on a GPU also the scenes that take minutes to prepare")
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--keep", action="store_true", help="on a GPU: what --out has, and this run does not, stays")
     options = parser.parse_args(words)
     options.repetitions, options.seconds = (2, 0.0) if options.quick else (7, 1.0)
     options.on_gpu = torch.device(options.device).type == "cuda"
@@ -200,10 +201,12 @@ def parse(words: list[str]) -> argparse.Namespace:
         scenes = QUICK_GPU_SCENES if options.quick else GPU_SCENES
     if options.on_gpu and not torch.cuda.is_available():
         parser.error("--device: torch finds no CUDA device")
-    names = [scene.name for scene in scenes] + ["paper"] * options.on_gpu
+    names = [scene.name for scene in scenes] + ["calls", "paper"] * options.on_gpu
     unknown = set(options.only or ()) - set(names)
     if unknown:
         parser.error(f"--only: no scene {', '.join(sorted(unknown))}; there are {', '.join(names)}")
+    if options.keep and not (options.on_gpu and options.out):
+        parser.error("--keep: is for a GPU, and for the file that --out names")
     wanted = options.only or [s.name for s in scenes if options.heavy or not getattr(s, "heavy", False)]
     options.scenes = [scene for scene in scenes if scene.name in wanted]
     return options
@@ -236,7 +239,10 @@ def main(words: list[str]) -> None:
         """Writes what there is so far: a run that is cut short has not been for nothing."""
         if options.out:
             options.out.parent.mkdir(parents=True, exist_ok=True)
-            options.out.write_text(json.dumps(result, indent=1) + "\n")
+            whole = result
+            if options.keep and options.out.exists():
+                whole = with_earlier(result, json.loads(options.out.read_text()))
+            options.out.write_text(json.dumps(whole, indent=1) + "\n")
 
     (run_on_gpu if options.on_gpu else run_on_cpu)(options, result, keep)
     keep()

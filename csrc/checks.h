@@ -89,11 +89,7 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   check_array(arrays[first], at::kInt, level_size_count, 1, {at::kCPU, "every plan's sizes"},
               "plan.level_sizes", "counts");
   const int32* size = arrays[first].const_data_ptr<int32>();
-  Levels<T> levels;
-  levels.vertices = vertices;
-  levels.fine_nodes = size[level_fine_nodes];
-  levels.middle_nodes = size[level_middle_nodes];
-  levels.direct = size[level_direct] != 0;
+  Levels<T> levels = count_levels<T>(size, vertices);
   const bool middle = levels.has_middle();
   const std::int64_t coarse = levels.coarse_unknowns();
   LevelRows count{};
@@ -209,16 +205,16 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
                     " with those of a multilevel preconditioner, got ", arrays.size(),
                     "; sim.to(...) compiles the plan of a device");
   const int32* size = sizes_view(arrays[0], size_count);
-  DevicePlan<T> plan;
-#define X(name, meaning) plan.name = size[size_##name];
-#include "plan/device_sizes.def"
-#undef X
+  DevicePlan<T> plan = count_device_plan<T>(size);
   TORCH_CHECK_VALUE(plan.kernel >= 0 && plan.kernel <= 3 && plan.patches >= 1 &&
                         (plan.kernel != 0 || plan.patches == 1) && plan.most_slots >= 1 &&
                         plan.most_slots <= plan.slots && plan.most_entries >= 0,
                     "plan.sizes must name a kernel, 0 to 3, and at least one patch, one alone for "
                     "kernel 0, got kernel ",
                     plan.kernel, " and ", plan.patches, " patches; compile the scene again");
+  TORCH_CHECK_VALUE(plan.blocks <= most_blocks, "plan.sizes must count up to ", most_blocks,
+                    " blocks of 32 pairs of tetrahedra, whose corners 32 bits count, got ",
+                    plan.blocks, "; compile the scene again, with fewer patches");
   // every slot that does not hold an interior vertex of its patch holds a shared one, but of a cluster, where all are inside
   // one patch; pieces and pins may be absent
   const bool pieces = plan.pieces > 0, cluster = plan.kernel == 1;

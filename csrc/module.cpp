@@ -5,6 +5,7 @@
 #include "plan/device_build.h"
 #include "plan/multilevel_build.h"
 #include "plan/shared_memory.h"
+#include "solver/multilevel.h"
 
 #include <pybind11/functional.h>
 #include <pybind11/numpy.h>
@@ -14,6 +15,7 @@
 #include <algorithm>
 #include <map>
 #include <span>
+#include <stdexcept>
 #include <vector>
 
 namespace py = pybind11;
@@ -41,13 +43,17 @@ void check_mesh(const Doubles& positions, const Indices& tets) {
   if (tets.ndim() != 2 || tets.shape(1) != 4 || tets.shape(0) == 0)
     throw py::value_error("tets must be int64 [count > 0, 4]");
   const std::int64_t count = positions.shape(0), *t = tets.data();
+  // slots, up to four a tetrahedron, are counted in 32 bits
+  constexpr std::int64_t most = std::int64_t(1) << 28;
+  if (tets.shape(0) > most || count > most) {
+    throw py::value_error("a mesh may have up to 2^28 = " + std::to_string(most) +
+                          " vertices and tetrahedra, which 32 bits count, got " +
+                          std::to_string(count) + " and " + std::to_string(tets.shape(0)) +
+                          "; take a coarser mesh, or simulate its pieces one by one");
+  }
   for (py::ssize_t i = 0; i < tets.size(); ++i) {
     if (t[i] < 0 || t[i] >= count)
       throw py::index_error("tets refer to vertices that positions does not have");
-  }
-  // slots, up to four a tetrahedron, are counted in 32 bits
-  if (tets.shape(0) > (std::int64_t(1) << 28) || count > (std::int64_t(1) << 28)) {
-    throw py::value_error("a mesh may have up to 2^28 vertices and tetrahedra");
   }
 }
 
@@ -210,6 +216,33 @@ py::dict build_info() {
   return info;
 }
 
+// Memory that the current CUDA device wants for a step, of which the counts are known.
+template <class T>
+std::int64_t bytes_of([[maybe_unused]] const pd::DeviceStep<T>& step) {
+#if defined(TORCHPD_CUDA)
+  return pd::step_bytes(step);
+#else
+  throw std::runtime_error("this build of torchpd has no CUDA kernels");
+#endif
+}
+
+template <class T>
+std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes, int schedule,
+                        std::int64_t batch, int planes, int spheres, bool own_stiffness) {
+  const bool levels = level_sizes.size() > 0;
+  if (sizes.size() != pd::size_count || (levels && level_sizes.size() != pd::level_size_count))
+    throw py::value_error("sizes and level_sizes must be those of a plan for a GPU");
+  pd::DeviceStep<T> step;
+  step.plan = pd::count_device_plan<T>(sizes.data());
+  if (levels) step.plan.levels = pd::count_levels<T>(level_sizes.data(), step.plan.vertices);
+  step.settings.schedule = pd::ScheduleKind(schedule);
+  step.batch = batch;
+  step.material.planes_count = planes;
+  step.material.spheres_count = spheres;
+  step.material.stiffness.stride = own_stiffness ? step.plan.tets : 0;
+  return bytes_of(step);
+}
+
 // float32 multiply-adds per second that one thread of this processor does
 double multiply_adds_per_second() {
   float seconds = 0;
@@ -254,6 +287,8 @@ PYBIND11_MODULE(_C, m) {
       },
       py::arg("real"), py::arg("pairs"), py::arg("interior"),
       "Whether a block of a cluster has a thread for everything in a patch of such sizes.");
+  m.def("cluster_threads", &pd::cluster_threads, py::arg("real"), py::arg("pairs"),
+        py::arg("interior"), "Threads of a block of the kernel cluster.");
   m.def("cluster_shared_bytes", &pd::cluster_shared_bytes, py::arg("real"), py::arg("slots"),
         py::arg("entries"), py::arg("interior"), py::arg("planes"), py::arg("balls"),
         "Shared memory of a block of the kernel cluster.");
@@ -268,8 +303,20 @@ PYBIND11_MODULE(_C, m) {
 #endif
       },
       "Blocks of the largest cluster that the current CUDA device runs; 1: none.");
+  m.def(
+      "step_bytes",
+      [](std::size_t real, const Numbers& sizes, const Numbers& level_sizes, int schedule,
+         std::int64_t batch, int planes, int spheres, bool own_stiffness) {
+        const auto bytes = real == sizeof(float) ? step_bytes<float> : step_bytes<double>;
+        return bytes(sizes, level_sizes, schedule, batch, planes, spheres, own_stiffness);
+      },
+      py::arg("real"), py::arg("sizes"), py::arg("level_sizes"), py::arg("schedule"),
+      py::arg("batch"), py::arg("planes"), py::arg("spheres"), py::arg("own_stiffness"),
+      "Memory that the current CUDA device wants for a step; level_sizes: none without a "
+      "preconditioner.");
   m.attr("outer_static_bytes") = pd::outer_static_bytes;
   m.attr("corotation_bytes") = pd::corotation_bytes;
+  m.attr("known_inertia") = pd::known_inertia;
   m.attr("pass_static_bytes") = pd::pass_static_bytes;
   m.def("pass_shared_bytes", &pd::pass_shared_bytes, py::arg("real"), py::arg("slots"),
         py::arg("entries"), py::arg("fields"),

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 import scipy.sparse
 import torch
-from cases import beam, contact_block
+from cases import beam, contact_block, sliver_mesh
 from runs import full_scene, moving, simulate, simulator, state_of
 
 import torchpd as pd
 from torchpd.accuracy import exact_steps, frictionless, problem_of, scene_without_friction, select_state
+from torchpd.contact_newton import ContactNewton
 from torchpd.reference import StepProblem
-from torchpd.reference_solvers import newton, newton_step
+from torchpd.reference_solvers import newton, newton_step, solve_with_contact
+from torchpd.subjects import SUBJECTS
 
 
 def test_the_first_iterate_has_error_one_and_the_solution_none() -> None:
@@ -102,6 +104,55 @@ def test_contacts_are_solved_without_friction() -> None:
     # it slides: without friction the momentum along the ground is kept
     masses = step.problem.values.masses
     assert masses @ step.solution[:, 0] == pytest.approx(masses.sum() * sim.time_step * 1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize(("cells", "youngs"), [(8, 1e8), (12, 1e7)])
+def test_stiff_beams_are_solved(cells: int, youngs: float) -> None:
+    """3,321 and 10,309 vertices, on which 500 iterations of Chebyshev do not halve the residual."""
+    subject = SUBJECTS["beam"]()
+    scene = subject.scene(subject.mesh(cells), youngs)
+    sim = pd.Simulator(scene, subject.time_step, 100, pd.Multilevel(), torch.float64, progress=False)
+    state = subject.start(sim)
+    step = exact_steps(sim, state)[0]
+    after, info = sim(state, return_info=True)
+    assert float(info.residual) < 1e-12
+    # |grad E| / min m/h^2 of a residual of 1e-13 is some 1e-9 here
+    assert step.judge(after.velocities[0].numpy() * sim.time_step).position < 1e-8
+    assert step.uncertainty < 1e-8
+
+
+def test_stiff_slivers_on_the_ground_are_solved() -> None:
+    """Chebyshev creeps on them, and Multilevel is brought back again and again: Newton's method is at home."""
+    mesh = sliver_mesh()
+    scene = pd.Scene(pd.Solid(mesh, youngs=3e7, density=1000.0), pd.Gravity(), pd.Ground(float(mesh.bounds[0, 1])))
+    sim = pd.Simulator(scene, 1 / 60, 1000, dtype=torch.float64, progress=False)
+    state = sim.rest_state()
+    state.velocities[:] = torch.tensor([0.5, -2.0, 0.0])
+    step = exact_steps(sim, state)[0]
+    assert step.uncertainty < 1e-8
+    assert step.judge(step.solution).residual < 1e-10
+    assert (step.problem.smallest_gap(step.solution) > -1e-12).all()
+    # no method finds a lower energy
+    assert step.judge(sim(state).velocities[0].numpy() * sim.time_step).energy > 0.0
+
+
+@pytest.mark.parametrize("kind", ["plane", "ball", "both"])
+def test_newtons_method_knows_contacts(kind: str) -> None:
+    """It ends at the fixed point of the guarded scheme, where its next step is none."""
+    ground, ball = pd.Ground(0.0), pd.Sphere((0.15, -0.2, 0.15), 0.21)
+    parts = {"plane": [ground], "ball": [ball], "both": [ground, ball]}[kind]
+    problem = contact_block(*parts, velocity=(0.3, -1.0, 0.0)).problem()
+    exact = solve_with_contact(problem)
+    method = ContactNewton(problem)
+    near = problem.project(exact + 1e-5 * np.random.default_rng(0).standard_normal(exact.shape))
+    found = method.minimise(near)
+    assert np.abs(found - exact).max() < 1e-12
+    way, own = method.step(found)
+    assert own
+    assert np.abs(way).max() < 1e-12
+    # one step, on which the touching vertices may still change
+    first, second = (np.linalg.norm(u - exact) for u in (near, near + method.step(near)[0]))
+    assert second < 0.1 * first
 
 
 def test_friction_is_left_out_of_a_copy() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,16 @@ def test_every_kind_of_device_has_costs() -> None:
         for batch in (1, 1024):
             times = [cost.iteration(10_000, batch) for cost in (costs.chebyshev, costs.multilevel)]
             assert times[1] > times[0] > 0.0
+
+
+def test_costs_of_clusters_are_those_that_were_measured() -> None:
+    """Within a factor of 1.6: clusters run in waves, whose length goes by their number of blocks."""
+    file = Path(__file__).parent.parent / "benchmarks" / "results" / "few-environments-h100.json"
+    for row in json.loads(file.read_text())["rows"]:
+        for batch, took in zip(row["batches"], row["microseconds"]["cluster"], strict=True):
+            if batch > 1:
+                estimate = 64 * COSTS["cluster"].chebyshev.iteration(row["vertices"], batch)
+                assert 1 / 1.6 < took / estimate < 1.6, (row["tets"], batch)
 
 
 def test_time_of_a_batch() -> None:

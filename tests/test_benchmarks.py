@@ -173,7 +173,8 @@ def test_scenes_of_the_gpu_are_what_their_names_say() -> None:
     assert len(named) == len(scenes.GPU_SCENES)
     for scene in scenes.GPU_SCENES:
         vertices = np.prod(np.add(scene.cells, 1))
-        size = scene.name.removesuffix(f"-{scene.mesh}").removeprefix("one-")
+        assert scene.name.endswith("-effects") == scene.effects
+        size = scene.name.removesuffix("-effects").removesuffix(f"-{scene.mesh}").removeprefix("one-")
         if "x" in size:
             assert size == f"{vertices}x{scene.batch}"
         elif size == "1200-tets":
@@ -182,7 +183,7 @@ def test_scenes_of_the_gpu_are_what_their_names_say() -> None:
             goal = float(size.replace("k", "e3").replace("M", "e6"))
             assert goal <= vertices <= 1.05 * goal
         for aim in scene.aims:
-            assert (aim.stretch < aim.must) == aim.is_time
+            assert aim.stretch is None or (aim.stretch < aim.must) == aim.is_time
     for test in scenes.PAPER:
         assert 6 * np.prod(test.cells) == pytest.approx(test.constraints, rel=0.02)
     batch = named["256x8192-five"]
@@ -262,6 +263,22 @@ def test_numbers_of_a_gpu_row() -> None:
     assert gpu.aims(large, row, torch.float32)[0]["share_of_must"] == pytest.approx(2.0)  # half the time
     floor = gpu.floors(large, facts, device, torch.float64, 64 * 65e-6)
     assert floor == {"issue": None, "bandwidth": pytest.approx(488 * (1 << 20) / 3e12 / 65e-6)}
+
+
+@pytest.mark.usefixtures("on_path")
+def test_a_result_keeps_rows_of_earlier_runs() -> None:
+    gpu = importlib.import_module("gpu")
+
+    def rows(**steps: float) -> list[dict[str, object]]:
+        return [{"scene": name.replace("_", "-"), "dtype": "float32", "step": step} for name, step in steps.items()]
+
+    earlier = {"results": rows(one_10k=1.0, one_1M=2.0), "call_microseconds": {"block": 3.0}, "paper": [{"tets": 4}]}
+    result = {"results": rows(one_1M=5.0, one_100k=6.0), "call_microseconds": {}, "paper": []}
+    whole = gpu.with_earlier(result, earlier)
+    assert whole["results"] == rows(one_10k=1.0, one_100k=6.0, one_1M=5.0)  # in the order of the scenes
+    assert (whole["call_microseconds"], whole["paper"]) == ({"block": 3.0}, [{"tets": 4}])
+    assert result["results"] == rows(one_1M=5.0, one_100k=6.0)
+    assert gpu.with_earlier(result, {}) == result | {"results": rows(one_100k=6.0, one_1M=5.0)}
 
 
 @pytest.mark.skipif(not missing_gpu(), reason="there is a GPU")

@@ -128,6 +128,23 @@ def test_a_replay_runs_on_the_current_stream_and_nobody_waits(kernel: str, preci
     assert not host_waits(step.replay)
 
 
+def test_a_replay_takes_no_memory(kernel: str, precision: str) -> None:
+    """None of torch either: the recording has its own."""
+    sim, start = small_on_gpu(DTYPES[precision], kernel)
+    (own,) = twins(start, 1)
+    step = sim.capture(own, return_info=True)
+
+    def taken() -> int:
+        return int(torch.cuda.memory_stats(GPU)["allocation.all.allocated"])
+
+    before = taken()
+    for _ in range(20):
+        step.replay()
+    assert taken() == before
+    sim.step_(own)  # control
+    assert taken() > before
+
+
 def test_two_recordings_take_turns(kernel: str, precision: str) -> None:
     """Of one simulator, for two states: neither is in the other's memory."""
     sim, start = small_on_gpu(DTYPES[precision], kernel)

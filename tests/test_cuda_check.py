@@ -1,13 +1,16 @@
-"""What tools/cuda_check.py reads out of the compiler's reports."""
+"""What tools/cuda_check.py reads out of the compiler's reports, and that the table of this repository is not stale."""
 
 from __future__ import annotations
 
-import csv
 import runpy
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+TABLE = ROOT / "benchmarks" / "results" / "cuda-registers.csv"
 
 REPORT = """nvcc -c x.cu
 ptxas info    : 0 bytes gmem
@@ -24,8 +27,12 @@ ptxas info    : Used 34 registers, used 1 barriers, 768 bytes smem, 800 bytes cm
 """
 
 
-def test_kernels_without_the_functions_they_call() -> None:
-    tool = runpy.run_path(str(Path(__file__).parent.parent / "tools" / "cuda_check.py"))
+@pytest.fixture(scope="module")
+def tool() -> dict[str, Any]:
+    return runpy.run_path(str(ROOT / "tools" / "cuda_check.py"))
+
+
+def test_kernels_without_the_functions_they_call(tool: dict[str, Any]) -> None:
     first = {"kernel": "_Z1av", "architecture": "80", "registers": "128", "stack": "72", "spill_stores": "96"}
     second = {"kernel": "_Z1bv", "architecture": "90", "registers": "34", "stack": "0", "spill_stores": "0"}
     assert tool["kernels_of"](REPORT) == [
@@ -34,12 +41,8 @@ def test_kernels_without_the_functions_they_call() -> None:
     ]
 
 
-TABLE = Path(__file__).parent.parent / "benchmarks" / "results" / "cuda-registers.csv"
-
-
-def test_names_keep_their_template_arguments() -> None:
+def test_names_keep_their_template_arguments(tool: dict[str, Any]) -> None:
     """A value of an enumeration prints with brackets that are not those of the arguments."""
-    tool = runpy.run_path(str(Path(__file__).parent.parent / "tools" / "cuda_check.py"))
     for signature, name in (
         ("void pd::rotate<double>(pd::RotationCall<double>)", "pd::rotate<double>"),
         (
@@ -59,25 +62,71 @@ def test_names_keep_their_template_arguments() -> None:
         assert tool["kernel_name"](signature) == name
 
 
-def test_a_kernel_has_one_row_for_each_source_and_architecture() -> None:
-    with TABLE.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+def test_a_kernel_has_one_row_for_each_source_and_architecture(tool: dict[str, Any]) -> None:
+    _, rows = tool["read_table"](TABLE)
     names = Counter((row["source"], row["architecture"], row["kernel"]) for row in rows)
     assert len(rows) > 100
     assert [name for name, count in names.items() if count > 1] == []
     assert all(row["kernel"].count(one) == row["kernel"].count(other) for row in rows for one, other in ("<>", "()"))
 
 
-def test_a_table_is_made_of_reports(tmp_path: Path) -> None:
+def test_the_table_is_of_these_sources(tool: dict[str, Any]) -> None:
+    stamp, rows = tool["read_table"](TABLE)
+    command = f"python tools/cuda_check.py --table {TABLE.relative_to(ROOT)}"
+    assert stamp == tool["fingerprint"](), f"CUDA sources or flags have changed since; run `{command}`"
+    targets = {path.stem: set(tool["targets_of"](path)) for path in (ROOT / "csrc" / "cuda").glob("*.cu")}
+    found: dict[str, set[str]] = {}
+    for row in rows:
+        found.setdefault(row["source"].removeprefix("cuda-").removesuffix(".cu"), set()).add(row["architecture"])
+    assert found == {name: wanted for name, wanted in targets.items() if name != "runtime"}  # which has no kernels
+
+
+def test_a_fingerprint_follows_what_the_compiler_reads(tool: dict[str, Any], tmp_path: Path) -> None:
+    def write(name: str, text: str) -> str:
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        stamp: str = tool["fingerprint"](tmp_path)
+        return stamp
+
+    write("b.def", "X(1)")
+    write("a.h", '#include "b.def"\n#include "nowhere.h"\n#include <vector>\n')
+    before = write("a.cu", '#include "a.h"\nint f();')
+    assert [path.name for path in tool["with_headers"]([tmp_path / "a.cu"], tmp_path)] == ["a.cu", "a.h", "b.def"]
+    for name, text in (
+        ("a.cu", '#include "a.h"\n\nint f();  // a comment'),
+        ("of_the_cpu.cpp", '#include "a.h"'),
+        ("of_the_cpu.h", "int g();"),
+    ):
+        assert write(name, text) == before, name
+    for name, text in (("b.def", "X(2)"), ("a.cu", '#include "a.h"\nint g();'), ("c.cu", "")):
+        after = write(name, text)
+        assert after != before, name
+        before = after
+
+
+def test_glue_is_compiled_as_in_a_build_with_cuda(tool: dict[str, Any]) -> None:
+    """Every C++ source that only such a build compiles, or that has parts for it."""
+    csrc = ROOT / "csrc"
+    wanted = {
+        path for path in csrc.glob("**/*.cpp") if "cuda" in path.parts[-2:-1] or "TORCHPD_CUDA" in path.read_text()
+    }
+    assert {csrc / name for name in tool["GLUE"]} == wanted
+    command = tool["command_for"]("nvcc", csrc / "cuda" / "ops.cpp", ["-I", "x"])
+    assert {"-DTORCHPD_CUDA", "-std=c++20", "-I", "x"} <= set(command)
+    assert "-fsyntax-only" in " ".join(command)
+
+
+def test_a_table_is_made_of_reports(tool: dict[str, Any], tmp_path: Path) -> None:
     """Of those that are there, without compiling; a name that two kernels share is refused."""
-    tool = runpy.run_path(str(Path(__file__).parent.parent / "tools" / "cuda_check.py"))
     report, table = tmp_path / "x.cu.txt", tmp_path / "table.csv"
     report.write_text(REPORT, encoding="utf-8")
-    tool["write_table"](table, [report])
+    tool["write_table"](table, [report], "012abc")
+    stamp, rows = tool["read_table"](table)
+    assert stamp == "012abc"
+    assert [row["architecture"] for row in rows] == ["80", "90"]
     assert table.read_text(encoding="utf-8").splitlines()[1:] in (
-        ["x.cu,80,a,128,72,96,172,0", "x.cu,90,b,34,0,0,0,768"],
-        ["x.cu,80,_Z1av,128,72,96,172,0", "x.cu,90,_Z1bv,34,0,0,0,768"],  # without c++filt
+        ["x.cu,80,a,128,72,96,172,0,012abc", "x.cu,90,b,34,0,0,0,768,"],
+        ["x.cu,80,_Z1av,128,72,96,172,0,012abc", "x.cu,90,_Z1bv,34,0,0,0,768,"],  # without c++filt
     )
     report.write_text(REPORT.replace("'_Z1bv' for 'sm_90'", "'_Z1av' for 'sm_80'"), encoding="utf-8")
     with pytest.raises(ValueError, match=r"x\.cu has two kernels of the name .*a.* for sm_80"):
-        tool["write_table"](table, [report])
+        tool["write_table"](table, [report], "")

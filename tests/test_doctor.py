@@ -97,6 +97,7 @@ def test_missing_packages_are_named_as_pip_names_them(built: None, monkeypatch: 
         (None, "", "13.0", "set CUDA_HOME"),
         ("/usr/local/cuda", "", "13.0", "no working nvcc in /usr/local/cuda/bin"),
         ("/usr/local/cuda", "12.8", "13.0", "nvcc is CUDA 12.8 but torch is built for CUDA 13.0"),
+        ("/usr/local/cuda", "12.2", "12.8", "nvcc is CUDA 12.2 and the kernels need 12.3 or newer: install a newer"),
     ],
 )
 def test_cuda_is_left_out_for_a_stated_reason(
@@ -108,7 +109,8 @@ def test_cuda_is_left_out_for_a_stated_reason(
 
 
 def test_cuda_is_used_when_the_major_versions_agree() -> None:
-    assert choose_toolkit("/opt/cuda", "13.2", "13.0") == Toolkit("/opt/cuda", "13.2", "")
+    for release, torch_cuda in (("13.2", "13.0"), ("12.10", "12.8"), ("12.3", "12.8")):
+        assert choose_toolkit("/opt/cuda", release, torch_cuda) == Toolkit("/opt/cuda", release, "")
 
 
 def test_command_works_without_the_extension() -> None:

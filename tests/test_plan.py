@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -255,3 +257,17 @@ def test_indices_are_checked_before_memory_is_touched() -> None:
         _C.build_plan(vertices[:, :2].copy(), tets, 128, lambda done: None)
     with pytest.raises(ValueError, match=r"tets must be int64 \[count > 0, 4\]"):
         _C.build_plan(vertices, tets[:0], 128, lambda done: None)
+
+
+def test_a_mesh_that_32_bits_do_not_count_is_refused_unread(tmp_path: Path) -> None:
+    """Files without contents stand for arrays of gigabytes."""
+    vertices, tets = box((0.1, 0.1, 0.1), (1, 1, 1))
+    most = 1 << 28
+    many_tets = np.memmap(tmp_path / "tets", np.int64, "w+", shape=(most + 1, 4))
+    many_vertices = np.memmap(tmp_path / "vertices", np.float64, "w+", shape=(most + 1, 3))
+    for x, t in ((vertices, many_tets), (many_vertices, tets)):
+        with pytest.raises(
+            ValueError,
+            match=rf"up to 2\^28 = {most} vertices and tetrahedra.* got {len(x)} and {len(t)}; take a coarser",
+        ):
+            _C.build_plan(x, t, 128, lambda done: None)

@@ -2,28 +2,41 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
 import shutil
 import subprocess
+import warnings
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from torchpd import study
+from torchpd import study, study_axes, study_bench
 from torchpd.__main__ import main
+from torchpd.accuracy import ExactStep
 from torchpd.baselines import BASELINES
 from torchpd.contenders import CONTENDERS, DEFAULT
 from torchpd.ledger import Row
 from torchpd.shapes import box
 from torchpd.study import AXES, StudyOptions, cost_table, paper_table, run_study, study_rows, study_table
 from torchpd.study_axes import baseline_rows, contender_rows, float_rows, mesh_rows, paper_rows, time_step_rows
-from torchpd.study_bench import Bench, Setting, Timing, count_kernels, time_calls
+from torchpd.study_bench import (
+    Bench,
+    Setting,
+    Timing,
+    UncertainWarning,
+    count_kernels,
+    solved_step,
+    time_calls,
+    verdicts,
+)
 from torchpd.study_plots import STYLES, float32_floor, pareto_front
 from torchpd.subjects import SUBJECTS, subject_of
 
@@ -149,6 +162,56 @@ def test_float32_levels_off_where_float64_goes_on() -> None:
     assert float32_floor(rows([0.5, 1e-5], [])) is None
 
 
+def test_diverged_is_what_ends_so() -> None:
+    """Not the first iterate of a method that descends in energy; and an error that nobody knows is neither."""
+    assert verdicts([3.05, 0.4, 1e-3]) == ["ok", "ok", "ok"]
+    assert verdicts([0.9, 3.0, math.inf]) == ["ok", "diverged", "diverged"]
+    assert verdicts([math.nan, 0.1]) == ["diverged", "ok"]
+    assert verdicts([3.0, 0.4, 1e-3, 1e-12], 0.02) == ["ok", "ok", "uncertain", "uncertain"]
+    # below what any figure shows
+    assert verdicts([1e-12], 1e-10) == ["ok"]
+
+
+def test_a_stiff_beam_is_compared_with_its_converged_step() -> None:
+    """3,321 vertices at 1e8 Pa, on which Chebyshev does not converge."""
+    bench, setting = Bench(SUBJECTS["beam"](), CPU, series=1), Setting(1e8, 1 / 30, 8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UncertainWarning)
+        rows = contender_rows(bench, "Multilevel", torch.float64, setting, [1, 16, 64])
+    assert [row.status for row in rows] == ["ok"] * 3
+    assert rows[-1].error < 1e-6
+    assert study_table(rows).splitlines()[1].count("16 it.") >= 2
+    sim = bench.simulator(setting, torch.float64)
+    after, solved = solved_step(sim, bench.start(sim))
+    assert solved
+    exact = bench.hard_step(setting)[1]
+    assert exact.judge(after.velocities[0].numpy() * sim.time_step).position < 1e-6
+
+
+def test_uncertain_rows_are_marked_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the table, CSV, JSON and report, and by a warning."""
+    honest = study_bench.exact_steps
+
+    def doubtful(*given: Any, **more: Any) -> list[ExactStep]:
+        return [dataclasses.replace(step, uncertainty=0.05) for step in honest(*given, **more)]
+
+    monkeypatch.setattr(study_bench, "exact_steps", doubtful)
+    monkeypatch.setattr(study_axes, "solved_step", lambda sim, state: (sim(state), False))
+    options = StudyOptions(resolution=1, youngs=1e5, quick=True, axes=("solver", "time step"), out=tmp_path)
+    with pytest.warns(UncertainWarning, match=r"may itself be wrong by 5\.0e-02"):
+        said = run_study(options, progress=False)
+    assert "uncertain" in next(line for line in said.splitlines() if line.startswith("Multilevel"))
+    rows = [Row.from_json(row) for row in json.loads((tmp_path / "study.json").read_text())["rows"]]
+    for row in rows:
+        if row.axis == "solver":
+            assert row.uncertainty == 0.05
+            assert (row.status == "uncertain") == (row.error < 0.5)
+        else:
+            assert row.status == "uncertain"
+    assert "uncertain" in (tmp_path / "study.csv").read_text()
+    assert 'class="bad">uncertain' in (tmp_path / "report.html").read_text()
+
+
 def test_table_tells_refusals_from_what_is_not_reached() -> None:
     """A method that could not be run is not one that ran in vain."""
     row = Row("solver", "z", status="refused: knows no contacts; others do")
@@ -258,6 +321,11 @@ def test_report_opens_in_a_browser(quick: tuple[Path, str]) -> None:
     text = (out / "report.html").read_text(encoding="utf-8")
     # nothing is fetched: no script or style from elsewhere
     assert not re.search(r'<(script|link)[^>]+(src|href)="http', text)
+
+
+def test_report_has_the_slopes_of_the_pictures(quick: tuple[Path, str]) -> None:
+    text = (quick[0] / "report.html").read_text(encoding="utf-8")
+    assert text.count('"name":"order one in h"') == text.count('"name":"order two in the edge"') == 1
 
 
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,8 +10,9 @@ from cases import Case, box
 from runs import moving, same_bits, simulator
 
 import torchpd as pd
+from torchpd import summary
 from torchpd.gpu import Properties
-from torchpd.multilevel import precondition_plan, reference_of_levels
+from torchpd.plan import Plan
 from torchpd.regimes import choose_plan
 from torchpd.summary import workspace_bytes
 
@@ -112,10 +113,11 @@ def test_absent_effects_change_no_bits(dtype: torch.dtype, device: torch.device)
                 '"block", "cluster" or "stream"',
             ),
         ),
-        ("stream", ("1 patch,", "launches for every iteration", "B an environment during a step")),
+        ("stream", ("1 patch,", "launches for every iteration")),
     ],
 )
-def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...]) -> None:
+def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(summary, "step_bytes", lambda *_: 1)  # which asks a GPU
     sim = simulator(bare(pd.Ground()), torch.float32)
     values = sim.scene.values()
     sim.plan = choose_plan(values, torch.float32, Properties(132, 232_448, 16), kernel)
@@ -133,21 +135,23 @@ def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...]) ->
     assert "for a batch" not in str(told)
 
 
-@pytest.mark.parametrize(
-    ("outer", "direct", "count"),
-    [("momentum", 0, 4_032), ("lbfgs", 0, 13_248), ("lbfgs", 36, 12_672), ("corotated", 36, 30_848)],
-)
-def test_print_says_what_the_multilevel_solver_keeps_on_a_gpu(outer: str, direct: int, count: int) -> None:
-    """Of 36 vertices in float32: 7 quads, of a direct solve 6, eight pairs of quads, and for the small problem nine.
+@pytest.mark.parametrize("kernel", ["block", "stream"])
+def test_print_says_what_a_step_takes_on_a_gpu(kernel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each environment in the batch it was told, rounded up; but for a stream no more than those in work want."""
 
-    That adds up products of 16 and 16 numbers, twice, in one chunk and in all, and 300 of strains likewise.
-    """
-    sim = simulator(bare(), torch.float32, solver=pd.Multilevel(outer))
-    values = sim.scene.values()
-    plan = choose_plan(values, torch.float32, Properties(132, 232_448), levels=True)
-    sim.plan = precondition_plan(plan, values, *reference_of_levels(sim.plan.arrays), most_direct=direct)
-    assert (sim.vertices, sim.plan.patches) == (36, 1)
-    assert f"and {count:,} B for each that the GPU has in work at a time" in str(sim)
+    def taken(_: pd.Simulator, plan: Plan, batch: int, device: torch.device) -> int:
+        assert (plan.kernel, device.type) == (kernel, "cpu")
+        return 1000 * min(batch, 9) + 1
+
+    monkeypatch.setattr(summary, "step_bytes", taken)
+    most = ", at most 9,001 B in all" if kernel == "block" else ""
+    for batch, words in (
+        (None, "1,001 B an environment during a step"),
+        (12, "751 B an environment during a step of 12"),
+    ):
+        sim = simulator(bare(), torch.float32, batch=batch)
+        sim.plan = choose_plan(sim.scene.values(), torch.float32, Properties(132, 232_448), kernel)
+        assert str(sim).splitlines()[-2].endswith(f" B, {words}{most}")
 
 
 @pytest.mark.parametrize(("outer", "more"), [("momentum", 8), ("lbfgs", 24), ("corotated", 24 + 8)])

@@ -1,5 +1,7 @@
 """Compiles every CUDA source for the architectures that matter. Needs nvcc, but no GPU and no CUDA build of torch.
 
+The C++ sources of a CUDA build are read too, as far as the compiler's syntax check goes.
+
 What ptxas says about registers, spills and shared memory is kept in build/cuda-check/, one report per source, and with
 --table FILE as one table (CSV) of all kernels; benchmarks/results/cuda-registers.csv is the one of this repository.
 """
@@ -8,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import hashlib
 import itertools
 import os
 import re
@@ -17,18 +20,26 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+CSRC = ROOT / "csrc"
 REPORTS = ROOT / "build" / "cuda-check"
 TARGETS = ("80", "90")
+# to save time only the kernels that most steps run
+NEWER_TARGETS, NEWER_SOURCES = ("100",), ("fused_float.cu", "stream_float.cu", "multilevel_float.cu")
+# C++ that only a CUDA build of torch compiles, and what has parts for it
+GLUE = ("cuda/ops.cpp", "cuda/freeform_ops.cpp", "module.cpp")
+# a torch without CUDA lacks the header that says how its CUDA part was built
+GLUE_FLAGS = ("-std=c++20", "-Xcompiler=-fsyntax-only,-Wall,-Wextra,-Wno-psabi", "-DC10_CUDA_NO_CMAKE_CONFIGURE_FILE")
 
 
-def find_nvcc() -> str | None:
-    """nvcc of CUDA_HOME, of the PATH, or of the usual place."""
+def find_tool(name: str) -> str | None:
+    """A program of the toolkit: of CUDA_HOME, of the PATH, or of the usual place."""
     home = os.environ.get("CUDA_HOME")
-    candidates = [f"{home}/bin/nvcc"] if home else ["nvcc", "/usr/local/cuda/bin/nvcc"]
+    candidates = [f"{home}/bin/{name}"] if home else [name, f"/usr/local/cuda/bin/{name}"]
     return next((found for found in map(shutil.which, candidates) if found), None)
 
 
@@ -37,22 +48,35 @@ def include_folders() -> list[str]:
     from torch.utils.cpp_extension import include_paths
 
     system = [*include_paths(), sysconfig.get_path("include")]
-    return ["-I", str(ROOT / "csrc"), *(word for path in system for word in ("-isystem", path))]
+    return ["-I", str(CSRC), *(word for path in system for word in ("-isystem", path))]
+
+
+def nvcc_flags() -> tuple[str, ...]:
+    """Those that a build has."""
+    flags: tuple[str, ...] = runpy.run_path(str(ROOT / "torchpd" / "toolkit.py"))["NVCC_FLAGS"]
+    return flags
+
+
+def targets_of(source: Path) -> tuple[str, ...]:
+    """The architectures that a source is compiled for."""
+    return TARGETS + (NEWER_TARGETS if source.name in NEWER_SOURCES else ())
 
 
 def command_for(nvcc: str, source: Path, folders: list[str]) -> list[str]:
-    flags = runpy.run_path(str(ROOT / "torchpd" / "toolkit.py"))["NVCC_FLAGS"]
-    targets = [f"-gencode=arch=compute_{target},code=sm_{target}" for target in TARGETS]
-    return [nvcc, "-c", str(source), "-o", os.devnull, *flags, *targets, "-Xptxas=-v", "-DTORCHPD_CUDA", *folders]
+    command = [nvcc, "-c", str(source), "-o", os.devnull, "-DTORCHPD_CUDA", *folders]
+    if source.suffix == ".cpp":
+        return [*command, *GLUE_FLAGS]
+    targets = [f"-gencode=arch=compute_{target},code=sm_{target}" for target in targets_of(source)]
+    return [*command, *nvcc_flags(), *targets, "-Xptxas=-v"]
 
 
 def report_of(source: Path) -> Path:
-    return REPORTS / (source.relative_to(ROOT / "csrc").as_posix().replace("/", "-") + ".txt")
+    return REPORTS / (source.relative_to(CSRC).as_posix().replace("/", "-") + ".txt")
 
 
 def compile_source(command: list[str], source: Path) -> bool:
     """Compile one source, keep the report, and say what went wrong."""
-    name = source.relative_to(ROOT / "csrc").as_posix()
+    name = source.relative_to(CSRC).as_posix()
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     report = report_of(source)
     report.write_text(f"{shlex.join(command)}\n{result.stdout}{result.stderr}", encoding="utf-8")
@@ -66,7 +90,10 @@ def compile_source(command: list[str], source: Path) -> bool:
 _ENTRY = re.compile(r"Compiling entry function '(?P<kernel>\w+)' for 'sm_(?P<architecture>\d+)'")
 _FRAME = re.compile(r"(?P<stack>\d+) bytes stack frame, (?P<spill_stores>\d+) bytes spill stores, (?P<spill_loads>\d+)")
 _USED = re.compile(r"Used (?P<registers>\d+) registers(?:.*?(?P<shared>\d+) bytes smem)?")
-COLUMNS = ("source", "architecture", "kernel", "registers", "stack", "spill_stores", "spill_loads", "shared")
+# the fingerprint is in the first row alone
+COLUMNS = (
+    "source", "architecture", "kernel", "registers", "stack", "spill_stores", "spill_loads", "shared", "fingerprint",
+)  # fmt: skip
 
 
 def kernels_of(report: str) -> list[dict[str, str]]:
@@ -95,8 +122,40 @@ def kernel_name(signature: str) -> str:
     return signature.removeprefix("void ")
 
 
-def write_table(path: Path, reports: list[Path]) -> None:
-    """All kernels of some reports, by name."""
+_INCLUDE = re.compile(r'^\s*#include "(.+)"', re.MULTILINE)
+_COMMENT = re.compile(r"//.*")
+
+
+def with_headers(sources: Iterable[Path], root: Path) -> list[Path]:
+    """Sources and what they include of a folder, by name."""
+    found: set[Path] = set()
+    new = set(sources)
+    while new:
+        found |= new
+        named = {root / name for path in new for name in _INCLUDE.findall(path.read_text(encoding="utf-8"))}
+        new = {path for path in named if path.exists()} - found
+    return sorted(found)
+
+
+def fingerprint(root: Path = CSRC) -> str:
+    """Of all that a table depends on but the compiler: CUDA sources without comments, what they include, and flags."""
+    sources = sorted(root.glob("**/*.cu"))
+    digest = hashlib.sha256(repr([nvcc_flags(), list(map(targets_of, sources))]).encode())
+    for path in with_headers(sources, root):
+        code = _COMMENT.sub("", path.read_text(encoding="utf-8"))
+        digest.update(repr((path.relative_to(root).as_posix(), code.split())).encode())
+    return digest.hexdigest()[:16]
+
+
+def read_table(path: Path) -> tuple[str, list[dict[str, str]]]:
+    """The fingerprint of what a table was made of, and its rows."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return rows[0].get("fingerprint", ""), rows
+
+
+def write_table(path: Path, reports: list[Path], made_of: str) -> None:
+    """All kernels of some reports, by name, and the fingerprint of what they were made of."""
     rows = [
         {"source": report.stem} | row for report in reports for row in kernels_of(report.read_text(encoding="utf-8"))
     ]
@@ -111,6 +170,7 @@ def write_table(path: Path, reports: list[Path]) -> None:
             raise ValueError(
                 f"{one['source']} has two kernels of the name {one['kernel']} for sm_{one['architecture']}"
             )
+    rows[0]["fingerprint"] = made_of
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
@@ -121,19 +181,24 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Compile every CUDA source; no GPU needed.")
     parser.add_argument("--table", type=Path, help="file for a table of the kernels' registers and spills (CSV)")
     options = parser.parse_args()
-    nvcc = find_nvcc()
+    nvcc = find_tool("nvcc")
     if nvcc is None:
         print("cuda-check: skipped, there is no nvcc (set CUDA_HOME to the folder of a CUDA toolkit)")
         return 0
-    sources = sorted((ROOT / "csrc").glob("**/*.cu"))
-    folders = include_folders() if sources else []
+    sources = sorted(CSRC.glob("**/*.cu"))
+    everything = [*sources, *(CSRC / name for name in GLUE)]
+    folders = include_folders()
     REPORTS.mkdir(parents=True, exist_ok=True)
+    made_of = fingerprint()  # now: who changes a source meanwhile makes the table stale
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        passed = list(pool.map(lambda source: compile_source(command_for(nvcc, source, folders), source), sources))
-    targets = ", ".join(f"sm_{target}" for target in TARGETS)
-    print(f"cuda-check: {sum(passed)} of {len(sources)} CUDA sources compile for {targets} with {nvcc}")
+        passed = list(pool.map(lambda source: compile_source(command_for(nvcc, source, folders), source), everything))
+    usual, newer = (" and ".join(f"sm_{target}" for target in targets) for targets in (TARGETS, NEWER_TARGETS))
+    print(
+        f"cuda-check: {sum(passed)} of {len(everything)} sources of a CUDA build compile for {usual}, "
+        f"{', '.join(NEWER_SOURCES)} for {newer} too, with {nvcc}"
+    )
     if options.table and all(passed):
-        write_table(options.table, [report_of(source) for source in sources])
+        write_table(options.table, [report_of(source) for source in sources], made_of)
     return 0 if all(passed) else 1
 
 

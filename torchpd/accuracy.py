@@ -21,13 +21,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .contact_newton import ContactNewton
 from .effects import Ground, Sphere
 from .material import MATERIAL_ROWS
 from .reference import StepProblem, step_problem
-from .reference_solvers import newton, newton_step
 from .scene import Part, Scene
-from .solvers import Chebyshev
-from .state import Info, State
+from .solvers import Chebyshev, Multilevel, Solver
+from .state import State
 from .targets import Targets
 
 if TYPE_CHECKING:
@@ -37,9 +37,15 @@ __all__ = ["Errors", "ExactStep", "exact_steps", "frictionless", "problem_of", "
 
 Array = NDArray[np.float64]
 
-_CHUNK = 500  # iterations between two looks at the residual
-_SOLVED = 1e-12  # residual at which nothing is left to gain
-_NEWTON_VERTICES = 3000  # above, the factorisation of the Hessian takes minutes
+# Solvers of exact steps, with iterations between two looks at the residual. The first is the best by far without
+# contacts; with them each knows scenes on which the others creep.
+_SOLVERS: tuple[tuple[Solver, int], ...] = ((Multilevel(), 50), (Multilevel("momentum"), 100), (Chebyshev(), 500))
+_SOLVED = 1e-13  # residual at which nothing is left to gain
+_NEARLY = 1e-9  # residual that may be as low as rounding lets it
+_PATIENCE = 3  # looks in which no residual halves, one where all are nearly solved
+_SURE = 1e-8  # uncertainty of a converged step that ends the search for a better one
+# and that Newton's method is spared for: what rounding of the precision hides
+_FINE = {torch.float32: 1e-8, torch.float64: 1e-14}
 # of the positions: what rounding them already moves a body that only falls, and what a stiff one scatters by
 ROUNDINGS = 10.0
 
@@ -77,8 +83,13 @@ class ExactStep:
 
     def error_beyond_rounding(self, displacement: Array, dtype: torch.dtype, roundings: float = ROUNDINGS) -> float:
         """The least e >= 0 with |u - u*| <= e |u_0 - u*| + `rounding`."""
-        excess = self.judge(displacement).position - self.rounding(dtype, roundings) / self.scale
-        return max(excess, 0.0)
+        return max(self.position_error(displacement) - self.rounding(dtype, roundings) / self.scale, 0.0)
+
+    def position_error(self, displacement: Array) -> float:
+        """|u - u*| / |u_0 - u*| of u [V, 3] m, which costs far less than all `Errors`; inf without numbers."""
+        with np.errstate(all="ignore"):
+            error = float(np.linalg.norm(displacement - self.solution)) / self.scale
+        return error if np.isfinite(error) else np.inf
 
     def judge(self, displacement: Array) -> Errors:
         """The errors of u [V, 3] m; inf where it left the range of numbers."""
@@ -91,7 +102,7 @@ class ExactStep:
             residual, course = (np.linalg.norm(problem.residual(u)) for u in (displacement, problem.course()))
             lift = energies[1] - energies[2]
             found = Errors(
-                float(np.linalg.norm(off)) / self.scale,
+                self.position_error(displacement),
                 (energies[0] - energies[2]) / lift if lift > 0.0 else 0.0,
                 float(residual / course) if course > 0.0 else 0.0,
                 float(np.linalg.norm(off, axis=1).max()),
@@ -164,10 +175,12 @@ def problem_of(
     )
 
 
-def _doubled(targets: Mapping[Part, Tensor] | None) -> Mapping[Part, Tensor] | None:
-    if targets is None:
-        return None
-    return {part: place.double() for part, place in targets.items()}
+def _widened(targets: Mapping[Part, Tensor] | None) -> Mapping[Part, Tensor] | None:
+    return None if targets is None else {part: _wide(place) for part, place in targets.items()}
+
+
+def _wide(tensor: Tensor) -> Tensor:
+    return tensor.detach().to("cpu", torch.float64)
 
 
 def _double(tensor: Tensor) -> Array:
@@ -182,68 +195,106 @@ def exact_steps(
     forces: Tensor | None = None,
     targets: Targets | None = None,
     start: str = "velocity",
-    iterations: int = 20000,
+    iterations: int = 5000,
 ) -> list[ExactStep]:
     """The converged step of every environment, from the state and material that `sim` holds, rounded as they are.
 
-    Guarded Chebyshev in float64 until the residual stops falling, then Newton's method where there is no contact and
-    the mesh is small enough. `ExactStep.uncertainty` bounds what is left: |grad E| / min m/h^2 >= |u - u*| where the
-    elements are stable, or twice its next step where Newton's method ended, which stiff bodies have far shorter.
+    `Multilevel` in float64 on the CPU until the residual stops falling, then Newton's method where it leaves a doubt,
+    contacts or not; if that does not help, other solvers go on from the best so far. `ExactStep.uncertainty` bounds
+    what is left: |grad E| / min m/h^2 >= |u - u*| where the elements are stable, or twice the next step of Newton's
+    method, which stiff bodies have far shorter. It may be large: then there is no converged step to compare with.
 
     Args:
-        sim: scene, time step and material; its solver and precision do not matter.
+        sim: scene, time step and material; its solver and device do not matter, float32 is content with less certainty.
         state: where the steps start, [B, V, 3].
         forces: [B, V, 3] N.
         targets: of pins and spheres, as in `Simulator.forward`.
         start: of the first iterate u_0, "velocity" or "inertial".
-        iterations: of Chebyshev, at most.
+        iterations: of each solver, at most.
     """
-    twin = frictionless(sim, torch.float64)
-    twin.solver, twin.iterations = Chebyshev(), _CHUNK
-    wide = State(state[0].double(), state[1].double())
-    force = None if forces is None else forces.double()
-    places = targets.double() if isinstance(targets, Tensor) else _doubled(targets)
-    best: Tensor | None = None
-    lowest = torch.full((len(wide.positions),), torch.inf, device="cpu")
-    guess: str | Tensor = start
-    for _ in range(0, iterations, _CHUNK):
-        after, info = _step(twin, wide, force, places, guess)
-        residual = info.residual.cpu()
-        if best is None:
-            best = after.velocities.clone()
-        better = residual < 0.5 * lowest
-        best[better] = after.velocities[better]
-        lowest = torch.where(better, residual, lowest)
-        if not bool((better & (lowest > _SOLVED)).any()):
-            break
-        guess = after.positions
-    assert best is not None
-    found = []
-    for item in range(len(wide.positions)):
-        problem = problem_of(sim, state, item, forces=forces, targets=targets)
-        found.append(_polished(problem, problem.first_iterate(start), _double(best[item]) * sim.time_step))
-    return found
+    # whatever torch's default device
+    with torch.device("cpu"):
+        search = _Search(sim, state, forces, targets, start)
+        for solver, chunk in _SOLVERS:
+            search.iterate(solver, chunk, iterations)
+            search.polish(_FINE[sim.dtype])
+            if search.sure:
+                break
+    return [step for step in search.found if step is not None]
 
 
-def _step(
-    sim: Simulator, state: State, forces: Tensor | None, targets: Targets | None, start: str | Tensor
-) -> tuple[State, Info]:
-    after, info = sim(state, forces, targets, start, return_info=True)
-    return after, info
+class _Search:
+    """Looks for the converged steps of a batch; keeps the best of each environment."""
+
+    def __init__(
+        self, sim: Simulator, state: State, forces: Tensor | None, targets: Targets | None, start: str
+    ) -> None:
+        # the CPU has all solvers, whatever kernel a GPU was asked for
+        self.twin = frictionless(sim)
+        self.twin.solver = Chebyshev()
+        self.twin = self.twin.to("cpu", torch.float64)
+        self.state = State(_wide(state[0]), _wide(state[1]))
+        self.forces = None if forces is None else _wide(forces)
+        self.targets = _wide(targets) if isinstance(targets, Tensor) else _widened(targets)
+        self.problems = [problem_of(sim, state, item, forces=forces, targets=targets) for item in range(len(state[0]))]
+        self.firsts = [problem.first_iterate(start) for problem in self.problems]
+        self.best: Tensor = torch.from_numpy(np.array(self.firsts))  # displacements [B, V, 3] m
+        self.lowest = torch.full((len(self.problems),), torch.inf, dtype=torch.float64)
+        self.found: list[ExactStep | None] = [None] * len(self.problems)
+
+    @property
+    def sure(self) -> bool:
+        """Whether every step is known well enough."""
+        return all(step is not None and step.uncertainty <= _SURE for step in self.found)
+
+    def iterate(self, solver: Solver, chunk: int, most: int) -> None:
+        """Go on from the best with a solver until no residual falls any more."""
+        self.twin.solver, self.twin.iterations = solver, chunk
+        guess, idle = self.state.positions + self.best, 0
+        for _ in range(0, most, chunk):
+            after, info = self.twin(self.state, self.forces, self.targets, guess, return_info=True)
+            # not the difference of positions, which has lost digits
+            reached = after.velocities * self.twin.time_step
+            better = info.residual < self.lowest
+            halved = bool((info.residual < 0.5 * self.lowest).any())
+            self.best = torch.where(better[:, None, None], reached, self.best)
+            self.lowest = torch.where(better, info.residual, self.lowest)
+            idle = 0 if halved else idle + 1
+            least = _PATIENCE if bool((self.lowest > _NEARLY).any()) else 1
+            if idle >= least or not bool((self.lowest > _SOLVED).any()):
+                break
+            guess = after.positions
+
+    def polish(self, fine: float) -> None:
+        """Judge the best of every environment that is not yet known, by Newton's method where the residual does not."""
+        for item, (problem, first) in enumerate(zip(self.problems, self.firsts, strict=True)):
+            known = self.found[item]
+            if known is not None and known.uncertainty <= _SURE:
+                continue
+            step = _judged(problem, first, self.best[item].numpy(), fine)
+            if known is None or step.uncertainty < known.uncertainty:
+                self.found[item] = step
+                self.best[item] = torch.from_numpy(step.solution)
 
 
-def _polished(problem: StepProblem, first: Array, near: Array) -> ExactStep:
+def _judged(problem: StepProblem, first: Array, near: Array, fine: float) -> ExactStep:
     """The solution next to an almost converged displacement, and how certain it is."""
-    contacts = len(problem.values.planes) + len(problem.values.spheres)
-    solution, nearest = near, np.inf
-    if not contacts and len(near) <= _NEWTON_VERTICES:
-        try:
-            solution = newton(problem, near)
-            step = newton_step(problem, solution)
-            nearest = np.inf if step is None else 2.0 * float(np.linalg.norm(step))
-        except RuntimeError:  # stalls at a kink of the rotations: the iterate stays
-            solution = near
-    left = float(np.linalg.norm(problem.residual(solution)))
-    scale = float(np.linalg.norm(first - solution))
+    step = ExactStep(problem, first, near, _doubt(problem, first, near))
+    if step.uncertainty <= fine:
+        return step
+    newton = ContactNewton(problem)
+    solution = newton.minimise(near)
+    way, own = newton.step(solution)
+    doubt = min(_doubt(problem, first, solution), _share(2.0 * way, first - solution) if own else np.inf)
+    return min(step, ExactStep(problem, first, solution, doubt), key=lambda found: found.uncertainty)
+
+
+def _doubt(problem: StepProblem, first: Array, displacement: Array) -> float:
+    """|grad E| / min m/h^2 over |u_0 - u|."""
     weakest = float(problem.weight[problem.free].min(initial=np.inf))
-    return ExactStep(problem, first, solution, min(left / weakest, nearest) / scale if scale > 0.0 else 0.0)
+    return _share(problem.residual(displacement) / weakest, first - displacement)
+
+
+def _share(way: Array, whole: Array) -> float:
+    size = float(np.linalg.norm(whole))
+    return float(np.linalg.norm(way)) / size if size > 0.0 else 0.0

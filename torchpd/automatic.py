@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from .forecast import Forecast, Spectrum, forecast, has_friction, spectrum_of
+from .forecast import Forecast, Spectrum, forecast, has_contacts, spectrum_of
 from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
 
 if TYPE_CHECKING:
@@ -62,12 +62,13 @@ class Costs(NamedTuple):
 
 # Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers,
 # those of further environments with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were
-# measured on "block" alone, with 256 and 936 vertices, which the squares fit.
+# measured on "block", with 256 and 936 vertices, which the squares fit, and on "cluster" with Chebyshev, by
+# `benchmarks/few_environments.py`; `Multilevel` runs alike there.
 # Kernels without `more` choose for a batch as for one environment.
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
     "block": Costs(Cost(2.6, 5.0, 0.033, 0.022), Cost(31.0, 3.0, 0.6, 0.79)),
-    "cluster": Costs(Cost(0.8, 0.5), Cost(28.0, 9.0)),
+    "cluster": Costs(Cost(0.8, 0.5, 0.3), Cost(28.0, 9.0, 0.6, 0.79)),
     "grid": Costs(Cost(1.2, 0.13), Cost(50.0, 2.4)),
     "stream": Costs(Cost(6.0, 0.18), Cost(50.0, 2.4)),
 }
@@ -100,9 +101,9 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
     if spectrum is None:
         return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
-    if has_friction(sim):
+    if has_contacts(sim):
         plain = _known(forecast(sim, chebyshev, spectrum))
-        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and friction may lead Multilevel astray"
+        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and contacts may keep Multilevel from working"
         return chebyshev, chosen(_enough(plain), why)
     plain, lasting, short = (_known(forecast(sim, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
     saves = short.iterations(AIM) - lasting.iterations(AIM) >= MAKING

@@ -3,7 +3,7 @@
 The smallest ratio mu of inertia to diagonal bounds the spectrum of D^-1 A from below, and with it the rate of the
 Jacobi and Chebyshev iterations. What `Multilevel` needs does not depend on the mesh, but on mu n^(2/3), n vertices of a
 body: about rho L^2 / (E h^2), how far a wave travels in a step against the size L of the body. It grows with the
-logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. On 190 random scenes
+logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. On 197 random scenes
 nine of ten needed 0.3 to 1.5 times the forecast, meshes with slivers the least (`benchmarks/forecast.py`).
 `Simulator.tune` measures instead.
 
@@ -29,6 +29,7 @@ __all__ = [
     "Spectrum",
     "UnsolvedWarning",
     "forecast",
+    "has_contacts",
     "has_friction",
     "spectrum_of",
     "warn_of_few_iterations",
@@ -37,7 +38,6 @@ __all__ = [
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
 # iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
 _LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
-_LEVELS_CONTACTS = 1.25  # times as many where vertices may touch something
 _MOST = 10_000
 FAR_TOO_FEW = 0.1  # error that is left
 
@@ -121,21 +121,26 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     numbers = solver.numbers()
     if spectrum is None or not numbers["weighted"]:
         return None
-    if isinstance(solver, Multilevel) and not has_friction(sim):
+    if isinstance(solver, Multilevel) and not has_contacts(sim):
         body = max(len(solid.mesh.vertices) for solid in sim.scene.solids)
         reach = min(spectrum.slow * body ** (2.0 / 3.0), 1.0)
         decade = _LEVELS_LEAST + _LEVELS_SLOPE[solver.outer] * math.log10(1.0 / reach)
-        contacts = sim.planes.shape[-2] + sim.spheres.shape[-2]
-        return Forecast(math.log(10.0) / (decade * (_LEVELS_CONTACTS if contacts else 1.0)))
+        return Forecast(math.log(10.0) / decade)
     theta, rho = numbers["relaxation"], numbers["rho"]
     slowest = 1.0 - theta * spectrum.slow
     limit = 0.0
-    if isinstance(solver, (Chebyshev, Multilevel)):  # with friction Multilevel is mostly accelerated Jacobi
+    # where much touches, or friction holds, Multilevel is mostly accelerated Jacobi
+    if isinstance(solver, (Chebyshev, Multilevel)):
         limit = _limit(rho if rho > 0.0 else slowest)
     # the error has little of the modes at the upper end of the spectrum, [mu, 1], but half of it of the middle
     middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0
     left = max(_decay(slowest, limit), _decay(middle, limit), 1e-3)
     return Forecast(-math.log(min(left, 1.0 - 1e-15)))
+
+
+def has_contacts(sim: Model) -> bool:
+    """Whether the scene has anything to touch."""
+    return sim.planes.shape[-2] + sim.spheres.shape[-2] > 0
 
 
 def has_friction(sim: Model) -> bool:

@@ -20,7 +20,7 @@ class Row:
 
     axis: str  # whose error: "solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper"
     method: str
-    status: str = "ok"  # else "diverged", or "refused: " and why
+    status: str = "ok"  # else "diverged", "uncertain", or "refused: " and why
     precision: str = "float64"
     compiled: bool = True  # C++ of this library, or NumPy and SciPy
     iterations: int = 0
@@ -30,6 +30,7 @@ class Row:
     vertices: int = 0
     tets: int = 0
     error: float = math.inf  # relative, of positions
+    uncertainty: float | None = None  # of what the error is measured against, relative as the error
     error_energy: float | None = None  # relative
     error_metres: float | None = None  # largest of a vertex
     residual: float | None = None
@@ -48,6 +49,19 @@ class Row:
         """Why nothing was run, in a few words; None for what ran, however badly."""
         verdict, _, why = self.status.partition(": ")
         return why.split(";")[0] if verdict == "refused" else None
+
+    @property
+    def failed(self) -> bool:
+        """Whether it diverged: what is uncertain may be as good as it says."""
+        return self.status == "diverged"
+
+    def reaches(self, goal: float) -> bool:
+        """Whether the error is below a goal for sure."""
+        return self.error + (self.uncertainty or 0.0) <= goal
+
+    def may_reach(self, goal: float) -> bool:
+        """Whether the error may be below a goal."""
+        return self.error - (self.uncertainty or 0.0) <= goal
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; JSON has no infinity, which becomes null."""

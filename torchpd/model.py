@@ -14,8 +14,8 @@ from .automatic import Choice, choose_solver
 from .checks import check_has_values, check_like, check_whole
 from .forecast import warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_batches, check_material, material_of
-from .multilevel import has_levels
-from .placing import check_wanted_device, plan_anew, plan_for_solver, plan_on
+from .multilevel import has_levels, has_strangers
+from .placing import check_wanted_device, move_plan, plan_anew, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
@@ -112,7 +112,7 @@ class Model(nn.Module):
         self._batch = _check_batch(batch)
         try:
             if self.plan.kernel is not None:
-                self.plan = plan_anew(self, self.dtype, self.device).to(self.device)
+                self.plan = move_plan(self, plan_anew(self, self.dtype, self.device), self.device)
             if self.choice is not None:
                 self._choose_again(self.choice)
         except BaseException:
@@ -199,8 +199,8 @@ class Model(nn.Module):
         """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`, the choice of "auto".
 
         Worth it after the material has changed unevenly, which `Info.rho` and `Info.residual` tell, or time_step has.
-        `set_material` does it by itself when it pins other vertices hard, or frees some. Takes 0.3 s for 8 thousand
-        vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
+        `set_material` does it by itself when it pins other vertices hard, frees some, or gives them much stiffer
+        springs. Takes 0.3 s for 8 thousand vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
         """
         check_has_values("prepare_solver", self.device)
         before = self.plan
@@ -245,6 +245,8 @@ class Model(nn.Module):
             }
             # before anything is replaced, because it may fail
             plan = self._plan_with(checked)
+            if self.promise is not None and any(not torch.equal(new, getattr(self, n)) for n, new in checked.items()):
+                self.promise.other_material = True
             for name, tensor in checked.items():
                 if name in parameters:
                     setattr(self, name, parameters[name])
@@ -254,18 +256,21 @@ class Model(nn.Module):
 
     def _plan_with(self, arrays: dict[str, Tensor]) -> Plan:
         """The plan that serves the material with some arrays replaced."""
-        # what is held belongs to the structure of a preconditioner
-        held = _held_everywhere(self.pin_stiffness), _held_everywhere(arrays.get("pin_stiffness", self.pin_stiffness))
-        if not has_levels(self.plan.arrays) or torch.equal(*held):
+        if not has_levels(self.plan.arrays) or "pin_stiffness" not in arrays:
             return self.plan
-        return plan_for_solver(self, [arrays.get(name, getattr(self, name)) for name in MATERIAL_ROWS])
+        # what is held belongs to the structure of a preconditioner
+        held = _held_everywhere(self.pin_stiffness), _held_everywhere(arrays["pin_stiffness"])
+        material = [arrays.get(name, getattr(self, name)) for name in MATERIAL_ROWS]
+        if torch.equal(*held) and not has_strangers(self.plan, material, self.time_step):
+            return self.plan
+        return plan_for_solver(self, material)
 
     def _checked_material(self, name: str, value: Tensor | float) -> Tensor:
         if name not in MATERIAL_ROWS:
             raise TypeError(f"set_material: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}")
         own = getattr(self, name)
         try:
-            tensor = (value if isinstance(value, Tensor) else torch.as_tensor(value, device=self.device)).detach()
+            tensor = (value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")).detach()
         except (TypeError, ValueError, RuntimeError):
             raise TypeError(f"set_material: {name} must be a number or a tensor, got {value!r}") from None
         if tensor.is_complex() or tensor.dtype == torch.bool:

@@ -17,7 +17,7 @@ from .plan import Plan, compiling
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE
 
-__all__ = ["has_levels", "precondition_plan", "reference_of", "reference_of_levels", "without_levels"]
+__all__ = ["has_levels", "has_strangers", "precondition_plan", "reference_of", "reference_of_levels", "without_levels"]
 
 # Two dense products there take less time than the many short phases of a cycle: each of those waits for all blocks.
 # With many environments, of a block or two each, the cycle's fewer numbers take less, but for a mesh of one patch.
@@ -61,6 +61,13 @@ def reference_of(plan: Plan, material: Sequence[Tensor], time_step: float) -> Re
         largest = torch.where(inertia.isinf(), 0.0, inertia).amax(0)
         inertia = torch.where(inertia.isinf().all(0), torch.inf, largest)
     return stiffness, inertia
+
+
+def has_strangers(plan: Plan, material: Sequence[Tensor], time_step: float) -> bool:
+    """Whether springs hold any vertex so much harder than M knows that it is left to the diagonal."""
+    _, known = reference_of_levels(plan.arrays)
+    _, inertia = reference_of(plan, material, time_step)
+    return bool((inertia > _C.known_inertia * known).any())
 
 
 def precondition_plan(

@@ -250,7 +250,8 @@ def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | No
     return grads
 
 
-@torch.library.custom_op("torchpd::step_vjp", mutates_args=())
+# it asks whether its solve has converged, which no recording can
+@torch.library.custom_op("torchpd::step_vjp", mutates_args=(), tags=[torch.Tag.cudagraph_unsafe])
 def step_vjp(
     grad_positions: Tensor,
     grad_velocities: Tensor,

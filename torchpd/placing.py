@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from . import _C
-from .gpu import free_memory, properties_of, refuse_full_memory, why_not
+from .gpu import free_memory, properties_of, refuse_full_memory, seen_devices, step_bytes, why_not
 from .material import material_of
 from .multilevel import precondition_plan, reference_of, reference_of_levels, without_levels
 from .plan import Plan, compile_plan
@@ -19,7 +19,7 @@ from .solvers import Multilevel
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_wanted_device", "find_device", "plan_anew", "plan_for_solver", "plan_on"]
+__all__ = ["check_wanted_device", "find_device", "move_plan", "plan_anew", "plan_for_solver", "plan_on"]
 
 
 def _reason(device: torch.device | None = None) -> str:
@@ -34,7 +34,10 @@ def find_device(name: str) -> torch.device:
         raise ValueError(f"--device must be cpu or cuda, got {name}")
     if kind == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: torch sees no CUDA device here; python -m torchpd doctor says more")
-    return torch.device(name)
+    device = torch.device(name)
+    if kind == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise ValueError(f"--device {name} is not there: {seen_devices()}")
+    return device
 
 
 def check_wanted_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor:
@@ -43,6 +46,8 @@ def check_wanted_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor
         wanted = fn(probe)
     except (AssertionError, RuntimeError) as error:
         reason = _reason()
+        if not reason and "invalid device ordinal" in str(error):
+            raise RuntimeError(f"Simulator: there is no such GPU: {seen_devices()}") from error
         if not reason or not any(word in str(error) for word in ("CUDA", "NVIDIA")):
             raise
         raise RuntimeError(f"Simulator: no CUDA here: {reason}") from error
@@ -78,10 +83,20 @@ def plan_for_solver(sim: Model, material: Sequence[Tensor]) -> Plan:
     plan = without_levels(sim.plan)
     # kernels of a GPU want other patches for a multilevel solver than for the others
     if plan.kernel is not None and wants != plan.for_levels:
-        plan = _compile(sim, sim.dtype, sim.device).to(sim.device)
+        plan = _compile(sim, sim.dtype, sim.device)
     if wants:
-        plan = precondition_plan(plan, sim.scene.values(), *reference_of(plan, material, sim.time_step))
-    return plan
+        plan = precondition_plan(plan, sim.scene.values(), *reference_of(sim.plan, material, sim.time_step))
+    return move_plan(sim, plan, sim.device)
+
+
+def move_plan(sim: Model, plan: Plan, device: torch.device, material: int = 0) -> Plan:
+    """A plan on its device, where a GPU has room for it, for `material` bytes beside it and for a step."""
+    if plan.device == device:
+        return plan
+    if device.type == "cuda":
+        needed = plan.bytes + material + step_bytes(sim, plan, sim.batch or 1, device)
+        refuse_full_memory(needed, free_memory(device))
+    return plan.to(device)
 
 
 def plan_anew(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
@@ -103,7 +118,5 @@ def plan_on(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
     """The plan of a simulator for a precision and a device: its own moved there where that will do."""
     same = dtype == sim.dtype and _same_plan(sim.device, device)
     plan = sim.plan if same else plan_anew(sim, dtype, device)
-    if device.type == "cuda" and device != sim.device:
-        material = sum(array.numel() for array in (*sim.material(), sim.rest_positions))
-        refuse_full_memory(plan.bytes + material * (torch.finfo(dtype).bits // 8), free_memory(device))
-    return plan.to(device)
+    numbers = sum(array.numel() for array in (*sim.material(), sim.rest_positions))
+    return move_plan(sim, plan, device, numbers * (torch.finfo(dtype).bits // 8))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .accuracy import ROUNDINGS
+from .material import fingerprint
 from .solvers import Solver
 from .state import Info, State
 from .targets import Targets
@@ -30,9 +31,9 @@ class Trial(NamedTuple):
     errors: tuple[float, ...] = ()  # of the states
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Promise:
-    """What `Simulator.tune` chose and what may be expected of it, for motions like the studied one.
+    """What `Simulator.tune` chose and what may be expected of it, for motions like the studied one of that material.
 
     |x - x*| <= error |x_0 - x*| + 10 eps |x|: x* the converged step, x_0 the first iterate, friction left out, eps of
     the precision. The last term matters to steps that hardly change anything, as of a body that comes to rest.
@@ -54,6 +55,9 @@ class Promise:
     device: str
     batch: int
     trials: tuple[Trial, ...]
+    material: str  # fingerprint of the arrays
+    left_out: str = ""  # solver that was not tried though it might do better, and why
+    other_material: bool = False  # set by `Simulator.set_material`, and by `covers` where it finds another one
 
     def holds(self, info: Info) -> Tensor:
         """Whether the error may still be relied on [B] (bool), from the residual that `return_info=True` reports.
@@ -61,8 +65,9 @@ class Promise:
         An estimate, calibrated on the studied states: the promise is doubted when the residual is larger than they had
         where their error was the promised one, and when it is not a number. Residuals weigh short waves and errors
         long ones, so most steps that break a promise have a residual like any other: see `estimate` and `audit`.
+        Nowhere once `set_material` has brought other numbers; what an optimiser writes in place only `covers` finds.
         """
-        return info.residual <= self.residual_limit
+        return (info.residual <= self.residual_limit) & (not self.other_material)
 
     @torch.no_grad()
     def audit(
@@ -106,12 +111,17 @@ class Promise:
         return info.residual * self.error_per_residual
 
     def covers(self, sim: Simulator) -> bool:
-        """Whether the simulator still has the settings that were promised for; the material is not compared."""
+        """Whether the simulator still has the settings and the material that were promised for; awaits a GPU."""
         now = (sim.solver, sim.iterations, sim.time_step, sim.dtype, str(sim.device), sim.tolerance)
-        return now == (self.solver, self.iterations, self.time_step, self.dtype, self.device, 0.0)
+        if now[3:5] == (self.dtype, self.device):
+            self.other_material = fingerprint(sim.material()) != self.material
+        same = now == (self.solver, self.iterations, self.time_step, self.dtype, self.device, 0.0)
+        return same and not self.other_material
 
     def __str__(self) -> str:
         wanted = f"error {self.asked_error:g}" if self.asked_error is not None else f"{self.asked_milliseconds:g} ms"
-        verdict = "" if self.attained else f" ({wanted} cannot be had)"
+        why = f"{wanted} not reached; {self.left_out}" if self.left_out else f"{wanted} cannot be had"
+        verdict = "" if self.attained else f" ({why})"
         rounding = f" and up to {self.rounding:.1e} of rounding" if self.rounding > 0.1 * self.error else ""
-        return f"error {self.error:.1e}{rounding}, {self.milliseconds:.2g} ms a step of {self.batch}{verdict}"
+        other = ", for another material than now" if self.other_material else ""
+        return f"error {self.error:.1e}{rounding}, {self.milliseconds:.2g} ms a step of {self.batch}{verdict}{other}"

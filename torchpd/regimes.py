@@ -6,7 +6,7 @@
     grid     a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
     stream   launches for every iteration: any mesh
 
-A few environments of a small mesh are done in a third of the time with "cluster" as with "block", which is for many
+A few environments of a small mesh are done in two fifths of the time with "cluster" as with "block", which is for many
 (`Simulator(batch=...)` says which they are).
 Every vertex belongs to one patch of a cluster, and a patch has every tetrahedron that touches one of its own vertices:
 those at the borders are worked out by several. So no forces are exchanged, and once an iteration the new position of a
@@ -39,7 +39,14 @@ _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than th
 # "auto" looks at clusters for meshes of so many at most; where there are blocks, a patch of one for every so many
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
 _CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
-# environments are many where they have no more multiprocessors than so many each
+# waves of clusters that are done before blocks, an environment a multiprocessor, are: 64 iterations take a wave 71 to
+# 91 us, and blocks 213 to 457 (benchmarks/results/few-environments-h100.json)
+_CLUSTER_WAVES = 3
+# registers of a multiprocessor, and of a thread of a cluster (benchmarks/results/cuda-registers.csv): what a wave has
+# room for, but for the share of a GPU that whole clusters leave free
+_REGISTERS, _CLUSTER_REGISTERS = 65536, {torch.float32: 168, torch.float64: 256}
+_CLUSTER_SHARE = 7 / 8
+# with a multilevel solver environments are many where they have no more multiprocessors than so many each
 _MANY_SHARE = 4
 # with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block, of a mesh of so many at
 # most, fewer for few environments; many take less with fewer patches
@@ -130,6 +137,17 @@ class _Scene(NamedTuple):
     def considers(self, kernel: str, gpu: Properties) -> bool:
         """Whether "auto" looks at a kernel."""
         return kernel != "cluster" or (gpu.cluster > 1 and self.tets <= _CLUSTER_TETS)
+
+    def are_few(self, batch: int | None, gpu: Properties) -> bool:
+        """Whether so many environments are done sooner with clusters than with blocks."""
+        if batch is None or batch > gpu.multiprocessors or not self.considers("cluster", gpu):
+            return False
+        plan, _ = _fused_plan(self, "cluster", gpu)
+        if plan is None:
+            return False
+        threads = _C.cluster_threads(self.real, plan.size("most_pairs"), plan.size("most_interior"))
+        blocks = max(1, _REGISTERS // (threads * _CLUSTER_REGISTERS[self.dtype])) * gpu.multiprocessors
+        return batch <= _CLUSTER_WAVES * max(1, int(_CLUSTER_SHARE * blocks) // plan.patches)
 
     def refuse_unbuilt(self, kernel: str, patches: int, gpu: Properties) -> str:
         """What is too much of a kernel whatever the plan, which need not be built then; empty where nothing is."""
@@ -238,7 +256,8 @@ def choose_plan(
             "first that fits"
         )
     needs = []
-    for name in ("cluster", "block", "grid") if size == "few" else ("block", "cluster", "grid"):
+    few = kernel == "auto" and scene.are_few(batch, gpu)
+    for name in ("cluster", "block", "grid") if few else ("block", "cluster", "grid"):
         if kernel != name and not (kernel == "auto" and scene.considers(name, gpu)):
             continue
         plan, needed = _fused_plan(scene, name, gpu)

@@ -225,9 +225,12 @@ class Simulator(Model):
 
         No step stops early then: `tolerance` becomes 0. Errors leave out 10 eps |x| of rounding, see `Promise`.
 
-        The promise also stays in `self.promise`: `promise.holds(info)` says during a run whether to rely on it. A
-        target out of reach gets the best there is, a promise with `attained=False`, and a `TuningWarning`. Files do not
-        keep it: times are of the machine that measured them.
+        The promise also stays in `self.promise`: `promise.holds(info)` says during a run whether to rely on it. It is
+        for the material that is there now. A target out of reach gets the best there is, a promise with
+        `attained=False`, and a `TuningWarning`. Files do not keep it: times are of the machine that measured them.
+
+        Takes about a second for a thousand vertices, 2 to 8 s for 3 thousand and 20 s for 10 thousand on one core of a
+        CPU: seven steps of each studied environment are solved to convergence in float64, on the CPU.
 
         Args:
             state: where typical motions start [B, V, 3], the rest state by default, once for each environment of the
@@ -243,7 +246,8 @@ class Simulator(Model):
             progress: show a bar.
 
         Raises:
-            ValueError: states that are not finite, a singular system, a scene without motion.
+            ValueError: states, forces or material that are not finite, a singular system, a scene without motion.
+            RuntimeError: no converged step to compare with; solver and iterations stay.
         """
         from .tuning import tune
 

@@ -139,9 +139,9 @@ class Multilevel:
     five times the cost of a Jacobi iteration on a CPU, and 5 to 36 times on a GPU, where M of a mesh of up to 1024
     vertices is A^-1 itself unless it comes in batches (`Simulator(batch=...)`). The scene takes longer to compile.
 
-    Every iterate is judged by its energy before the next one starts from it. Contacts project every iterate; while they
-    hold vertices M fits less well. With friction, which has no energy, a dozen accelerated Jacobi iterations follow the
-    first iterate that fails, two dozen the second, and so on.
+    Every iterate is judged by its energy before the next one starts from it. After four failures in a row, which many
+    contacts cause, since M knows none, come two accelerated Jacobi iterations, then four, eight and so on, until M
+    serves again. With friction, which has no energy, a dozen follow the first failure, two dozen the second.
     M is made of the material when the simulator is, see `Simulator.prepare_solver`; an environment that differs gets
     M / s, s its largest ratio of inertia or stiffness to that material. `Info.rho` says how unlike the two are.
 

@@ -216,6 +216,8 @@ def study_table(rows: list[Row]) -> str:
     for name, precision in dict.fromkeys((row.method, row.precision) for row in solver):
         own = [row for row in solver if (row.method, row.precision) == (name, precision)]
         lines.append(f"{name:<28}{precision:<11}{_costs(own)}")
+    if any(row.status == "uncertain" for row in rows):
+        lines.append("uncertain: no converged step is known well enough to say so")
     if any(row.refusal for row in solver):
         lines.append("with --scene held a body has no contacts, and every method runs")
     return "\n".join(lines) if solver else ""
@@ -230,9 +232,9 @@ def _costs(rows: list[Row]) -> str:
 
 def _first_at(rows: list[Row], goal: float) -> str:
     """The fewest iterations of the studied ones that reach an error, and their time."""
-    reached = [row for row in rows if row.error <= goal and row.milliseconds is not None]
+    reached = [row for row in rows if row.reaches(goal) and row.milliseconds is not None]
     if not reached:
-        return "not reached"
+        return "uncertain" if any(row.may_reach(goal) for row in rows) else "not reached"
     first = min(reached, key=lambda row: row.iterations)
     return f"{first.iterations} it., {first.milliseconds:.2g} ms"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,8 @@ from .effects import Gravity, Pin, Solid
 from .ledger import Row
 from .scene import Scene
 from .simulator import Simulator
-from .solvers import Chebyshev
 from .state import State
-from .study_bench import SOLVED, Bench, Setting, Timing, clock_of, measure_step, time_calls, verdict
+from .study_bench import Bench, Setting, Timing, clock_of, measure_step, solved_step, time_calls, verdicts
 
 __all__ = [
     "PAPER_TESTS",
@@ -55,13 +54,20 @@ def contender_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting
     state, exact = bench.hard_step(setting)
     solver, setup = bench.solver(name, setting)
     sim = bench.simulator(setting, dtype, solver)
-    return [
+    rows = [
         measure_step(
             sim, state, exact, count, series=bench.series, axis="solver", method=name, youngs=setting.youngs,
             setup_milliseconds=setup, default=_is_default(name, dtype, count),
         )
         for count in counts
     ]  # fmt: skip
+    return _judged(rows)
+
+
+def _judged(rows: list[Row]) -> list[Row]:
+    """Rows of one method by iterations, each with the status that it has among them."""
+    statuses = verdicts([row.error for row in rows], rows[0].uncertainty or 0.0) if rows else []
+    return [replace(row, status=status) for row, status in zip(rows, statuses, strict=True)]
 
 
 def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) -> list[Row]:
@@ -70,7 +76,7 @@ def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) 
     most = min(max(counts), _NEWTON_ITERATIONS) if BASELINES[name].few else max(counts)
     common: dict[str, Any] = {
         "axis": "solver", "method": name, "compiled": False, "youngs": setting.youngs, "time_step": setting.time_step,
-        "vertices": len(exact.first), "tets": len(exact.problem.values.tets),
+        "vertices": len(exact.first), "tets": len(exact.problem.values.tets), "uncertainty": exact.uncertainty,
     }  # fmt: skip
     method = BASELINES[name]
     try:
@@ -80,13 +86,14 @@ def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) 
     except ValueError as refusal:
         return [Row(status=f"refused: {refusal}", **common)]
     setup = Timing.of([trace.setup_seconds for trace in traces]).median
-    return [
+    rows = [
         _baseline_row(
             traces, iterations, exact.judge(traces[0].displacements[iterations]),
             {**common, "setup_milliseconds": setup, "bytes": memory.peak_bytes, "bytes_by": "tracemalloc"},
         )
         for iterations in _shown(traces[0], counts, every=method.few)
     ]  # fmt: skip
+    return _judged(rows)
 
 
 def _shown(trace: Trace, counts: list[int], *, every: bool) -> list[int]:
@@ -99,8 +106,8 @@ def _baseline_row(traces: list[Trace], iterations: int, errors: tuple[float, ...
     position, energy, residual, metres = errors
     timing = Timing.of([trace.seconds[iterations] for trace in traces])
     return Row(
-        iterations=iterations, local_steps=traces[0].local_steps[iterations], status=verdict(position), error=position,
-        error_energy=energy, residual=residual, error_metres=metres, **timing.columns(), **common,
+        iterations=iterations, local_steps=traces[0].local_steps[iterations], error=position, error_energy=energy,
+        residual=residual, error_metres=metres, **timing.columns(), **common,
     )  # fmt: skip
 
 
@@ -132,12 +139,12 @@ def float_rows(bench: Bench, setting: Setting, counts: list[int]) -> list[Row]:
         rows.append(
             Row(
                 axis="float", method=DEFAULT, precision="float32", iterations=count, local_steps=count,
-                status=verdict(error), youngs=setting.youngs, time_step=setting.time_step, vertices=sims[0].vertices,
+                youngs=setting.youngs, time_step=setting.time_step, vertices=sims[0].vertices,
                 tets=len(exact.problem.values.tets), error=error,
                 error_metres=float(np.linalg.norm(off, axis=1).max()), **timing.columns(),
             )
         )  # fmt: skip
-    return rows
+    return _judged(rows)
 
 
 # ---- time step and mesh: whole motions, solved so well that nothing else matters
@@ -152,21 +159,26 @@ class _Motion:
     energy: float  # at the end, J
     brought: float  # kinetic energy at the start, J
     seconds: float  # that it took
+    solved: bool  # every step of it
 
 
 @torch.no_grad()
 def _motion(bench: Bench, setting: Setting, steps: int) -> _Motion:
-    sim = bench.simulator(setting, torch.float64, Chebyshev(), **SOLVED)
+    sim = bench.simulator(setting, torch.float64)
     state = bench.start(sim)
     clock = clock_of(bench.device)
     begin = clock()
-    end = sim.rollout(state, steps, every=steps).state()
+    end, solved = state, True
+    for _ in range(steps):
+        end, converged = solved_step(sim, end)
+        solved = solved and converged
     positions = end.positions[0].cpu().numpy()
     seconds = clock() - begin
     mesh = bench.mesh(setting.resolution)
     places = [bench.subject.probes(mesh, x) for x in (state.positions[0].cpu().numpy(), positions)]
     brought = float(sim.energy(state)[0] - sim.energy(state.positions)[0])
-    return _Motion(setting, sim.vertices, steps, places[1] - places[0], float(sim.energy(end)[0]), brought, seconds)
+    way = places[1] - places[0]
+    return _Motion(setting, sim.vertices, steps, way, float(sim.energy(end)[0]), brought, seconds, solved)
 
 
 def _motion_rows(bench: Bench, axis: str, runs: list[tuple[Setting, int]]) -> list[Row]:
@@ -177,7 +189,8 @@ def _motion_rows(bench: Bench, axis: str, runs: list[tuple[Setting, int]]) -> li
         setting, off = motion.setting, motion.way - exact.way
         rows.append(
             Row(
-                axis=axis, method=DEFAULT, iterations=motion.steps, youngs=setting.youngs, time_step=setting.time_step,
+                axis=axis, method="solved", status="ok" if motion.solved and exact.solved else "uncertain",
+                iterations=motion.steps, youngs=setting.youngs, time_step=setting.time_step,
                 vertices=motion.vertices, tets=len(bench.mesh(setting.resolution).tets),
                 error=float(np.linalg.norm(off) / np.linalg.norm(exact.way)),
                 error_metres=float(np.linalg.norm(off, axis=1).max()),

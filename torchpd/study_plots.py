@@ -12,7 +12,7 @@ import numpy as np
 from .contenders import DEFAULT
 from .ledger import Row
 
-__all__ = ["STYLES", "TOP", "axis_label", "curves_of", "draw_study", "float32_floor", "pareto_front"]
+__all__ = ["SLOPES", "STYLES", "TOP", "axis_label", "curves_of", "draw_study", "float32_floor", "pareto_front"]
 
 TOP = 2.0  # where a failure is drawn: above the first iterate, whose error is 1
 _LOWEST = 1e-7
@@ -38,6 +38,10 @@ _LABELS = {"Newton-PCG with M": "Newton-PCG with M, C++ float64"}  # of methods 
 _INK, _PAPER_GRID = "#3e4046", "#e4e5e8"
 # left out of the picture of all methods, where it would lie beside Jacobi's curve; the report has it
 _REPEATED = ("damped Jacobi",)
+
+
+# what the theory has for an axis: the power, and its name
+SLOPES = {"time step": (1.0, "order one in h"), "mesh": (-2.0 / 3.0, "order two in the edge")}
 
 
 def axis_label(name: str) -> str:
@@ -109,9 +113,19 @@ def _drawn(rows: list[Row]) -> list[float]:
 
 
 def _mark_failures(axis: Any, xs: Sequence[float | None], rows: list[Row], color: str) -> None:
-    failed = [x for x, row in zip(xs, rows, strict=True) if row.status != "ok"]
+    """Crosses at the top, and rings around errors that nobody knows."""
+    failed = [x for x, row in zip(xs, rows, strict=True) if row.failed]
     if failed:  # an empty line that is not clipped has no bounds, which upsets the layout
         axis.plot(failed, [TOP] * len(failed), "x", color=color, markersize=7, markeredgewidth=2, zorder=5)
+    pairs = [(x, y) for x, y, row in zip(xs, _drawn(rows), rows, strict=True) if row.status == "uncertain"]
+    if pairs:
+        axis.plot(*zip(*pairs, strict=True), "o", color=color, fillstyle="none", markersize=8, zorder=5)
+
+
+def _note_uncertain(figure: Any, rows: list[Row]) -> None:
+    """Says below the panels what rings are."""
+    if any(row.status == "uncertain" for row in rows):
+        figure.supxlabel("rings: uncertain, no converged answer is known to compare with", fontsize=9, color="#b3261e")
 
 
 # ---- all solvers
@@ -156,6 +170,7 @@ def _draw_solvers(rows: list[Row], path: Path, subject: str) -> Path:
         _error_axis(axis, [row.error for row in rows], axis_label("error"))
         axis.axhline(1.0, color=_INK, linewidth=0.8, linestyle=(0, (2, 3)))
     figure.legend(frameon=False, loc="outside right upper", fontsize=9)
+    _note_uncertain(figure, rows)
     if refused:
         words = (f"refused, so not drawn\n({why}):\n" + "\n".join(names) for why, names in refused.items())
         figure.text(0.995, 0.02, "\n".join(words), ha="right", va="bottom", fontsize=8)
@@ -166,13 +181,8 @@ def _draw_solvers(rows: list[Row], path: Path, subject: str) -> Path:
 def _mark_default(left: Any, right: Any, rows: list[Row]) -> None:
     for row in (row for row in rows if row.default):
         star = {"marker": "*", "markersize": 17, "color": "#d55e00", "markeredgecolor": "white", "linestyle": "none"}
-        left.plot([row.iterations], _drawn([row]), zorder=6, **star)
+        left.plot([row.iterations], _drawn([row]), zorder=6, label=f"default: {row.iterations} iterations", **star)
         right.plot([row.milliseconds], _drawn([row]), zorder=6, **star)
-        right.annotate(
-            "default: 64 iterations", (row.milliseconds, _drawn([row])[0]), xytext=(9, 6), textcoords="offset points",
-            fontsize=9, color="#d55e00", zorder=7,
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1},
-        )  # fmt: skip
 
 
 def float32_floor(rows: list[Row]) -> float | None:
@@ -188,11 +198,7 @@ def _mark_floor(axis: Any, rows: list[Row]) -> None:
     """Where float32 levels off, if it does within the study."""
     floor = float32_floor(rows)
     if floor is not None:
-        axis.axhline(floor, color="#d55e00", linewidth=0.8, linestyle="dotted")
-        axis.annotate(
-            "float32 levels off", (0.02, floor), xycoords=("axes fraction", "data"), xytext=(0, 3),
-            textcoords="offset points", fontsize=8, color="#d55e00",
-        )  # fmt: skip
+        axis.axhline(floor, color="#d55e00", linewidth=1.2, linestyle="dotted", label="float32 levels off")
 
 
 # ---- three stiffnesses, as in the source paper
@@ -274,15 +280,15 @@ def _pascals(youngs: float) -> str:
 
 
 def _draw_axes(rows: list[Row], path: Path, subject: str) -> Path:
-    figure, axes = _figure(3, f"{subject}: the other errors, each by itself (everything else solved to rounding)")
+    figure, axes = _figure(3, f"{subject}: the other errors, each by itself (everything else {_how_solved(rows)})")
     by_axis = curves_of(rows, lambda row: row.axis)
     _panel(
         axes[0], by_axis.get("time step", []), lambda row: 1e3 * row.time_step, "time step [ms]",
-        "error of the motion by its time step", slope=1.0,
+        "error of the motion by its time step", slope=SLOPES["time step"],
     )  # fmt: skip
     _panel(
         axes[1], by_axis.get("mesh", []), lambda row: row.tets, "tetrahedra", "error of the motion by its mesh",
-        slope=-2.0 / 3.0,
+        slope=SLOPES["mesh"],
     )  # fmt: skip
     _panel(
         axes[2], by_axis.get("float", []), lambda row: row.iterations, axis_label("iterations"),
@@ -292,8 +298,18 @@ def _draw_axes(rows: list[Row], path: Path, subject: str) -> Path:
     return path
 
 
+def _how_solved(rows: list[Row]) -> str:
+    return "not solved for sure" if any(row.status == "uncertain" for row in rows) else "solved to 1e-9"
+
+
 def _panel(
-    axis: Any, rows: list[Row], place: Callable[[Row], float], label: str, title: str, *, slope: float | None
+    axis: Any,
+    rows: list[Row],
+    place: Callable[[Row], float],
+    label: str,
+    title: str,
+    *,
+    slope: tuple[float, str] | None,
 ) -> None:
     """Error against one quantity, with the slope that the theory has for it."""
     sound = [row for row in rows if 0.0 < row.error < math.inf]
@@ -306,11 +322,16 @@ def _panel(
     xs = np.array([place(row) for row in sound], dtype=np.float64)
     errors = np.array([row.error for row in sound])
     axis.plot(xs, errors, "o-", color="#d55e00", linewidth=2.0, label="measured")
+    unsure = [row.status == "uncertain" for row in sound]
+    if any(unsure):
+        label = "uncertain: steps unsolved"
+        axis.plot(xs[unsure], errors[unsure], "o", color="#d55e00", fillstyle="none", markersize=11, label=label)
+        axis.legend(frameon=False)
     if slope is not None and len(xs) > 1:
-        finest = int(errors.argmin())
+        finest, (power, name) = int(errors.argmin()), slope
         axis.plot(
-            xs, errors[finest] * (xs / xs[finest]) ** slope, color="#8a8d93", linestyle="dashed", linewidth=1.2,
-            label="order one in h" if slope == 1.0 else "order two in the edge",
+            xs, errors[finest] * (xs / xs[finest]) ** power, color="#8a8d93", linestyle="dashed", linewidth=1.2,
+            label=name,
         )  # fmt: skip
         axis.legend(frameon=False)
     axis.set_xscale("log")
@@ -358,13 +379,16 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     right.axhline(0.0, color=_INK, linewidth=0.8)
     right.set_ylabel("relative to the converged motion;\nenergies over the kinetic energy of the start")
     right.set_title("and what that looks like", fontsize=10, loc="left")
-    right.legend(frameon=False)
+    figure.legend(frameon=False, loc="outside lower right", ncols=2, fontsize=9)
+    _note_uncertain(figure, own)
     for axis in (left, right):
         axis.set_xscale("log")
         axis.set_xticks(xs, [str(x) for x in xs])
         axis.set_xticks([], minor=True)
         axis.set_xlabel(axis_label("iterations"))
         axis.axvline(64, color=_INK, linewidth=1.0, linestyle=(0, (2, 3)))
-        axis.annotate(" default", (64, 1.0), xycoords=("data", "axes fraction"), va="top", fontsize=9, color=_INK)
+        axis.annotate(
+            "default ", (64, 0.01), xycoords=("data", "axes fraction"), va="bottom", ha="right", fontsize=9, color=_INK
+        )
     figure.savefig(path)
     return path

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from .ledger import Row
-from .study_plots import STYLES, TOP, axis_label, curves_of, pareto_front
+from .study_plots import SLOPES, STYLES, TOP, axis_label, curves_of, pareto_front
 
 __all__ = ["write_report"]
 
 _OTHER = ("#56b4e9", 2.0, "solid")
 _COLORS = ("#d55e00", "#0072b2", "#56b4e9")  # the stiffness of the study first, then softer ones
+_SYMBOLS = {"diverged": "x", "uncertain": "circle-open"}  # circles for the others
 _LOWEST_POWER = -8  # of ten, of the errors that are shown at first
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #2b2d31; max-width: 1180px; margin: 2em auto; padding: 0 1em; }
@@ -69,8 +70,9 @@ def _header(record: dict[str, Any]) -> str:
     return (
         f"<p>Errors are |x &minus; x*| / |x<sub>0</sub> &minus; x*| of one time step: 1 is the first iterate, 0 the "
         f"converged step. Full lines are the compiled solvers of this library; dashed ones are NumPy and SciPy, whose "
-        f"iterations compare exactly and whose milliseconds are indications. Failures are crosses at the top; what "
-        f"is refused has not run. Click a name in a legend to hide it.</p>\n"
+        f"iterations compare exactly and whose milliseconds are indications. Failures are crosses at the top; rings "
+        f"are uncertain, for want of a converged step to compare with; what is refused has not run. Click a name in a "
+        f"legend to hide it.</p>\n"
         f"<pre>{html.escape(record['command'])}</pre>\n"
         f"<p>{html.escape(where)}<br>{html.escape(what)}<br>commit {html.escape(record['commit'][:12])}, "
         f"{html.escape(record['created'])}</p>"
@@ -109,7 +111,7 @@ def _figures(rows: list[Row]) -> list[Figure]:
     }
     for axis, title, place, label in others:
         if axis in by_axis:
-            found.append((title, words[axis], _plain_figure(by_axis[axis], place, label)))
+            found.append((title, words[axis], _plain_figure(by_axis[axis], place, label, SLOPES.get(axis))))
     return found
 
 
@@ -137,7 +139,7 @@ def _trace(rows: list[Row], place: Callable[[Row], float | None], name: str, sty
         line={"color": color, "width": width, "dash": {"solid": "solid", "dashed": "dash"}[dash]},
         marker={
             "size": [18 if row.default else 10 if row.status != "ok" else 5 for row in drawn],
-            "symbol": ["star" if row.default else "x" if row.status != "ok" else "circle" for row in drawn],
+            "symbol": ["star" if row.default else _SYMBOLS.get(row.status, "circle") for row in drawn],
         },
         hovertext=[_words(row) for row in drawn],
         hoverinfo="text",
@@ -146,7 +148,7 @@ def _trace(rows: list[Row], place: Callable[[Row], float | None], name: str, sty
 
 def _words(row: Row) -> str:
     """What a point says when it is pointed at."""
-    number = ("error", "error_energy", "error_metres", "residual", "milliseconds", "milliseconds_p5",
+    number = ("error", "uncertainty", "error_energy", "error_metres", "residual", "milliseconds", "milliseconds_p5",
               "milliseconds_p95", "setup_milliseconds", "bytes", "kernels", "local_steps")  # fmt: skip
     values = [(name, getattr(row, name)) for name in number] + list(row.more.items())
     shown = [f"{name.replace('_', ' ')}: {value:.4g}" for name, value in values if value is not None]
@@ -189,7 +191,7 @@ def _stiffness_figure(rows: list[Row]) -> Any:
     return _layout(figure, axis_label("iterations"), rows)
 
 
-def _plain_figure(rows: list[Row], place: Callable[[Row], float], label: str) -> Any:
+def _plain_figure(rows: list[Row], place: Callable[[Row], float], label: str, slope: tuple[float, str] | None) -> Any:
     import plotly.graph_objects as go
 
     figure = go.Figure()
@@ -197,6 +199,15 @@ def _plain_figure(rows: list[Row], place: Callable[[Row], float], label: str) ->
     for youngs, color in zip(sorted({row.youngs for row in measured}, reverse=True), _COLORS, strict=False):
         own = sorted((row for row in measured if row.youngs == youngs), key=place)
         figure.add_trace(_trace(own, place, f"{own[0].method}, {youngs:g} Pa", (color, 2.4, "solid")))
+    sound = [row for row in measured if 0.0 < row.error < math.inf]
+    if slope is not None and len(sound) > 1:
+        power, name = slope
+        least = min(sound, key=lambda row: row.error)
+        xs = [place(row) for row in sound]
+        figure.add_scatter(
+            x=xs, y=[least.error * (x / place(least)) ** power for x in xs], mode="lines", name=name, hoverinfo="skip",
+            line={"color": "#8a8d93", "width": 1.4, "dash": "dash"},
+        )  # fmt: skip
     for row in rows:
         if row not in measured:
             figure.add_annotation(text=row.status, showarrow=False, xref="paper", yref="paper", x=0.5, y=0.5)
@@ -235,9 +246,10 @@ def _all_rows(rows: list[Row]) -> str:
         lines.append(
             [row.axis, html.escape(row.method), row.precision, f"{row.iterations}", f"{row.youngs:g}",
              number(row.time_step), f"{row.tets}", number(row.error if math.isfinite(row.error) else None),
-             number(row.error_energy), number(row.residual), number(row.milliseconds), number(row.milliseconds_p5),
-             number(row.milliseconds_p95), "" if row.bytes is None else f"{row.bytes:,}", status]
+             number(row.uncertainty), number(row.error_energy), number(row.residual), number(row.milliseconds),
+             number(row.milliseconds_p5), number(row.milliseconds_p95),
+             "" if row.bytes is None else f"{row.bytes:,}", status]
         )  # fmt: skip
     head = ["axis", "method", "precision", "iterations", "Young's modulus [Pa]", "time step [s]", "tets", "error",
-            "energy error", "residual", "ms", "p5", "p95", "bytes", "status"]  # fmt: skip
+            "uncertainty", "energy error", "residual", "ms", "p5", "p95", "bytes", "status"]  # fmt: skip
     return f"<details><summary>All {len(rows)} rows</summary>\n{_table(head, lines)}</details>"

@@ -9,6 +9,7 @@ import torch
 from . import _C
 from .checks import NO_VALUES
 from .forecast import FAR_TOO_FEW, forecast
+from .gpu import step_bytes
 from .plan import any_of
 from .regimes import shared_bytes
 from .solvers import Chebyshev, Multilevel, Solver
@@ -23,6 +24,7 @@ __all__ = ["describe", "workspace_bytes"]
 # What each effect adds to a step; folded ones are part of the weights and targets that every vertex has anyway.
 _FOLDED = "folded into the inertia of a vertex: nothing per iteration"
 
+_ANY_BATCH = 2**31 - 1
 _TURNING_MODES = 24  # of the small problem of Multilevel("corotated"), see csrc/solver/corotation.h
 
 
@@ -146,9 +148,10 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     numbers += 4 * plan.vertices * (8 + (16 if solver.outer != "momentum" else 0))
     if solver.outer != "corotated":
         return real * numbers
-    # of each vertex sixteen numbers, and A times them; and two inverses
-    inverses = 8 * 2 * _TURNING_MODES**2
-    return real * (numbers + 32 * plan.vertices) + _turning_sums(plan, 256) + inverses
+    # of each vertex sixteen numbers, and A times them; sums of every 256 vertices and of every patch; and two inverses
+    products, pairs = 2 * 16 * 16, _TURNING_MODES * (_TURNING_MODES + 1) // 2
+    sums = products * -(-plan.vertices // 256) + pairs * plan.patches
+    return real * (numbers + 32 * plan.vertices) + 8 * (sums + 2 * _TURNING_MODES**2)
 
 
 def _step_bytes(sim: Simulator, real: int) -> str:
@@ -156,40 +159,13 @@ def _step_bytes(sim: Simulator, real: int) -> str:
     plan = sim.plan
     if plan.kernel is None:
         return f"{workspace_bytes(plan, real, sim.solver):,} B an environment during a step"
-    slots = plan.size("slots")
+    batch = sim.batch or 1
+    each = -(-step_bytes(sim, plan, batch, sim.device) // batch)
+    taken = f"{each:,} B an environment during a step{f' of {batch:,}' if batch > 1 else ''}"
     if plan.kernel == "stream":
-        own = f"{4 * real * (5 * plan.vertices + 2 * slots):,} B an environment during a step"
-        if not isinstance(sim.solver, Multilevel):
-            return own
-        return f"{own}, and {_team_bytes(sim, sim.solver, real):,} B for each that the GPU has in work at a time"
-    # five vectors of four numbers a slot; the weights of 32 pairs a block, but where each thread has its own
-    if plan.kernel != "cluster":
-        team = real * (20 * slots + 64 * plan.size("blocks"))
-    else:
-        team = 0 if real == 4 else real * 64 * plan.size("blocks")
-    return f"{team:,} B for each environment that the GPU has in work at a time"
-
-
-def _team_bytes(sim: Simulator, solver: Multilevel, real: int) -> int:
-    """Memory of an environment that a GPU has in work with `Multilevel`, but for a few sums."""
-    plan = sim.plan
-    # three vectors of the outer iteration, those of a cycle, eight pairs; two more and two matrices with contacts
-    *_, direct = plan.level_sizes.tolist()
-    cycle = 3 if direct else 4
-    held = 26 if sim.scene.grounds or sim.scene.spheres else 0
-    numbers = 4 * (3 + cycle + (16 if solver.outer != "momentum" else 0)) + held
-    if solver.outer != "corotated":
-        return real * plan.vertices * numbers
-    # of each vertex where it is, sixteen numbers, and A times them; and the sums of all chunks, and of all patches
-    chunk = max(64, -(-plan.vertices // 128))
-    totals = 8 * (2 * 16 * 16 + _TURNING_MODES * (_TURNING_MODES + 1) // 2)
-    return real * plan.vertices * (numbers + 36) + _turning_sums(plan, chunk) + totals
-
-
-def _turning_sums(plan: Plan, chunk: int) -> int:
-    """Bytes of what the small problem of "corotated" adds up: for every `chunk` vertices, and for every patch."""
-    products, pairs = 2 * 16 * 16, _TURNING_MODES * (_TURNING_MODES + 1) // 2
-    return 8 * (products * -(-plan.vertices // chunk) + pairs * plan.patches)
+        return taken
+    # only those that the GPU has in work at a time take any
+    return f"{taken}, at most {step_bytes(sim, plan, _ANY_BATCH, sim.device):,} B in all"
 
 
 def describe(sim: Simulator) -> str:

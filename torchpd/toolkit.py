@@ -11,13 +11,14 @@ import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["CUDA_ARCHITECTURES", "NVCC_FLAGS", "Toolkit", "choose_toolkit", "find_toolkit"]
+__all__ = ["CUDA_ARCHITECTURES", "LEAST_RELEASE", "NVCC_FLAGS", "Toolkit", "choose_toolkit", "find_toolkit"]
 
 # torch asks a visible GPU when TORCH_CUDA_ARCH_LIST is unset, which fails on a build machine without one.
 # The PTX of the last architecture lets newer devices compile it when they load it.
 CUDA_ARCHITECTURES = "8.0;9.0+PTX"
 # --fmad=false: the code says itself where to fuse, as for the CPU.
 NVCC_FLAGS = ("-std=c++20", "-O3", "--expt-relaxed-constexpr", "--fmad=false")
+LEAST_RELEASE = "12.3"  # the first with PTX 8.3, which has the words of 128 bits of csrc/cuda/collect.h
 
 
 class Toolkit(NamedTuple):
@@ -39,6 +40,10 @@ def _nvcc_release(home: str) -> str:
     return found.group(1) if found else ""
 
 
+def _numbers(release: str) -> tuple[int, ...]:
+    return tuple(map(int, release.split(".")))
+
+
 def choose_toolkit(home: str | None, release: str, torch_cuda: str | None) -> Toolkit:
     """Decide from the facts alone; whether a GPU is visible is not one of them.
 
@@ -55,6 +60,9 @@ def choose_toolkit(home: str | None, release: str, torch_cuda: str | None) -> To
         return Toolkit(None, "", f"no working nvcc in {home}/bin")
     if release.split(".")[0] != torch_cuda.split(".")[0]:
         return Toolkit(None, release, f"nvcc is CUDA {release} but torch is built for CUDA {torch_cuda}")
+    if _numbers(release) < _numbers(LEAST_RELEASE):
+        reason = f"nvcc is CUDA {release} and the kernels need {LEAST_RELEASE} or newer: install a newer toolkit"
+        return Toolkit(None, release, f"{reason} of the same major version, and set CUDA_HOME to it")
     return Toolkit(home, release, "")
 
 

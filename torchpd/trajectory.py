@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from .contenders import DEFAULT, DEFAULT_ITERATIONS
 from .ledger import Row
 from .simulator import Simulator
-from .solvers import Chebyshev, Solver
+from .solvers import Solver
 from .state import State
-from .study_bench import SOLVED, Bench, Setting, clock_of, precision_name
+from .study_bench import Bench, Setting, clock_of, precision_name, solved_step
 
 __all__ = ["Trajectory", "compare_trajectories", "first_turn", "record_trajectory", "trajectory_rows"]
 
@@ -30,23 +30,39 @@ class Trajectory:
     energies: Array  # [T + 1] mechanical, J
     brought: float  # kinetic energy at the start, J
     milliseconds: float  # a step, mean
+    solved: bool = True  # every step of it, where that was asked for
 
 
 @torch.no_grad()
-def record_trajectory(bench: Bench, sim: Simulator, resolution: int, seconds: float) -> Trajectory:
-    """The motion of the subject from its start, for so many seconds of its time."""
+def record_trajectory(
+    bench: Bench, sim: Simulator, resolution: int, seconds: float, *, solve: bool = False
+) -> Trajectory:
+    """The motion of the subject from its start, for so many seconds of its time.
+
+    With `solve` every step is solved to 1e-9, whatever the solver of the simulator.
+    """
     state, steps = bench.start(sim), max(1, round(seconds / sim.time_step))
     clock = clock_of(bench.device)
     begin = clock()
-    track = sim.rollout(state, steps)
-    positions = torch.cat([state.positions, track.positions[:, 0]]).cpu()
+    solved = True
+    if solve:
+        states = [state]
+        for _ in range(steps):
+            after, converged = solved_step(sim, states[-1])
+            states.append(after)
+            solved = solved and converged
+        positions, velocities = (torch.cat(parts) for parts in zip(*states, strict=True))
+    else:
+        track = sim.rollout(state, steps)
+        positions = torch.cat([state.positions, track.positions[:, 0]])
+        velocities = torch.cat([state.velocities, track.velocities[:, 0]])
+    positions = positions.cpu()
     elapsed = clock() - begin
-    velocities = torch.cat([state.velocities, track.velocities[:, 0]])
     energies = sim.energy(State(positions.to(sim.device), velocities)).double().cpu().numpy()
     mesh = bench.mesh(resolution)
     probes = np.stack([bench.subject.probes(mesh, x) for x in positions.double().numpy()])
     brought = float(sim.energy(state)[0] - sim.energy(state.positions)[0])
-    return Trajectory(sim.time_step, probes, energies, brought, 1e3 * elapsed / steps)
+    return Trajectory(sim.time_step, probes, energies, brought, 1e3 * elapsed / steps, solved)
 
 
 def first_turn(signal: Array, time_step: float) -> float:
@@ -94,8 +110,7 @@ def trajectory_rows(
     bench: Bench, setting: Setting, counts: list[int], *, seconds: float = 1.0, name: str = DEFAULT
 ) -> list[Row]:
     """A motion at several iteration counts of a solver in float32, against the converged one in float64."""
-    solved = bench.simulator(setting, torch.float64, Chebyshev(), **SOLVED)
-    exact = record_trajectory(bench, solved, setting.resolution, seconds)
+    exact = record_trajectory(bench, bench.simulator(setting, torch.float64), setting.resolution, seconds, solve=True)
     solver: Solver = bench.solver(name, setting)[0]
     rows = []
     for count in counts:
@@ -103,10 +118,11 @@ def trajectory_rows(
         motion = record_trajectory(bench, sim, setting.resolution, seconds)
         found = compare_trajectories(motion, exact)
         finite = math.isfinite(found["path"])
+        status = "diverged" if not finite else "ok" if exact.solved else "uncertain"
         rows.append(
             Row(
                 axis="trajectory", method=name, precision=precision_name(sim.dtype), iterations=count,
-                local_steps=count, status="ok" if finite else "diverged", youngs=setting.youngs,
+                local_steps=count, status=status, youngs=setting.youngs,
                 time_step=setting.time_step, vertices=sim.vertices, tets=len(bench.mesh(setting.resolution).tets),
                 error=found["path"] if finite else math.inf, milliseconds=motion.milliseconds,
                 default=name == DEFAULT and count == DEFAULT_ITERATIONS, more={**found, "seconds_of_motion": seconds},

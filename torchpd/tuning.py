@@ -14,7 +14,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 import torch
@@ -26,11 +26,12 @@ from .checks import check_has_values, check_scalar, check_whole
 from .contenders import safe_solvers
 from .diagonal import step_diagonal
 from .forecast import has_friction
-from .material import MATERIAL_ROWS
+from .material import MATERIAL_ROWS, fingerprint
 from .promise import Promise, Trial
-from .solvers import Chebyshev, Multilevel, Solver
+from .solvers import Multilevel, Solver
 from .state import State
 from .targets import Targets
+from .tuning_checks import check_known, check_request, check_start, environments_of_material
 from .warn import warn_user
 
 if TYPE_CHECKING:
@@ -48,6 +49,9 @@ _TURNED = (0, 4)  # those that are also studied with the axes of their velocitie
 _ENVIRONMENTS = 3  # of a batch, and the worst conditioned one
 _HEADROOM = 0.95  # of a budget in milliseconds that is spent: times scatter
 _NEAR = 1.1  # a safer candidate wins although it takes this much longer
+_HOPELESS = 1.5  # a candidate that takes this much longer than another one is given up
+_MOVING = 64  # iterations of Multilevel for the states that are studied
+_KNOWN = 0.1  # uncertainty of the converged steps, at most, where a time is asked for and no error
 
 
 class TuningWarning(UserWarning):
@@ -108,15 +112,16 @@ def tune(
     error = None if error is None else check_scalar("tune: error", error)
     milliseconds = None if milliseconds is None else check_scalar("tune: milliseconds", milliseconds)
     most = check_whole("tune: most", most, minimum=1)
-    _check_request(error, milliseconds)
+    check_request(error, milliseconds)
     if isinstance(candidates, (str, Solver)):
         raise TypeError(f"tune: candidates must be a sequence of solvers, got {candidates!r}; write [{candidates!r}]")
     for solver in candidates or ():
         if not isinstance(solver, Solver):
             raise TypeError(f"tune: candidates must be solvers, such as Chebyshev() and Multilevel(), got {solver!r}")
-    start = sim.rest_state(_environments_of_material(sim)) if state is None else state
-    _check_start(sim, start, forces)
+    start = sim.rest_state(environments_of_material(sim)) if state is None else state
+    check_start(sim, start, forces)
     study = _prepare(_with_targets(sim, targets, len(start[0])), start, forces)
+    check_known(study.exact, _KNOWN if error is None else error / SAFETY)
     named: Mapping[str, Solver] = (
         _usual(sim, safe_solvers(study.sim, study.state))
         if candidates is None
@@ -124,16 +129,16 @@ def tune(
     )
     if not named:
         raise ValueError("tune: candidates must hold at least one solver, got none")
-    seek = (
-        _fewest(study, lambda trial: trial.error <= error / SAFETY, most)
-        if error is not None
-        else _for_time(sim, study, start, milliseconds, most)
-    )
-    with tqdm(named.values(), desc="tuning", unit="solver", disable=not progress, leave=False) as bar:
-        found = [seek(solver) for solver in bar]
-    timed = [(trials, _milliseconds(sim, start, trials[-1])) for trials in found]
-    trials, cost = _cheapest(timed, error) if error is not None else _most_accurate(study, timed)
+    with tqdm(total=len(named), desc="tuning", unit="solver", disable=not progress, leave=False) as bar:
+        if error is not None:
+            trials, cost = _for_error(sim, study, start, list(named.values()), error, most, bar)
+        else:
+            seek = _for_time(sim, study, start, milliseconds, most)
+            timed = [(found := seek(solver), _milliseconds(sim, start, found[-1])) for solver in named.values()]
+            trials, cost = _most_accurate(study, timed)
     promise = _promise(sim, study, start, trials, cost, error, milliseconds)
+    if candidates is None and has_friction(sim):
+        promise.left_out = "Multilevel, which friction leaves out, might: see candidates"
     sim.solver, sim.iterations, sim.tolerance, sim.promise = promise.solver, promise.iterations, 0.0, promise
     if not promise.attained:
         warn_user(f"tune: {promise}", TuningWarning)
@@ -144,47 +149,6 @@ def _usual(sim: Simulator, solvers: Mapping[str, Solver]) -> dict[str, Solver]:
     """Those that are studied unless others are named: the study knows no friction, which may lead Multilevel astray."""
     smooth = not has_friction(sim)
     return {name: solver for name, solver in solvers.items() if smooth or not isinstance(solver, Multilevel)}
-
-
-# ---- what is refused
-
-
-def _check_request(error: float | None, milliseconds: float | None) -> None:
-    if (error is None) == (milliseconds is None):
-        raise ValueError(
-            f"tune takes one of error and milliseconds, got error={error} and milliseconds={milliseconds}; "
-            "for example sim.tune(error=1e-2)"
-        )
-    if error is not None and not 0.0 < error < 1.0:
-        raise ValueError(f"tune: error must lie in (0, 1), 1 being the first iterate; got {error}")
-    if milliseconds is not None and not 0.0 < milliseconds < math.inf:
-        raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
-
-
-def _environments_of_material(sim: Simulator) -> int:
-    arrays = {name: getattr(sim, name) for name in MATERIAL_ROWS}
-    return max(len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1 for name, array in arrays.items())
-
-
-def _check_start(sim: Simulator, state: State, forces: Tensor | None) -> None:
-    sim.check_state(state, forces=forces)
-    if state[0].dim() != 3 or not len(state[0]):
-        raise ValueError(f"tune: state must hold environments [B, V, 3], at least one, got {list(state[0].shape)}")
-    count = _environments_of_material(sim)
-    if count not in (1, len(state[0])):
-        raise ValueError(f"tune: state must have the {count} environments of the material, got {len(state[0])}")
-    for name, part in zip(State._fields, state, strict=True):
-        bad = (~part.isfinite()).flatten(1).any(1).nonzero()
-        if len(bad):
-            raise ValueError(f"tune: state.{name} must be finite, got NaN or infinity in environment {int(bad[0])}")
-    inertia, diagonal = step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)
-    bad = ~((inertia > 0) & (diagonal > 0)).reshape(-1, sim.vertices).all(0)
-    if bool(bad.any()):
-        vertex = int(bad.nonzero()[0])
-        raise ValueError(
-            f"tune: the system is singular: vertex {vertex} has inertia {float(inertia[..., vertex].min()):g} N/m and "
-            f"diagonal {float(diagonal[..., vertex].min()):g} N/m, which must be positive; look at masses and stiffness"
-        )
 
 
 # ---- the study
@@ -238,7 +202,7 @@ def _motion(sim: Simulator, start: State, forces: Tensor | None) -> list[State]:
     These have the same shape and speeds in other directions: as likely a motion, whose steps err in other modes.
     """
     mover = copy.copy(sim)
-    mover.solver, mover.iterations = Chebyshev(), 512
+    mover.solver, mover.iterations = Multilevel(), _MOVING
     states, state = [], start
     for step in range(max(_STEPS) + 1):
         if step in _STEPS:
@@ -264,6 +228,38 @@ def _of_environments(sim: Simulator, items: list[int], batch: int) -> Simulator:
 
 
 Seek = Callable[[Solver], list[Trial]]
+
+
+def _for_error(
+    sim: Simulator, study: _Study, start: State, solvers: list[Solver], error: float, most: int, bar: tqdm[NoReturn]
+) -> tuple[list[Trial], float]:
+    """The trials of the cheapest that reaches an error, and its milliseconds; of the best where none does.
+
+    Multilevel goes first: on stiff bodies it saves the others thousands of iterations that would take longer.
+    """
+    found: dict[Solver, list[Trial]] = {}
+    costs: dict[Solver, float] = {}
+    for solver in sorted(dict.fromkeys(solvers), key=lambda solver: not isinstance(solver, Multilevel)):
+        allowed = _affordable(sim, start, solver, _HOPELESS * min(costs.values()), most) if costs else most
+        trials = _fewest(study, lambda trial: trial.error <= error / SAFETY, allowed)(solver)
+        found[solver] = trials
+        if trials[-1].error <= error / SAFETY:
+            costs[solver] = _milliseconds(sim, start, trials[-1])
+        bar.update(1)
+    if not costs:
+        best = min(found.values(), key=lambda trials: trials[-1].error)
+        return best, _milliseconds(sim, start, best[-1])
+    # the first of those that take hardly longer than the fastest
+    solver = next(s for s in solvers if s in costs and costs[s] <= _NEAR * min(costs.values()))
+    return found[solver], costs[solver]
+
+
+def _affordable(sim: Simulator, start: State, solver: Solver, budget: float, most: int) -> int:
+    """The most iterations that a time [ms] pays for, about."""
+    few, many = 4, 20
+    times = [_milliseconds(sim, start, Trial(solver, count, 0.0, ())) for count in (few, many)]
+    slope = max((times[1] - times[0]) / (many - few), 1e-9)
+    return int(np.clip((budget - times[0]) / slope + few, 1, most))
 
 
 def _fewest(study: _Study, suffices: Callable[[Trial], bool], most: int) -> Seek:
@@ -339,15 +335,6 @@ def _wait_for(sim: Simulator) -> None:
 # ---- the choice
 
 
-def _cheapest(timed: list[tuple[list[Trial], float]], error: float) -> tuple[list[Trial], float]:
-    """The first candidate that takes hardly longer than the fastest of those that reach the error; else the best."""
-    reached = [(trials, cost) for trials, cost in timed if trials[-1].error <= error / SAFETY]
-    if not reached:
-        return min(timed, key=lambda pair: pair[0][-1].error)
-    fastest = min(cost for _, cost in reached)
-    return next((trials, cost) for trials, cost in reached if cost <= _NEAR * fastest)
-
-
 def _with_broken(study: _Study, trials: list[Trial], promised: float) -> list[Trial]:
     """The trials, the chosen one last, and where none of them breaks the promise some of fewer iterations that do."""
     if any(promised < study.worst(trial) < math.inf for trial in trials):
@@ -415,4 +402,5 @@ def _promise(
         device=str(sim.device),
         batch=len(start[0]),
         trials=tuple(trials),
+        material=fingerprint(sim.material()),
     )

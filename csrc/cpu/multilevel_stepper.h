@@ -147,6 +147,14 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     team_.barrier();
   }
 
+  // whether no lane asks for M
+  bool goes_by_diagonal() const {
+    const auto without = [&](int lane) { return done_[lane] || outer_[lane].diagonal; };
+    for (int lane = 0; lane < width; ++lane)
+      if (!without(lane)) return false;
+    return lbfgs_;
+  }
+
   // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
   void precondition() {
     if (corotates_) corotate(iteration_);
@@ -221,6 +229,9 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     bool asks[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
       const TurningPlan plan(k, made_[lane], outer_[lane].restarts - doubted_[lane]);
+      asks[lane] = false;
+      // alone it would not have come here
+      if (outer_[lane].diagonal) continue;
       asks[lane] = !done_[lane] && plan.make;
       some = some || asks[lane];
       if (plan.forget) corotation_.forget(lane);

@@ -8,9 +8,6 @@
 #include "cuda/slots.h"
 #include "plan/shared_memory.h"
 
-#include <stdexcept>
-#include <string>
-
 namespace pd {
 
 constexpr int field_threads = 256;
@@ -197,9 +194,7 @@ void launch_field(void (*kernel)(FieldWork<T>), const FieldWork<T>& work, int fi
   const std::size_t bytes =
       pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, fields);
   if (resident_blocks(reinterpret_cast<const void*>(kernel), field_threads, bytes) == 0)
-    throw std::runtime_error("torchpd: a patch of the plan wants " + std::to_string(bytes) +
-                             " bytes of shared memory, more than this device has; build the "
-                             "simulator with kernel=\"stream\"");
+    refuse_shared_memory(bytes);
   kernel<<<blocks_of(work.field.batch * plan.patches), field_threads, bytes, stream>>>(work);
   check(cudaGetLastError());
 }

@@ -30,6 +30,12 @@ std::int64_t stream_bytes(const DeviceStep<T>& call);
 template <class T>
 void run_stream(const DeviceStep<T>& call, void* memory, Stream stream);
 
+// The same of any kernel.
+template <class T>
+std::int64_t step_bytes(const DeviceStep<T>& call) {
+  return call.plan.kernel == int(DeviceKernel::stream) ? stream_bytes(call) : fused_bytes(call);
+}
+
 template <class T>
 using DeviceField = FieldCall<T, DevicePlan<T>>;
 

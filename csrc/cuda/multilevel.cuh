@@ -8,8 +8,6 @@
 #include "plan/shared_memory.h"
 
 #include <algorithm>
-#include <stdexcept>
-#include <string>
 
 namespace pd {
 
@@ -122,10 +120,7 @@ struct OuterLaunch {
     if (step.settings.schedule == ScheduleKind::corotated) add_corotation();
     resident = blocks_with(shared);
     keep_cycle(step);
-    if (resident == 0)
-      throw std::runtime_error("torchpd: a patch of the plan wants " + std::to_string(shared) +
-                               " bytes of shared memory beside those of the multilevel solver, "
-                               "more than this device has");
+    if (resident == 0) refuse_shared_memory(shared);
   }
 
   int blocks_with(std::size_t bytes) const {

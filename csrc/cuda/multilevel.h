@@ -145,6 +145,8 @@ class MultilevelRunner {
     __syncthreads();
   }
 
+  PD_DEVICE bool goes_by_diagonal() const { return lbfgs_ && c_.outer.diagonal; }
+
   // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
   PD_DEVICE void precondition() {
     if (corotates_) corotate();

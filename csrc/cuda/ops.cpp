@@ -21,8 +21,7 @@ struct Cuda {
   template <class T>
   static void step(const DeviceStep<T>& call, const Tensor& like) {
     const bool stream = call.plan.kernel == int(DeviceKernel::stream);
-    run(like, call, stream ? stream_bytes<T> : fused_bytes<T>,
-        stream ? run_stream<T> : run_fused<T>);
+    run(like, call, step_bytes<T>, stream ? run_stream<T> : run_fused<T>);
   }
 
   template <class T>

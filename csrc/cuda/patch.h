@@ -64,8 +64,8 @@ struct OneOf {
   }
 };
 
-// Where a pair's numbers lie in the plan and in the weights of an environment. 32 bits count them: a mesh has at most 2^28
-// tetrahedra.
+// Where a pair's numbers lie in the plan and in the weights of an environment. 32 bits count them: a plan has at most
+// most_blocks.
 struct PairPlace {
   unsigned pair;  // of all patches, the last block of each filled up
 

@@ -8,10 +8,33 @@
 
 namespace pd {
 
+// What to do where none of the code of this build is for the current device.
+static std::string remedy(cudaError_t status) {
+  if (status != cudaErrorNoKernelImageForDevice && status != cudaErrorInvalidDeviceFunction &&
+      status != cudaErrorUnsupportedPtxVersion)
+    return "";
+  int device = 0, major = 0, minor = 0;
+  cudaGetDevice(&device);
+  cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device);
+  cudaDeviceGetAttribute(&minor, cudaDevAttrComputeCapabilityMinor, device);
+  const std::string capability = std::to_string(major) + "." + std::to_string(minor);
+  return "; this build has no code for the GPU, of compute capability " + capability +
+         ": build torchpd again with TORCH_CUDA_ARCH_LIST=" + capability + " in the environment";
+}
+
 void check(cudaError_t status) {
   if (status == cudaSuccess) return;
+  const std::string words = cudaGetErrorString(status) + remedy(status);
   cudaGetLastError();
-  throw std::runtime_error(std::string("torchpd: CUDA says: ") + cudaGetErrorString(status));
+  throw std::runtime_error("torchpd: CUDA says: " + words);
+}
+
+void refuse_shared_memory(std::size_t shared_bytes) {
+  throw std::runtime_error("torchpd: a patch of the plan wants " + std::to_string(shared_bytes) +
+                           " bytes of shared memory, and a block of this device has up to " +
+                           std::to_string(shared_memory_per_block()) +
+                           ": the plan is for another GPU; sim.to(\"cpu\").to(\"cuda\") "
+                           "compiles the scene for this one");
 }
 
 static int ask_for_resident_blocks(const void* kernel, int device, int threads,
@@ -132,9 +155,11 @@ std::size_t shared_memory_per_block() {
 }
 
 unsigned blocks_of(std::int64_t count) {
-  if (count > 0x7fffffff)
+  constexpr std::int64_t most = 0x7fffffff;
+  if (count > most)
     throw std::runtime_error("torchpd: the batch needs " + std::to_string(count) +
-                             " blocks, more than one launch can have; split it");
+                             " thread blocks, and one launch has up to " + std::to_string(most) +
+                             ": split it into several calls");
   return unsigned(count);
 }
 

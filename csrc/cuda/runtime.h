@@ -13,6 +13,9 @@ void check(cudaError_t status);
 // Blocks of a kernel that the current device runs at once; also lets it have that much shared memory. 0: too much for it.
 int resident_blocks(const void* kernel, int threads, std::size_t shared_bytes);
 
+// Throws that a patch wants too much, and what to do; the plan is for a device that has more.
+[[noreturn]] void refuse_shared_memory(std::size_t shared_bytes);
+
 // Clusters of so many blocks that the current device runs at once, after resident_blocks; 0: it has none, or none so large.
 int resident_clusters(const void* kernel, int threads, std::size_t shared_bytes, int blocks);
 

@@ -11,8 +11,6 @@
 #include "solver/step.h"
 
 #include <algorithm>
-#include <stdexcept>
-#include <string>
 #include <utility>
 
 namespace pd {
@@ -260,8 +258,7 @@ void allow_shared_memory(std::size_t bytes) {
         stream_patches<Visit::update_guarded, T, Touching>,
         stream_patches<Visit::measure, T, Touching>}) {
     if (resident_blocks(reinterpret_cast<const void*>(kernel), pass_threads, bytes) == 0)
-      throw std::runtime_error("torchpd: a patch of the plan wants " + std::to_string(bytes) +
-                               " bytes of shared memory, more than this device has");
+      refuse_shared_memory(bytes);
   }
 }
 

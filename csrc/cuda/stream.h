@@ -329,6 +329,8 @@ __global__ void __launch_bounds__(decide_threads)
     p.schedule = Schedule(set, p.least, w.contacts.friction() > T(0));
     p.used = set.tolerance > 0 ? 0 : set.iterations;
     p.done = false;
+    // read with the rest, whether or not anybody has measured them
+    if (!set.report) p.energy = p.residual = p.course = 0;
     omega[0] = p.schedule.next(0);
   } else if constexpr (What == Decision::iterate) {
     const bool soft = set.tolerance > 0;

@@ -182,6 +182,11 @@ void number_patches(DeviceMeshPlan& plan, const std::vector<Patch>& patches, boo
     plan.patch_slot.push_back(plan.patch_slot.back() + std::int32_t(patch.vertex.size()));
   }
   const std::size_t blocks = plan.patch_block.back(), slots = plan.patch_slot.back();
+  if (std::int64_t(blocks) > most_blocks)
+    throw std::overflow_error(
+        "patches = " + std::to_string(patches.size()) + " is too many: they would have " +
+        std::to_string(blocks) + " blocks of 32 pairs of tetrahedra, and 32 bits count up to " +
+        std::to_string(most_blocks) + "; take fewer patches, or a coarser mesh");
   plan.pair_tet.resize(blocks * 2 * lanes);
   plan.pair_bound.resize(blocks * 2 * lanes);
   if (stored) plan.pair_rest.resize(blocks * pair_rest_numbers * lanes);

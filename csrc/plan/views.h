@@ -53,6 +53,17 @@ struct Levels {
   }
 };
 
+// Its counts, from its array of sizes; without the other arrays.
+template <class T>
+Levels<T> count_levels(const int32* sizes, int vertices) {
+  Levels<T> levels;
+  levels.vertices = vertices;
+  levels.fine_nodes = sizes[level_fine_nodes];
+  levels.middle_nodes = sizes[level_middle_nodes];
+  levels.direct = sizes[level_direct] != 0;
+  return levels;
+}
+
 template <class T>
 struct Plan {
   using real = T;
@@ -87,6 +98,19 @@ struct DevicePlan {
 #undef X
   Levels<T> levels;
 };
+
+// Its counts, from its array of sizes; without the other arrays.
+template <class T>
+DevicePlan<T> count_device_plan(const int32* sizes) {
+  DevicePlan<T> plan;
+#define X(name, meaning) plan.name = sizes[size_##name];
+#include "plan/device_sizes.def"
+#undef X
+  return plan;
+}
+
+// Of pairs, by which kernels count the corners of all of them, 5 times 32 of a block, in 32 bits (cuda/patch.h).
+constexpr std::int64_t most_blocks = (std::int64_t(1) << 32) / (5 * 32);
 
 // One array of the material: the same for all environments when stride is 0.
 template <class T>

@@ -45,7 +45,7 @@ struct TurningPlan {
 
   PD_HD TurningPlan(int k, int made, int failed) {
     const bool doubted = made > 0 && failed >= turning_doubts;
-    make = k == turning_begins || (doubted && made < turning_most);
+    make = made > 0 ? doubted && made < turning_most : k >= turning_begins;
     forget = doubted && !make;
   }
 };

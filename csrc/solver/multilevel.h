@@ -4,10 +4,11 @@
 // to rounding, so u - theta M grad E with theta < 2 lowers E by at least theta (1 - theta / 2) g^T M g. With another one,
 // A <= s A_0 for the largest ratio s of its inertias and stiffnesses to those M was made for: theta M / s does.
 // What accelerates that step may overshoot, so every trial is judged by its energy before the next one starts from it.
-// Trials that fail go back, and after a few of them a plain Jacobi iteration takes over, which descends by the proof there:
-// once with L-BFGS, which has learnt from the failures; accelerated and for the rest of the step with momentum, which has not.
-// With friction, whose forces no energy has, a dozen accelerated ones follow the first failure, two dozen the second, and so on:
-// while friction has not settled, M leads stiff bodies astray (by 200 times the error of the first iterate).
+// Trials that fail go back, and after a few of them Jacobi iterations take over, which descend by the proof there, accelerated:
+// for a while with L-BFGS, which has learnt from the failures, and for the rest of the step with momentum, which has not. A while
+// is two iterations, then four, eight, and shorter again where M serves: contacts on many vertices are more than eight pairs can
+// tell M of. With friction, whose forces no energy has, a dozen follow the first failure, two dozen the second, and so on: while
+// friction has not settled, M leads stiff bodies astray (by 200 times the error of the first iterate).
 //
 // Contacts hold vertices in directions that M does not know of. M is applied to what is out of balance in the others, and
 // its result taken in the others, while the held ones go by the diagonal (two-metric projection, Bertsekas 1982), as does a
@@ -45,8 +46,9 @@ PD_HD void multilevel_iterations(Runner& run, const Settings& settings) {
     if (k == settings.iterations) break;
     run.learn(k);  // what the way to it says about the curvature
     if (run.finished()) break;
-    run.precondition();  // direction: M, corrected by what was learnt
-    run.advance();       // next trial, on the pins and out of the contacts
+    // direction: M, corrected by what was learnt
+    if (!run.goes_by_diagonal()) run.precondition();
+    run.advance();  // next trial, on the pins and out of the contacts
   }
   run.settle();  // on the last trial that was better
 }
@@ -214,9 +216,10 @@ struct Misfit {
 // ---- the outer iteration of one environment: numbers only
 
 constexpr int history = 8;  // pairs that L-BFGS remembers
-// accelerated Jacobi iterations, with friction, after a first failure
-constexpr int detour_length = 12;
-constexpr int patience = 4;                // trials that may fail before a plain iteration
+// accelerated Jacobi iterations in place of L-BFGS the first time, and with friction
+constexpr int detour_length = 2, friction_detour_length = 12;
+constexpr int most_doublings = 7;          // of these lengths
+constexpr int patience = 4;                // trials that may fail before Jacobi iterations
 constexpr double sufficient = 1e-4;        // of the decrease that the slope promises (Armijo)
 constexpr double least_curvature = 1e-12;  // s.y of a pair, in |s| |y|
 constexpr double momentum_rho = 0.9995;    // that of M A is not known, and this limit serves all
@@ -232,7 +235,8 @@ struct Outer {
   double scale = 1;              // M / scale serves the material of the step
   double energy = 0, slope = 0;  // at the base; g.d of the direction from there
   double slack = 0;
-  int failures = 0, restarts = 0, momentum = 0, detour = 0;
+  int failures = 0, restarts = 0, momentum = 0;
+  int detour = 0, doublings = 0;  // iterations left of a detour; how long the next one is
   bool plain = false, friction = false, accepted = true, known = false;
   // momentum with 1 / D in place of M: to the end of the step, of L-BFGS while a detour lasts
   bool diagonal = false;
@@ -257,16 +261,30 @@ struct Outer {
       known = true;
       energy = trial;
     }
-    plain = failures >= patience;
-    if (armijo && friction) {
-      // pairs learn nothing of sliding; where it settles M serves again
-      detour = fell ? detour - (detour > 0) : detour_length << (restarts < 8 ? restarts - 1 : 7);
-      diagonal = detour > 0;
-    } else if (!armijo) {
+    if (!armijo) {
       // with the momentum gone M alone descends, if it fits
       diagonal = diagonal || failures > 1;
+    } else if (!diagonal) {
+      if (failures >= (friction ? 1 : patience)) {
+        start_detour();
+      } else if (fell && !friction && doublings > 0) {
+        --doublings;
+      }
+    } else if (friction && !fell) {
+      start_detour();
+    } else if (fell) {
+      // what fails here without friction is momentum
+      diagonal = --detour > 0;
     }
+    plain = failures >= patience;
     return accepted;
+  }
+
+  PD_HD void start_detour() {
+    detour = (friction ? friction_detour_length : detour_length) << doublings;
+    doublings += doublings < most_doublings;
+    diagonal = true;
+    failures = 0;
   }
 
   // the most that momentum with M takes

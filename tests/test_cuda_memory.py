@@ -1,0 +1,106 @@
+"""What `print(sim)` and the check before a simulator moves say of memory is what torch's allocator hands out."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+from cases import Case
+from devices import require_gpu
+from on_gpu import DTYPES, GPU, KERNELS, bar, on_gpu
+from runs import noise, plan_of, simulator, small
+from torch import Tensor
+
+import torchpd as pd
+from torchpd.gpu import properties_of, step_bytes
+from torchpd.tables import DEVICE_SIZES
+
+require_gpu()
+
+SOLVERS = ("corotated", "lbfgs", "momentum")
+
+
+def body(contacts: bool, cells: tuple[int, int, int] = (8, 3, 3)) -> Case:
+    """Held, or free to move over a ground."""
+    parts = (pd.Ground(-0.3), pd.Sphere((0.0, -9.0, 0.0), 0.5)) if contacts else (pd.Gravity(),)
+    return bar(cells, *parts, pinned=not contacts)
+
+
+def bytes_taken(sim: pd.Simulator, batch: int) -> int:
+    """Of torch's memory by a step in place, which holds nothing else; as asked for, before the allocator rounds it."""
+    rest = sim.rest_state(batch)
+    state = pd.State(rest.positions + 0.01 * noise(rest.positions, 1), noise(rest.positions, 2))
+    rows = torch.empty((batch, 6), dtype=torch.float64, device=GPU)
+    sim.step_(state, info=rows)
+    torch.cuda.synchronize()
+    torch.cuda.reset_peak_memory_stats(GPU)
+    before = torch.cuda.memory_stats(GPU)["requested_bytes.all.current"]
+    held = torch.cuda.memory_allocated(GPU)
+    sim.step_(state, info=rows)
+    torch.cuda.synchronize()
+    taken: int = torch.cuda.memory_stats(GPU)["requested_bytes.all.peak"] - before
+    # blocks of the allocator: of 512 bytes, and large ones with up to 1 MB that is not worth splitting off
+    assert taken <= torch.cuda.max_memory_allocated(GPU) - held <= taken + (1 << 20) + 512
+    return taken
+
+
+def batches() -> tuple[int, ...]:
+    """Of one, of several, and of more than are in work at a time."""
+    return (1, 7, 24 * properties_of(GPU).multiprocessors)
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("kernel", [*KERNELS, "far"])
+@pytest.mark.parametrize("contacts", [False, True], ids=["plain", "contacts"])
+def test_a_step_takes_what_it_is_said_to(contacts: bool, kernel: str, precision: str) -> None:
+    case = body(contacts, (24, 6, 6) if kernel == "far" else (8, 3, 3))
+    sim = on_gpu(case, DTYPES[precision], kernel, iterations=2)
+    for batch in batches():
+        assert step_bytes(sim, sim.plan, batch, GPU) == bytes_taken(sim, batch)
+    own = sim.stiffness * torch.linspace(0.5, 2.0, 7, dtype=sim.dtype, device=GPU)[:, None]
+    sim.set_material(stiffness=own)
+    assert step_bytes(sim, sim.plan, 7, GPU) == bytes_taken(sim, 7)
+
+
+@pytest.mark.parametrize("precision", DTYPES)
+@pytest.mark.parametrize("outer", SOLVERS)
+@pytest.mark.parametrize("batch", [None, 1024])
+def test_a_step_of_the_multilevel_solver_takes_what_it_is_said_to(
+    batch: int | None, outer: str, precision: str
+) -> None:
+    """With the patches and the preconditioner of few and of many environments."""
+    for contacts in (False, True):
+        solver = pd.Multilevel(outer)
+        sim = simulator(body(contacts), DTYPES[precision], GPU, solver=solver, batch=batch, iterations=2)
+        for count in batches():
+            assert step_bytes(sim, sim.plan, count, GPU) == bytes_taken(sim, count)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_print_says_how_much(kernel: str) -> None:
+    sim = on_gpu(body(contacts=False), torch.float32, kernel)
+    said = re.search(r"([\d,]+) B an environment during a step(, at most ([\d,]+) B in all)?$", str(sim), re.MULTILINE)
+    assert said
+    one, _, most = said.groups()
+    assert int(one.replace(",", "")) == bytes_taken(sim, 1)
+    if kernel == "stream":
+        assert most is None
+    else:
+        assert int(most.replace(",", "")) == bytes_taken(sim, batches()[-1])
+
+
+def test_a_plan_that_is_still_on_the_cpu_tells_it_too() -> None:
+    """Before anything moves."""
+    sim, _ = small(torch.float32, GPU)
+    assert step_bytes(sim, sim.plan.to("cpu"), 3, GPU) == step_bytes(sim, sim.plan, 3, GPU) > 0
+
+
+def test_more_blocks_than_32_bits_count_are_refused() -> None:
+    """Of a plan whose sizes say so: kernels count the corners of their pairs, 160 a block."""
+    sim, state = small(torch.float32, GPU)
+    arrays: list[Tensor] = plan_of(sim)
+    sizes = arrays[0].clone()
+    sizes[DEVICE_SIZES.index("blocks")] = 2**32 // 160 + 1
+    with pytest.raises(ValueError, match=r"up to 26843545 blocks of 32 pairs of tetrahedra.* got 26843546; compile"):
+        torch.ops.torchpd.gradient(state.positions, sim.stiffness, [sizes, *arrays[1:]])

@@ -1,0 +1,77 @@
+"""What `Simulator.tune` refuses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from .accuracy import ExactStep
+from .diagonal import step_diagonal
+from .material import MATERIAL_ROWS
+from .state import State
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+__all__ = ["check_known", "check_request", "check_start", "environments_of_material"]
+
+
+def check_request(error: float | None, milliseconds: float | None) -> None:
+    """One of the two, within its range."""
+    if (error is None) == (milliseconds is None):
+        raise ValueError(
+            f"tune takes one of error and milliseconds, got error={error} and milliseconds={milliseconds}; "
+            "for example sim.tune(error=1e-2)"
+        )
+    if error is not None and not 0.0 < error < 1.0:
+        raise ValueError(f"tune: error must lie in (0, 1), 1 being the first iterate; got {error}")
+    if milliseconds is not None and not 0.0 < milliseconds < math.inf:
+        raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
+
+
+def environments_of_material(sim: Simulator) -> int:
+    """That have numbers of their own; 1 where all share them."""
+    arrays = {name: getattr(sim, name) for name in MATERIAL_ROWS}
+    return max(len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1 for name, array in arrays.items())
+
+
+def check_start(sim: Simulator, state: State, forces: Tensor | None) -> None:
+    """States, forces and material that can be studied."""
+    sim.check_state(state, forces=forces)
+    if state[0].dim() != 3 or not len(state[0]):
+        raise ValueError(f"tune: state must hold environments [B, V, 3], at least one, got {list(state[0].shape)}")
+    count = environments_of_material(sim)
+    if count not in (1, len(state[0])):
+        raise ValueError(f"tune: state must have the {count} environments of the material, got {len(state[0])}")
+    for name, part in zip(State._fields, state, strict=True):
+        bad = (~part.isfinite()).flatten(1).any(1).nonzero()
+        if len(bad):
+            raise ValueError(f"tune: state.{name} must be finite, got NaN or infinity in environment {int(bad[0])}")
+    values = {"forces": forces} if forces is not None else {}
+    for name, array in (values | dict(zip(MATERIAL_ROWS, sim.material(), strict=True))).items():
+        # hard pins have springs without end
+        bad = (array.isnan() if name == "pin_stiffness" else ~array.isfinite()).nonzero()
+        if len(bad):
+            raise ValueError(f"tune: {name} must be finite, got NaN or infinity at {bad[0].tolist()}")
+    inertia, diagonal = step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)
+    bad = ~((inertia > 0) & (diagonal > 0)).reshape(-1, sim.vertices).all(0)
+    if bool(bad.any()):
+        vertex = int(bad.nonzero()[0])
+        raise ValueError(
+            f"tune: the system is singular: vertex {vertex} has inertia {float(inertia[..., vertex].min()):g} N/m and "
+            f"diagonal {float(diagonal[..., vertex].min()):g} N/m, which must be positive; look at masses and stiffness"
+        )
+
+
+def check_known(steps: Sequence[ExactStep], allowed: float) -> None:
+    """Nothing is promised where there is nothing to compare with."""
+    doubt = max(step.uncertainty for step in steps)
+    if not doubt <= allowed:
+        raise RuntimeError(
+            f"tune: no converged step to compare with: the best float64 solution of one of the {len(steps)} studied "
+            f"steps may itself be wrong by {doubt:.1e}, which must be at most {allowed:.1e}; solver and iterations "
+            "stay as they were. Look for slivers in the mesh (quality()), or ask for a larger error"
+        )
