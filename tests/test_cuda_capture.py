@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from dataclasses import replace
 
 import pytest
 import torch
@@ -69,6 +70,19 @@ def test_material_of_the_same_shape_is_read_anew(kernel: str, precision: str) ->
     sim.step_(eager)
     assert same_bits(own, eager)
     assert not same_bits(own, deaf)
+
+
+def test_a_replay_for_another_plan_is_refused(kernel: str, precision: str) -> None:
+    sim, start = small_on_gpu(DTYPES[precision], kernel)
+    own, eager = twins(start, 2)
+    step, plan = sim.capture(own), sim.plan
+    sim.plan = replace(plan)
+    with pytest.raises(RuntimeError, match="capture it again"):
+        step.replay()
+    sim.plan = plan
+    step.replay()
+    sim.step_(eager)
+    assert same_bits(own, eager)
 
 
 def test_settings_and_tensors_of_the_recording_stay(kernel: str, precision: str) -> None:

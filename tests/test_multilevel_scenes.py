@@ -205,6 +205,10 @@ def test_springs_that_grow_much_stiffer_prepare_it_anew() -> None:
     anew = sim.plan
     sim.set_material(pin_stiffness=torch.full_like(sim.pin_stiffness, 2e6))
     assert sim.plan is anew  # within what M puts up with
+    # as a whole M serves it
+    grown = {name: 10.0 * getattr(sim, name).detach() for name in ("stiffness", "masses", "pin_stiffness")}
+    sim.set_material(**grown)
+    assert sim.plan is anew
     _, info = sim(state_of(case, sim), return_info=True)
     assert float(info.rho) < 0.6
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import pickle
 import re
 import warnings
 from collections.abc import Callable
@@ -260,6 +261,31 @@ def test_stiff_beams_are_tuned() -> None:
     assert isinstance(promise.solver, pd.Multilevel)
     assert promise.iterations < 40
     assert worst_error(sim, swinging(sim, speed=-10.0)) <= 1e-2
+
+
+def test_asking_about_another_simulator_changes_nothing(tuned: tuple[pd.Simulator, Promise]) -> None:
+    sim, promise = copy.deepcopy(tuned)
+    sim.promise = promise
+    other = copy.deepcopy(sim)
+    other.set_material(stiffness=1e3 * other.stiffness)
+    _, info = sim(swinging(sim), return_info=True)
+    held = promise.holds(info)
+    assert not promise.covers(other)
+    assert torch.equal(promise.holds(info), held)
+    assert "another material" not in str(promise)
+    assert pickle.loads(pickle.dumps(promise)) == promise
+    with pytest.raises(AttributeError):
+        promise.error = 1.0  # type: ignore[misc]
+
+
+def test_a_kernel_without_multilevel_is_tuned_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU's "block", for one: the study moves by Chebyshev then."""
+    for module in ("contenders", "tuning"):
+        monkeypatch.setattr(f"torchpd.{module}.runs", lambda solver, _: not isinstance(solver, pd.Multilevel))
+    sim = bar()
+    promise = sim.tune(swinging(sim), error=1e-2)
+    assert promise.attained
+    assert not any(isinstance(trial.solver, pd.Multilevel) for trial in promise.trials)
 
 
 def material_twice(sim: pd.Simulator) -> None:

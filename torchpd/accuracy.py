@@ -125,14 +125,15 @@ def scene_without_friction(scene: Scene) -> Scene:
 
 def frictionless(sim: Simulator, dtype: torch.dtype | None = None) -> Simulator:
     """A copy of the simulator with its present material, smooth contacts, and no stop before the last iteration."""
-    twin = copy.deepcopy(sim)
-    if dtype is not None:
-        twin = twin.to(dtype)
-    twin.tolerance = 0.0
-    smooth = {name: getattr(twin, name).detach().clone() for name in ("planes", "spheres")}
-    for array in smooth.values():
-        array[..., 4] = 0.0
-    twin.set_material(**smooth)
+    with torch.inference_mode(False), torch.no_grad():
+        twin = copy.deepcopy(sim)
+        if dtype is not None:
+            twin = twin.to(dtype)
+        twin.tolerance = 0.0
+        smooth = {name: getattr(twin, name).detach().clone() for name in ("planes", "spheres")}
+        for array in smooth.values():
+            array[..., 4] = 0.0
+        twin.set_material(**smooth)
     return twin
 
 

@@ -17,7 +17,7 @@ from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_so
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["AIM", "COSTS", "Choice", "Cost", "Costs", "choose_solver"]
+__all__ = ["AIM", "COSTS", "Choice", "Cost", "Costs", "choose_solver", "runs"]
 
 AIM = 1e-3  # error of a step that "auto" sets its iterations for
 MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes
@@ -109,7 +109,7 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     saves = short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
     multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
-    if not _runs(multilevel, sim):
+    if not runs(multilevel, sim):
         where = f"{sim.device} with kernel={sim.kernel!r}" if sim.device.type == "cuda" else str(sim.device)
         return chebyshev, chosen(_enough(plain), f"{counts}, and Multilevel does not run on {where}")
     costs = COSTS[sim.plan.kernel or "cpu"]
@@ -145,7 +145,7 @@ def _relaxation(spectrum: Spectrum | None) -> float | None:
     return best if best < Chebyshev().numbers()["relaxation"] else None
 
 
-def _runs(solver: Solver, sim: Model) -> bool:
+def runs(solver: Solver, sim: Model) -> bool:
     """Whether there are kernels for the solver where the simulator is."""
     try:
         check_solver(solver, sim.device)

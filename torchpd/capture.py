@@ -23,7 +23,8 @@ class CapturedStep:
 
     A replay reads and writes the very tensors that were given: put new values into them with `copy_`, and into the
     material with `sim.pin_targets.copy_(...)` or, in the same shape, `sim.set_material(...)`. Settings (time step,
-    iterations, tolerance) and the batch are those of the recording; capture again to change them.
+    iterations, tolerance) and the batch are those of the recording; capture again to change them, and where
+    `set_material` prepares the solver anew: a replay refuses then.
 
         step = sim.capture(state, forces)
         for _ in range(100):
@@ -47,11 +48,12 @@ class CapturedStep:
                 '.to("cuda"), or call step_ or rollout, which do the same on every device'
             )
         self.state = state
+        self._sim, self._plan = sim, sim.plan
         rows = (len(state[0]), INFO_WIDTH)
         self._rows = torch.empty(rows, dtype=torch.float64, device=sim.device) if report else None
         # the graph knows addresses only: what lies there has to live as long as it does
         own = dict(targets) if isinstance(targets, Mapping) else targets
-        self._alive = (sim.plan, [array.detach() for array in sim.material()], forces, own, start)
+        self._alive = ([array.detach() for array in sim.material()], forces, own, start)
 
         def run(moved: State) -> None:
             sim.step_(moved, forces, targets, start, info=self._rows)
@@ -69,6 +71,11 @@ class CapturedStep:
 
     def replay(self) -> None:
         """The step once more, on the current stream, without waiting for it."""
+        if self._sim.plan is not self._plan:
+            raise RuntimeError(
+                "replay: the simulator has another plan than when the step was captured (another solver, kernel or "
+                "device, or a preconditioner made anew): capture it again"
+            )
         self._graph.replay()
 
     @property

@@ -36,7 +36,7 @@ class _Touching:
     gradient: Array  # [V, 3] N
     landing: Array  # [V, 3] m: the way of touching vertices onto their surfaces
     tangents: csr_array  # [3 V, n], orthonormal
-    bending: Array  # [V] N/m: force of a ball over its radius, by which its curvature stiffens the tangents
+    bending: Array  # [V] N/m: force of a ball over its radius, by which its curvature softens the tangents
 
     def project(self, vectors: Array) -> Array:
         """What of vectors [V, 3] the contacts leave."""
@@ -113,7 +113,7 @@ class ContactNewton:
         here = torch.from_numpy(displacement)
 
         def multiply(p: Array) -> Array:
-            return np.asarray(self.krylov.product(here, torch.from_numpy(p)).numpy() + found.bending[:, None] * p)
+            return np.asarray(self.krylov.product(here, torch.from_numpy(p)).numpy() - found.bending[:, None] * p)
 
         residual = -found.project(found.gradient + multiply(found.landing))
         goal = _LINEAR * float(np.linalg.norm(residual))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from .automatic import runs
 from .solvers import DEFAULT_ITERATIONS, Chebyshev, Jacobi, Multilevel, Solver
 from .spectrum import estimate_rho
 from .state import State
@@ -51,4 +52,5 @@ DEFAULT = "guarded Chebyshev"  # what `Simulator(scene)` does
 def safe_solvers(sim: Simulator, state: State) -> dict[str, Solver]:
     """Those that cannot diverge and run where the simulator is, the default first."""
     here = {name: c for name, c in CONTENDERS.items() if c.safe and sim.device.type in c.devices}
-    return {name: here[name].make(sim, state) for name in sorted(here, key=lambda name: name != DEFAULT)}
+    made = {name: here[name].make(sim, state) for name in sorted(here, key=lambda name: name != DEFAULT)}
+    return {name: solver for name, solver in made.items() if runs(solver, sim)}

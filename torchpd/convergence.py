@@ -15,11 +15,15 @@ from .simulator import Simulator
 from .solvers import Chebyshev, Jacobi, Solver
 from .spectrum import estimate_rho
 from .state import State
+from .warn import warn_user
 
 __all__ = ["ConvergenceCurve", "SolvedAlreadyError", "compare_solvers", "measure_convergence", "plot_convergence"]
 
 # Okabe and Ito's palette, told apart with every kind of colour vision.
 _COLORS = ("#8a8d93", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
+
+
+_DOUBTFUL = 1e-6  # uncertainty of the converged step, of the error that errors are relative to
 
 
 class SolvedAlreadyError(ValueError):
@@ -61,7 +65,13 @@ def measure_convergence(
         after_step: State = study(start)
         return after_step.positions
 
-    solution = start.positions + torch.from_numpy(exact_steps(study, start)[0].solution).to(start.positions.device)
+    exact = exact_steps(study, start)[0]
+    if exact.uncertainty > _DOUBTFUL:
+        warn_user(
+            f"measure_convergence: the converged step is uncertain by {exact.uncertainty:.1g}, in the unit of the "
+            "curves, which below that say nothing"
+        )
+    solution = start.positions + torch.from_numpy(exact.solution).to(start.positions.device)
     scale = float((after(Chebyshev(), 0) - solution).norm())
     # rounded positions strain a body a little, even one that only falls
     if scale <= 10.0 * torch.finfo(state.positions.dtype).eps * float(start.positions.norm()):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,7 +13,17 @@ from torch import Tensor
 from .scene import SceneValues
 from .tables import MATERIAL_TABLE
 
-__all__ = ["MATERIAL_ROWS", "check_batches", "check_material", "fingerprint", "material_of"]
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = [
+    "MATERIAL_ROWS",
+    "check_batches",
+    "check_material",
+    "environments_of_material",
+    "fingerprint",
+    "material_of",
+]
 
 MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
 
@@ -89,3 +100,9 @@ def check_batches(new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None
             )
         if count != 1:
             first = count, name + stays
+
+
+def environments_of_material(sim: Model) -> int:
+    """How many environments the material of a simulator has numbers for; 1 where all share them."""
+    arrays = {name: getattr(sim, name) for name in MATERIAL_ROWS}
+    return max(len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1 for name, array in arrays.items())

@@ -226,7 +226,8 @@ class Model(nn.Module):
 
         Args:
             arrays: by name, see `Simulator`. Shapes and values are checked here, once, and that batches agree with each
-                other and with those of the arrays that stay.
+                other and with those of the arrays that stay. Pins that hold others, or much harder, make the matrix of
+                `Multilevel` anew, see `prepare_solver`; a captured step wants to be captured again then.
         """
         check_has_values("set_material", self.device)
         checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
@@ -246,7 +247,7 @@ class Model(nn.Module):
             # before anything is replaced, because it may fail
             plan = self._plan_with(checked)
             if self.promise is not None and any(not torch.equal(new, getattr(self, n)) for n, new in checked.items()):
-                self.promise.other_material = True
+                self.promise.doubt(True)
             for name, tensor in checked.items():
                 if name in parameters:
                     setattr(self, name, parameters[name])

@@ -65,9 +65,14 @@ def reference_of(plan: Plan, material: Sequence[Tensor], time_step: float) -> Re
 
 def has_strangers(plan: Plan, material: Sequence[Tensor], time_step: float) -> bool:
     """Whether springs hold any vertex so much harder than M knows that it is left to the diagonal."""
-    _, known = reference_of_levels(plan.arrays)
-    _, inertia = reference_of(plan, material, time_step)
-    return bool((inertia > _C.known_inertia * known).any())
+    was, now = reference_of_levels(plan.arrays), reference_of(plan, material, time_step)
+    elements, inertias = ((new / old)[old.isfinite() & (old > 0.0)] for new, old in zip(now, was, strict=True))
+    inertias = inertias[inertias.isfinite()]
+    if not len(inertias):
+        return False
+    # as Misfit in csrc/solver/multilevel.h: what has grown as a whole M serves
+    trusted = torch.maximum(elements.max(), inertias.min())
+    return bool(inertias.max() > _C.known_inertia * trusted)
 
 
 def precondition_plan(

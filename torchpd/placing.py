@@ -10,7 +10,7 @@ from torch import Tensor
 
 from . import _C
 from .gpu import free_memory, properties_of, refuse_full_memory, seen_devices, step_bytes, why_not
-from .material import material_of
+from .material import environments_of_material, material_of
 from .multilevel import precondition_plan, reference_of, reference_of_levels, without_levels
 from .plan import Plan, compile_plan
 from .regimes import choose_plan
@@ -94,7 +94,7 @@ def move_plan(sim: Model, plan: Plan, device: torch.device, material: int = 0) -
     if plan.device == device:
         return plan
     if device.type == "cuda":
-        needed = plan.bytes + material + step_bytes(sim, plan, sim.batch or 1, device)
+        needed = plan.bytes + material + step_bytes(sim, plan, sim.batch or environments_of_material(sim), device)
         refuse_full_memory(needed, free_memory(device))
     return plan.to(device)
 

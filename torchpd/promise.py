@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -31,7 +31,7 @@ class Trial(NamedTuple):
     errors: tuple[float, ...] = ()  # of the states
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True)
 class Promise:
     """What `Simulator.tune` chose and what may be expected of it, for motions like the studied one of that material.
 
@@ -57,7 +57,8 @@ class Promise:
     trials: tuple[Trial, ...]
     material: str  # fingerprint of the arrays
     left_out: str = ""  # solver that was not tried though it might do better, and why
-    other_material: bool = False  # set by `Simulator.set_material`, and by `covers` where it finds another one
+    # said by `Simulator.set_material`, and by `covers` of its own simulator
+    other_material: bool = field(default=False, compare=False)
 
     def holds(self, info: Info) -> Tensor:
         """Whether the error may still be relied on [B] (bool), from the residual that `return_info=True` reports.
@@ -113,10 +114,16 @@ class Promise:
     def covers(self, sim: Simulator) -> bool:
         """Whether the simulator still has the settings and the material that were promised for; awaits a GPU."""
         now = (sim.solver, sim.iterations, sim.time_step, sim.dtype, str(sim.device), sim.tolerance)
+        other = self.other_material
         if now[3:5] == (self.dtype, self.device):
-            self.other_material = fingerprint(sim.material()) != self.material
-        same = now == (self.solver, self.iterations, self.time_step, self.dtype, self.device, 0.0)
-        return same and not self.other_material
+            other = fingerprint(sim.material()) != self.material
+            if sim.promise is self:
+                self.doubt(other)
+        return now == (self.solver, self.iterations, self.time_step, self.dtype, self.device, 0.0) and not other
+
+    def doubt(self, other: bool) -> None:
+        """Note whether its simulator has another material now."""
+        object.__setattr__(self, "other_material", other)
 
     def __str__(self) -> str:
         wanted = f"error {self.asked_error:g}" if self.asked_error is not None else f"{self.asked_milliseconds:g} ms"

@@ -10,6 +10,7 @@ from . import _C
 from .checks import NO_VALUES
 from .forecast import FAR_TOO_FEW, forecast
 from .gpu import step_bytes
+from .material import environments_of_material
 from .plan import any_of
 from .regimes import shared_bytes
 from .solvers import Chebyshev, Multilevel, Solver
@@ -159,7 +160,7 @@ def _step_bytes(sim: Simulator, real: int) -> str:
     plan = sim.plan
     if plan.kernel is None:
         return f"{workspace_bytes(plan, real, sim.solver):,} B an environment during a step"
-    batch = sim.batch or 1
+    batch = sim.batch or environments_of_material(sim)
     each = -(-step_bytes(sim, plan, batch, sim.device) // batch)
     taken = f"{each:,} B an environment during a step{f' of {batch:,}' if batch > 1 else ''}"
     if plan.kernel == "stream":

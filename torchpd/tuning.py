@@ -13,7 +13,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
@@ -22,16 +22,17 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .accuracy import ExactStep, exact_steps, frictionless
+from .automatic import runs
 from .checks import check_has_values, check_scalar, check_whole
 from .contenders import safe_solvers
 from .diagonal import step_diagonal
 from .forecast import has_friction
-from .material import MATERIAL_ROWS, fingerprint
+from .material import MATERIAL_ROWS, environments_of_material, fingerprint
 from .promise import Promise, Trial
-from .solvers import Multilevel, Solver
+from .solvers import Chebyshev, Multilevel, Solver
 from .state import State
 from .targets import Targets
-from .tuning_checks import check_known, check_request, check_start, environments_of_material
+from .tuning_checks import check_known, check_request, check_start
 from .warn import warn_user
 
 if TYPE_CHECKING:
@@ -50,7 +51,8 @@ _ENVIRONMENTS = 3  # of a batch, and the worst conditioned one
 _HEADROOM = 0.95  # of a budget in milliseconds that is spent: times scatter
 _NEAR = 1.1  # a safer candidate wins although it takes this much longer
 _HOPELESS = 1.5  # a candidate that takes this much longer than another one is given up
-_MOVING = 64  # iterations of Multilevel for the states that are studied
+# iterations for the states that are studied: of Multilevel, and of Chebyshev where a GPU's kernel runs no other
+_MOVING, _MOVING_PLAINLY = 64, 512
 _KNOWN = 0.1  # uncertainty of the converged steps, at most, where a time is asked for and no error
 
 
@@ -138,7 +140,7 @@ def tune(
             trials, cost = _most_accurate(study, timed)
     promise = _promise(sim, study, start, trials, cost, error, milliseconds)
     if candidates is None and has_friction(sim):
-        promise.left_out = "Multilevel, which friction leaves out, might: see candidates"
+        promise = replace(promise, left_out="Multilevel, which friction leaves out, might: see candidates")
     sim.solver, sim.iterations, sim.tolerance, sim.promise = promise.solver, promise.iterations, 0.0, promise
     if not promise.attained:
         warn_user(f"tune: {promise}", TuningWarning)
@@ -202,7 +204,10 @@ def _motion(sim: Simulator, start: State, forces: Tensor | None) -> list[State]:
     These have the same shape and speeds in other directions: as likely a motion, whose steps err in other modes.
     """
     mover = copy.copy(sim)
-    mover.solver, mover.iterations = Multilevel(), _MOVING
+    if runs(Multilevel(), mover):
+        mover.solver, mover.iterations = Multilevel(), _MOVING
+    else:
+        mover.solver, mover.iterations = Chebyshev(), _MOVING_PLAINLY
     states, state = [], start
     for step in range(max(_STEPS) + 1):
         if step in _STEPS:

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from .accuracy import ExactStep
 from .diagonal import step_diagonal
-from .material import MATERIAL_ROWS
+from .material import MATERIAL_ROWS, environments_of_material
 from .state import State
 
 if TYPE_CHECKING:
     from .simulator import Simulator
 
-__all__ = ["check_known", "check_request", "check_start", "environments_of_material"]
+__all__ = ["check_known", "check_request", "check_start"]
 
 
 def check_request(error: float | None, milliseconds: float | None) -> None:
@@ -30,12 +30,6 @@ def check_request(error: float | None, milliseconds: float | None) -> None:
         raise ValueError(f"tune: error must lie in (0, 1), 1 being the first iterate; got {error}")
     if milliseconds is not None and not 0.0 < milliseconds < math.inf:
         raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
-
-
-def environments_of_material(sim: Simulator) -> int:
-    """That have numbers of their own; 1 where all share them."""
-    arrays = {name: getattr(sim, name) for name in MATERIAL_ROWS}
-    return max(len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1 for name, array in arrays.items())
 
 
 def check_start(sim: Simulator, state: State, forces: Tensor | None) -> None:

@@ -265,7 +265,7 @@ struct Outer {
       // with the momentum gone M alone descends, if it fits
       diagonal = diagonal || failures > 1;
     } else if (!diagonal) {
-      if (failures >= (friction ? 1 : patience)) {
+      if (failures >= patience || (friction && !fell)) {
         start_detour();
       } else if (fell && !friction && doublings > 0) {
         --doublings;
