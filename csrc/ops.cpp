@@ -55,30 +55,32 @@ const std::string step_numbers =
 }  // namespace
 
 TORCH_LIBRARY(torchpd, m) {
-  m.def(("step(Tensor positions, Tensor velocities, Tensor? forces, Tensor? start, Tensor[] "
-         "material, Tensor[] plan, *, " +
-         step_numbers + ") -> (Tensor, Tensor, Tensor)")
-            .c_str());
-  m.def(("step_(Tensor(a!) positions, Tensor(b!) velocities, Tensor(c!) info, Tensor? forces, "
-         "Tensor? start, "
-         "Tensor[] material, Tensor[] plan, *, " +
-         step_numbers + ") -> ()")
-            .c_str());
-  m.def(("rollout(Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, Tensor[] "
-         "plan, *, int steps, "
-         "int every, " +
-         step_numbers + ") -> (Tensor, Tensor, Tensor)")
-            .c_str());
-  m.def("gradient(Tensor positions, Tensor stiffness, Tensor[] plan) -> Tensor");
-  m.def(
+  // CUDA graphs that torch.compile makes return what they were given and backward wants, and can
+  // return nothing on the CPU, where every plan has its counts. Ours (capture.py) can hold them.
+  const std::vector<at::Tag> between_graphs{at::Tag::cudagraph_unsafe};
+  const auto with_plan = [&](const std::string& schema) { m.def(schema.c_str(), between_graphs); };
+  with_plan(
+      "step(Tensor positions, Tensor velocities, Tensor? forces, Tensor? start, Tensor[] material, "
+      "Tensor[] plan, *, " +
+      step_numbers + ") -> (Tensor, Tensor, Tensor)");
+  with_plan(
+      "step_(Tensor(a!) positions, Tensor(b!) velocities, Tensor(c!) info, Tensor? forces, Tensor? "
+      "start, Tensor[] material, Tensor[] plan, *, " +
+      step_numbers + ") -> ()");
+  with_plan(
+      "rollout(Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, Tensor[] "
+      "plan, *, int steps, int every, " +
+      step_numbers + ") -> (Tensor, Tensor, Tensor)");
+  with_plan("gradient(Tensor positions, Tensor stiffness, Tensor[] plan) -> Tensor");
+  with_plan(
       "hessian_product(Tensor positions, Tensor direction, Tensor stiffness, Tensor[] plan) -> "
       "Tensor");
-  m.def("element_energy(Tensor positions, Tensor stiffness, Tensor[] plan) -> Tensor");
-  m.def(
+  with_plan("element_energy(Tensor positions, Tensor stiffness, Tensor[] plan) -> Tensor");
+  with_plan(
       "element_energy_product(Tensor positions, Tensor direction, Tensor stiffness, Tensor[] plan) "
       "-> Tensor");
-  m.def("elastic_diagonal(Tensor stiffness, Tensor[] plan, *, bool weighted) -> Tensor");
-  m.def("precondition(Tensor field, Tensor[] plan) -> Tensor");
+  with_plan("elastic_diagonal(Tensor stiffness, Tensor[] plan, *, bool weighted) -> Tensor");
+  with_plan("precondition(Tensor field, Tensor[] plan) -> Tensor");
   m.def("nearest_rotation(Tensor matrices) -> Tensor");
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }

@@ -9,23 +9,30 @@ import numpy as np
 import pytest
 import torch
 from cases import Case, box, contact_block
+from runs import simulator
 
 import torchpd as pd
-from torchpd.baselines import BASELINES, GaussSeidel, colour_vertices, run_baseline, two_stage_rho
+from torchpd import dense_direct
+from torchpd.baselines import BASELINES, GaussSeidel, colour_vertices, factorised, run_baseline, two_stage_rho
+from torchpd.dense_direct import DENSE, DenseDirect
 from torchpd.newton_krylov import NewtonKrylov
 from torchpd.reference import StepProblem
 from torchpd.reference_solvers import newton, relative_error
 
 
-@pytest.fixture(scope="module")
-def problem() -> StepProblem:
-    """A short beam that swings: spectral radius of Jacobi about 0.98."""
+def swinging() -> Case:
+    """A short beam: spectral radius of Jacobi about 0.98."""
     mesh = pd.TetMesh(*box((0.6, 0.2, 0.2), (6, 2, 2)))
     body = pd.Solid(mesh, youngs=3e4)
     velocities = np.zeros_like(mesh.vertices)
     velocities[:, 1] = -5.0 * mesh.vertices[:, 0] ** 2
     scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
-    return Case(scene, np.array(mesh.vertices), velocities, 1 / 30).problem()
+    return Case(scene, np.array(mesh.vertices), velocities, 1 / 30)
+
+
+@pytest.fixture(scope="module")
+def problem() -> StepProblem:
+    return swinging().problem()
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +66,45 @@ def test_every_method_finds_the_minimum(name: str, problem: StepProblem, solutio
     assert seconds[0] == 0.0
     # pins stay where they are
     assert not trace.displacements[trace.last][~problem.free].any()
+
+
+@pytest.mark.parametrize("name", DENSE)
+def test_dense_inverses_have_the_iterates_of_the_factorisation(
+    name: str, dtype: torch.dtype, device: torch.device
+) -> None:
+    """On the device, recorded or not; and with Chebyshev they are at 1e-4 after twenty, without it not."""
+    case = swinging()
+    problem = case.problem()
+    sim = simulator(case, dtype, device)
+    first = problem.first_iterate()
+    omegas = DENSE[name](problem, first, 60)
+    method = DenseDirect(sim, problem)
+    play = method.recorded(torch.as_tensor(first, dtype=dtype, device=device), omegas)
+    rounding = {torch.float32: 1e-4, torch.float64: 1e-11}[dtype]
+    for _ in range(2):
+        found = play().double().cpu().numpy()
+        assert not found[~problem.free].any()
+        expected = first
+        before, solve = first, factorised(problem)
+        for omega in omegas:
+            stepped = expected - solve(problem.gradient(expected))
+            expected, before = before + omega * (stepped - before), expected
+        assert relative_error(found, expected, first) < rounding
+    solution = newton(problem)
+    twenty = method.iterate(torch.as_tensor(first, dtype=dtype, device=device), omegas[:20]).double().cpu().numpy()
+    reached = relative_error(twenty, solution, first)
+    assert (reached < 1e-4) == ("Chebyshev" in name)
+    assert method.bytes == int(problem.free.sum()) ** 2 * torch.finfo(dtype).bits // 8
+
+
+def test_dense_inverses_refuse_contacts_and_large_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    resting = contact_block(pd.Ground(0.0))
+    with pytest.raises(ValueError, match="knows no contacts"):
+        DenseDirect(simulator(resting, torch.float64), resting.problem())
+    monkeypatch.setattr(dense_direct, "MOST_VERTICES", 40)
+    case = swinging()
+    with pytest.raises(ValueError, match="for up to 40 vertices; this scene has 54"):
+        DenseDirect(simulator(case, torch.float64), case.problem())
 
 
 def test_colours_separate_neighbours(problem: StepProblem) -> None:
@@ -132,7 +178,8 @@ def test_memory_is_watched_and_contacts_are_refused(problem: StepProblem) -> Non
 
 def test_examination_is_not_imported_with_the_library() -> None:
     """Neither the methods to compare with nor what draws them: they are asked for by name."""
-    modules = ["torchpd.baselines", "torchpd.study", "torchpd.tuning", "torchpd.accuracy", "plotly", "matplotlib"]
+    ours = ("baselines", "dense_direct", "study", "tuning", "accuracy")
+    modules = [*(f"torchpd.{name}" for name in ours), "plotly", "matplotlib"]
     code = f"import sys, torchpd; print([name for name in {modules} if name in sys.modules])"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == "[]"

@@ -30,7 +30,8 @@ WAYS = (
 def test_inductor_changes_no_bit(device: str, mode: str, precision: str, kernel: str) -> None:
     """Of a step and a rollout and of their gradients; what is compiled around them rounds at most once.
 
-    With CUDA graphs the first call warms up, the second records and the others replay with other numbers.
+    With CUDA graphs the first call warms up, the second records and the others replay with other numbers. The steps
+    themselves stay between the graphs, since torch's cannot hand backward what a plan has on the CPU.
     """
     if device == "cuda" and missing_gpu():
         pytest.skip(missing_gpu())

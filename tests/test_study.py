@@ -23,10 +23,19 @@ from torchpd.__main__ import main
 from torchpd.accuracy import ExactStep
 from torchpd.baselines import BASELINES
 from torchpd.contenders import CONTENDERS, DEFAULT
+from torchpd.dense_direct import DENSE
 from torchpd.ledger import Row
 from torchpd.shapes import box
 from torchpd.study import AXES, StudyOptions, cost_table, paper_table, run_study, study_rows, study_table
-from torchpd.study_axes import baseline_rows, contender_rows, float_rows, mesh_rows, paper_rows, time_step_rows
+from torchpd.study_axes import (
+    baseline_rows,
+    contender_rows,
+    dense_rows,
+    float_rows,
+    mesh_rows,
+    paper_rows,
+    time_step_rows,
+)
 from torchpd.study_bench import (
     Bench,
     Setting,
@@ -107,6 +116,22 @@ def test_refusals_and_divergence_become_rows() -> None:
     assert plain.status == "ok"
 
 
+def test_rows_of_the_direct_step_on_the_device(device: torch.device) -> None:
+    """They approach the converged step, float64 further than float32; contacts and large meshes are refused."""
+    bench, setting = Bench(SUBJECTS["beam"](), device, series=1), Setting(1e5, 1 / 60, 2)
+    for name in DENSE:
+        for dtype, floor in ((torch.float32, 1e-4), (torch.float64, 1e-6)):
+            rows = dense_rows(bench, name, dtype, setting, [1, 4, 16, 64])
+            assert [row.iterations for row in rows] == [1, 4, 16, 64]
+            assert [row.status for row in rows] == ["ok"] * 4
+            assert all(before.error > after.error for before, after in pairwise(rows[:3]))
+            assert rows[-1].error < floor
+            assert all(row.milliseconds and row.setup_milliseconds and row.bytes for row in rows)
+    landing = Bench(SUBJECTS["octopus"](), device, series=1)
+    (row,) = dense_rows(landing, "direct global step, dense", torch.float32, Setting(3e4, 1 / 60, 8), [4])
+    assert row.refusal == "this method knows no contacts"
+
+
 def test_the_tests_of_the_paper_are_solved(bench: Bench) -> None:
     rows = paper_rows(bench)
     assert [row.more["constraints"] for row in rows] == [1200.0, 1000.0, 200.0]
@@ -136,7 +161,7 @@ def test_the_front_has_what_nothing_beats() -> None:
 
 def test_every_curve_looks_different() -> None:
     drawn = [name for name, method in BASELINES.items() if method.compiled_twin in (None, DEFAULT)]
-    styles = [STYLES[name] for name in (*CONTENDERS, *drawn)]
+    styles = [STYLES[name] for name in (*CONTENDERS, *drawn, *DENSE)]
     assert len(set(styles)) == len(styles)
 
 

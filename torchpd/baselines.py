@@ -25,7 +25,17 @@ from .newton_krylov import NewtonKrylov
 from .reference import StepProblem
 from .reference_solvers import classic_chebyshev, classic_omegas, guarded_chebyshev, jacobi, newton
 
-__all__ = ["BASELINES", "Baseline", "GaussSeidel", "Trace", "colour_vertices", "run_baseline", "two_stage_rho"]
+__all__ = [
+    "BASELINES",
+    "Baseline",
+    "GaussSeidel",
+    "Trace",
+    "colour_vertices",
+    "factorised",
+    "refuse_contacts",
+    "run_baseline",
+    "two_stage_rho",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -75,6 +85,16 @@ class _Counted(StepProblem):
         return super().evaluate(displacement)
 
 
+def refuse_contacts(problem: StepProblem) -> None:
+    """For methods that know none.
+
+    Raises:
+        ValueError: the scene has planes or spheres.
+    """
+    if len(problem.values.planes) or len(problem.values.spheres):
+        raise ValueError("this method knows no contacts; only the Jacobi family projects vertices out of them")
+
+
 def run_baseline(
     method: Baseline,
     problem: StepProblem,
@@ -97,8 +117,8 @@ def run_baseline(
     Raises:
         ValueError: the scene has contacts and the method knows none.
     """
-    if not method.contacts and (len(problem.values.planes) or len(problem.values.spheres)):
-        raise ValueError("this method knows no contacts; only the Jacobi family projects vertices out of them")
+    if not method.contacts:
+        refuse_contacts(problem)
     fields = {f.name: getattr(problem, f.name) for f in dataclasses.fields(StepProblem)}
     counted = _Counted(**fields)
     if memory:
@@ -227,7 +247,7 @@ def _conjugate_gradients(problem: StepProblem) -> Solve:
     return solve
 
 
-def _factorised(problem: StepProblem) -> Solve:
+def factorised(problem: StepProblem) -> Solve:
     """The global step solved exactly with a sparse factorisation made once (SuperLU through SciPy)."""
     free = np.flatnonzero(problem.free)
     factor = splu(csc_array(problem.matrix[free][:, free]), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
@@ -340,7 +360,7 @@ BASELINES: dict[str, Baseline] = {
         iteration="local step + sweep there and back",
     ),
     "PCG global step": Baseline(_plain(_conjugate_gradients), iteration="local step + CG to 1e-2"),
-    "direct global step": Baseline(_plain(_factorised), iteration="local step + two triangular solves"),
+    "direct global step": Baseline(_plain(factorised), iteration="local step + two triangular solves"),
     "Newton": Baseline(_newton, iteration="Hessian, factorisation, line search", few=True),
     "Newton-PCG with M": Baseline(
         _newton_krylov, iteration="conjugate gradients on the Hessian, line search; all of it compiled", few=True

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from .baselines import BASELINES
 from .contenders import CONTENDERS, DEFAULT
+from .dense_direct import DENSE
 from .doctor import OPTIONAL, missing_packages
 from .ledger import Ledger, Row, write_csv
 from .placing import find_device
@@ -27,6 +28,7 @@ from .provenance import describe_run
 from .study_axes import (
     baseline_rows,
     contender_rows,
+    dense_rows,
     float_rows,
     mesh_rows,
     paper_rows,
@@ -43,7 +45,7 @@ SCHEMA = 1
 AXES = ("solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper")
 _PACKAGES = ("matplotlib", "plotly")
 _STIFFNESS_FACTORS = (0.01, 0.1, 1.0)
-_NUMPY_MOST = 256  # iterations of methods in NumPy
+_LITERATURE_MOST = 256  # iterations of methods of the literature
 
 Task = Callable[[], list[Row]]
 
@@ -103,8 +105,13 @@ def _solver_tasks(bench: Bench, setting: Setting, counts: list[int]) -> dict[str
         for dtype in (torch.float32, torch.float64):
             key = f"solver: {name}, {precision_name(dtype)}"
             tasks[key] = partial(contender_rows, bench, name, dtype, setting, counts)
-    if bench.device.type == "cpu":
-        fewer = [count for count in counts if count <= _NUMPY_MOST]
+    fewer = [count for count in counts if count <= _LITERATURE_MOST]
+    if bench.device.type == "cuda":
+        for name in DENSE:
+            for dtype in (torch.float32, torch.float64):
+                key = f"solver: {name}, {precision_name(dtype)}"
+                tasks[key] = partial(dense_rows, bench, name, dtype, setting, fewer)
+    else:
         for name, method in BASELINES.items():
             # one twin is enough to show what the language costs
             if method.compiled_twin not in (None, DEFAULT):

@@ -13,17 +13,29 @@ from . import shapes
 from .accuracy import exact_steps
 from .baselines import BASELINES, Trace, run_baseline
 from .contenders import DEFAULT, DEFAULT_ITERATIONS
+from .dense_direct import DENSE, DenseDirect
 from .effects import Gravity, Pin, Solid
 from .ledger import Row
 from .scene import Scene
 from .simulator import Simulator
 from .state import State
-from .study_bench import Bench, Setting, Timing, clock_of, measure_step, solved_step, time_calls, verdicts
+from .study_bench import (
+    Bench,
+    Setting,
+    Timing,
+    clock_of,
+    measure_step,
+    precision_name,
+    solved_step,
+    time_calls,
+    verdicts,
+)
 
 __all__ = [
     "PAPER_TESTS",
     "baseline_rows",
     "contender_rows",
+    "dense_rows",
     "float_rows",
     "mesh_rows",
     "paper_rows",
@@ -109,6 +121,39 @@ def _baseline_row(traces: list[Trace], iterations: int, errors: tuple[float, ...
         iterations=iterations, local_steps=traces[0].local_steps[iterations], error=position, error_energy=energy,
         residual=residual, error_metres=metres, **timing.columns(), **common,
     )  # fmt: skip
+
+
+@torch.no_grad()
+def dense_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, counts: list[int]) -> list[Row]:
+    """The direct global step on the device at several iteration counts, against the converged step."""
+    _, exact = bench.hard_step(setting)
+    problem = exact.problem
+    common: dict[str, Any] = {
+        "axis": "solver", "method": name, "precision": precision_name(dtype), "youngs": setting.youngs,
+        "time_step": setting.time_step, "vertices": len(exact.first), "tets": len(problem.values.tets),
+        "uncertainty": exact.uncertainty,
+    }  # fmt: skip
+    clock = clock_of(bench.device)
+    begin = clock()
+    try:
+        method = DenseDirect(bench.simulator(setting, dtype), problem)
+    except ValueError as refusal:
+        return [Row(status=f"refused: {refusal}", **common)]
+    omegas = DENSE[name](problem, exact.first, max(counts))
+    first = torch.as_tensor(exact.first, dtype=dtype, device=bench.device)
+    setup = 1e3 * (clock() - begin)
+    rows = []
+    for count in counts:
+        play = method.recorded(first, omegas[:count])
+        errors = exact.judge(play().double().cpu().numpy())
+        rows.append(
+            Row(
+                iterations=count, local_steps=count, error=errors.position, error_energy=errors.energy,
+                residual=errors.residual, error_metres=errors.metres, setup_milliseconds=setup, bytes=method.bytes,
+                bytes_by="layout", **time_calls(play, bench.device, series=bench.series).columns(), **common,
+            )
+        )  # fmt: skip
+    return _judged(rows)
 
 
 def stiffness_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, counts: list[int]) -> list[Row]:

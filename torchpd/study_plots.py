@@ -29,12 +29,18 @@ STYLES: dict[str, tuple[str, float, str]] = {
     "Gauss-Seidel + Chebyshev": ("#005c43", 1.2, "dashed"),
     "PCG global step": ("#e69f00", 1.2, "dashed"),
     "direct global step": ("#8c5f00", 1.2, "dashed"),
+    "direct global step, dense": ("#8c5f00", 1.6, "solid"),
+    "direct global step + Chebyshev, dense": ("#e69f00", 1.6, "solid"),
     "Newton": ("#cc79a7", 1.2, "dashed"),
     "Newton-PCG with M": ("#1b1b1b", 1.2, "solid"),
     "L-BFGS": ("#7d3c98", 1.2, "dashed"),
 }
 _OTHER = ("#b0447b", 2.0, "solid")  # of a solver that has joined since
-_LABELS = {"Newton-PCG with M": "Newton-PCG with M, C++ float64"}  # of methods that are neither
+_LABELS = {  # of methods that are neither
+    "Newton-PCG with M": "Newton-PCG with M, C++ float64",
+    "direct global step, dense": "direct global step, dense inverse (cuBLAS, float32)",
+    "direct global step + Chebyshev, dense": "the same + Chebyshev",
+}
 _INK, _PAPER_GRID = "#3e4046", "#e4e5e8"
 # left out of the picture of all methods, where it would lie beside Jacobi's curve; the report has it
 _REPEATED = ("damped Jacobi",)

@@ -69,9 +69,10 @@ def _header(record: dict[str, Any]) -> str:
     what = ", ".join(f"{name} {version}" for name, version in versions.items())
     return (
         f"<p>Errors are |x &minus; x*| / |x<sub>0</sub> &minus; x*| of one time step: 1 is the first iterate, 0 the "
-        f"converged step. Full lines are the compiled solvers of this library; dashed ones are NumPy and SciPy, whose "
-        f"iterations compare exactly and whose milliseconds are indications. Failures are crosses at the top; rings "
-        f"are uncertain, for want of a converged step to compare with; what is refused has not run. Click a name in a "
+        f"converged step. Full lines are compiled: the solvers of this library and, on a GPU, dense inverses in "
+        f"cuBLAS; dashed ones are NumPy and SciPy, whose iterations compare exactly and whose milliseconds are "
+        f"indications. Failures are crosses at the top; rings are uncertain, for want of a converged step to compare "
+        f"with; what is refused has not run. Click a name in a "
         f"legend to hide it.</p>\n"
         f"<pre>{html.escape(record['command'])}</pre>\n"
         f"<p>{html.escape(where)}<br>{html.escape(what)}<br>commit {html.escape(record['commit'][:12])}, "

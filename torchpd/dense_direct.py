@@ -1,0 +1,110 @@
+"""Projective dynamics as it was first published, on a GPU: the global step solved exactly by a dense inverse.
+
+What a study on a GPU compares with, as `baselines` are on the CPU. The local step is the compiled one of the library,
+and all iterations are one CUDA graph, so that neither the language nor the host slows the method down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .baselines import factorised, refuse_contacts, two_stage_rho
+from .reference import StepProblem
+from .reference_solvers import classic_omegas
+from .simulator import Simulator
+
+__all__ = ["DENSE", "MOST_VERTICES", "DenseDirect"]
+
+Array = NDArray[np.float64]
+
+MOST_VERTICES = 8192  # whose inverse takes 0.5 GB in float64
+_DELAY = 10
+
+
+class DenseDirect:
+    """u <- u_prev + omega (u - A^-1 grad E(u) - u_prev), from A^-1 as a matrix; omega = 1 is the plain iteration.
+
+    Source: Bouaziz et al. 2014, with Wang's (2015) acceleration of it.
+
+    Args:
+        sim: of the scene, whose device and precision are those of the iterations.
+        problem: the step, of one environment.
+
+    Raises:
+        ValueError: the scene has contacts, or more than `MOST_VERTICES` vertices.
+    """
+
+    def __init__(self, sim: Simulator, problem: StepProblem) -> None:
+        refuse_contacts(problem)
+        free = np.flatnonzero(problem.free)
+        if len(free) > MOST_VERTICES:
+            raise ValueError(f"a dense inverse is for up to {MOST_VERTICES} vertices; this scene has {len(free)}")
+
+        def here(array: Array) -> Tensor:
+            return torch.as_tensor(array, dtype=sim.dtype, device=sim.device)
+
+        matrix = torch.as_tensor(problem.matrix[free][:, free].toarray(), device=sim.device)
+        self._inverse = torch.cholesky_inverse(torch.linalg.cholesky(matrix)).to(sim.dtype)
+        self._free = torch.as_tensor(free, device=sim.device)
+        self._weight, self._target = here(problem.weight[free, None]), here(problem.target[free])
+        self._positions = here(problem.positions)
+        self._stiffness, self._plan = sim.stiffness.detach(), list(sim.plan.arrays)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the inverse."""
+        return self._inverse.numel() * self._inverse.element_size()
+
+    def iterate(self, first: Tensor, omegas: Sequence[float]) -> Tensor:
+        """u [V, 3] m after as many iterations as there are omegas, from `first`."""
+        moved = self._positions + first
+        before = current = first[self._free]
+        for omega in omegas:
+            moved[self._free] = self._positions[self._free] + current
+            elastic = torch.ops.torchpd.gradient(moved[None], self._stiffness, self._plan)[0]
+            slope = torch.addcmul(elastic[self._free], self._weight, current - self._target)
+            stepped = torch.addmm(current, self._inverse, slope, alpha=-1.0)
+            current, before = stepped if omega == 1.0 else torch.lerp(before, stepped, omega), current
+        end = first.clone()
+        end[self._free] = current
+        return end
+
+    def recorded(self, first: Tensor, omegas: Sequence[float]) -> Callable[[], Tensor]:
+        """`iterate` to be called again and again; on a GPU as one CUDA graph, whose result the next call overwrites."""
+        if first.device.type != "cuda":
+            return lambda: self.iterate(first, omegas)
+        # libraries allocate at their first call, which a graph cannot hold
+        side = torch.cuda.Stream(first.device)
+        side.wait_stream(torch.cuda.current_stream(first.device))
+        with torch.cuda.stream(side):
+            self.iterate(first, omegas[:1])
+        torch.cuda.current_stream(first.device).wait_stream(side)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            end = self.iterate(first, omegas)
+
+        def play() -> Tensor:
+            graph.replay()
+            return end
+
+        return play
+
+
+def _plain(problem: StepProblem, first: Array, iterations: int) -> list[float]:
+    return [1.0] * iterations
+
+
+def _accelerated(problem: StepProblem, first: Array, iterations: int) -> list[float]:
+    return classic_omegas(two_stage_rho(problem, first, factorised(problem)), _DELAY, iterations)
+
+
+# the omegas of a step, from its first iterate
+DENSE: dict[str, Callable[[StepProblem, Array, int], list[float]]] = {
+    "direct global step, dense": _plain,
+    "direct global step + Chebyshev, dense": _accelerated,
+}
