@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import fcntl
 import gc
+import json
+import os
 import statistics
 import tempfile
 import time
@@ -246,6 +248,21 @@ def with_earlier(result: Row, earlier: Row) -> Row:
     for name in ("call_microseconds", "paper"):
         whole[name] = result[name] or earlier.get(name, result[name])
     return whole
+
+
+def write_result(path: Path, result: Row, *, keep: bool) -> None:
+    """The file anew or, with `keep`, its rows and those of the result: others may be writing theirs at the same time."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY)  # whose lock leaves no file behind
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        whole = with_earlier(result, json.loads(path.read_text())) if keep and path.exists() else result
+        # a run that is killed leaves the file as it was
+        part = path.with_name(f"{path.name}.part")
+        part.write_text(json.dumps(whole, indent=1) + "\n")
+        part.replace(path)
+    finally:
+        os.close(folder)
 
 
 def run_on_gpu(options: argparse.Namespace, result: Row, keep: Callable[[], None]) -> None:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 
 import numpy as np
+from numpy.typing import NDArray
 from scenes import DENSITY, YOUNGS
 from scipy.spatial import Delaunay
 
@@ -12,6 +17,8 @@ import torchpd as pd
 
 SIZE = (1.0, 0.2, 0.2)  # m
 ITERATIONS = 64
+_SLAB, _MARGIN = 32, 6.0  # cells of a bar whose Delaunay tetrahedra one process finds, and that it sees beside them
+_SLIVER = 0.01  # volume in cells
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,29 @@ def five_tet_bar(cells: tuple[int, int, int]) -> pd.TetMesh:
     return pd.TetMesh(grid.vertices, np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets))
 
 
+def _delaunay_slab(points: NDArray[np.float64], low: float, high: float) -> NDArray[np.int64]:
+    """Delaunay tetrahedra of all points whose spheres have their centres at low <= x < high.
+
+    A sphere within the layers that are looked at is empty of all points, so these are those of the whole. Spheres as
+    large as the margin are those of slivers on a wall, which are left out in the end.
+    """
+    near = np.flatnonzero((points[:, 0] > low - _MARGIN) & (points[:, 0] < high + _MARGIN))
+    tets = near[Delaunay(points[near]).simplices.astype(np.int64)]
+    if np.isinf(low) and np.isinf(high):
+        return tets
+    # in an order that neighbouring slabs share, lest they round a centre to different sides
+    corners = points[np.sort(tets, axis=1)]
+    edges = corners[:, 1:] - corners[:, :1]
+    flat = np.abs(np.linalg.det(edges)) / 6.0 <= _SLIVER
+    edges[flat] = np.eye(3)
+    arms = np.linalg.solve(edges, 0.5 * (edges**2).sum(axis=2, keepdims=True))[..., 0]
+    centre = corners[:, 0, 0] + arms[:, 0]
+    own = ~flat & (centre >= low) & (centre < high)
+    if np.linalg.norm(arms[own], axis=1).max() > _MARGIN:
+        raise RuntimeError("a sphere reaches past the margin: take a larger one")
+    return tets[own]
+
+
 def irregular_bar(cells: tuple[int, int, int], *, seed: int = 0) -> pd.TetMesh:
     """Delaunay tetrahedra of the corners of the cells, each moved by up to 0.3 of a cell, without slivers.
 
@@ -63,10 +93,14 @@ def irregular_bar(cells: tuple[int, int, int], *, seed: int = 0) -> pd.TetMesh:
     shift = rng.uniform(-0.3, 0.3, points.shape)
     shift[(points == 0.0) | (points == cells)] = 0.0  # the walls stay flat
     points = rng.permutation(points + shift)
-    tets = Delaunay(points).simplices.astype(np.int64)
+    cuts = np.arange(0, cells[0] - _SLAB, _SLAB) + _SLAB + 0.25  # where no wall has its points, nor squares of them
+    edges = [-np.inf, *cuts, np.inf]
+    with ProcessPoolExecutor(min(len(edges) - 1, os.cpu_count() or 1), get_context("spawn")) as pool:
+        slabs = partial(_delaunay_slab, points)
+        tets = np.concatenate(list((pool.map if len(cuts) else map)(slabs, edges[:-1], edges[1:])))
     volume = np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) / 6.0
     # in units of a cell, where Kuhn's tetrahedra have 1/6
-    tets = np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)[np.abs(volume) > 0.01]
+    tets = np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)[np.abs(volume) > _SLIVER]
     used, compact = np.unique(tets, return_inverse=True)
     return pd.TetMesh(points[used] / cells * SIZE, compact.reshape(-1, 4))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import json
 import statistics
 import sys
 import time
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from gpu import run_on_gpu, with_earlier
+from gpu import run_on_gpu, write_result
 from gpu_scenes import GPU_SCENES, QUICK_GPU_SCENES
 from machine import describe_run, measure, milliseconds, multiply_adds_per_second
 from scenes import GOAL_MULTIPLY_ADDS_PER_SECOND, GOAL_THREADS, QUICK_SCENES, SCENES, TIME_STEP, BenchScene
@@ -238,11 +237,7 @@ def main(words: list[str]) -> None:
     def keep() -> None:
         """Writes what there is so far: a run that is cut short has not been for nothing."""
         if options.out:
-            options.out.parent.mkdir(parents=True, exist_ok=True)
-            whole = result
-            if options.keep and options.out.exists():
-                whole = with_earlier(result, json.loads(options.out.read_text()))
-            options.out.write_text(json.dumps(whole, indent=1) + "\n")
+            write_result(options.out, result, keep=options.keep)
 
     (run_on_gpu if options.on_gpu else run_on_cpu)(options, result, keep)
     keep()

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -208,6 +209,20 @@ def test_irregular_bar_is_a_mesh_of_the_same_size(cells: tuple[int, int, int]) -
 
 
 @pytest.mark.usefixtures("on_path")
+def test_irregular_bar_is_the_same_in_slabs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Long bars are made by several processes."""
+    scenes = importlib.import_module("gpu_scenes")
+    cells = (23, 3, 3)
+    whole = scenes.irregular_bar(cells)
+    monkeypatch.setattr(scenes, "_SLAB", 7)
+    slabs = scenes.irregular_bar(cells)
+    assert np.array_equal(slabs.vertices, whole.vertices)
+    sets = [np.unique(np.sort(mesh.tets, axis=1), axis=0) for mesh in (slabs, whole)]
+    assert len(sets[0]) == len(slabs.tets)
+    assert np.array_equal(*sets)
+
+
+@pytest.mark.usefixtures("on_path")
 def test_a_run_that_is_cut_short_leaves_its_rows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     run = importlib.import_module("run")
     done = []
@@ -279,6 +294,24 @@ def test_a_result_keeps_rows_of_earlier_runs() -> None:
     assert (whole["call_microseconds"], whole["paper"]) == ({"block": 3.0}, [{"tets": 4}])
     assert result["results"] == rows(one_1M=5.0, one_100k=6.0)
     assert gpu.with_earlier(result, {}) == result | {"results": rows(one_100k=6.0, one_1M=5.0)}
+
+
+@pytest.mark.usefixtures("on_path")
+def test_runs_side_by_side_keep_each_others_rows(tmp_path: Path) -> None:
+    gpu = importlib.import_module("gpu")
+    path = tmp_path / "deep" / "rows.json"
+    names = [scene.name for scene in gpu.GPU_SCENES][:24]
+
+    def write(name: str) -> None:
+        result = {"results": [{"scene": name, "dtype": "float32"}], "call_microseconds": {}, "paper": []}
+        gpu.write_result(path, result, keep=True)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, names))
+    assert [row["scene"] for row in json.loads(path.read_text())["results"]] == names
+    assert [file.name for file in path.parent.iterdir()] == ["rows.json"]
+    gpu.write_result(path, {"results": []}, keep=False)
+    assert json.loads(path.read_text()) == {"results": []}
 
 
 @pytest.mark.skipif(not missing_gpu(), reason="there is a GPU")

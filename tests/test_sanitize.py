@@ -63,8 +63,10 @@ def test_every_way_is_planted_an_error_that_shows(tool: dict[str, Any]) -> None:
         with tool["compiled_for"](kernel, tool["WAYS"][kernel][0]) as name:
             plan = regimes.choose_plan(values, torch.float32, H100, name, progress=False)
         assert len(tool["without_last"](plan.part_slot)) == len(plan.part_slot) - 1
-    _, starts, entries, *_ = tool["behind_list"](tool["ball_of_patches"]()).lists
+    patches = tool["ball_of_patches"]()
+    _, starts, entries, *_ = tool["behind_list"](patches).lists
     assert int(starts[-1]) == len(entries) + 1
+    assert int(tool["samples_everywhere"](patches).patch.max()) == len(patches.triangles) - 1
 
 
 def test_kernels_that_did_not_run_are_named(tool: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:

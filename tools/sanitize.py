@@ -223,6 +223,11 @@ def ball_of_patches(**options: Any) -> pd.FreeFormPatches:
     return pd.FreeFormPatches.from_mesh(mesh, quadrics, dtype=torch.float64, **options)
 
 
+def samples_everywhere(patches: pd.FreeFormPatches) -> pd.PatchSamples:
+    """On the edges of the patches and inside of each, of the last one too."""
+    return patches.tessellate(3).samples
+
+
 def free_form(dtype: torch.dtype) -> int:
     """Every op of free-form patches and its adjoint, two poses at once."""
     rng = np.random.default_rng(0)
@@ -240,7 +245,7 @@ def free_form(dtype: torch.dtype) -> int:
         inside = torch.tensor(rng.uniform(-1, 1, (77, 3)), dtype=dtype, device="cuda")
         number = torch.tensor(rng.integers(0, 80, 77), device="cuda")
         field = patches.field(inside, number)
-        (image.color.sum() + patches.surface(patches.tessellate(3).samples, pose).points.sum() + field.sum()).backward()
+        (image.color.sum() + patches.surface(samples_everywhere(patches), pose).points.sum() + field.sum()).backward()
         pd.PatchRays(patches).cast_field(2 * inside, -inside, far=4.0)
         if not all(bool(t.grad is not None and t.grad.isfinite().all()) for t in leaves):
             raise RuntimeError("a gradient has not stayed finite")
@@ -373,7 +378,7 @@ def behind_list(patches: pd.FreeFormPatches) -> pd.FreeFormPatches:
 def plant_in_patches(tool: str) -> None:
     """Heights in which `tool` must find an error."""
     patches = ball_of_patches().to("cuda")
-    samples = patches.tessellate(2).samples
+    samples = samples_everywhere(patches)
     if tool == "memcheck":
         patches = behind_list(patches)
     else:

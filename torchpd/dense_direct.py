@@ -7,6 +7,7 @@ and all iterations are one CUDA graph, so that neither the language nor the host
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -41,17 +42,19 @@ class DenseDirect:
 
     def __init__(self, sim: Simulator, problem: StepProblem) -> None:
         refuse_contacts(problem)
-        free = np.flatnonzero(problem.free)
-        if len(free) > MOST_VERTICES:
-            raise ValueError(f"a dense inverse is for up to {MOST_VERTICES} vertices; this scene has {len(free)}")
+        vertices, free = len(problem.free), np.flatnonzero(problem.free)
+        if vertices > MOST_VERTICES:
+            raise ValueError(f"a dense inverse is for up to {MOST_VERTICES} vertices; this scene has {vertices}")
 
         def here(array: Array) -> Tensor:
             return torch.as_tensor(array, dtype=sim.dtype, device=sim.device)
 
         matrix = torch.as_tensor(problem.matrix[free][:, free].toarray(), device=sim.device)
-        self._inverse = torch.cholesky_inverse(torch.linalg.cholesky(matrix)).to(sim.dtype)
-        self._free = torch.as_tensor(free, device=sim.device)
-        self._weight, self._target = here(problem.weight[free, None]), here(problem.target[free])
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(matrix)).to(sim.dtype)
+        # zero where vertices are held, so that an iteration is a few calls without a detour through the free ones
+        self._inverse = inverse.new_zeros((vertices, vertices))
+        self._inverse[torch.from_numpy(free[:, None]), torch.from_numpy(free)] = inverse
+        self._weight, self._target = here(problem.weight[:, None]), here(problem.target)
         self._positions = here(problem.positions)
         self._stiffness, self._plan = sim.stiffness.detach(), list(sim.plan.arrays)
 
@@ -62,17 +65,13 @@ class DenseDirect:
 
     def iterate(self, first: Tensor, omegas: Sequence[float]) -> Tensor:
         """u [V, 3] m after as many iterations as there are omegas, from `first`."""
-        moved = self._positions + first
-        before = current = first[self._free]
+        before = current = first
         for omega in omegas:
-            moved[self._free] = self._positions[self._free] + current
-            elastic = torch.ops.torchpd.gradient(moved[None], self._stiffness, self._plan)[0]
-            slope = torch.addcmul(elastic[self._free], self._weight, current - self._target)
+            elastic = torch.ops.torchpd.gradient((self._positions + current)[None], self._stiffness, self._plan)[0]
+            slope = torch.addcmul(elastic, self._weight, current - self._target)
             stepped = torch.addmm(current, self._inverse, slope, alpha=-1.0)
             current, before = stepped if omega == 1.0 else torch.lerp(before, stepped, omega), current
-        end = first.clone()
-        end[self._free] = current
-        return end
+        return current.clone()
 
     def recorded(self, first: Tensor, omegas: Sequence[float]) -> Callable[[], Tensor]:
         """`iterate` to be called again and again; on a GPU as one CUDA graph, whose result the next call overwrites."""
@@ -88,11 +87,13 @@ class DenseDirect:
         with torch.cuda.graph(graph):
             end = self.iterate(first, omegas)
 
-        def play() -> Tensor:
-            graph.replay()
-            return end
+        return partial(_replay, graph, end, (self, first))
 
-        return play
+
+def _replay(graph: torch.cuda.CUDAGraph, end: Tensor, read: object) -> Tensor:
+    """The end of the iterations; `read` is what the graph reads, which has to live as long."""
+    graph.replay()
+    return end
 
 
 def _plain(problem: StepProblem, first: Array, iterations: int) -> list[float]:

@@ -219,10 +219,11 @@ _GOALS = (1e-1, 1e-2, 1e-3)
 def study_table(rows: list[Row]) -> str:
     """The compiled solvers at a glance: iterations and milliseconds to three errors."""
     solver = [row for row in rows if row.axis == "solver"]
-    lines = [f"{'solver':<28}{'precision':<11}" + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)]
+    width = max(28, *(len(row.method) + 2 for row in solver)) if solver else 28
+    lines = [f"{'solver':<{width}}{'precision':<11}" + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)]
     for name, precision in dict.fromkeys((row.method, row.precision) for row in solver):
         own = [row for row in solver if (row.method, row.precision) == (name, precision)]
-        lines.append(f"{name:<28}{precision:<11}{_costs(own)}")
+        lines.append(f"{name:<{width}}{precision:<11}{_costs(own)}")
     if any(row.status == "uncertain" for row in rows):
         lines.append("uncertain: no converged step is known well enough to say so")
     if any(row.refusal for row in solver):
