@@ -7,8 +7,11 @@ The beam of the tests: 1 x 0.2 x 0.2 m, 3750 tetrahedra, held at x = 0, thrown d
 from __future__ import annotations
 
 import argparse
+import json
+from pathlib import Path
 
 import torch
+from machine import describe_run
 from torch import Tensor
 
 import torchpd as pd
@@ -40,8 +43,8 @@ def solution(sim: pd.Simulator, state: pd.State) -> Tensor:
     return torch.from_numpy(x + newton(problem, problem.first_iterate("inertial")))
 
 
-def iterations_to(sim: pd.Simulator, state: pd.State, solved: Tensor, error: float, most: int) -> str:
-    """Fewest iterations, by bisection."""
+def iterations_to(sim: pd.Simulator, state: pd.State, solved: Tensor, error: float, most: int) -> int | None:
+    """Fewest iterations, by bisection; None where more than `most` are needed."""
 
     def error_after(iterations: int) -> float:
         sim.iterations = iterations
@@ -50,25 +53,33 @@ def iterations_to(sim: pd.Simulator, state: pd.State, solved: Tensor, error: flo
     goal = error * error_after(0)
     low, high = 0, most
     if error_after(most) > goal:
-        return f"> {most}"
+        return None
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if error_after(middle) <= goal else (middle, high)
-    return str(high)
+    return high
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--most", type=int, default=5000, help="iterations at most")
-    most = parser.parse_args().most
+    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    options = parser.parse_args()
+    rows = []
     print(f"{'youngs':>8}  {'solver':<20}" + "".join(f"{error:>10.0e}" for error in ERRORS))
     for youngs in STIFFNESSES:
         sim, state = beam(youngs)
         solved = solution(sim, state)
         for name, solver in SOLVERS.items():
             sim.solver = solver
-            counts = [iterations_to(sim, state, solved, error, most) for error in ERRORS]
-            print(f"{youngs:>8.0e}  {name:<20}" + "".join(f"{count:>10}" for count in counts))
+            counts = [iterations_to(sim, state, solved, error, options.most) for error in ERRORS]
+            rows.append({"youngs": youngs, "solver": name, "iterations": counts})
+            cells = (f"> {options.most}" if count is None else str(count) for count in counts)
+            print(f"{youngs:>8.0e}  {name:<20}" + "".join(f"{cell:>10}" for cell in cells))
+    if options.out:
+        run = describe_run(torch.device("cpu"), torch.get_num_threads())
+        record = {"schema": 1, **run, "errors": ERRORS, "most": options.most, "rows": rows}
+        options.out.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -251,7 +251,7 @@ def with_earlier(result: Row, earlier: Row) -> Row:
 
 
 def write_result(path: Path, result: Row, *, keep: bool) -> None:
-    """The file anew or, with `keep`, its rows and those of the result: others may be writing theirs at the same time."""
+    """The file anew or, with `keep`, its rows and those of the result; others may be writing at the same time."""
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = os.open(path.parent, os.O_RDONLY)  # whose lock leaves no file behind
     try:

@@ -13,17 +13,22 @@ of the processor, one thread.
     python benchmarks/multilevel.py --mesh bunny.mesh
     python benchmarks/multilevel.py --blocks 12 16
     python benchmarks/multilevel.py --setup 32
+
+All of it in one run, with --out, is in results/multilevel.json.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from machine import describe_run
 from torch import Tensor
 
 import torchpd as pd
@@ -31,6 +36,8 @@ from torchpd.tables import PLAN_TABLE
 
 ERRORS = (1e-2, 1e-3, 1e-4)
 OUTERS: tuple[Literal["lbfgs", "momentum", "corotated"], ...] = ("lbfgs", "momentum", "corotated")
+Row = dict[str, Any]
+
 MOST = 160
 ROUND, MOST_OF_BLOCKS = 4, 512  # iterations
 CHEBYSHEV = 512
@@ -92,7 +99,8 @@ def fewest(sim: pd.Simulator, state: pd.State, solution: Tensor, goals: list[flo
     return found
 
 
-def measure(name: str, scene: pd.Scene, state: pd.State) -> None:
+def measure(name: str, scene: pd.Scene, state: pd.State) -> Row:
+    """Iterations to each error, printed and returned."""
     sim = pd.Simulator(scene, 1 / 30, 64, dtype=torch.float64, progress=False)
     start = time.perf_counter()
     sim.solver = pd.Multilevel()
@@ -102,18 +110,22 @@ def measure(name: str, scene: pd.Scene, state: pd.State) -> None:
     print(f"{name}: {sim.vertices} vertices, set-up {setup:.2f} s, {own / 1e6:.1f} MB, "
           f"residual of x* {float(info.residual):.0e}")  # fmt: skip
     scale = float((moved(sim, state, 0)[0] - solution).norm())
+    row = {"scene": name, "vertices": sim.vertices, "setup_seconds": setup, "bytes": own,
+           "residual_of_the_solution": float(info.residual), "iterations": {}, "taken_back": {}}  # fmt: skip
     for outer in OUTERS:
         sim.solver = pd.Multilevel(outer)
         counts = fewest(sim, state, solution, [error * scale for error in ERRORS])
         failed = int(moved(sim, state, counts[-1] if counts else MOST)[1].restarts)
+        row["iterations"][outer], row["taken_back"][outer] = counts, failed
         columns = [str(count) for count in counts] + [f"> {MOST}"] * (len(ERRORS) - len(counts))
         print(f"    {outer:<10}" + "".join(f"{column:>8}" for column in columns) + f"   trials taken back: {failed}")
     sim.solver = pd.Chebyshev()
     left = float((moved(sim, state, CHEBYSHEV)[0] - solution).norm()) / scale
     print(f"    {CHEBYSHEV} iterations of guarded Chebyshev leave {left:.1e}")
+    return {**row, "chebyshev_leaves": left}
 
 
-def measure_blocks(name: str, scene: pd.Scene, state: pd.State) -> None:
+def measure_blocks(name: str, scene: pd.Scene, state: pd.State) -> Row:
     """Iterations and milliseconds to each error, with rigid motions and alone."""
     sim = pd.Simulator(scene, 1 / 30, ROUND, pd.Multilevel("lbfgs"), torch.float64, progress=False)
     start = time.process_time()
@@ -133,8 +145,11 @@ def measure_blocks(name: str, scene: pd.Scene, state: pd.State) -> None:
         sim.iterations = iterations
         return sim(state, start="inertial")
 
+    row = {"scene": name, "vertices": sim.vertices, "pieces": len(pieces.pieces), "setup_seconds": setup,
+           "residual_of_the_solution": float(info.residual), "iterations": {}, "milliseconds": {}}  # fmt: skip
     for label, solve in (("rigid motions", rigid), ("alone", alone)):
         columns, count = [], ROUND
+        counts, times = row["iterations"].setdefault(label, []), row["milliseconds"].setdefault(label, [])
         for goal in ERRORS:
             while True:
                 start = time.process_time()
@@ -142,15 +157,18 @@ def measure_blocks(name: str, scene: pd.Scene, state: pd.State) -> None:
                 took = time.process_time() - start
                 if float((after.velocities - solution.velocities).norm()) * sim.time_step <= goal * scale:
                     columns.append(f"{count} it., {1e3 * took:.0f} ms")
+                    counts.append(count)
+                    times.append(1e3 * took)
                     break
                 if count >= MOST_OF_BLOCKS:
                     columns.append(f"> {MOST_OF_BLOCKS} it.")
                     break
                 count += ROUND
         print(f"    {label:<15}" + "".join(f"{column:>18}" for column in columns))
+    return row
 
 
-def setup_of(cells: int) -> None:
+def setup_of(cells: int) -> Row:
     """Set-up, memory and time of an iteration in float32."""
     scene, state = box(cells, 1e6)
     sim = pd.Simulator(scene, 1 / 30, 16, progress=False)
@@ -161,6 +179,8 @@ def setup_of(cells: int) -> None:
     tets = len(scene.values().tets)
     print(f"{tets} tetrahedra, {sim.vertices} vertices: set-up {setup:.2f} s on {torch.get_num_threads()} threads, "
           f"{own / 1e6:.1f} MB beside a plan of {(sim.plan.bytes - own) / 1e6:.1f} MB")  # fmt: skip
+    row = {"tets": tets, "vertices": sim.vertices, "threads": torch.get_num_threads(), "setup_seconds": setup,
+           "bytes": own, "bytes_of_the_plan": sim.plan.bytes - own, "milliseconds_an_iteration": {}}  # fmt: skip
     single = pd.State(state.positions.float(), state.velocities.float())
     for solver in (pd.Multilevel(), pd.Multilevel("momentum"), pd.Chebyshev()):
         sim.solver = solver
@@ -169,31 +189,37 @@ def setup_of(cells: int) -> None:
             start = time.perf_counter()
             sim(single)
             best = min(best, time.perf_counter() - start)
+        row["milliseconds_an_iteration"][str(solver)] = 1e3 * best / sim.iterations
         print(f"    {solver}: {1e3 * best / sim.iterations:.2f} ms an iteration")
+    return row
 
 
 def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cells", type=int, nargs="+", default=[11], help="r of the boxes")
+    parser.add_argument("--cells", type=int, nargs="+", help="r of the boxes: 11 where nothing else is asked for")
     parser.add_argument("--youngs", type=float, nargs="+", default=[1e6, 1e8], help="Young's moduli of the boxes [Pa]")
-    parser.add_argument("--mesh", nargs="+", default=[], help="tetrahedral meshes, in place of the boxes")
-    parser.add_argument("--setup", type=int, nargs="+", default=[], help="r of boxes to set up in float32 instead")
+    parser.add_argument("--mesh", nargs="+", default=[], help="tetrahedral meshes")
+    parser.add_argument("--setup", type=int, nargs="+", default=[], help="r of boxes to set up in float32")
     parser.add_argument("--blocks", type=int, nargs="+", default=[], help="even r, from 6, of boxes with stiff pieces")
     parser.add_argument("--contrasts", type=float, nargs="+", default=[1e2, 1e4, 1e6], help="of these pieces")
+    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
     arguments = parser.parse_args(words)
+    rows = []
+    rows += [measure(Path(path).name, *loaded(path)) for path in arguments.mesh]
+    rows += [setup_of(cells) for cells in arguments.setup]
+    others = arguments.mesh or arguments.setup or arguments.blocks
+    for cells in arguments.cells or ([] if others else [11]):
+        for youngs in arguments.youngs:
+            rows.append(measure(f"box {cells}, {youngs:g} Pa", *box(cells, youngs)))
     for cells in arguments.blocks:
         torch.set_num_threads(1)
         for kind in ("slabs", "cubes"):
             for contrast in arguments.contrasts:
-                measure_blocks(f"box {cells}, {kind} at {contrast:g}", *blocks(cells, kind, contrast))
-    for path in arguments.mesh:
-        measure(path, *loaded(path))
-    for cells in arguments.setup:
-        setup_of(cells)
-    if not (arguments.mesh or arguments.setup or arguments.blocks):
-        for cells in arguments.cells:
-            for youngs in arguments.youngs:
-                measure(f"box {cells}, {youngs:g} Pa", *box(cells, youngs))
+                rows.append(measure_blocks(f"box {cells}, {kind} at {contrast:g}", *blocks(cells, kind, contrast)))
+    if arguments.out:
+        run = describe_run(torch.device("cpu"), torch.get_num_threads())
+        record = {"schema": 1, **run, "errors": ERRORS, "most": MOST, "rows": rows}
+        arguments.out.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

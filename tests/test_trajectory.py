@@ -48,9 +48,16 @@ def test_every_measure_is_what_it_says() -> None:
 def test_more_iterations_come_nearer_to_the_converged_motion() -> None:
     """And few are false softness: a solve that ends early has not yet felt the stiffness."""
     bench = Bench(SUBJECTS["beam"](), torch.device("cpu"))
-    few, more, most = trajectory_rows(bench, Setting(1e5, 1 / 30, 2), [4, 16, 256], seconds=0.3)
+    setting = Setting(1e5, 1 / 30, 2)
+    few, more, most = trajectory_rows(bench, setting, [4, 16, 256], seconds=0.3)
     assert few.error > more.error > most.error
     assert few.more["softness"] > 0.05
     # float32 of a converged motion of ten steps
     assert most.error < 1e-4
     assert [row.default for row in (few, more, most)] == [False, False, False]
+    # the converged motion is recorded once for all solvers
+    (kept,) = bench.motions.values()
+    (stiff,) = trajectory_rows(bench, setting, [16], seconds=0.3, name="Multilevel")
+    assert list(bench.motions.values()) == [kept]
+    assert stiff.method == "Multilevel"
+    assert stiff.error < 1e-4 < more.error

@@ -45,6 +45,7 @@ SCHEMA = 1
 AXES = ("solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper")
 _PACKAGES = ("matplotlib", "plotly")
 _STIFFNESS_FACTORS = (0.01, 0.1, 1.0)
+_STIFF, _STIFF_MOST = "Multilevel", 32  # the solver for stiff bodies, and its iterations in a motion at most
 _LITERATURE_MOST = 256  # iterations of methods of the literature
 
 Task = Callable[[], list[Row]]
@@ -139,8 +140,9 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
     tasks["mesh: default"] = partial(mesh_rows, bench, setting, resolutions)
     seconds, fewer = 0.2 if options.quick else 1.0, [count for count in counts if count >= 4][::2]
     for softer in softened:
-        key = f"trajectory: {DEFAULT}, {softer.youngs:g} Pa"
-        tasks[key] = partial(trajectory_rows, bench, softer, fewer, seconds=seconds)
+        for name, own in ((DEFAULT, fewer), (_STIFF, [count for count in fewer[:-1] if count <= _STIFF_MOST])):
+            key = f"trajectory: {name}, {softer.youngs:g} Pa"
+            tasks[key] = partial(trajectory_rows, bench, softer, own, seconds=seconds, name=name)
     tasks["paper: table"] = partial(paper_rows, bench)
     return {key: task for key, task in tasks.items() if key.split(":")[0] in options.axes}
 

@@ -68,6 +68,7 @@ class Bench:
     series: int = 6  # of times, where they scatter
     _meshes: dict[int, TetMesh] = field(default_factory=dict)
     _steps: dict[Setting, tuple[State, ExactStep]] = field(default_factory=dict)
+    motions: dict[tuple[Setting, float], Any] = field(default_factory=dict)  # converged, by their seconds
 
     def mesh(self, resolution: int) -> TetMesh:
         """Of the subject."""

@@ -356,20 +356,25 @@ def _panel(
 
 def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     stiffest = max(row.youngs for row in rows)
-    own = sorted((row for row in rows if row.youngs == stiffest), key=lambda row: row.iterations)
+    curves = curves_of([row for row in rows if row.youngs == stiffest], lambda row: row.method)
+    shown = [row for curve in curves.values() for row in curve]
+    own = curves.get(DEFAULT, shown)
     seconds = own[0].more["seconds_of_motion"]
     figure, (left, right) = _figure(
         2, f"{subject}: {seconds:g} s of motion at a Young's modulus of {_pascals(own[0].youngs)}, against the "
         "converged motion",
         width=6.2,
     )  # fmt: skip
-    xs = [row.iterations for row in own]
-    left.plot(xs, _drawn(own), "o-", color="#d55e00", linewidth=2.4)
-    _mark_failures(left, xs, own, "#d55e00")
+    for name, curve in curves.items():
+        color, width, dash = STYLES.get(name, _OTHER)
+        counts = [row.iterations for row in curve]
+        left.plot(counts, _drawn(curve), "o", color=color, linewidth=width, linestyle=dash, label=name)
+        _mark_failures(left, counts, curve, color)
     _error_axis(
-        left, [row.error for row in own], "largest distance from the converged path,\nover the length of the way"
+        left, [row.error for row in shown], "largest distance from the converged path,\nover the length of the way"
     )
     left.set_title("how far the body is from where it should be", fontsize=10, loc="left")
+    xs = [row.iterations for row in own]
     names = {
         "softness": ("too far out: false softness", "#0072b2"),
         "energy": ("energy at the end: above 0 out of nothing", "#009e73"),
@@ -384,12 +389,13 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     right.set_yscale("symlog", linthresh=1e-3)
     right.axhline(0.0, color=_INK, linewidth=0.8)
     right.set_ylabel("relative to the converged motion;\nenergies over the kinetic energy of the start")
-    right.set_title("and what that looks like", fontsize=10, loc="left")
+    right.set_title(f"and what that looks like: {own[0].method}", fontsize=10, loc="left")
     figure.legend(frameon=False, loc="outside lower right", ncols=2, fontsize=9)
-    _note_uncertain(figure, own)
-    for axis in (left, right):
+    _note_uncertain(figure, shown)
+    for axis, among in ((left, shown), (right, own)):
         axis.set_xscale("log")
-        axis.set_xticks(xs, [str(x) for x in xs])
+        ticks = sorted({row.iterations for row in among})
+        axis.set_xticks(ticks, [str(x) for x in ticks])
         axis.set_xticks([], minor=True)
         axis.set_xlabel(axis_label("iterations"))
         axis.axvline(64, color=_INK, linewidth=1.0, linestyle=(0, (2, 3)))

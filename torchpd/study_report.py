@@ -198,8 +198,10 @@ def _plain_figure(rows: list[Row], place: Callable[[Row], float], label: str, sl
     figure = go.Figure()
     measured = [row for row in rows if math.isfinite(row.error) or row.iterations]
     for youngs, color in zip(sorted({row.youngs for row in measured}, reverse=True), _COLORS, strict=False):
-        own = sorted((row for row in measured if row.youngs == youngs), key=place)
-        figure.add_trace(_trace(own, place, f"{own[0].method}, {youngs:g} Pa", (color, 2.4, "solid")))
+        for method in dict.fromkeys(row.method for row in measured if row.youngs == youngs):
+            own = sorted((row for row in measured if (row.youngs, row.method) == (youngs, method)), key=place)
+            dash = "solid" if method == measured[0].method else "dashed"
+            figure.add_trace(_trace(own, place, f"{method}, {youngs:g} Pa", (color, 2.4, dash)))
     sound = [row for row in measured if 0.0 < row.error < math.inf]
     if slope is not None and len(sound) > 1:
         power, name = slope

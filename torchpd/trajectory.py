@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -106,11 +107,20 @@ def compare_trajectories(motion: Trajectory, exact: Trajectory) -> dict[str, flo
     }
 
 
+def _converged(bench: Bench, setting: Setting, seconds: float) -> Trajectory:
+    """Recorded once for all solvers."""
+    key = (setting, seconds)
+    if key not in bench.motions:
+        sim = bench.simulator(setting, torch.float64)
+        bench.motions[key] = record_trajectory(bench, sim, setting.resolution, seconds, solve=True)
+    return cast(Trajectory, bench.motions[key])
+
+
 def trajectory_rows(
     bench: Bench, setting: Setting, counts: list[int], *, seconds: float = 1.0, name: str = DEFAULT
 ) -> list[Row]:
     """A motion at several iteration counts of a solver in float32, against the converged one in float64."""
-    exact = record_trajectory(bench, bench.simulator(setting, torch.float64), setting.resolution, seconds, solve=True)
+    exact = _converged(bench, setting, seconds)
     solver: Solver = bench.solver(name, setting)[0]
     rows = []
     for count in counts:
