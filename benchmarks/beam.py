@@ -7,11 +7,10 @@ The beam of the tests: 1 x 0.2 x 0.2 m, 3750 tetrahedra, held at x = 0, thrown d
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import torch
-from machine import describe_run
+from machine import describe_run, write_result
 from torch import Tensor
 
 import torchpd as pd
@@ -79,7 +78,7 @@ def main() -> None:
     if options.out:
         run = describe_run(torch.device("cpu"), torch.get_num_threads())
         record = {"schema": 1, **run, "errors": ERRORS, "most": options.most, "rows": rows}
-        options.out.write_text(json.dumps(record, indent=1) + "\n")
+        write_result(options.out, record)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import fcntl
 import gc
-import json
-import os
 import statistics
 import tempfile
 import time
@@ -18,7 +16,7 @@ from typing import Any
 import torch
 from gpu_scenes import GPU_SCENES, PAPER, GpuScene, PaperTest
 from gpu_timing import Device, describe_device, event_times, graph_times, host_seconds, kernel_seconds
-from machine import describe_run, milliseconds
+from machine import milliseconds
 from scenes import TIME_STEP
 from tqdm import tqdm
 
@@ -29,6 +27,7 @@ from torchpd.plan import KERNELS
 Row = dict[str, Any]
 
 ROLLOUT = 16  # steps in one call
+PROVENANCE = ("command", "created", "commit")
 
 
 @contextmanager
@@ -108,7 +107,7 @@ def measure_scene(scene: GpuScene, dtype: torch.dtype, machine: Device, options:
     sim, facts = compile_on(scene, dtype, torch.device(options.device))
     with turn(sim.device):
         row = measure_steps(scene, sim, facts, machine, options)
-    return {**row, "run": {name: options.run[name] for name in ("command", "created", "commit")}}
+    return {**row, "run": options.run}
 
 
 def measure_steps(scene: GpuScene, sim: pd.Simulator, facts: Row, machine: Device, options: argparse.Namespace) -> Row:
@@ -245,30 +244,17 @@ def with_earlier(result: Row, earlier: Row) -> Row:
     whole = {**result, "results": [*earlier.get("results", [])]}
     for row in result["results"]:
         put(whole["results"], row)
-    for name in ("call_microseconds", "paper"):
-        whole[name] = result[name] or earlier.get(name, result[name])
-    return whole
-
-
-def write_result(path: Path, result: Row, *, keep: bool) -> None:
-    """The file anew or, with `keep`, its rows and those of the result; others may be writing at the same time."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)  # whose lock leaves no file behind
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX)
-        whole = with_earlier(result, json.loads(path.read_text())) if keep and path.exists() else result
-        # a run that is killed leaves the file as it was
-        part = path.with_name(f"{path.name}.part")
-        part.write_text(json.dumps(whole, indent=1) + "\n")
-        part.replace(path)
-    finally:
-        os.close(folder)
+    if not result["call_microseconds"]:
+        whole.update({name: earlier[name] for name in ("call_microseconds", "call_run") if name in earlier})
+    whole["paper"] = result["paper"] or earlier.get("paper", [])
+    # each row says where it comes from, and the whole comes from several runs
+    return {name: value for name, value in whole.items() if name not in PROVENANCE}
 
 
 def run_on_gpu(options: argparse.Namespace, result: Row, keep: Callable[[], None]) -> None:
     """Everything, into the result and printed."""
     device = torch.device(options.device)
-    options.run = describe_run(device, options.threads)
+    options.run = {name: result[name] for name in PROVENANCE}
     result.update({"call_microseconds": {}, "paper": [], "results": []})
     with torch.no_grad(), torch.cuda.device(device):
         machine = describe_device(device)
@@ -280,15 +266,15 @@ def run_on_gpu(options: argparse.Namespace, result: Row, keep: Callable[[], None
         wanted = options.only or ["calls", *(() if options.quick else ("paper",))]
         with turn(device):
             if "calls" in wanted:
-                result["call_microseconds"] = measure_calls(options)
+                result["call_microseconds"], result["call_run"] = measure_calls(options), options.run
             if "paper" in wanted:
-                result["paper"] = measure_paper(options)
+                result["paper"] = [{**row, "run": options.run} for row in measure_paper(options)]
+        keep()
         jobs = [(scene, getattr(torch, name)) for name in options.dtype for scene in options.scenes]
         bar = tqdm(jobs, desc="measuring", unit="scene", leave=False)
         for scene, dtype in bar:
             put(result["results"], measure_scene(scene, dtype, machine, options))
-            with turn(device):
-                keep()
+            keep()
     print(table(result["results"]))
     if result["call_microseconds"]:
         print("\nmicroseconds of a call (host, in a graph, kernels alone), one iteration on one tetrahedron:")

@@ -67,8 +67,6 @@ def _delaunay_slab(points: NDArray[np.float64], low: float, high: float) -> NDAr
     """
     near = np.flatnonzero((points[:, 0] > low - _MARGIN) & (points[:, 0] < high + _MARGIN))
     tets = near[Delaunay(points[near]).simplices.astype(np.int64)]
-    if np.isinf(low) and np.isinf(high):
-        return tets
     # in an order that neighbouring slabs share, lest they round a centre to different sides
     corners = points[np.sort(tets, axis=1)]
     edges = corners[:, 1:] - corners[:, :1]
@@ -77,9 +75,17 @@ def _delaunay_slab(points: NDArray[np.float64], low: float, high: float) -> NDAr
     arms = np.linalg.solve(edges, 0.5 * (edges**2).sum(axis=2, keepdims=True))[..., 0]
     centre = corners[:, 0, 0] + arms[:, 0]
     own = ~flat & (centre >= low) & (centre < high)
-    if np.linalg.norm(arms[own], axis=1).max() > _MARGIN:
+    if np.linalg.norm(arms[own], axis=1).max(initial=0.0) > _MARGIN:
         raise RuntimeError("a sphere reaches past the margin: take a larger one")
     return tets[own]
+
+
+def _in_slabs(points: NDArray[np.float64], cells: int) -> NDArray[np.int64]:
+    """Delaunay tetrahedra of points with 0 <= x <= cells, by several processes: in a script behind its __main__."""
+    # squares of the walls have several triangulations, with one sphere, whose centre is at multiples of 1/2
+    edges = [-np.inf, *(np.arange(_SLAB, cells, _SLAB) + 0.25), np.inf]
+    with ProcessPoolExecutor(min(len(edges) - 1, len(os.sched_getaffinity(0))), get_context("spawn")) as pool:
+        return np.concatenate(list(pool.map(partial(_delaunay_slab, points), edges[:-1], edges[1:])))
 
 
 def irregular_bar(cells: tuple[int, int, int], *, seed: int = 0) -> pd.TetMesh:
@@ -93,11 +99,7 @@ def irregular_bar(cells: tuple[int, int, int], *, seed: int = 0) -> pd.TetMesh:
     shift = rng.uniform(-0.3, 0.3, points.shape)
     shift[(points == 0.0) | (points == cells)] = 0.0  # the walls stay flat
     points = rng.permutation(points + shift)
-    cuts = np.arange(0, cells[0] - _SLAB, _SLAB) + _SLAB + 0.25  # where no wall has its points, nor squares of them
-    edges = [-np.inf, *cuts, np.inf]
-    with ProcessPoolExecutor(min(len(edges) - 1, os.cpu_count() or 1), get_context("spawn")) as pool:
-        slabs = partial(_delaunay_slab, points)
-        tets = np.concatenate(list((pool.map if len(cuts) else map)(slabs, edges[:-1], edges[1:])))
+    tets = _in_slabs(points, cells[0]) if cells[0] > _SLAB else Delaunay(points).simplices.astype(np.int64)
     volume = np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) / 6.0
     # in units of a cell, where Kuhn's tetrahedra have 1/6
     tets = np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)[np.abs(volume) > _SLIVER]

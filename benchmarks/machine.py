@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
+import json
+import os
 import shlex
 import statistics
 import sys
@@ -43,6 +46,25 @@ def _wait_for(device: torch.device) -> None:
 def milliseconds(times: list[float]) -> Record:
     """A summary of times."""
     return {"median": 1e3 * statistics.median(times), "min": 1e3 * min(times), "repetitions": len(times)}
+
+
+def write_result(path: Path, result: Record, merge: Callable[[Record, Record], Record] | None = None) -> None:
+    """A file anew or, with `merge`, made of the result and of what is there; others may write at the same time."""
+    if path.exists() and not path.is_file():  # a pipe or a terminal
+        path.write_text(json.dumps(result, indent=1) + "\n")
+        return
+    path = path.resolve()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY)  # whose lock leaves no file behind
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX)
+        whole = merge(result, json.loads(path.read_text())) if merge and path.exists() else result
+        # a run that is killed leaves the file as it was
+        part = path.with_name(f"{path.name}.part")
+        part.write_text(json.dumps(whole, indent=1) + "\n")
+        part.replace(path)
+    finally:
+        os.close(folder)
 
 
 def describe_run(device: torch.device, threads: int) -> Record:

@@ -14,21 +14,21 @@ of the processor, one thread.
     python benchmarks/multilevel.py --blocks 12 16
     python benchmarks/multilevel.py --setup 32
 
-All of it in one run, with --out, is in results/multilevel.json.
+Several of these may be asked for at once, as for results/multilevel.json, which names its command.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from machine import describe_run
+from machine import describe_run, write_result
 from torch import Tensor
 
 import torchpd as pd
@@ -36,11 +36,11 @@ from torchpd.tables import PLAN_TABLE
 
 ERRORS = (1e-2, 1e-3, 1e-4)
 OUTERS: tuple[Literal["lbfgs", "momentum", "corotated"], ...] = ("lbfgs", "momentum", "corotated")
-Row = dict[str, Any]
-
 MOST = 160
 ROUND, MOST_OF_BLOCKS = 4, 512  # iterations
 CHEBYSHEV = 512
+
+Row = dict[str, Any]
 
 
 def box(cells: int, youngs: float) -> tuple[pd.Scene, pd.State]:
@@ -110,8 +110,11 @@ def measure(name: str, scene: pd.Scene, state: pd.State) -> Row:
     print(f"{name}: {sim.vertices} vertices, set-up {setup:.2f} s, {own / 1e6:.1f} MB, "
           f"residual of x* {float(info.residual):.0e}")  # fmt: skip
     scale = float((moved(sim, state, 0)[0] - solution).norm())
-    row = {"scene": name, "vertices": sim.vertices, "setup_seconds": setup, "bytes": own,
-           "residual_of_the_solution": float(info.residual), "iterations": {}, "taken_back": {}}  # fmt: skip
+    row = {
+        "kind": "steps", "scene": name, "vertices": sim.vertices, "threads": torch.get_num_threads(), "most": MOST,
+        "setup_seconds": setup, "bytes": own, "residual_of_the_solution": float(info.residual), "iterations": {},
+        "taken_back": {},
+    }  # fmt: skip
     for outer in OUTERS:
         sim.solver = pd.Multilevel(outer)
         counts = fewest(sim, state, solution, [error * scale for error in ERRORS])
@@ -145,8 +148,11 @@ def measure_blocks(name: str, scene: pd.Scene, state: pd.State) -> Row:
         sim.iterations = iterations
         return sim(state, start="inertial")
 
-    row = {"scene": name, "vertices": sim.vertices, "pieces": len(pieces.pieces), "setup_seconds": setup,
-           "residual_of_the_solution": float(info.residual), "iterations": {}, "milliseconds": {}}  # fmt: skip
+    row = {
+        "kind": "blocks", "scene": name, "vertices": sim.vertices, "pieces": len(pieces.pieces),
+        "threads": torch.get_num_threads(), "most": MOST_OF_BLOCKS, "setup_seconds": setup,
+        "residual_of_the_solution": float(info.residual), "iterations": {}, "milliseconds": {},
+    }  # fmt: skip
     for label, solve in (("rigid motions", rigid), ("alone", alone)):
         columns, count = [], ROUND
         counts, times = row["iterations"].setdefault(label, []), row["milliseconds"].setdefault(label, [])
@@ -179,8 +185,11 @@ def setup_of(cells: int) -> Row:
     tets = len(scene.values().tets)
     print(f"{tets} tetrahedra, {sim.vertices} vertices: set-up {setup:.2f} s on {torch.get_num_threads()} threads, "
           f"{own / 1e6:.1f} MB beside a plan of {(sim.plan.bytes - own) / 1e6:.1f} MB")  # fmt: skip
-    row = {"tets": tets, "vertices": sim.vertices, "threads": torch.get_num_threads(), "setup_seconds": setup,
-           "bytes": own, "bytes_of_the_plan": sim.plan.bytes - own, "milliseconds_an_iteration": {}}  # fmt: skip
+    row = {
+        "kind": "setup", "tets": tets, "vertices": sim.vertices, "threads": torch.get_num_threads(),
+        "setup_seconds": setup, "bytes": own, "bytes_of_the_plan": sim.plan.bytes - own,
+        "milliseconds_an_iteration": {},
+    }  # fmt: skip
     single = pd.State(state.positions.float(), state.velocities.float())
     for solver in (pd.Multilevel(), pd.Multilevel("momentum"), pd.Chebyshev()):
         sim.solver = solver
@@ -194,6 +203,23 @@ def setup_of(cells: int) -> Row:
     return row
 
 
+def measured(arguments: argparse.Namespace) -> Iterator[Row]:
+    """Everything that was asked for."""
+    for path in arguments.mesh:
+        yield measure(Path(path).name, *loaded(path))
+    for cells in arguments.setup:
+        yield setup_of(cells)
+    others = arguments.mesh or arguments.setup or arguments.blocks
+    for cells in arguments.cells or ([] if others else [11]):
+        for youngs in arguments.youngs:
+            yield measure(f"box {cells}, {youngs:g} Pa", *box(cells, youngs))
+    for cells in arguments.blocks:
+        torch.set_num_threads(1)
+        for kind in ("slabs", "cubes"):
+            for contrast in arguments.contrasts:
+                yield measure_blocks(f"box {cells}, {kind} at {contrast:g}", *blocks(cells, kind, contrast))
+
+
 def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cells", type=int, nargs="+", help="r of the boxes: 11 where nothing else is asked for")
@@ -204,22 +230,10 @@ def main(words: list[str]) -> None:
     parser.add_argument("--contrasts", type=float, nargs="+", default=[1e2, 1e4, 1e6], help="of these pieces")
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
     arguments = parser.parse_args(words)
-    rows = []
-    rows += [measure(Path(path).name, *loaded(path)) for path in arguments.mesh]
-    rows += [setup_of(cells) for cells in arguments.setup]
-    others = arguments.mesh or arguments.setup or arguments.blocks
-    for cells in arguments.cells or ([] if others else [11]):
-        for youngs in arguments.youngs:
-            rows.append(measure(f"box {cells}, {youngs:g} Pa", *box(cells, youngs)))
-    for cells in arguments.blocks:
-        torch.set_num_threads(1)
-        for kind in ("slabs", "cubes"):
-            for contrast in arguments.contrasts:
-                rows.append(measure_blocks(f"box {cells}, {kind} at {contrast:g}", *blocks(cells, kind, contrast)))
+    run = describe_run(torch.device("cpu"), torch.get_num_threads())
+    rows = list(measured(arguments))
     if arguments.out:
-        run = describe_run(torch.device("cpu"), torch.get_num_threads())
-        record = {"schema": 1, **run, "errors": ERRORS, "most": MOST, "rows": rows}
-        arguments.out.write_text(json.dumps(record, indent=1) + "\n")
+        write_result(arguments.out, {"schema": 1, **run, "errors": ERRORS, "rows": rows})
 
 
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from gpu import run_on_gpu, write_result
+from gpu import run_on_gpu, with_earlier
 from gpu_scenes import GPU_SCENES, QUICK_GPU_SCENES
-from machine import describe_run, measure, milliseconds, multiply_adds_per_second
+from machine import describe_run, measure, milliseconds, multiply_adds_per_second, write_result
 from scenes import GOAL_MULTIPLY_ADDS_PER_SECOND, GOAL_THREADS, QUICK_SCENES, SCENES, TIME_STEP, BenchScene
 from tqdm import tqdm
 from vectorised import VectorisedStep
@@ -237,7 +237,7 @@ def main(words: list[str]) -> None:
     def keep() -> None:
         """Writes what there is so far: a run that is cut short has not been for nothing."""
         if options.out:
-            write_result(options.out, result, keep=options.keep)
+            write_result(options.out, result, with_earlier if options.keep else None)
 
     (run_on_gpu if options.on_gpu else run_on_cpu)(options, result, keep)
     keep()

@@ -55,8 +55,9 @@ const std::string step_numbers =
 }  // namespace
 
 TORCH_LIBRARY(torchpd, m) {
-  // CUDA graphs that torch.compile makes return what they were given and backward wants, and can
-  // return nothing on the CPU, where every plan has its counts. Ours (capture.py) can hold them.
+  // A CUDA graph of torch.compile returns what it was given and others want, backward above all,
+  // and can return nothing on the CPU, where every plan has its counts: no op that takes one may be
+  // in such a graph. Ours (capture.py) can hold them.
   const std::vector<at::Tag> between_graphs{at::Tag::cudagraph_unsafe};
   const auto with_plan = [&](const std::string& schema) { m.def(schema.c_str(), between_graphs); };
   with_plan(

@@ -129,18 +129,29 @@ def test_unknown_scene_is_refused() -> None:
     assert "no scene nothing; there are 1k, 10k" in ended.stderr
 
 
-def test_beam_counts_iterations() -> None:
-    command = [sys.executable, "benchmarks/beam.py", "--most", "40"]
+def test_beam_counts_iterations(tmp_path: Path) -> None:
+    command = [sys.executable, "benchmarks/beam.py", "--most", "40", "--out", str(tmp_path / "beam.json")]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    written = json.loads((tmp_path / "beam.json").read_text())
+    assert written["rows"][1] == {"youngs": 1e4, "solver": "guarded Chebyshev", "iterations": [22, 38, None]}
     soft = next(line for line in result.stdout.splitlines() if "1e+04  guarded" in line)
     # 1e-2 and 1e-3 within 40 iterations, 1e-6 not
     assert soft.split()[-4:] == ["22", "38", ">", "40"]
 
 
-def test_multilevel_counts_iterations() -> None:
-    command = [sys.executable, "benchmarks/multilevel.py", "--cells", "3", "--youngs", "1e6"]
+def test_multilevel_counts_iterations(tmp_path: Path) -> None:
+    """Of a box; beside it the set-up of one, and what both need is in the file."""
+    out = tmp_path / "multilevel.json"
+    words = ["--cells", "3", "--youngs", "1e6", "--setup", "3", "--out", str(out)]
+    command = [sys.executable, "benchmarks/multilevel.py", *words]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    name, lbfgs, momentum, corotated, chebyshev = result.stdout.splitlines()
+    setup, *speeds, name, lbfgs, momentum, corotated, chebyshev = result.stdout.splitlines()
+    assert setup.startswith("810 tetrahedra, 256 vertices: set-up")
+    assert len(speeds) == 3
+    written = json.loads(out.read_text())
+    assert [row["kind"] for row in written["rows"]] == ["setup", "steps"]
+    assert len(written["rows"][0]["milliseconds_an_iteration"]) == 3
+    assert [str(count) for count in written["rows"][1]["iterations"]["lbfgs"]] == lbfgs.split()[1:4]
     assert name.startswith("box 3, 1e+06 Pa: 256 vertices")
     for line, outer in ((lbfgs, "lbfgs"), (momentum, "momentum"), (corotated, "corotated")):
         counts = line.split()[1:4]
@@ -220,6 +231,11 @@ def test_irregular_bar_is_the_same_in_slabs(monkeypatch: pytest.MonkeyPatch) -> 
     sets = [np.unique(np.sort(mesh.tets, axis=1), axis=0) for mesh in (slabs, whole)]
     assert len(sets[0]) == len(slabs.tets)
     assert np.array_equal(*sets)
+    # a sphere that is not seen as a whole may have a point within it
+    monkeypatch.setattr(scenes, "_MARGIN", 0.5)
+    points = whole.vertices / scenes.SIZE * cells
+    with pytest.raises(RuntimeError, match="a sphere reaches past the margin"):
+        scenes._delaunay_slab(points, 7.25, 14.25)
 
 
 @pytest.mark.usefixtures("on_path")
@@ -287,31 +303,42 @@ def test_a_result_keeps_rows_of_earlier_runs() -> None:
     def rows(**steps: float) -> list[dict[str, object]]:
         return [{"scene": name.replace("_", "-"), "dtype": "float32", "step": step} for name, step in steps.items()]
 
-    earlier = {"results": rows(one_10k=1.0, one_1M=2.0), "call_microseconds": {"block": 3.0}, "paper": [{"tets": 4}]}
-    result = {"results": rows(one_1M=5.0, one_100k=6.0), "call_microseconds": {}, "paper": []}
+    earlier = {
+        "results": rows(one_10k=1.0, one_1M=2.0), "call_microseconds": {"block": 3.0}, "call_run": {"commit": "1"},
+        "paper": [{"tets": 4}], "commit": "1",
+    }  # fmt: skip
+    result = {"results": rows(one_1M=5.0, one_100k=6.0), "call_microseconds": {}, "paper": [], "commit": "2"}
     whole = gpu.with_earlier(result, earlier)
     assert whole["results"] == rows(one_10k=1.0, one_100k=6.0, one_1M=5.0)  # in the order of the scenes
     assert (whole["call_microseconds"], whole["paper"]) == ({"block": 3.0}, [{"tets": 4}])
+    assert whole["call_run"] == {"commit": "1"}
+    assert "commit" not in whole
     assert result["results"] == rows(one_1M=5.0, one_100k=6.0)
-    assert gpu.with_earlier(result, {}) == result | {"results": rows(one_100k=6.0, one_1M=5.0)}
+    assert gpu.with_earlier(result, {})["results"] == rows(one_100k=6.0, one_1M=5.0)
+    again = gpu.with_earlier({**result, "call_microseconds": {"grid": 1.0}, "call_run": {"commit": "2"}}, whole)
+    assert (again["call_microseconds"], again["call_run"]) == ({"grid": 1.0}, {"commit": "2"})
 
 
 @pytest.mark.usefixtures("on_path")
 def test_runs_side_by_side_keep_each_others_rows(tmp_path: Path) -> None:
-    gpu = importlib.import_module("gpu")
+    gpu, machine = importlib.import_module("gpu"), importlib.import_module("machine")
     path = tmp_path / "deep" / "rows.json"
     names = [scene.name for scene in gpu.GPU_SCENES][:24]
 
     def write(name: str) -> None:
         result = {"results": [{"scene": name, "dtype": "float32"}], "call_microseconds": {}, "paper": []}
-        gpu.write_result(path, result, keep=True)
+        machine.write_result(path, result, gpu.with_earlier)
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(write, names))
     assert [row["scene"] for row in json.loads(path.read_text())["results"]] == names
     assert [file.name for file in path.parent.iterdir()] == ["rows.json"]
-    gpu.write_result(path, {"results": []}, keep=False)
+    other = tmp_path / "other.json"
+    other.symlink_to(path)
+    machine.write_result(other, {"results": []})
     assert json.loads(path.read_text()) == {"results": []}
+    assert other.is_symlink()
+    machine.write_result(Path(os.devnull), {"results": []})
 
 
 @pytest.mark.skipif(not missing_gpu(), reason="there is a GPU")

@@ -71,6 +71,15 @@ def test_opcheck(name: str, dtype: torch.dtype, device: torch.device) -> None:
     assert set(report.values()) == {"SUCCESS"}
 
 
+def test_ops_with_a_plan_stay_out_of_the_graphs_of_torch_compile() -> None:
+    """Which cannot return the counts that a plan has on the CPU."""
+    schemas = [schema for schema in torch._C._jit_get_all_schemas() if schema.name.startswith("torchpd::")]
+    with_plan = [s.name.split("::")[1] for s in schemas if any(a.name == "plan" for a in s.arguments)]
+    assert {"step", "rollout", "gradient", "precondition", "step_vjp"} <= set(with_plan)
+    for name in with_plan:
+        assert torch.Tag.cudagraph_unsafe in getattr(ops, name).default.tags, name
+
+
 @pytest.mark.parametrize("outer", ["lbfgs", "momentum"])
 @pytest.mark.parametrize("name", ["step", "step_", "rollout", "step_vjp"])
 def test_opcheck_of_the_multilevel_solver(name: str, outer: str, dtype: torch.dtype) -> None:

@@ -46,7 +46,7 @@ from torchpd.study_bench import (
     time_calls,
     verdicts,
 )
-from torchpd.study_plots import STYLES, float32_floor, pareto_front
+from torchpd.study_plots import STYLES, draw_study, float32_floor, pareto_front
 from torchpd.subjects import SUBJECTS, subject_of
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -163,6 +163,18 @@ def test_every_curve_looks_different() -> None:
     drawn = [name for name, method in BASELINES.items() if method.compiled_twin in (None, DEFAULT)]
     styles = [STYLES[name] for name in (*CONTENDERS, *drawn, *DENSE)]
     assert len(set(styles)) == len(styles)
+
+
+def test_motions_are_drawn_without_the_default_too(tmp_path: Path) -> None:
+    """What the right panel shows is one solver's."""
+    more = {"softness": 0.1, "energy": 0.2, "growth": 0.0, "turn": 0.1, "seconds_of_motion": 1.0}
+    rows = [
+        Row("trajectory", method, iterations=count, error=1.0 / count, youngs=1e5, milliseconds=1.0, more=more)
+        for method in ("Multilevel", "Jacobi")
+        for count in (4, 8)
+    ]
+    (path,) = draw_study(rows, tmp_path, subject="x")
+    assert Image.open(path).size[0] > 1000
 
 
 def test_table_says_what_is_not_reached() -> None:

@@ -1,7 +1,7 @@
 """Projective dynamics as it was first published, on a GPU: the global step solved exactly by a dense inverse.
 
 What a study on a GPU compares with, as `baselines` are on the CPU. The local step is the compiled one of the library,
-and all iterations are one CUDA graph, so that neither the language nor the host slows the method down.
+and all iterations are one CUDA graph, so that the host does not slow the method down.
 """
 
 from __future__ import annotations
@@ -74,26 +74,33 @@ class DenseDirect:
         return current.clone()
 
     def recorded(self, first: Tensor, omegas: Sequence[float]) -> Callable[[], Tensor]:
-        """`iterate` to be called again and again; on a GPU as one CUDA graph, whose result the next call overwrites."""
-        if first.device.type != "cuda":
-            return lambda: self.iterate(first, omegas)
-        # libraries allocate at their first call, which a graph cannot hold
-        side = torch.cuda.Stream(first.device)
-        side.wait_stream(torch.cuda.current_stream(first.device))
-        with torch.cuda.stream(side):
-            self.iterate(first, omegas[:1])
-        torch.cuda.current_stream(first.device).wait_stream(side)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            end = self.iterate(first, omegas)
+        """`iterate` to be called again and again, from what `first` then holds.
 
-        return partial(_replay, graph, end, (self, first))
+        On a GPU it is one CUDA graph, whose result the next call overwrites.
+        """
+        return _Recording(self, first, omegas) if first.device.type == "cuda" else partial(self.iterate, first, omegas)
 
 
-def _replay(graph: torch.cuda.CUDAGraph, end: Tensor, read: object) -> Tensor:
-    """The end of the iterations; `read` is what the graph reads, which has to live as long."""
-    graph.replay()
-    return end
+class _Recording:
+    """A CUDA graph of all iterations."""
+
+    def __init__(self, method: DenseDirect, first: Tensor, omegas: Sequence[float]) -> None:
+        # the graph knows addresses only: what lies there has to live as long as it does
+        self._alive = (method, first)
+        with torch.cuda.device(first.device):
+            # what libraries allocate or load at a first call cannot be recorded; nor can what only omega = 1 leaves out
+            stream = torch.cuda.Stream()
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                method.iterate(first, [1.0, omegas[-1]])
+            torch.cuda.current_stream().wait_stream(stream)
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph):
+                self._end = method.iterate(first, omegas)
+
+    def __call__(self) -> Tensor:
+        self._graph.replay()
+        return self._end
 
 
 def _plain(problem: StepProblem, first: Array, iterations: int) -> list[float]:

@@ -140,7 +140,7 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
     tasks["mesh: default"] = partial(mesh_rows, bench, setting, resolutions)
     seconds, fewer = 0.2 if options.quick else 1.0, [count for count in counts if count >= 4][::2]
     for softer in softened:
-        for name, own in ((DEFAULT, fewer), (_STIFF, [count for count in fewer[:-1] if count <= _STIFF_MOST])):
+        for name, own in ((DEFAULT, fewer), (_STIFF, [count for count in fewer if count <= _STIFF_MOST])):
             key = f"trajectory: {name}, {softer.youngs:g} Pa"
             tasks[key] = partial(trajectory_rows, bench, softer, own, seconds=seconds, name=name)
     tasks["paper: table"] = partial(paper_rows, bench)
@@ -219,9 +219,9 @@ _GOALS = (1e-1, 1e-2, 1e-3)
 
 
 def study_table(rows: list[Row]) -> str:
-    """The compiled solvers at a glance: iterations and milliseconds to three errors."""
+    """The solvers at a glance: iterations and milliseconds to three errors."""
     solver = [row for row in rows if row.axis == "solver"]
-    width = max(28, *(len(row.method) + 2 for row in solver)) if solver else 28
+    width = max([28, *(len(row.method) + 2 for row in solver)])
     lines = [f"{'solver':<{width}}{'precision':<11}" + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)]
     for name, precision in dict.fromkeys((row.method, row.precision) for row in solver):
         own = [row for row in solver if (row.method, row.precision) == (name, precision)]

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,8 +23,12 @@ from .subjects import Subject
 from .summary import workspace_bytes
 from .warn import warn_user
 
+if TYPE_CHECKING:
+    from .trajectory import Trajectory
+
 __all__ = [
     "Bench",
+    "PeakMemory",
     "Setting",
     "Timing",
     "UncertainWarning",
@@ -68,7 +72,7 @@ class Bench:
     series: int = 6  # of times, where they scatter
     _meshes: dict[int, TetMesh] = field(default_factory=dict)
     _steps: dict[Setting, tuple[State, ExactStep]] = field(default_factory=dict)
-    motions: dict[tuple[Setting, float], Any] = field(default_factory=dict)  # converged, by their seconds
+    motions: dict[tuple[Setting, float], Trajectory] = field(default_factory=dict)  # converged, by their seconds
 
     def mesh(self, resolution: int) -> TetMesh:
         """Of the subject."""
@@ -191,15 +195,21 @@ def count_kernels(work: Callable[[], object], device: torch.device) -> int | Non
     return sum("memcpy" not in name and "memset" not in name for name in named)
 
 
-def _peak_bytes(sim: Simulator, work: Callable[[], object]) -> tuple[int, str]:
-    if sim.device.type == "cuda":
-        _wait_for(sim.device)
-        torch.cuda.reset_peak_memory_stats(sim.device)
-        work()
-        _wait_for(sim.device)
-        return int(torch.cuda.max_memory_allocated(sim.device)), "torch.cuda"
-    real = torch.finfo(sim.dtype).bits // 8
-    return sim.plan.bytes + workspace_bytes(sim.plan, real, sim.solver), "layout"
+class PeakMemory:
+    """Of what runs between making and reading this: what the allocator of a GPU has seen, or what the layout says."""
+
+    def __init__(self, device: torch.device, layout: int) -> None:
+        self._device, self._layout = device, layout
+        if device.type == "cuda":
+            _wait_for(device)
+            torch.cuda.reset_peak_memory_stats(device)
+
+    def read(self) -> tuple[int, str]:
+        """Bytes, and how they are known."""
+        if self._device.type != "cuda":
+            return self._layout, "layout"
+        _wait_for(self._device)
+        return int(torch.cuda.max_memory_allocated(self._device)), "torch.cuda"
 
 
 def precision_name(dtype: torch.dtype) -> str:
@@ -260,7 +270,10 @@ def measure_step(
     after = sim(given)
     errors = exact.judge(after.velocities[0].double().cpu().numpy() * sim.time_step)
     timing = time_calls(lambda: sim(given), sim.device, series=series)
-    held, how = _peak_bytes(sim, lambda: sim(given))
+    real = torch.finfo(sim.dtype).bits // 8
+    memory = PeakMemory(sim.device, sim.plan.bytes + workspace_bytes(sim.plan, real, sim.solver))
+    sim(given)
+    held, how = memory.read()
     return Row(
         precision=precision_name(sim.dtype),
         iterations=iterations,

@@ -17,7 +17,7 @@ __all__ = ["SLOPES", "STYLES", "TOP", "axis_label", "curves_of", "draw_study", "
 TOP = 2.0  # where a failure is drawn: above the first iterate, whose error is 1
 _LOWEST = 1e-7
 # Okabe and Ito's palette, told apart with every kind of colour vision: ours in strong colours and full lines, methods
-# in NumPy in thin dashed ones.
+# of the literature in thin ones, which are dashed where they are NumPy's.
 STYLES: dict[str, tuple[str, float, str]] = {
     DEFAULT: ("#d55e00", 2.8, "solid"),
     "classic Chebyshev": ("#0072b2", 2.0, "solid"),
@@ -36,10 +36,10 @@ STYLES: dict[str, tuple[str, float, str]] = {
     "L-BFGS": ("#7d3c98", 1.2, "dashed"),
 }
 _OTHER = ("#b0447b", 2.0, "solid")  # of a solver that has joined since
-_LABELS = {  # of methods that are neither
+_LABELS = {  # of methods that are neither ours in float32 nor NumPy's
     "Newton-PCG with M": "Newton-PCG with M, C++ float64",
     "direct global step, dense": "direct global step, dense inverse (cuBLAS, float32)",
-    "direct global step + Chebyshev, dense": "the same + Chebyshev",
+    "direct global step + Chebyshev, dense": "direct global step + Chebyshev, dense inverse (cuBLAS, float32)",
 }
 _INK, _PAPER_GRID = "#3e4046", "#e4e5e8"
 # left out of the picture of all methods, where it would lie beside Jacobi's curve; the report has it
@@ -358,7 +358,7 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     stiffest = max(row.youngs for row in rows)
     curves = curves_of([row for row in rows if row.youngs == stiffest], lambda row: row.method)
     shown = [row for curve in curves.values() for row in curve]
-    own = curves.get(DEFAULT, shown)
+    own = curves.get(DEFAULT) or next(iter(curves.values()))
     seconds = own[0].more["seconds_of_motion"]
     figure, (left, right) = _figure(
         2, f"{subject}: {seconds:g} s of motion at a Young's modulus of {_pascals(own[0].youngs)}, against the "
@@ -368,7 +368,7 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     for name, curve in curves.items():
         color, width, dash = STYLES.get(name, _OTHER)
         counts = [row.iterations for row in curve]
-        left.plot(counts, _drawn(curve), "o", color=color, linewidth=width, linestyle=dash, label=name)
+        left.plot(counts, _drawn(curve), marker="o", color=color, linewidth=width, linestyle=dash, label=name)
         _mark_failures(left, counts, curve, color)
     _error_axis(
         left, [row.error for row in shown], "largest distance from the converged path,\nover the length of the way"
@@ -390,7 +390,8 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     right.axhline(0.0, color=_INK, linewidth=0.8)
     right.set_ylabel("relative to the converged motion;\nenergies over the kinetic energy of the start")
     right.set_title(f"and what that looks like: {own[0].method}", fontsize=10, loc="left")
-    figure.legend(frameon=False, loc="outside lower right", ncols=2, fontsize=9)
+    left.legend(frameon=False, fontsize=9)
+    right.legend(frameon=False, fontsize=9)
     _note_uncertain(figure, shown)
     for axis, among in ((left, shown), (right, own)):
         axis.set_xscale("log")

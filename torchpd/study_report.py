@@ -108,7 +108,8 @@ def _figures(rows: list[Row]) -> list[Figure]:
         "time step": "Whole motions, solved to 1e-9, against 8 times shorter steps.",
         "mesh": "Whole motions on coarser meshes, against the finest one.",
         "float": "The same iterations in both precisions, relative to |x<sub>0</sub> &minus; x*|.",
-        "trajectory": "Largest distance from the converged path over the way; hover for softness and energy.",
+        "trajectory": "Largest distance from the converged path over the way; hover for softness and energy. "
+        "Full lines are the default solver, dashed ones Multilevel.",
     }
     for axis, title, place, label in others:
         if axis in by_axis:
@@ -200,8 +201,9 @@ def _plain_figure(rows: list[Row], place: Callable[[Row], float], label: str, sl
     for youngs, color in zip(sorted({row.youngs for row in measured}, reverse=True), _COLORS, strict=False):
         for method in dict.fromkeys(row.method for row in measured if row.youngs == youngs):
             own = sorted((row for row in measured if (row.youngs, row.method) == (youngs, method)), key=place)
-            dash = "solid" if method == measured[0].method else "dashed"
-            figure.add_trace(_trace(own, place, f"{method}, {youngs:g} Pa", (color, 2.4, dash)))
+            first = method == measured[0].method
+            style = (color, 2.4, "solid") if first else (color, 1.2, "dashed")
+            figure.add_trace(_trace(own, place, f"{method}, {youngs:g} Pa", style))
     sound = [row for row in measured if 0.0 < row.error < math.inf]
     if slope is not None and len(sound) > 1:
         power, name = slope

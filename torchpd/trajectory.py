@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import torch
@@ -113,7 +112,7 @@ def _converged(bench: Bench, setting: Setting, seconds: float) -> Trajectory:
     if key not in bench.motions:
         sim = bench.simulator(setting, torch.float64)
         bench.motions[key] = record_trajectory(bench, sim, setting.resolution, seconds, solve=True)
-    return cast(Trajectory, bench.motions[key])
+    return bench.motions[key]
 
 
 def trajectory_rows(
