@@ -8,7 +8,7 @@ import torch
 
 from torchpd.study_bench import Bench, Setting
 from torchpd.subjects import SUBJECTS
-from torchpd.trajectory import Trajectory, compare_trajectories, first_turn, trajectory_rows
+from torchpd.trajectory import Trajectory, compare_trajectories, first_turn, tolerance_rows, trajectory_rows
 
 TIME_STEP = 0.01  # s
 
@@ -61,3 +61,10 @@ def test_more_iterations_come_nearer_to_the_converged_motion() -> None:
     assert [motion is kept for motion in bench.motions.values()] == [True]
     assert stiff.method == "Multilevel"
     assert stiff.error < 1e-4 < more.error
+    # and a tolerance asks for few iterations where few are enough
+    loose, tight = tolerance_rows(bench, setting, [1e-2, 1e-4], 64, seconds=0.3, name="Multilevel")
+    assert loose.method == "Multilevel, tolerance"
+    assert loose.more["tolerance"] == 1e-2
+    assert 1 < loose.iterations < tight.iterations < 16
+    assert loose.error > tight.error
+    assert tight.error < 1e-3

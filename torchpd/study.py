@@ -37,7 +37,7 @@ from .study_axes import (
 )
 from .study_bench import Bench, Setting, clock_of, precision_name
 from .subjects import Subject, subject_of
-from .trajectory import trajectory_rows
+from .trajectory import tolerance_rows, trajectory_rows
 
 __all__ = ["AXES", "SCHEMA", "StudyOptions", "cost_table", "paper_table", "run_study", "study_rows", "study_table"]
 
@@ -46,6 +46,7 @@ AXES = ("solver", "stiffness", "float", "time step", "mesh", "trajectory", "pape
 _PACKAGES = ("matplotlib", "plotly")
 _STIFFNESS_FACTORS = (0.01, 0.1, 1.0)
 _STIFF, _STIFF_MOST = "Multilevel", 32  # the solver for stiff bodies, and its iterations in a motion at most
+_TOLERANCES = [1e-2, 1e-3, 1e-4], 128  # of its steps elsewhere, and iterations at most
 _LITERATURE_MOST = 256  # iterations of methods of the literature
 
 Task = Callable[[], list[Row]]
@@ -143,6 +144,8 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
         for name, own in ((DEFAULT, fewer), (_STIFF, [count for count in fewer if count <= _STIFF_MOST])):
             key = f"trajectory: {name}, {softer.youngs:g} Pa"
             tasks[key] = partial(trajectory_rows, bench, softer, own, seconds=seconds, name=name)
+        key = f"trajectory: {_STIFF}, tolerance, {softer.youngs:g} Pa"
+        tasks[key] = partial(tolerance_rows, bench, softer, *_TOLERANCES, seconds=seconds, name=_STIFF)
     tasks["paper: table"] = partial(paper_rows, bench)
     return {key: task for key, task in tasks.items() if key.split(":")[0] in options.axes}
 

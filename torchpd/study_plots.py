@@ -22,6 +22,7 @@ STYLES: dict[str, tuple[str, float, str]] = {
     DEFAULT: ("#d55e00", 2.8, "solid"),
     "classic Chebyshev": ("#0072b2", 2.0, "solid"),
     "Multilevel": ("#56b4e9", 2.0, "solid"),
+    "Multilevel, tolerance": ("#2b6f95", 2.0, "solid"),
     "Jacobi": ("#6f737b", 2.0, "solid"),
     "damped Jacobi": ("#a9adb5", 1.4, "solid"),
     "guarded Chebyshev, NumPy": ("#d55e00", 1.2, "dashed"),
@@ -368,7 +369,8 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     for name, curve in curves.items():
         color, width, dash = STYLES.get(name, _OTHER)
         counts = [row.iterations for row in curve]
-        left.plot(counts, _drawn(curve), marker="o", color=color, linewidth=width, linestyle=dash, label=name)
+        label = f"{name}: mean of its steps" if "tolerance" in curve[0].more else name
+        left.plot(counts, _drawn(curve), marker="o", color=color, linewidth=width, linestyle=dash, label=label)
         _mark_failures(left, counts, curve, color)
     _error_axis(
         left, [row.error for row in shown], "largest distance from the converged path,\nover the length of the way"
@@ -395,7 +397,7 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     _note_uncertain(figure, shown)
     for axis, among in ((left, shown), (right, own)):
         axis.set_xscale("log")
-        ticks = sorted({row.iterations for row in among})
+        ticks = sorted({row.iterations for row in among if "tolerance" not in row.more})
         axis.set_xticks(ticks, [str(x) for x in ticks])
         axis.set_xticks([], minor=True)
         axis.set_xlabel(axis_label("iterations"))

@@ -109,7 +109,8 @@ def _figures(rows: list[Row]) -> list[Figure]:
         "mesh": "Whole motions on coarser meshes, against the finest one.",
         "float": "The same iterations in both precisions, relative to |x<sub>0</sub> &minus; x*|.",
         "trajectory": "Largest distance from the converged path over the way; hover for softness and energy. "
-        "Full lines are the default solver, dashed ones Multilevel.",
+        "Full lines are the default solver, dashed ones Multilevel: as many iterations for each step, or those that a "
+        "tolerance asks for.",
     }
     for axis, title, place, label in others:
         if axis in by_axis:

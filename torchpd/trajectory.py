@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from .contenders import DEFAULT, DEFAULT_ITERATIONS
 from .ledger import Row
 from .simulator import Simulator
-from .solvers import Solver
 from .state import State
 from .study_bench import Bench, Setting, clock_of, precision_name, solved_step
 
-__all__ = ["Trajectory", "compare_trajectories", "first_turn", "record_trajectory", "trajectory_rows"]
+__all__ = ["Trajectory", "compare_trajectories", "first_turn", "record_trajectory", "tolerance_rows", "trajectory_rows"]
 
 Array = NDArray[np.float64]
 
@@ -31,6 +30,7 @@ class Trajectory:
     brought: float  # kinetic energy at the start, J
     milliseconds: float  # a step, mean
     solved: bool = True  # every step of it, where that was asked for
+    iterations: float = math.nan  # of a step, mean, where it was not
 
 
 @torch.no_grad()
@@ -44,7 +44,7 @@ def record_trajectory(
     state, steps = bench.start(sim), max(1, round(seconds / sim.time_step))
     clock = clock_of(bench.device)
     begin = clock()
-    solved = True
+    solved, iterations = True, math.nan
     if solve:
         states = [state]
         for _ in range(steps):
@@ -56,13 +56,14 @@ def record_trajectory(
         track = sim.rollout(state, steps)
         positions = torch.cat([state.positions, track.positions[:, 0]])
         velocities = torch.cat([state.velocities, track.velocities[:, 0]])
+        iterations = float(track.info.iterations.double().mean())
     positions = positions.cpu()
     elapsed = clock() - begin
     energies = sim.energy(State(positions.to(sim.device), velocities)).double().cpu().numpy()
     mesh = bench.mesh(resolution)
     probes = np.stack([bench.subject.probes(mesh, x) for x in positions.double().numpy()])
     brought = float(sim.energy(state)[0] - sim.energy(state.positions)[0])
-    return Trajectory(sim.time_step, probes, energies, brought, 1e3 * elapsed / steps, solved)
+    return Trajectory(sim.time_step, probes, energies, brought, 1e3 * elapsed / steps, solved, iterations)
 
 
 def first_turn(signal: Array, time_step: float) -> float:
@@ -119,22 +120,39 @@ def trajectory_rows(
     bench: Bench, setting: Setting, counts: list[int], *, seconds: float = 1.0, name: str = DEFAULT
 ) -> list[Row]:
     """A motion at several iteration counts of a solver in float32, against the converged one in float64."""
-    exact = _converged(bench, setting, seconds)
-    solver: Solver = bench.solver(name, setting)[0]
+    solver = bench.solver(name, setting)[0]
     rows = []
     for count in counts:
         sim = bench.simulator(setting, torch.float32, solver, iterations=count)
-        motion = record_trajectory(bench, sim, setting.resolution, seconds)
-        found = compare_trajectories(motion, exact)
-        finite = math.isfinite(found["path"])
-        status = "diverged" if not finite else "ok" if exact.solved else "uncertain"
-        rows.append(
-            Row(
-                axis="trajectory", method=name, precision=precision_name(sim.dtype), iterations=count,
-                local_steps=count, status=status, youngs=setting.youngs,
-                time_step=setting.time_step, vertices=sim.vertices, tets=len(bench.mesh(setting.resolution).tets),
-                error=found["path"] if finite else math.inf, milliseconds=motion.milliseconds,
-                default=name == DEFAULT and count == DEFAULT_ITERATIONS, more={**found, "seconds_of_motion": seconds},
-            )
-        )  # fmt: skip
+        default = name == DEFAULT and count == DEFAULT_ITERATIONS
+        rows.append(replace(_motion_row(bench, sim, setting, seconds), method=name, default=default))
     return rows
+
+
+def tolerance_rows(
+    bench: Bench, setting: Setting, tolerances: list[float], most: int, *, seconds: float = 1.0, name: str
+) -> list[Row]:
+    """A motion whose steps take the iterations that a tolerance asks for, as many as `most`; theirs is the mean."""
+    solver = bench.solver(name, setting)[0]
+    rows = []
+    for tolerance in tolerances:
+        sim = bench.simulator(setting, torch.float32, solver, iterations=most, tolerance=tolerance)
+        row = _motion_row(bench, sim, setting, seconds)
+        rows.append(replace(row, method=f"{name}, tolerance", more={**row.more, "tolerance": tolerance}))
+    return rows
+
+
+def _motion_row(bench: Bench, sim: Simulator, setting: Setting, seconds: float) -> Row:
+    exact = _converged(bench, setting, seconds)
+    motion = record_trajectory(bench, sim, setting.resolution, seconds)
+    found = compare_trajectories(motion, exact)
+    finite = math.isfinite(found["path"])
+    status = "diverged" if not finite else "ok" if exact.solved else "uncertain"
+    iterations = round(motion.iterations)
+    return Row(
+        axis="trajectory", method="", precision=precision_name(sim.dtype), iterations=iterations,
+        local_steps=iterations, status=status, youngs=setting.youngs, time_step=setting.time_step,
+        vertices=sim.vertices, tets=len(bench.mesh(setting.resolution).tets),
+        error=found["path"] if finite else math.inf, milliseconds=motion.milliseconds,
+        more={**found, "seconds_of_motion": seconds},
+    )  # fmt: skip
