@@ -403,7 +403,7 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
         axis.set_xlabel(axis_label("iterations"))
         axis.axvline(64, color=_INK, linewidth=1.0, linestyle=(0, (2, 3)))
         axis.annotate(
-            "default ", (64, 0.01), xycoords=("data", "axes fraction"), va="bottom", ha="right", fontsize=9, color=_INK
+            "default ", (64, 0.25), xycoords=("data", "axes fraction"), va="bottom", ha="right", fontsize=9, color=_INK
         )
     figure.savefig(path)
     return path
