@@ -17,7 +17,7 @@ from torchpd.baselines import BASELINES, GaussSeidel, colour_vertices, factorise
 from torchpd.dense_direct import DENSE, DenseDirect
 from torchpd.newton_krylov import NewtonKrylov
 from torchpd.reference import StepProblem
-from torchpd.reference_solvers import newton, relative_error
+from torchpd.reference_solvers import newton, relative_error, solve_with_contact
 
 
 def swinging() -> Case:
@@ -174,6 +174,20 @@ def test_memory_is_watched_and_contacts_are_refused(problem: StepProblem) -> Non
     with pytest.raises(ValueError, match="knows no contacts"):
         run_baseline(BASELINES["Newton"], resting, resting.first_iterate(), 1)
     assert run_baseline(BASELINES["guarded Chebyshev, NumPy"], resting, resting.first_iterate(), 2).last == 2
+
+
+@pytest.mark.parametrize("ground", [pd.Ground(0.0), pd.Ground(-0.001)], ids=["resting", "landing"])
+def test_newton_krylov_finds_contacts(ground: pd.Ground) -> None:
+    case = contact_block(ground, velocity=(0.0, -1.0, 0.0), youngs=1e5)
+    problem = case.problem()
+    first, solution = problem.first_iterate(), solve_with_contact(problem)
+    trace = run_baseline(BASELINES["Newton-PCG with M"], problem, first, 20)
+    assert relative_error(trace.displacements[trace.last], solution, first) < 1e-6
+    assert sorted(trace.displacements) == list(range(trace.last + 1))
+    assert trace.local_steps[trace.last] > trace.last > 1
+    rough = contact_block(pd.Ground(0.0, friction=0.5)).problem()
+    with pytest.raises(ValueError, match="knows no friction"):
+        run_baseline(BASELINES["Newton-PCG with M"], rough, rough.first_iterate(), 1)
 
 
 def test_examination_is_not_imported_with_the_library() -> None:

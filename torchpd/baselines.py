@@ -4,7 +4,7 @@ Iterations and errors of these are exact. Their milliseconds are those of vector
 solvers, not of tuned code: beside the compiled solvers of the library they are indications only, and the row
 "guarded Chebyshev, NumPy" says how much of the difference is the language. Every method takes its local step from
 `StepProblem.evaluate`, starts from the same iterate, and knows no contact unless it projects vertex by vertex (the
-Jacobi family).
+Jacobi family) or works on active sets (Newton-PCG, smooth contacts).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import cg, splu
 
+from .contact_newton import ContactNewton
 from .newton_krylov import NewtonKrylov
 from .reference import StepProblem
 from .reference_solvers import classic_chebyshev, classic_omegas, guarded_chebyshev, jacobi, newton
@@ -92,7 +93,7 @@ def refuse_contacts(problem: StepProblem) -> None:
         ValueError: the scene has planes or spheres.
     """
     if len(problem.values.planes) or len(problem.values.spheres):
-        raise ValueError("this method knows no contacts; only the Jacobi family projects vertices out of them")
+        raise ValueError("this method knows no contacts; only the Jacobi family and Newton-PCG do")
 
 
 def run_baseline(
@@ -317,8 +318,16 @@ def _newton(problem: StepProblem, first: Array) -> Run:
 
 
 def _newton_krylov(problem: StepProblem, first: Array) -> Run:
-    method = NewtonKrylov(problem, problem.calls if isinstance(problem, _Counted) else [0])
-    return lambda iterations, observe: method.minimise(first, iterations, observe)
+    """On active sets where there are contacts."""
+    passes = problem.calls if isinstance(problem, _Counted) else [0]
+    planes, spheres = problem.values.planes, problem.values.spheres
+    if not len(planes) and not len(spheres):
+        method = NewtonKrylov(problem, passes)
+        return lambda iterations, observe: method.minimise(first, iterations, observe)
+    if (planes[:, 4] > 0.0).any() or (spheres[:, 4] > 0.0).any():
+        raise ValueError("this method knows no friction; friction=0 makes contacts smooth")
+    sets = ContactNewton(problem, passes)
+    return lambda iterations, observe: _discard(sets.minimise(first, iterations=iterations, observe=observe))
 
 
 def _lbfgs(problem: StepProblem, first: Array) -> Run:
@@ -363,7 +372,10 @@ BASELINES: dict[str, Baseline] = {
     "direct global step": Baseline(_plain(factorised), iteration="local step + two triangular solves"),
     "Newton": Baseline(_newton, iteration="Hessian, factorisation, line search", few=True),
     "Newton-PCG with M": Baseline(
-        _newton_krylov, iteration="conjugate gradients on the Hessian, line search; all of it compiled", few=True
+        _newton_krylov,
+        contacts=True,
+        few=True,
+        iteration="conjugate gradients on the Hessian (compiled; with contacts around it NumPy), line search",
     ),
     "L-BFGS": Baseline(_lbfgs, iteration="local step + two-loop recursion"),
 }

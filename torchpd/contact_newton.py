@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from .newton_krylov import NewtonKrylov
+from .newton_krylov import NewtonKrylov, Observer
 from .reference import StepProblem
 
 __all__ = ["ContactNewton"]
@@ -98,11 +98,16 @@ def _tangents(held: Mask, normals: Array, gaps: Array, free: Mask) -> tuple[Arra
 
 
 class ContactNewton:
-    """Newton's method for one step, with contacts or without; its linear systems are solved by conjugate gradients."""
+    """Newton's method for one step, with contacts or without; its linear systems are solved by conjugate gradients.
 
-    def __init__(self, problem: StepProblem) -> None:
+    Args:
+        problem: the step; friction is left out.
+        passes: a counter [1] that goes up with every product with the Hessian.
+    """
+
+    def __init__(self, problem: StepProblem, passes: list[int] | None = None) -> None:
         self.problem = problem
-        self.krylov = NewtonKrylov(problem, [0])
+        self.krylov = NewtonKrylov(problem, [0] if passes is None else passes)
 
     def step(self, displacement: Array) -> tuple[Array, bool]:
         """From u [V, 3] m to the minimum of the quadratic of E around it, among what the contacts leave.
@@ -132,15 +137,17 @@ class ContactNewton:
             residual = residual - (rho / curvature) * image
         return found.landing + way, False
 
-    def minimise(self, displacement: Array, *, iterations: int = 50) -> Array:
+    def minimise(self, displacement: Array, *, iterations: int = 50, observe: Observer | None = None) -> Array:
         """Steps from u [V, 3] m while energy falls, and residuals once energies differ by rounding only."""
         u, energy = displacement, self.problem.energy(displacement)
         size = float(np.linalg.norm(self.problem.residual(u)))
-        for _ in range(iterations):
+        for k in range(iterations):
             found = self._descend(u, energy, size, self.step(u)[0])
             if found is None:
                 break
             u, energy, size = found
+            if observe is not None:
+                observe(k + 1, u)
         return u
 
     def _descend(self, u: Array, energy: float, size: float, way: Array) -> tuple[Array, float, float] | None:

@@ -19,7 +19,7 @@ from .multilevel import precondition_plan
 from .plan import compile_plan
 from .reference import StepProblem
 
-__all__ = ["NewtonKrylov"]
+__all__ = ["NewtonKrylov", "Observer"]
 
 Array = NDArray[np.float64]
 Observer = Callable[[int, Array], None]
