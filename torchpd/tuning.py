@@ -47,6 +47,7 @@ SAFETY = 2.0
 _STUDIED_ROUNDINGS = 2.0
 _STEPS = (0, 1, 4, 12, 30)  # of the motion, whose states are studied
 _TURNED = (0, 4)  # those that are also studied with the axes of their velocities exchanged
+_HARDEST = 2  # other states up to there
 _ENVIRONMENTS = 3  # of a batch, and the worst conditioned one
 _HEADROOM = 0.95  # of a budget in milliseconds that is spent: times scatter
 _NEAR = 1.1  # a safer candidate wins although it takes this much longer
@@ -199,25 +200,41 @@ def _environments(sim: Simulator, batch: int) -> list[int]:
 
 
 def _motion(sim: Simulator, start: State, forces: Tensor | None) -> list[State]:
-    """The states before the steps `_STEPS`, solved well enough to be those of the true motion, and a few turned ones.
+    """The states before the steps `_STEPS`, solved well enough to be those of the true motion, and a few others.
 
-    These have the same shape and speeds in other directions: as likely a motion, whose steps err in other modes.
+    Turned ones have the same shape and speeds in other directions: as likely a motion, whose steps err in other modes.
+    And the hardest, where a fifth of the iterations leaves most to do: a motion may go through states where the energy
+    is not convex, which are few, and which all solvers leave slowly.
     """
     mover = copy.copy(sim)
     if runs(Multilevel(), mover):
         mover.solver, mover.iterations = Multilevel(), _MOVING
     else:
         mover.solver, mover.iterations = Chebyshev(), _MOVING_PLAINLY
-    states, state = [], start
+    prober = copy.copy(mover)
+    prober.iterations = mover.iterations // 5
+    states, state, hardest = [], start, list[tuple[float, State]]()
     for step in range(max(_STEPS) + 1):
         if step in _STEPS:
             states.append(state)
         if step in _TURNED:
             states.append(State(state[0], state[1].roll(1, -1)))
-        state = mover(state, forces)
-        if not bool(state[0].isfinite().all()):
+        after = mover(state, forces)
+        if not bool(after[0].isfinite().all()):
             break
-    return states
+        if step not in _STEPS:
+            left = _left(prober(state, forces), state, after, sim.time_step)
+            hardest = sorted([*hardest, (left, state)], key=lambda pair: -pair[0])[:_HARDEST]
+        state = after
+    return [*states, *(state for _, state in hardest)]
+
+
+def _left(rough: State, before: State, after: State, time_step: float) -> float:
+    """The error of a step's rough end, relative to what the step changes of x + h v, largest of the environments."""
+    size = [(v - after[1]).flatten(1).norm(dim=1) for v in (rough[1], before[1])]
+    rounding = 10.0 * torch.finfo(after[0].dtype).eps / time_step * after[0].flatten(1).norm(dim=1)
+    left = (size[0] - rounding).clamp(min=0.0) / size[1].clamp(min=torch.finfo(after[0].dtype).tiny)
+    return float(left.max())
 
 
 def _of_environments(sim: Simulator, items: list[int], batch: int) -> Simulator:
