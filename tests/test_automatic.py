@@ -75,6 +75,20 @@ def test_iterations_that_are_given_stay() -> None:
     assert own.iterations == 7
 
 
+def test_a_tolerance_leaves_hard_steps_their_iterations() -> None:
+    """A beam goes through states where the energy is not convex: with the iterations of the others 0.2 is left."""
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (25, 5, 5))
+    body = pd.Solid(mesh, youngs=1e5, density=1000.0)
+    scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+    plain = pd.Simulator(scene, 1 / 30, solver="auto", progress=False)
+    sim = pd.Simulator(scene, 1 / 30, solver="auto", tolerance=1e-4, progress=False)
+    assert sim.iterations == 4 * plain.iterations
+    track = sim.rollout(sim.rest_state(), 30)
+    assert bool(track.info.converged.all())
+    assert float(track.info.iterations.double().mean()) < plain.iterations < int(track.info.iterations.max())
+    assert pd.Simulator(scene, 1 / 30, 20, "auto", tolerance=1e-4, progress=False).iterations == 20
+
+
 def test_costs_decide(monkeypatch: pytest.MonkeyPatch) -> None:
     """At 1e6 Pa some 370 iterations stand against 19: Chebyshev wins when one of Multilevel costs 100 of its."""
     monkeypatch.setitem(automatic.COSTS, "cpu", Costs(Cost(1.0, 1.0), Cost(100.0, 100.0)))

@@ -14,6 +14,7 @@ from .solvers import Chebyshev, Jacobi, Multilevel
 from .state import Info, State, Track
 from .tetrahedralize import tetrahedralize
 from .version import __version__
+from .warn import TuningWarning
 
 if load_extension()[0] is not None:
     from .capture import CapturedStep
@@ -75,6 +76,7 @@ __all__ = [
     "TetMesh",
     "Track",
     "TriMesh",
+    "TuningWarning",
     "UnsolvedWarning",
     "__version__",
     "compile_plan",

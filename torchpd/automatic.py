@@ -21,6 +21,7 @@ __all__ = ["AIM", "COSTS", "Choice", "Cost", "Costs", "choose_solver", "runs"]
 
 AIM = 1e-3  # error of a step that "auto" sets its iterations for
 MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes
+PATIENCE = 4  # times that where a tolerance ends easy steps: hard ones, which no forecast sees, need as many
 MAKING = 3  # iterations of "lbfgs" that "corotated" must save to be worth its time
 
 
@@ -91,11 +92,12 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     Args:
         sim: scene, time step, material, device, and the batch to choose for.
         iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error. None
-            sets as many as are expected to reach an error of `AIM`, times `MARGIN`.
+            sets as many as are expected to reach an error of `AIM`, times `MARGIN`, and with a tolerance `PATIENCE`.
     """
 
     def chosen(enough: int, why: str) -> Choice:
-        return Choice(enough if iterations is None else iterations, iterations is None, why)
+        most = enough * (PATIENCE if sim.tolerance > 0.0 else 1)
+        return Choice(most if iterations is None else iterations, iterations is None, why)
 
     spectrum = spectrum_of(sim)
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))

@@ -48,8 +48,9 @@ class Simulator(Model):
             expected to leave a tenth of the error or more an `UnsolvedWarning` says so; `print(sim)` tells for any.
         solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later. None is Chebyshev.
             "auto" takes Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner on the device,
-            and as many iterations as that takes unless they are given; `print(sim)` says why. It chooses anew when the
-            simulator moves to another device and in `prepare_solver`.
+            and as many iterations as that takes unless they are given, four times as many where a `tolerance` ends easy
+            steps; `print(sim)` says why. It chooses anew when the simulator moves to another device and in
+            `prepare_solver`.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "cluster", "grid" or "stream", see

@@ -33,7 +33,7 @@ from .solvers import Chebyshev, Multilevel, Solver
 from .state import State
 from .targets import Targets
 from .tuning_checks import check_known, check_request, check_start
-from .warn import warn_user
+from .warn import TuningWarning, warn_user
 
 if TYPE_CHECKING:
     from .simulator import Simulator
@@ -55,10 +55,6 @@ _HOPELESS = 1.5  # a candidate that takes this much longer than another one is g
 # iterations for the states that are studied: of Multilevel, and of Chebyshev where a GPU's kernel runs no other
 _MOVING, _MOVING_PLAINLY = 64, 512
 _KNOWN = 0.1  # uncertainty of the converged steps, at most, where a time is asked for and no error
-
-
-class TuningWarning(UserWarning):
-    """The target of `tune` cannot be reached; the promise says what can."""
 
 
 @dataclass(frozen=True, eq=False)

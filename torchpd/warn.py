@@ -7,9 +7,13 @@ import traceback
 import warnings
 from types import FrameType
 
-__all__ = ["warn_user"]
+__all__ = ["TuningWarning", "warn_user"]
 
 _NOT_USERS = (__package__, "torch", "")  # code that torch generates has no name
+
+
+class TuningWarning(UserWarning):
+    """The target of `Simulator.tune` cannot be reached; the promise says what can."""
 
 
 def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
