@@ -231,7 +231,7 @@ class Simulator(Model):
         `attained=False`, and a `TuningWarning`. Files do not keep it: times are of the machine that measured them.
 
         Takes about a second for a thousand vertices, 2 to 8 s for 3 thousand and 20 s for 10 thousand on one core of a
-        CPU: seven steps of each studied environment are solved to convergence in float64, on the CPU.
+        CPU: nine steps of each studied environment are solved to convergence in float64, on the CPU.
 
         Args:
             state: where typical motions start [B, V, 3], the rest state by default, once for each environment of the
