@@ -391,3 +391,9 @@ def test_short_floats_are_numbers_too(kind: torch.dtype) -> None:
     assert pd.Solid(solid.mesh, torch.tensor(1024.0, dtype=kind)).youngs.tolist() == [1024.0] * 48
     grid = torch.tensor(solid.mesh.vertices * 40, dtype=kind)  # 0, 4, 8
     assert np.array_equal(pd.TetMesh(grid, solid.mesh.tets).vertices, grid.double().numpy())
+
+
+def test_parts_of_what_is_no_state_are_named(sim: pd.Simulator) -> None:
+    rest = sim.rest_state()
+    with pytest.raises(TypeError, match="got State of ndarray and ndarray; rest_state"):
+        sim(pd.State(*(part.numpy() for part in rest)))  # type: ignore[arg-type]

@@ -536,3 +536,10 @@ def test_the_hardest_states_of_the_motion_are_studied() -> None:
         state = after
     # 0.46 from the states of five fixed steps
     assert worst <= promise.error
+
+
+def test_what_is_no_info_is_named(tuned: tuple[pd.Simulator, Promise]) -> None:
+    sim, promise = tuned
+    for ask in (promise.holds, promise.estimate):
+        with pytest.raises(TypeError, match=r"info must be what `state, info = .* gives, got tuple"):
+            ask(sim(sim.rest_state(), return_info=True))  # type: ignore[arg-type]

@@ -326,7 +326,7 @@ class Model(nn.Module):
         if not _is_pair(state):
             raise TypeError(
                 f"state must be a State, positions and velocities [B, {self.vertices}, 3], got "
-                f"{type(state).__name__}; rest_state() makes one"
+                f"{_kind_of(state)}; rest_state() makes one"
             )
         self._check_kind("state", state[0])
         check_like("velocities", state[1], state[0], "m/s")
@@ -347,7 +347,7 @@ class Model(nn.Module):
         if not (alone or _is_pair(state)):
             raise TypeError(
                 f"{name} must be a State, positions and velocities [B, {self.vertices}, 3], or positions alone, got "
-                f"{type(state).__name__}"
+                f"{_kind_of(state)}"
             )
         positions = state if isinstance(state, Tensor) else state[0]
         self._check_kind(name, positions)
@@ -436,6 +436,12 @@ def _held_everywhere(pin_stiffness: Tensor) -> Tensor:
     """Whether each pin holds exactly in all environments [P]."""
     hard = pin_stiffness.isinf()
     return hard.all(0) if hard.dim() == 2 else hard
+
+
+def _kind_of(value: object) -> str:
+    """A type by its name, a tuple with the types of its parts."""
+    name = type(value).__name__
+    return f"{name} of {' and '.join(type(part).__name__ for part in value)}" if isinstance(value, tuple) else name
 
 
 def _number_or_nan(value: float) -> float:

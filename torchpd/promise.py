@@ -68,7 +68,7 @@ class Promise:
         long ones, so most steps that break a promise have a residual like any other: see `estimate` and `audit`.
         Nowhere once `set_material` has brought other numbers; what an optimiser writes in place only `covers` finds.
         """
-        return (info.residual <= self.residual_limit) & (not self.other_material)
+        return (_info(info, "holds").residual <= self.residual_limit) & (not self.other_material)
 
     @torch.no_grad()
     def audit(
@@ -109,7 +109,7 @@ class Promise:
 
         High rather than low: it exceeds `error` on one in three steps that keep the promise; an `audit` tells which.
         """
-        return info.residual * self.error_per_residual
+        return _info(info, "estimate").residual * self.error_per_residual
 
     def covers(self, sim: Simulator) -> bool:
         """Whether the simulator still has the settings and the material that were promised for; awaits a GPU."""
@@ -132,3 +132,10 @@ class Promise:
         rounding = f" and up to {self.rounding:.1e} of rounding" if self.rounding > 0.1 * self.error else ""
         other = ", for another material than now" if self.other_material else ""
         return f"error {self.error:.1e}{rounding}, {self.milliseconds:.2g} ms a step of {self.batch}{verdict}{other}"
+
+
+def _info(info: object, name: str) -> Info:
+    if not isinstance(info, Info):
+        given = type(info).__name__
+        raise TypeError(f"{name}: info must be what `state, info = sim(state, return_info=True)` gives, got {given}")
+    return info

@@ -183,6 +183,8 @@ def check_solver(solver: object, device: torch.device) -> Solver:
     """The solver, if a simulator on this device can have it."""
     if not isinstance(solver, Jacobi | Chebyshev | Multilevel):
         given = repr(solver) if isinstance(solver, str) else type(solver).__name__
+        if isinstance(solver, type):
+            given = f"the class {solver.__name__}: write {solver.__name__}()"
         raise TypeError(f'Simulator: solver must be Jacobi, Chebyshev, Multilevel or "auto", got {given}')
     if isinstance(solver, Multilevel) and device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"Simulator: Multilevel is prepared on the CPU or on a GPU, not on {device}")
