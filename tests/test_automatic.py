@@ -122,11 +122,28 @@ def test_costs_of_clusters_are_those_that_were_measured() -> None:
 
 
 def test_time_of_a_batch() -> None:
-    """2 + 4 * 0.5 us of one environment, 500 vertices; two others take turns, or 0.8 * 0.5 us each, or 1.2 / 4 more."""
+    """2 + 4 * 0.5 us of one environment, 500 vertices; two others take turns, or 0.8 * 0.5 us each, or 1.2 / 4 more.
+
+    Never longer than taking turns: 20 * 0.5 us are 10.
+    """
     assert Cost(2.0, 4.0).iteration(500) == 4.0
     assert Cost(2.0, 4.0).iteration(500, 3) == 12.0
     assert Cost(2.0, 4.0, 0.8).iteration(500, 3) == pytest.approx(4.0 + 2 * 0.4)
     assert Cost(2.0, 4.0, 0.8, 1.2).iteration(500, 3) == pytest.approx(4.0 + 2 * 0.7)
+    assert Cost(2.0, 4.0, 20.0).iteration(500, 3) == 12.0
+
+
+def test_few_environments_get_the_solver_that_was_faster() -> None:
+    """Of the measured steps of 16 beams: from the forecasts in the rows, as `choose_solver` decides."""
+    file = Path(__file__).parent.parent / "benchmarks" / "results" / "time-to-error-cuda-batch-16.json"
+    for row in json.loads(file.read_text())["rows"]:
+        solvers = [row["solvers"][name] for name in ("Chebyshev", "Multilevel")]
+        times = [
+            solver["forecast"] * cost.iteration(row["vertices"], row["batch"])
+            for solver, cost in zip(solvers, COSTS[row["kernel"]], strict=True)
+        ]
+        took = [solver["milliseconds"]["median"] for solver in solvers]
+        assert (times[0] < times[1]) == (took[0] < took[1]), (row["size"], row["youngs"])
 
 
 def test_the_batch_decides_where_environments_share_a_device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

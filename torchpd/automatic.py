@@ -8,6 +8,7 @@ same bits alone and in any batch.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,13 +32,13 @@ _LEVELS = (Multilevel(), Multilevel("lbfgs"))
 class Cost(NamedTuple):
     """Time of an iteration in microseconds, n thousand vertices an environment.
 
-    `latency` + `each` n of the first environment, `more` n + `square` n^2 of every other one; `more` is None where they
-    take turns, and every one takes as long as the first.
+    `latency` + `each` n of the first environment, `more` n + `square` n^2 of every other one, but no longer than the
+    first: they can take turns.
     """
 
     latency: float
     each: float
-    more: float | None = None
+    more: float = math.inf
     square: float = 0.0
 
     def iteration(self, vertices: int, batch: int = 1) -> float:
@@ -51,7 +52,7 @@ class Cost(NamedTuple):
     def other(self, vertices: int) -> float:
         """Microseconds that every further environment adds."""
         thousands = vertices / 1000.0
-        return self.first(vertices) if self.more is None else self.more * thousands + self.square * thousands**2
+        return min(self.first(vertices), self.more * thousands + self.square * thousands**2)
 
 
 class Costs(NamedTuple):
@@ -63,15 +64,14 @@ class Costs(NamedTuple):
 
 # Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers,
 # those of further environments with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were
-# measured on "block", with 256 and 936 vertices, which the squares fit, and on "cluster" with Chebyshev, by
-# `benchmarks/few_environments.py`; `Multilevel` runs alike there.
-# Kernels without `more` choose for a batch as for one environment.
+# measured on "block" with 1024 environments of 256 and 936 vertices, on "cluster" and "grid" with 16 of 936 to 10,309;
+# the squares fit these sizes. `Multilevel` runs alike on "grid" and "stream".
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
     "block": Costs(Cost(2.6, 5.0, 0.033, 0.022), Cost(31.0, 3.0, 0.6, 0.79)),
     "cluster": Costs(Cost(0.8, 0.5, 0.3), Cost(28.0, 9.0, 0.6, 0.79)),
-    "grid": Costs(Cost(1.2, 0.13), Cost(50.0, 2.4)),
-    "stream": Costs(Cost(6.0, 0.18), Cost(50.0, 2.4)),
+    "grid": Costs(Cost(1.2, 0.13, 0.3), Cost(50.0, 2.4, 0.85, 0.073)),
+    "stream": Costs(Cost(6.0, 0.18), Cost(50.0, 2.4, 0.85, 0.073)),
 }
 
 

@@ -86,6 +86,8 @@ def draw(rows: list[Row], path: Path) -> None:
         sharey=True,
         squeeze=False,
     )
+    for panel in panels.flat:
+        panel.set_visible(False)
     for row in rows:
         panel = panels[problems.index(row["problem"])][stiffnesses.index(row["youngs"])]
         for method in row["methods"]:
@@ -94,13 +96,14 @@ def draw(rows: list[Row], path: Path) -> None:
                 style = "--" if "substeps" in method["method"] else "-"
                 colour = COLOURS[method["method"]]
                 panel.plot(*zip(*points, strict=True), style, marker=".", color=colour, label=method["method"])
+        panel.set_visible(True)
         panel.set(xscale="log", yscale="log", ylim=(3e-4, 10.0), title=f"{row['problem']}\n{row['youngs']:.0e} Pa")
         panel.title.set_fontsize(9)
         panel.grid(alpha=0.3)
-    for panel in panels[-1]:
         panel.set_xlabel("milliseconds")
-    for line in panels:
-        line[0].set_ylabel("distance from its own\nconverged answer")
+        if row["youngs"] == min(other["youngs"] for other in rows if other["problem"] == row["problem"]):
+            panel.set_ylabel("distance from its own\nconverged answer")
+            panel.tick_params(labelleft=True)
     handles = {
         label: handle for panel in figure.axes for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
     }
