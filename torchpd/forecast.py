@@ -71,6 +71,10 @@ class Forecast(NamedTuple):
         """About what so many leave; 1 is the first iterate."""
         return math.exp(-self.rate * iterations)
 
+    def left_by(self, tolerance: float) -> float:
+        """About |x - x*| / |x - x_t| where a tolerance stops: the last iteration changed it by (exp(rate) - 1) |x - x*|."""
+        return tolerance / math.expm1(self.rate)
+
 
 @torch.no_grad()
 def spectrum_of(sim: Model) -> Spectrum | None:
@@ -149,9 +153,24 @@ def has_friction(sim: Model) -> bool:
 
 
 def warn_of_few_iterations(sim: Model) -> None:
-    """Say so when the default number of iterations leaves most of the error: the user may not know of the setting."""
+    """Say so when the default number of iterations leaves most of the error: the user may not know of the setting.
+
+    With a tolerance, which makes that number a limit, when the tolerance does.
+    """
     expected = forecast(sim)
-    if expected is None or sim.tolerance > 0.0 or expected.error(sim.iterations) <= FAR_TOO_FEW:
+    if expected is None:
+        return
+    if sim.tolerance > 0.0:
+        left = expected.left_by(sim.tolerance)
+        if left > FAR_TOO_FEW:
+            warn_user(
+                f"Simulator: tolerance={sim.tolerance:g} may stop a step here that has about {min(left, 1.0):.1g} of its way "
+                f"still to go, for an iteration takes {math.expm1(expected.rate):.1g} of what is left. Give a smaller one, "
+                "or solver=torchpd.Multilevel()",
+                UnsolvedWarning,
+            )
+        return
+    if expected.error(sim.iterations) <= FAR_TOO_FEW:
         return
     warn_user(
         f"Simulator: the default of {sim.iterations} iterations leaves an error of about "

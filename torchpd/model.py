@@ -83,7 +83,7 @@ class Model(nn.Module):
             self._choose_solver(None if iterations is None else self.iterations)
         else:
             self.solver = given
-            if iterations is None:
+            if iterations is None or self.tolerance > 0.0:
                 warn_of_few_iterations(self)
 
     @property
