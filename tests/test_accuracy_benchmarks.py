@@ -79,6 +79,8 @@ def test_promises_and_refusals_are_counted_apart() -> None:
     assert counts["attained"] == {"scenes": 2, "held": 1}
     assert counts["best reachable"] == {"scenes": 2, "held": 1}
     assert counts["held"] == 0.5
+    assert counts["with an error beyond rounding"] == {"scenes": 4, "held": 2}
+    assert summary([row(True, 0.0, 1e-2)])["with an error beyond rounding"] == {"scenes": 0, "held": 0}
     assert counts["broken steps"] == {
         "steps": 2,
         "doubted by holds(info)": 1,

@@ -141,6 +141,12 @@ def tune(
     sim.solver, sim.iterations, sim.tolerance, sim.promise = promise.solver, promise.iterations, 0.0, promise
     if not promise.attained:
         warn_user(f"tune: {promise}", TuningWarning)
+    elif min(study.roundings) > promise.error:
+        warn_user(
+            f"tune: {promise}: more than the error, in every state of the study, which therefore shows little of it; "
+            "a simulator with dtype=torch.float64 has none",
+            TuningWarning,
+        )
     return promise
 
 
