@@ -207,6 +207,9 @@ def test_diverged_is_what_ends_so() -> None:
     assert verdicts([3.0, 0.4, 1e-3, 1e-12], 0.02) == ["ok", "ok", "uncertain", "uncertain"]
     # below what any figure shows
     assert verdicts([1e-12], 1e-10) == ["ok"]
+    # the last iterate has less energy than the converged step: they go to another minimum
+    assert verdicts([0.5, math.inf, 0.7], 0.0, [0.3, None, -1e-3]) == ["uncertain", "diverged", "uncertain"]
+    assert verdicts([0.5, 1e-9], 0.0, [0.3, -1e-15]) == ["ok", "ok"]
 
 
 def test_a_stiff_beam_is_compared_with_its_converged_step() -> None:
@@ -258,30 +261,19 @@ def test_table_tells_refusals_from_what_is_not_reached() -> None:
 
 
 def test_the_cost_of_an_error_is_tabled() -> None:
-    rows = [
-        Row(
-            "stiffness",
-            "x",
-            precision="float32",
-            youngs=1e4,
-            iterations=k,
-            error=error,
-            milliseconds=0.1 * k,
-            default=k == 64,
-        )
-        for k, error in ((32, 0.02), (64, 1e-3), (128, 1e-5))
-    ]
-    assert cost_table(rows).splitlines()[1].split() == [
-        "10000",
-        "32",
-        "it.,",
-        "3.2",
-        "ms",
-        *["64", "it.,", "6.4", "ms"] * 2,
-        "1.0e-03",
-        "not",
-        "studied",
-    ]
+    def row(method: str, k: int, error: float) -> Row:
+        return Row(
+            "stiffness", method, precision="float32", youngs=1e4, iterations=k, error=error, milliseconds=0.1 * k,
+            default=method == DEFAULT and k == 64,
+        )  # fmt: skip
+
+    rows = [row("Multilevel", 8, 5e-3)]
+    rows += [row(DEFAULT, k, error) for k, error in ((32, 0.02), (64, 1e-3), (128, 1e-5))]
+    default, other = (re.split(r"  +", line) for line in cost_table(rows).splitlines()[1:])
+    assert default == [
+        "10000", DEFAULT, "32 it., 3.2 ms", *["64 it., 6.4 ms"] * 2, "1.0e-03", "not studied",
+    ]  # fmt: skip
+    assert other == ["10000", "Multilevel", *["8 it., 0.8 ms"] * 2, "not reached"]
     assert cost_table([]) == study_table([]) == paper_table([]) == ""
 
 

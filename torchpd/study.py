@@ -45,7 +45,7 @@ SCHEMA = 1
 AXES = ("solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper")
 _PACKAGES = ("matplotlib", "plotly")
 _STIFFNESS_FACTORS = (0.01, 0.1, 1.0)
-_STIFF, _STIFF_MOST = "Multilevel", 32  # the solver for stiff bodies, and its iterations in a motion at most
+_STIFF, _STIFF_MOST = "Multilevel", 32  # the solver for stiff bodies, and its iterations there at most
 _TOLERANCES = [1e-2, 1e-3, 1e-4], 128  # of its steps elsewhere, and iterations at most
 _LITERATURE_MOST = 256  # iterations of methods of the literature
 
@@ -132,6 +132,9 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
         for name, dtype in (("Jacobi", torch.float64), (DEFAULT, torch.float64), (DEFAULT, torch.float32)):
             key = f"stiffness: {name}, {precision_name(dtype)}, {softer.youngs:g} Pa"
             tasks[key] = partial(stiffness_rows, bench, name, dtype, softer, counts)
+        few = [count for count in counts if count <= _STIFF_MOST]
+        key = f"stiffness: {_STIFF}, float32, {softer.youngs:g} Pa"
+        tasks[key] = partial(stiffness_rows, bench, _STIFF, torch.float32, softer, few)
     resolutions = bench.subject.resolutions[:3] if options.quick else bench.subject.resolutions
     tasks["float: default"] = partial(float_rows, bench, setting, counts)
     if options.quick:
@@ -230,7 +233,7 @@ def study_table(rows: list[Row]) -> str:
         own = [row for row in solver if (row.method, row.precision) == (name, precision)]
         lines.append(f"{name:<{width}}{precision:<11}{_costs(own)}")
     if any(row.status == "uncertain" for row in rows):
-        lines.append("uncertain: no converged step is known well enough to say so")
+        lines.append("uncertain: no converged step is known well enough to say so, or one of less energy was met")
     if any(row.refusal for row in solver):
         lines.append("with --scene held a body has no contacts, and every method runs")
     return "\n".join(lines) if solver else ""
@@ -253,24 +256,25 @@ def _first_at(rows: list[Row], goal: float) -> str:
 
 
 def cost_table(rows: list[Row]) -> str:
-    """What an error costs the default in float32, at every stiffness, beside what its 64 iterations give.
+    """What an error costs the default and `Multilevel` in float32, at every stiffness, and what 64 iterations give.
 
     The last column is how far the body is from its converged path at most, over its way, when all steps are like that.
     """
     own = [row for row in rows if row.axis == "stiffness" and row.precision == "float32"]
     lines = [
-        f"{'Young [Pa]':<12}"
+        f"{'Young [Pa]':<12}{'':<20}"
         + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)
         + f"{'default: error':>18}{'its path':>14}"
     ]
-    for youngs in sorted({row.youngs for row in own}):
-        at = [row for row in own if row.youngs == youngs]
-        default = [f"{row.error:.1e}" for row in at if row.default] or ["not studied"]
-        paths = [row for row in rows if row.axis == "trajectory" and row.youngs == youngs and row.default]
-        path = f"{paths[0].error:.1e}" if paths else "not studied"
-        lines.append(
-            f"{youngs:<12g}" + "".join(f"{_first_at(at, goal):>22}" for goal in _GOALS) + f"{default[0]:>18}{path:>14}"
-        )
+    for youngs, method in sorted({(row.youngs, row.method) for row in own}, key=lambda at: (at[0], at[1] != DEFAULT)):
+        at = [row for row in own if (row.youngs, row.method) == (youngs, method)]
+        line = f"{youngs:<12g}{method:<20}" + "".join(f"{_first_at(at, goal):>22}" for goal in _GOALS)
+        if method == DEFAULT:
+            default = [f"{row.error:.1e}" for row in at if row.default] or ["not studied"]
+            paths = [row for row in rows if row.axis == "trajectory" and row.youngs == youngs and row.default]
+            path = f"{paths[0].error:.1e}" if paths else "not studied"
+            line += f"{default[0]:>18}{path:>14}"
+        lines.append(line)
     return "\n".join(lines) if own else ""
 
 

@@ -79,7 +79,10 @@ def contender_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting
 
 def _judged(rows: list[Row]) -> list[Row]:
     """Rows of one method by iterations, each with the status that it has among them."""
-    statuses = verdicts([row.error for row in rows], rows[0].uncertainty or 0.0) if rows else []
+    if not rows:
+        return []
+    energies = [row.error_energy for row in rows]
+    statuses = verdicts([row.error for row in rows], rows[0].uncertainty or 0.0, energies)
     return [replace(row, status=status) for row, status in zip(rows, statuses, strict=True)]
 
 

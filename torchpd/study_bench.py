@@ -47,6 +47,7 @@ _SOLVERS: tuple[tuple[Solver, int], ...] = ((Multilevel(), 300), (Chebyshev(), 3
 _DOUBTFUL = 0.1  # uncertainty of the converged step over the error that is measured from it
 _UNSEEN = 1e-8  # errors below are in no figure and no table
 _SCATTER = 1.3  # 95th over 5th percentile, of a machine that does something else too
+_LOWER = 1e-6  # energy below that of the converged step, relative to the first iterate's: more than rounding
 _DIVERGED = 2.0  # times as far from the converged step as the first iterate
 
 
@@ -217,12 +218,15 @@ def precision_name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-def verdicts(errors: Sequence[float], uncertainty: float = 0.0) -> list[str]:
+def verdicts(errors: Sequence[float], uncertainty: float = 0.0, energies: Sequence[float | None] = ()) -> list[str]:
     """The status of each row of a method, in the order of iterations: diverged is what stays far off to the end.
 
     Far off may be the first iterates of a method that descends in energy. Errors that the uncertainty of the converged
-    step is more than a tenth of are uncertain, and those that it may explain too.
+    step is more than a tenth of are uncertain, and those that it may explain too. So is all where any iterate has less
+    energy than the converged step: that is another minimum then, and not the lowest.
     """
+    if any(energy is not None and energy < -_LOWER for energy in energies):
+        return ["uncertain" if math.isfinite(error) else "diverged" for error in errors]
     # the least error from here on
     best = [*accumulate(reversed([e if math.isfinite(e) else math.inf for e in errors]), min)][::-1]
     found = []
@@ -278,7 +282,7 @@ def measure_step(
         precision=precision_name(sim.dtype),
         iterations=iterations,
         local_steps=iterations,
-        status=verdicts([errors.position], exact.uncertainty)[0],
+        status=verdicts([errors.position], exact.uncertainty, [errors.energy])[0],
         vertices=sim.vertices,
         tets=len(exact.problem.values.tets),
         time_step=sim.time_step,

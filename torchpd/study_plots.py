@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -238,28 +239,38 @@ def _draw_stiffness(rows: list[Row], path: Path, subject: str) -> Path:
 
 
 def _draw_cost(rows: list[Row], path: Path, subject: str) -> Path:
-    """The default in float32, error against milliseconds: what a user pays for accuracy."""
+    """The default and `Multilevel` in float32, error against milliseconds: what a user pays for accuracy."""
     from matplotlib.ticker import FuncFormatter
 
     own = [row for row in rows if row.precision == "float32" and row.milliseconds is not None]
     if not own:
         return path
     first = own[0]
-    title = f"{subject}, {first.tets:,} tetrahedra, {first.method}, float32: what accuracy costs on this machine"
+    title = f"{subject}, {first.tets:,} tetrahedra, float32: what accuracy costs on this machine"
     figure, (axis,) = _figure(1, title, width=8.2)
-    for youngs, color in zip(sorted({row.youngs for row in own}), _SHADES, strict=False):
-        curve = sorted((row for row in own if row.youngs == youngs), key=lambda row: row.iterations)
+    shades = dict(zip(sorted({row.youngs for row in own}), _SHADES, strict=False))
+    methods = list(dict.fromkeys(row.method for row in own))
+    for (youngs, color), method in itertools.product(shades.items(), methods):
+        of_both = (row for row in own if (row.youngs, row.method) == (youngs, method))
+        curve = sorted(of_both, key=lambda row: row.iterations)
+        main = method == DEFAULT
         xs = [row.milliseconds for row in curve]
         axis.fill_betweenx(
             _drawn(curve), [row.milliseconds_p5 for row in curve], [row.milliseconds_p95 for row in curve], color=color,
             alpha=0.15, linewidth=0,
         )  # fmt: skip
-        axis.plot(xs, _drawn(curve), color=color, linewidth=2.6, solid_capstyle="round", label=_pascals(youngs))
+        axis.plot(
+            xs, _drawn(curve), color=color, linewidth=2.6, linestyle="-" if main else (0, (2.2, 1.4)),
+            label=_pascals(youngs) if main else "",
+        )  # fmt: skip
         _mark_failures(axis, xs, curve, color)
         for row in (row for row in curve if row.default):
             axis.plot(
                 [row.milliseconds], _drawn([row]), "*", color=color, markersize=18, markeredgecolor="white", zorder=6
             )
+    for method in methods:
+        style = "-" if method == DEFAULT else (0, (2.2, 1.4))
+        axis.plot([], [], color=_INK, linewidth=2.0, linestyle=style, label=method)
     axis.plot([], [], "*", color=_INK, markersize=14, markeredgecolor="white", label="the default: 64 iterations")
     axis.axvline(1e3 * first.time_step, color=_INK, linewidth=1.0, linestyle=(0, (2, 3)))
     axis.annotate(
