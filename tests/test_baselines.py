@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 import torch
-from cases import Case, box, contact_block
+from cases import Case, box, contact_block, sliver_mesh
 from runs import simulator
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import torchpd as pd
 from torchpd import dense_direct
-from torchpd.baselines import BASELINES, GaussSeidel, colour_vertices, factorised, run_baseline, two_stage_rho
+from torchpd.baselines import (
+    BASELINES,
+    Baseline,
+    GaussSeidel,
+    colour_vertices,
+    factorised,
+    run_baseline,
+    two_stage_rho,
+)
+from torchpd.compiled_step import CompiledStep, CountedStep
 from torchpd.dense_direct import DENSE, DenseDirect
 from torchpd.newton_krylov import NewtonKrylov
-from torchpd.reference import StepProblem
-from torchpd.reference_solvers import newton, relative_error, solve_with_contact
+from torchpd.reference import StepProblem, step_problem
+from torchpd.reference_solvers import newton, preconditioned_lbfgs, relative_error, solve_with_contact
 
 
 def swinging() -> Case:
@@ -49,10 +60,128 @@ ENOUGH = {
     "Gauss-Seidel + Chebyshev": 200,
     "PCG global step": 60,
     "direct global step": 60,
+    "direct global step + Chebyshev": 30,
     "Newton": 12,
     "Newton-PCG with M": 12,
     "L-BFGS": 120,
+    "L-BFGS with A^-1": 25,
 }
+
+
+def compiled(problem: StepProblem) -> CompiledStep:
+    return CompiledStep(**{field.name: getattr(problem, field.name) for field in dataclasses.fields(StepProblem)})
+
+
+def everything(seed: int = 0) -> StepProblem:
+    """Slivers, each of its own stiffness, with hard and soft pins, gravity, drag and forces, out of shape."""
+    rng = np.random.default_rng(seed)
+    mesh = sliver_mesh((3, 2, 2), seed=seed)
+    body = pd.Solid(mesh, youngs=10.0 ** rng.uniform(4.0, 6.0, len(mesh.tets)))
+    pins = [pd.Pin(body, [0, 3]), pd.Pin(body, [5, 9], stiffness=2e4)]
+    values = pd.Scene(body, *pins, pd.Gravity(), pd.Damping(2.0)).values()
+    positions = mesh.vertices + 0.01 * rng.standard_normal(mesh.vertices.shape)
+    velocities, forces = rng.standard_normal((2, *positions.shape))
+    targets = values.pin_targets + 0.01 * rng.standard_normal(values.pin_targets.shape)
+    return step_problem(values, positions, velocities, 0.02, forces=forces, pin_targets=targets)
+
+
+def test_the_compiled_step_pulls_a_stretched_tetrahedron_back() -> None:
+    """Stretched by s along x: E = w V / 2 (s - 1)^2, and the force is its derivative; inertia by its formula."""
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    values = pd.Scene(pd.Solid(pd.TetMesh(vertices, [[0, 1, 2, 3]]), youngs=1e4, density=600.0)).values()
+    step = compiled(step_problem(values, vertices, 0.0 * vertices, 0.1))
+    u = vertices * [0.3, 0.0, 0.0]
+    # 25 kg at each vertex, m / h^2 = 2500 N/m, and one of them has moved by 0.3 m
+    assert step.energy(u) == pytest.approx(1e4 / 6.0 / 2.0 * 0.09 + 2500.0 / 2.0 * 0.09, rel=1e-13)
+    pull = 1e4 / 6.0 * 0.3
+    expected = [[-pull, 0.0, 0.0], [pull + 2500.0 * 0.3, 0.0, 0.0], [0.0] * 3, [0.0] * 3]
+    assert np.allclose(step.gradient(u), expected, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.01, 1.0], ids=["still", "near", "crumpled"])
+def test_the_compiled_step_is_that_of_the_reference(size: float) -> None:
+    """E, grad E and both, to rounding, and each of them counts as one local step."""
+    problem = everything()
+    step = compiled(problem)
+    u = size * np.random.default_rng(1).standard_normal(problem.positions.shape)
+    energy, gradient = problem.evaluate(u)
+    found = [step.evaluate(u), (step.energy(u), step.gradient(u))]
+    assert step.calls == [3]
+    for own, slopes in found:
+        assert own == pytest.approx(energy, rel=1e-12)
+        assert np.allclose(slopes, gradient, rtol=0, atol=1e-11 * np.abs(gradient).max())
+        assert not slopes[~problem.free].any()
+
+
+def test_local_steps_are_compiled_but_for_those_of_the_twins(problem: StepProblem) -> None:
+    for method in BASELINES.values():
+        seen: list[type] = []
+        asked = Baseline(lambda step, _, seen=seen: seen.append(type(step)) or (lambda *_: None),
+                         compiled_twin=method.compiled_twin)  # fmt: skip
+        run_baseline(asked, problem, problem.first_iterate(), 1)
+        assert seen == [CountedStep if method.compiled_twin else CompiledStep]
+        assert ("C++" in method.parts) == (method.compiled_twin is None)
+
+
+def test_blas_has_the_threads_of_torch_while_a_method_runs(problem: StepProblem) -> None:
+    seen: list[set[int]] = []
+
+    def threads() -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+    method = Baseline(lambda *_: lambda *_: seen.append(threads()))
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        with threadpool_limits(2, user_api="blas"):
+            run_baseline(method, problem, problem.first_iterate(), 1)
+            assert threads() == {2}
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [{1}]
+
+
+@pytest.mark.parametrize("name", ["direct global step", "direct global step + Chebyshev", "L-BFGS with A^-1"])
+def test_one_global_step_solves_a_free_fall(name: str) -> None:
+    """Along translations E is the quadratic of A: u_1 = u_0 - A^-1 grad E(u_0) falls as Newton's apple, and stays."""
+    case = contact_block(height=5.0, velocity=(1.0, 2.0, 3.0))
+    problem = case.problem()
+    fall = np.tile(case.time_step * (np.array([1.0, 2.0, 3.0]) + case.time_step * np.array([0.0, -9.8, 0.0])), (64, 1))
+    trace = run_baseline(BASELINES[name], problem, np.zeros_like(fall), 30)
+    for displacement in (trace.displacements[1], trace.displacements[trace.last]):
+        assert np.allclose(displacement, fall, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["direct global step + Chebyshev", "L-BFGS with A^-1"])
+def test_the_first_step_is_that_of_the_factorised_matrix(name: str, problem: StepProblem) -> None:
+    """A bounds the Hessian, so that it is no shorter than that."""
+    first, free = problem.first_iterate(), problem.free
+    expected = first.copy()
+    expected[free] -= np.linalg.solve(problem.matrix[free][:, free].toarray(), problem.gradient(first)[free])
+    found = run_baseline(BASELINES[name], problem, first, 1).displacements[1]
+    assert np.allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_a_step_that_is_too_long_is_halved() -> None:
+    """Ten times too long on a quadratic: 10, 5 and 2.5 rise, 1.25 of the way falls by enough."""
+    problem = contact_block(velocity=(1.0, 0.0, 0.0), gravity=(0.0, 0.0, 0.0)).problem()
+    zero = np.zeros_like(problem.positions)
+    with pytest.raises(RuntimeError, match="iteration 0 fails to lower the energy"):
+        preconditioned_lbfgs(problem, zero, factorised(problem), iterations=1, relaxation=10.0)
+    found = preconditioned_lbfgs(problem, zero, factorised(problem), iterations=1, relaxation=10.0, backtrack=True)
+    assert np.allclose(found, 1.25 * problem.target, rtol=0, atol=1e-12)
+
+
+def test_chebyshev_on_the_direct_step_has_the_iterates_of_the_dense_inverse(problem: StepProblem) -> None:
+    name = "direct global step + Chebyshev"
+    first = problem.first_iterate()
+    found = run_baseline(BASELINES[name], problem, first, 25).displacements
+    method = DenseDirect(simulator(swinging(), torch.float64), problem)
+    omegas = DENSE[f"{name}, dense"](problem, first, 25)
+    assert max(omegas) > 1.0
+    for count in (1, 11, 25):
+        expected = method.iterate(torch.from_numpy(first), omegas[:count]).numpy()
+        assert relative_error(found[count], expected, first) < 1e-9
 
 
 @pytest.mark.parametrize("name", BASELINES)
@@ -192,8 +321,8 @@ def test_newton_krylov_finds_contacts(ground: pd.Ground) -> None:
 
 def test_examination_is_not_imported_with_the_library() -> None:
     """Neither the methods to compare with nor what draws them: they are asked for by name."""
-    ours = ("baselines", "dense_direct", "study", "tuning", "accuracy")
-    modules = [*(f"torchpd.{name}" for name in ours), "plotly", "matplotlib"]
+    ours = ("baselines", "compiled_step", "dense_direct", "study", "tuning", "accuracy")
+    modules = [*(f"torchpd.{name}" for name in ours), "plotly", "matplotlib", "threadpoolctl"]
     code = f"import sys, torchpd; print([name for name in {modules} if name in sys.modules])"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == "[]"

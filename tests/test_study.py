@@ -46,7 +46,7 @@ from torchpd.study_bench import (
     time_calls,
     verdicts,
 )
-from torchpd.study_plots import STYLES, draw_study, float32_floor, pareto_front
+from torchpd.study_plots import STYLES, draw_study, float32_floor, in_words, pareto_front
 from torchpd.subjects import SUBJECTS, subject_of
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -99,12 +99,17 @@ def test_solvers_and_methods_meet_at_the_converged_step(bench: Bench) -> None:
     *_, theirs = baseline_rows(bench, "Newton", setting, [30])
     assert max(ours.error, theirs.error) < 1e-9
     assert (ours.compiled, theirs.compiled) == (True, False)
+    assert (ours.parts, theirs.parts) == ("", "C++, Hessian in NumPy, SuperLU")
     assert (ours.bytes_by, theirs.bytes_by) == ("layout", "tracemalloc")
     assert ours.milliseconds_p5 <= ours.milliseconds <= ours.milliseconds_p95
     (same,) = [row for row in baseline_rows(bench, "guarded Chebyshev, NumPy", setting, [8]) if row.iterations == 8]
     (compiled,) = contender_rows(bench, "guarded Chebyshev", torch.float64, setting, [8])
     # the same iterates in two languages
     assert same.error == pytest.approx(compiled.error, rel=1e-9)
+    assert (in_words(theirs), in_words(same)) == (
+        "Newton (float64: C++, Hessian in NumPy, SuperLU)",
+        "guarded Chebyshev, NumPy",
+    )
 
 
 def test_refusals_and_divergence_become_rows() -> None:
@@ -383,7 +388,15 @@ def bar(tmp_path: Path) -> str:
     return str(tmp_path / "bar.mesh")
 
 
-_NO_CONTACTS = ("Gauss-Seidel", "PCG global step", "direct global step", "Newton", "L-BFGS")
+_NO_CONTACTS = (
+    "Gauss-Seidel",
+    "PCG global step",
+    "direct global step",
+    "direct global step + Chebyshev",
+    "Newton",
+    "L-BFGS",
+    "L-BFGS with A^-1",
+)
 
 
 def test_a_body_that_lands_is_refused_by_methods_without_contacts(bar: str, tmp_path: Path) -> None:
@@ -437,7 +450,10 @@ def test_a_tetrahedral_mesh_lands(bar: str) -> None:
 
 
 def test_missing_packages_are_said_before_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(study, "missing_packages", lambda found: [p for p in found if p.module == "plotly"])
-    with pytest.raises(ModuleNotFoundError, match=r"plotly, not installed: pip install torchpd\[study\]"):
+    some = ("plotly", "threadpoolctl")
+    monkeypatch.setattr(study, "missing_packages", lambda found: [p for p in found if p.module in some])
+    with pytest.raises(
+        ModuleNotFoundError, match=r"plotly, threadpoolctl, not installed: pip install torchpd\[study\]"
+    ):
         run_study(StudyOptions(out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()

@@ -134,6 +134,25 @@ def test_an_audit_finds_the_error() -> None:
     assert sim.iterations == promise.iterations
 
 
+def test_what_is_not_doubted_is_not_audited(monkeypatch: pytest.MonkeyPatch) -> None:
+    sim = bar(dtype=torch.float64)
+    promise = sim.tune(swinging(sim), error=1e-2)
+    state = swinging(sim, batch=3)
+    after, info = sim(state, return_info=True)
+    full = promise.audit(sim, state, after)
+    # residuals at which half and twice the promised error are expected, and none
+    edge = promise.error / promise.error_per_residual
+    told = info._replace(residual=torch.tensor([0.5 * edge, 2.0 * edge, math.nan], dtype=torch.float64))
+    found = promise.audit(sim, state, after, info=told)
+    assert float(found[0]) == pytest.approx(0.5 * promise.error)
+    assert torch.equal(found[1:], full[1:])
+    calls: list[object] = []
+    monkeypatch.setattr(pd.Simulator, "forward", lambda *given, **more: calls.append(given))
+    calm = info._replace(residual=torch.full((3,), 0.5 * edge, dtype=torch.float64))
+    assert promise.audit(sim, state, after, info=calm).tolist() == promise.estimate(calm).tolist()
+    assert calls == []
+
+
 @pytest.mark.parametrize("error", [1e-5, 1e-7])
 def test_rounding_is_told_apart_from_error(error: float) -> None:
     """A float32 step has 10 eps |x| of it: more than such promises, which hold beyond it and are audited beyond it."""

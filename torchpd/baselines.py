@@ -1,10 +1,12 @@
-"""Methods of the literature on the step of `reference`, to compare the library with: float64, NumPy and SciPy.
+"""Methods of the literature on the step of `reference`, to compare the library with: float64, on the CPU.
 
-Iterations and errors of these are exact. Their milliseconds are those of vectorised NumPy and of SciPy's compiled
-solvers, not of tuned code: beside the compiled solvers of the library they are indications only, and the row
-"guarded Chebyshev, NumPy" says how much of the difference is the language. Every method takes its local step from
-`StepProblem.evaluate`, starts from the same iterate, and knows no contact unless it projects vertex by vertex (the
-Jacobi family) or works on active sets (Newton-PCG, smooth contacts).
+Iterations and errors of these are exact. Their local step is the compiled one of the library (`CompiledStep`) in as
+many threads, so that milliseconds compare methods. What is around it is `Baseline.parts`: SuperLU's triangular solves
+are compiled, but not tuned to a machine; what NumPy does vertex by vertex, colour by colour or element by element has
+costs of its own, and such milliseconds are upper bounds. The twins of compiled solvers, "..., NumPy", are NumPy
+throughout: "guarded Chebyshev, NumPy" beside "guarded Chebyshev" says what the language costs. Every method starts from
+the same iterate, and knows no contact unless it projects vertex by vertex (the Jacobi family) or works on active sets
+(Newton-PCG, smooth contacts).
 """
 
 from __future__ import annotations
@@ -13,18 +15,28 @@ import dataclasses
 import time
 import tracemalloc
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import cg, splu
 
+from .compiled_step import CompiledStep, CountedStep
 from .contact_newton import ContactNewton
 from .newton_krylov import NewtonKrylov
 from .reference import StepProblem
-from .reference_solvers import classic_chebyshev, classic_omegas, guarded_chebyshev, jacobi, newton
+from .reference_solvers import (
+    classic_chebyshev,
+    classic_omegas,
+    guarded_chebyshev,
+    jacobi,
+    newton,
+    preconditioned_lbfgs,
+)
 
 __all__ = [
     "BASELINES",
@@ -54,7 +66,8 @@ class Baseline:
 
     prepare: Callable[[StepProblem, Array], Run]
     contacts: bool = False  # knows planes and spheres
-    compiled_twin: str | None = None  # the contender that has the same iterates
+    compiled_twin: str | None = None  # the contender that has the same iterates; its local step stays NumPy's
+    parts: str = "NumPy"  # what it runs in
     iteration: str = "local step + global step"  # what one iteration is
     few: bool = False  # ten or twenty iterations find the minimum to rounding
 
@@ -73,17 +86,6 @@ class Trace:
     def last(self) -> int:
         """The last iteration that was carried out."""
         return max(self.displacements)
-
-
-@dataclass(frozen=True)
-class _Counted(StepProblem):
-    """A step that counts how often it was evaluated."""
-
-    calls: list[int] = field(default_factory=lambda: [0])
-
-    def evaluate(self, displacement: Array) -> tuple[float, Array]:
-        self.calls[0] += 1
-        return super().evaluate(displacement)
 
 
 def refuse_contacts(problem: StepProblem) -> None:
@@ -105,7 +107,7 @@ def run_baseline(
     memory: bool = False,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Trace:
-    """Iterate from `first`, keeping every iterate.
+    """Iterate from `first`, keeping every iterate; BLAS has as many threads as torch.
 
     Args:
         method: of `BASELINES`.
@@ -121,29 +123,40 @@ def run_baseline(
     if not method.contacts:
         refuse_contacts(problem)
     fields = {f.name: getattr(problem, f.name) for f in dataclasses.fields(StepProblem)}
-    counted = _Counted(**fields)
+    counted = (CountedStep if method.compiled_twin else CompiledStep)(**fields)
     if memory:
         tracemalloc.start()
     try:
-        begin = clock()
-        counted.evaluate(first)  # assembles the operator
-        run = method.prepare(counted, first)
-        trace = Trace(clock() - begin, {0: first}, {0: 0.0}, {0: 0})
-        counted.calls[0] = 0
-        stopwatch = _Stopwatch(clock)
+        with _blas_threads():
+            counted.evaluate(first)  # compiles the plan or assembles the operator: no method's own, and not timed
+            begin = clock()
+            run = method.prepare(counted, first)
+            trace = Trace(clock() - begin, {0: first}, {0: 0.0}, {0: 0})
+            counted.calls[0] = 0
+            stopwatch = _Stopwatch(clock)
 
-        def observe(iteration: int, displacement: Array) -> None:
-            with stopwatch.paused():
-                trace.displacements[iteration] = np.array(displacement)
-                trace.seconds[iteration] = stopwatch.seconds
-                trace.local_steps[iteration] = counted.calls[0]
+            def observe(iteration: int, displacement: Array) -> None:
+                with stopwatch.paused():
+                    trace.displacements[iteration] = np.array(displacement)
+                    trace.seconds[iteration] = stopwatch.seconds
+                    trace.local_steps[iteration] = counted.calls[0]
 
-        run(iterations, observe)
+            run(iterations, observe)
         trace.peak_bytes = tracemalloc.get_traced_memory()[1] if memory else 0
     finally:
         if memory:
             tracemalloc.stop()
     return trace
+
+
+def _blas_threads() -> AbstractContextManager[object]:
+    """As many for BLAS as torch has: processor time counts those that wait too."""
+    try:
+        from threadpoolctl import threadpool_limits
+    except ImportError:
+        raise ModuleNotFoundError("the study needs threadpoolctl: pip install torchpd[study]") from None
+    limits: AbstractContextManager[object] = threadpool_limits(torch.get_num_threads(), user_api="blas")
+    return limits
 
 
 class _Stopwatch:
@@ -319,7 +332,7 @@ def _newton(problem: StepProblem, first: Array) -> Run:
 
 def _newton_krylov(problem: StepProblem, first: Array) -> Run:
     """On active sets where there are contacts."""
-    passes = problem.calls if isinstance(problem, _Counted) else [0]
+    passes = problem.calls if isinstance(problem, CountedStep) else [0]
     planes, spheres = problem.values.planes, problem.values.spheres
     if not len(planes) and not len(spheres):
         method = NewtonKrylov(problem, passes)
@@ -328,6 +341,17 @@ def _newton_krylov(problem: StepProblem, first: Array) -> Run:
         raise ValueError("this method knows no friction; friction=0 makes contacts smooth")
     sets = ContactNewton(problem, passes)
     return lambda iterations, observe: _discard(sets.minimise(first, iterations=iterations, observe=observe))
+
+
+def _quasi_newton(problem: StepProblem, first: Array) -> Run:
+    """L-BFGS that starts from the global step, with backtracking (Liu, Bouaziz and Kavan 2017)."""
+    solve = factorised(problem)
+    return lambda iterations, observe: _discard(
+        preconditioned_lbfgs(
+            problem, first, solve, iterations=iterations, relaxation=1.0, memory=_LBFGS_PAIRS, backtrack=True,
+            observe=observe,
+        )
+    )  # fmt: skip
 
 
 def _lbfgs(problem: StepProblem, first: Array) -> Run:
@@ -363,19 +387,40 @@ BASELINES: dict[str, Baseline] = {
     "Jacobi, NumPy": Baseline(_jacobi, contacts=True, compiled_twin="Jacobi"),
     "classic Chebyshev, NumPy": Baseline(_classic, contacts=True, compiled_twin="classic Chebyshev"),
     "guarded Chebyshev, NumPy": Baseline(_guarded, contacts=True, compiled_twin="guarded Chebyshev"),
-    "Gauss-Seidel": Baseline(_plain(GaussSeidel), iteration="local step + one sweep over the colours"),
+    "Gauss-Seidel": Baseline(
+        _plain(GaussSeidel), iteration="local step + one sweep over the colours", parts="C++, sweeps in SciPy"
+    ),
     "Gauss-Seidel + Chebyshev": Baseline(
         _accelerated(lambda problem: GaussSeidel(problem, symmetric=True)),
         iteration="local step + sweep there and back",
+        parts="C++, sweeps in SciPy",
     ),
-    "PCG global step": Baseline(_plain(_conjugate_gradients), iteration="local step + CG to 1e-2"),
-    "direct global step": Baseline(_plain(factorised), iteration="local step + two triangular solves"),
-    "Newton": Baseline(_newton, iteration="Hessian, factorisation, line search", few=True),
+    "PCG global step": Baseline(
+        _plain(_conjugate_gradients), iteration="local step + CG to 1e-2", parts="C++, CG in SciPy"
+    ),
+    "direct global step": Baseline(
+        _plain(factorised), iteration="local step + two triangular solves", parts="C++, SuperLU"
+    ),
+    "direct global step + Chebyshev": Baseline(
+        _accelerated(factorised), iteration="local step + two triangular solves", parts="C++, SuperLU"
+    ),
+    "Newton": Baseline(
+        _newton,
+        iteration="Hessian, factorisation, line search",
+        few=True,
+        parts="C++, Hessian in NumPy, SuperLU",
+    ),
     "Newton-PCG with M": Baseline(
         _newton_krylov,
         contacts=True,
         few=True,
-        iteration="conjugate gradients on the Hessian (compiled; with contacts around it NumPy), line search",
+        iteration="conjugate gradients on the Hessian, line search",
+        parts="C++, torch; contacts in NumPy",
     ),
-    "L-BFGS": Baseline(_lbfgs, iteration="local step + two-loop recursion"),
+    "L-BFGS": Baseline(_lbfgs, iteration="local step + two-loop recursion", parts="C++, SciPy"),
+    "L-BFGS with A^-1": Baseline(
+        _quasi_newton,
+        iteration="local step + two-loop recursion around two triangular solves",
+        parts="C++, SuperLU, NumPy",
+    ),
 }

@@ -45,6 +45,7 @@ OPTIONAL = (
     Package("mitsuba", "mitsuba", "pictures"),
     Package("matplotlib", "matplotlib", "plots"),
     Package("plotly", "plotly", "reports of studies"),
+    Package("threadpoolctl", "threadpoolctl", "times of studies"),
     Package("PIL", "pillow", "pictures"),
     Package("imageio", "imageio", "GIF"),
     Package("imageio_ffmpeg", "imageio-ffmpeg", "MP4"),

@@ -72,7 +72,7 @@ class Forecast(NamedTuple):
         return math.exp(-self.rate * iterations)
 
     def left_by(self, tolerance: float) -> float:
-        """About |x - x*| / |x - x_t| where a tolerance stops: the last iteration changed it by (exp(rate) - 1) |x - x*|."""
+        """About |x - x*| / |x - x_t| where a tolerance stops: the last change was (exp(rate) - 1) |x - x*|."""
         return tolerance / math.expm1(self.rate)
 
 
@@ -164,9 +164,9 @@ def warn_of_few_iterations(sim: Model) -> None:
         left = expected.left_by(sim.tolerance)
         if left > FAR_TOO_FEW:
             warn_user(
-                f"Simulator: tolerance={sim.tolerance:g} may stop a step here that has about {min(left, 1.0):.1g} of its way "
-                f"still to go, for an iteration takes {math.expm1(expected.rate):.1g} of what is left. Give a smaller one, "
-                "or solver=torchpd.Multilevel()",
+                f"Simulator: tolerance={sim.tolerance:g} may stop a step here that has about {min(left, 1.0):.1g} of "
+                f"its way still to go, for an iteration takes {math.expm1(expected.rate):.1g} of what is left. Give a "
+                "smaller one, or solver=torchpd.Multilevel()",
                 UnsolvedWarning,
             )
         return

@@ -22,7 +22,8 @@ class Row:
     method: str
     status: str = "ok"  # else "diverged", "uncertain", or "refused: " and why
     precision: str = "float64"
-    compiled: bool = True  # C++ of this library, or NumPy and SciPy
+    compiled: bool = True  # a solver of this library, throughout C++; else `parts` says what is
+    parts: str = ""  # what a method of the literature runs in: "C++" is the local step of this library
     iterations: int = 0
     local_steps: int | None = None  # evaluations of all rotations
     youngs: float = 0.0  # Pa

@@ -197,12 +197,13 @@ def preconditioned_lbfgs(
     iterations: int,
     relaxation: float = 1.8,
     memory: int = 8,
+    backtrack: bool = False,
     observe: Observer | None = None,
 ) -> Array:
     """L-BFGS from H_0 = relaxation M, two loops over its pairs (Nocedal 1980), in a step without contact.
 
-    Every iteration takes a full step. One that fails the decrease of Armijo, 1e-4, is an error: what the library then
-    does is not textbook.
+    Every iteration takes a full step. One that fails the decrease of Armijo, 1e-4, is an error, since what the library
+    then does is not textbook; or it is halved until it does not, and the iterations end where no step descends.
 
     Args:
         problem: the step.
@@ -210,25 +211,34 @@ def preconditioned_lbfgs(
         precondition: M of a gradient [V, 3], zero at hard pins.
         iterations: to carry out.
         relaxation: of M, in (0, 2).
-        memory: pairs that are kept.
+        memory: pairs that are kept, of those that saw positive curvature.
+        backtrack: halve steps that fail.
         observe: sees (k, u_k) from the first update on.
     """
-    u, pairs = first, list[tuple[Array, Array]]()
+    u, pairs = first, list[tuple[Array, Array, float]]()
     energy, gradient = problem.evaluate(u)
     for k in range(iterations):
         direction, weights = gradient, []
-        for s, y in reversed(pairs):
-            weights.append(float((s * direction).sum()) / float((s * y).sum()))
+        for s, y, curvature in reversed(pairs):
+            weights.append(float(np.vdot(s, direction)) / curvature)
             direction = direction - weights[-1] * y
         direction = relaxation * precondition(direction)
-        for (s, y), weight in zip(pairs, reversed(weights), strict=True):
-            direction = direction + (weight - float((y * direction).sum()) / float((s * y).sum())) * s
-        following = u - direction
+        for (s, y, curvature), weight in zip(pairs, reversed(weights), strict=True):
+            direction = direction + (weight - float(np.vdot(y, direction)) / curvature) * s
         last, before = energy, gradient
-        energy, gradient = problem.evaluate(following)
-        if energy > last - 1e-4 * float((before * direction).sum()) + 1e-12 * abs(last):
-            raise RuntimeError(f"preconditioned_lbfgs: iteration {k} fails to lower the energy enough")
-        pairs = [*pairs, (following - u, gradient - before)][-memory:]
+        if backtrack:
+            following, energy, gradient = _descend(problem, u, energy, gradient, -direction)
+            if following is u:
+                break
+        else:
+            following = u - direction
+            energy, gradient = problem.evaluate(following)
+            if energy > last - 1e-4 * float(np.vdot(before, direction)) + 1e-12 * abs(last):
+                raise RuntimeError(f"preconditioned_lbfgs: iteration {k} fails to lower the energy enough")
+        s, y = following - u, gradient - before
+        curvature = float(np.vdot(s, y))
+        if curvature > 0.0:
+            pairs = [*pairs, (s, y, curvature)][-memory:]
         u = following
         if observe is not None:
             observe(k + 1, u)

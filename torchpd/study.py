@@ -43,7 +43,7 @@ __all__ = ["AXES", "SCHEMA", "StudyOptions", "cost_table", "paper_table", "run_s
 
 SCHEMA = 1
 AXES = ("solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper")
-_PACKAGES = ("matplotlib", "plotly")
+_PACKAGES = ("matplotlib", "plotly", "threadpoolctl")
 _STIFFNESS_FACTORS = (0.01, 0.1, 1.0)
 _STIFF, _STIFF_MOST = "Multilevel", 32  # the solver for stiff bodies, and its iterations there at most
 _TOLERANCES = [1e-2, 1e-3, 1e-4], 128  # of its steps elsewhere, and iterations at most
@@ -218,7 +218,7 @@ def _check(options: StudyOptions) -> None:
     missing = missing_packages(package for package in OPTIONAL if package.module in _PACKAGES)
     if missing:  # said before the work, not after it
         names = ", ".join(package.pip_name for package in missing)
-        raise ModuleNotFoundError(f"the study draws with {names}, not installed: pip install torchpd[study]")
+        raise ModuleNotFoundError(f"the study needs {names}, not installed: pip install torchpd[study]")
 
 
 _GOALS = (1e-1, 1e-2, 1e-3)
@@ -232,6 +232,8 @@ def study_table(rows: list[Row]) -> str:
     for name, precision in dict.fromkeys((row.method, row.precision) for row in solver):
         own = [row for row in solver if (row.method, row.precision) == (name, precision)]
         lines.append(f"{name:<{width}}{precision:<11}{_costs(own)}")
+    if any(row.parts for row in solver):
+        lines.append("methods of the literature, in float64, have the C++ local step too, but for ..., NumPy")
     if any(row.status == "uncertain" for row in rows):
         lines.append("uncertain: no converged step is known well enough to say so, or one of less energy was met")
     if any(row.refusal for row in solver):

@@ -46,7 +46,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-_REPEATS = 3  # of a method in NumPy
+_REPEATS = 3  # of a method of the literature
 _MEMORY_ITERATIONS = 3
 _NEWTON_ITERATIONS = 25
 
@@ -87,14 +87,15 @@ def _judged(rows: list[Row]) -> list[Row]:
 
 
 def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) -> list[Row]:
-    """A method in NumPy at several iteration counts, against the converged step."""
+    """A method of the literature at several iteration counts, against the converged step."""
     _, exact = bench.hard_step(setting)
-    most = min(max(counts), _NEWTON_ITERATIONS) if BASELINES[name].few else max(counts)
-    common: dict[str, Any] = {
-        "axis": "solver", "method": name, "compiled": False, "youngs": setting.youngs, "time_step": setting.time_step,
-        "vertices": len(exact.first), "tets": len(exact.problem.values.tets), "uncertainty": exact.uncertainty,
-    }  # fmt: skip
     method = BASELINES[name]
+    most = min(max(counts), _NEWTON_ITERATIONS) if method.few else max(counts)
+    common: dict[str, Any] = {
+        "axis": "solver", "method": name, "compiled": False, "parts": method.parts, "youngs": setting.youngs,
+        "time_step": setting.time_step, "vertices": len(exact.first), "tets": len(exact.problem.values.tets),
+        "uncertainty": exact.uncertainty,
+    }  # fmt: skip
     try:
         clock = clock_of(bench.device)
         traces = [run_baseline(method, exact.problem, exact.first, most, clock=clock) for _ in range(_REPEATS)]

@@ -13,12 +13,22 @@ import numpy as np
 from .contenders import DEFAULT
 from .ledger import Row
 
-__all__ = ["SLOPES", "STYLES", "TOP", "axis_label", "curves_of", "draw_study", "float32_floor", "pareto_front"]
+__all__ = [
+    "SLOPES",
+    "STYLES",
+    "TOP",
+    "axis_label",
+    "curves_of",
+    "draw_study",
+    "float32_floor",
+    "in_words",
+    "pareto_front",
+]
 
 TOP = 2.0  # where a failure is drawn: above the first iterate, whose error is 1
 _LOWEST = 1e-7
 # Okabe and Ito's palette, told apart with every kind of colour vision: ours in strong colours and full lines, methods
-# of the literature in thin ones, which are dashed where they are NumPy's.
+# of the literature in thin ones, which are dashed where Python takes much of their time.
 STYLES: dict[str, tuple[str, float, str]] = {
     DEFAULT: ("#d55e00", 2.8, "solid"),
     "classic Chebyshev": ("#0072b2", 2.0, "solid"),
@@ -30,16 +40,17 @@ STYLES: dict[str, tuple[str, float, str]] = {
     "Gauss-Seidel": ("#009e73", 1.2, "dashed"),
     "Gauss-Seidel + Chebyshev": ("#005c43", 1.2, "dashed"),
     "PCG global step": ("#e69f00", 1.2, "dashed"),
-    "direct global step": ("#8c5f00", 1.2, "dashed"),
+    "direct global step": ("#8c5f00", 1.2, "solid"),
+    "direct global step + Chebyshev": ("#e69f00", 1.2, "solid"),
     "direct global step, dense": ("#8c5f00", 1.6, "solid"),
     "direct global step + Chebyshev, dense": ("#e69f00", 1.6, "solid"),
     "Newton": ("#cc79a7", 1.2, "dashed"),
     "Newton-PCG with M": ("#1b1b1b", 1.2, "solid"),
     "L-BFGS": ("#7d3c98", 1.2, "dashed"),
+    "L-BFGS with A^-1": ("#7d3c98", 1.2, "solid"),
 }
 _OTHER = ("#b0447b", 2.0, "solid")  # of a solver that has joined since
-_LABELS = {  # of methods that are neither ours in float32 nor NumPy's
-    "Newton-PCG with M": "Newton-PCG with M, C++ float64",
+_LABELS = {  # of methods on a GPU
     "direct global step, dense": "direct global step, dense inverse (cuBLAS, float32)",
     "direct global step + Chebyshev, dense": "direct global step + Chebyshev, dense inverse (cuBLAS, float32)",
 }
@@ -59,6 +70,11 @@ def axis_label(name: str) -> str:
         "milliseconds": "time of a step [ms]",
         "iterations": "iterations of a step",
     }[name]
+
+
+def in_words(row: Row) -> str:
+    """A method of the literature, and what it runs in where its name does not say so."""
+    return row.method if "NumPy" in row.method else f"{row.method} (float64: {row.parts or 'NumPy'})"
 
 
 def pareto_front(rows: list[Row]) -> list[Row]:
@@ -140,7 +156,7 @@ def _note_uncertain(figure: Any, rows: list[Row]) -> None:
 
 
 def _shown(rows: list[Row]) -> dict[str, list[Row]]:
-    """Curves of the picture: ours in float32, methods in NumPy."""
+    """Curves of the picture: ours in float32, methods of the literature in float64."""
     chosen = [row for row in rows if row.method not in _REPEATED and (row.precision == "float32" or not row.compiled)]
     return dict(curves_of(chosen, lambda row: row.method))
 
@@ -158,8 +174,7 @@ def _draw_solvers(rows: list[Row], path: Path, subject: str) -> Path:
         if own[0].refusal:
             refused.setdefault(own[0].refusal, []).append(name)
             continue
-        label = f"{name}, C++ float32" if own[0].compiled else name if "NumPy" in name else f"{name}, NumPy"
-        label = _LABELS.get(name, label)
+        label = _LABELS.get(name, f"{name}, C++ float32" if own[0].compiled else in_words(own[0]))
         for axis, xs in ((left, [row.iterations for row in timed]), (right, [row.milliseconds for row in timed])):
             axis.plot(
                 xs, _drawn(timed), color=color, linewidth=width, linestyle=dash, label=label if axis is left else ""

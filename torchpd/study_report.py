@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from .ledger import Row
-from .study_plots import SLOPES, STYLES, TOP, axis_label, curves_of, pareto_front
+from .study_plots import SLOPES, STYLES, TOP, axis_label, curves_of, in_words, pareto_front
 
 __all__ = ["write_report"]
 
@@ -69,11 +69,12 @@ def _header(record: dict[str, Any]) -> str:
     what = ", ".join(f"{name} {version}" for name, version in versions.items())
     return (
         f"<p>Errors are |x &minus; x*| / |x<sub>0</sub> &minus; x*| of one time step: 1 is the first iterate, 0 the "
-        f"converged step. Full lines are compiled: the solvers of this library and, on a GPU, dense inverses in "
-        f"cuBLAS; dashed ones are NumPy and SciPy, whose iterations compare exactly and whose milliseconds are "
-        f"indications. Failures are crosses at the top; rings are uncertain, for want of a converged step to compare "
-        f"with; what is refused has not run. Click a name in a "
-        f"legend to hide it.</p>\n"
+        f"converged step. Thick lines are the solvers of this library; thin ones are methods of the literature: on a "
+        f"GPU dense inverses in cuBLAS, on the CPU, in float64, methods on the compiled local step of this library "
+        f"(C++) but for those with NumPy in their names. What is around that step is in brackets. Full lines are "
+        f"compiled in nearly all that takes time; dashed ones spend much of it in Python: their iterations compare "
+        f"exactly, their milliseconds are upper bounds. Failures are crosses at the top; rings are uncertain, for want "
+        f"of a converged step to compare with; what is refused has not run. Click a name in a legend to hide it.</p>\n"
         f"<pre>{html.escape(record['command'])}</pre>\n"
         f"<p>{html.escape(where)}<br>{html.escape(what)}<br>commit {html.escape(record['commit'][:12])}, "
         f"{html.escape(record['created'])}</p>"
@@ -173,6 +174,8 @@ def _solver_figure(rows: list[Row], place: Callable[[Row], float | None], axis: 
         color, width, dash = STYLES.get(name, _OTHER)
         if compiled:
             width, name = (width, f"{name}, float32") if precision == "float32" else (1.0, f"{name}, float64")
+        elif not own[0].refusal:
+            name = in_words(own[0])
         if own[0].refusal:
             figure.add_scatter(x=[None], y=[None], mode="markers", marker={"symbol": "x", "color": color},
                                name=f"{name} (refused: {own[0].refusal})", legendrank=1001)  # fmt: skip
