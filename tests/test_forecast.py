@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from typing import Any
 
@@ -139,9 +140,11 @@ def test_a_default_that_is_far_too_small_is_said_once_and_printed() -> None:
     assert warning.category is UnsolvedWarning
     assert warning.filename == __file__
     assert "the default of 64 iterations leaves an error of about 0.3" in str(warning.message)
-    # who names a number has decided; with a tolerance it is a limit; 64 of Multilevel are plenty
-    for options in ({}, {"iterations": None, "tolerance": 1e-4}, {"iterations": None, "solver": pd.Multilevel()}):
+    # who names a number has decided; 64 of Multilevel are plenty; a tolerance does not make 64 more
+    for options in ({}, {"tolerance": 1e-4}, {"iterations": None, "solver": pd.Multilevel()}):
         assert compiled(**options) == []
+    (limited,) = compiled(iterations=None, tolerance=1e-4)
+    assert "the default of 64 iterations" in str(limited.message)
     assert "64 leave about 0.3: far too few" in repr(beam(1e6, 5))
     assert "far too few" not in repr(beam(1e4, 5))
 
@@ -175,6 +178,13 @@ def test_a_tolerance_that_says_nothing_is_said() -> None:
     with pytest.warns(UnsolvedWarning, match=r"tolerance=0.001 may stop a step here that has about 1 of its way"):
         sim = beam(1e6, 5, solver=pd.Jacobi(), tolerance=1e-3)
     assert "tolerance 0.001 stops a step with about 1 of its way still to go" in repr(sim)
+    solid = pd.Solid(pd.shapes.box((1.0, 0.2, 0.2), (5, 1, 1)), 1e8)
+    for solver, parts, advice in (
+        (pd.Jacobi(), [], ", or solver=torchpd.Multilevel()"),
+        (pd.Multilevel(), [pd.Ground()], ""),
+    ):
+        with pytest.warns(UnsolvedWarning, match=rf"Give a smaller one{re.escape(advice)}$"):
+            pd.Simulator(pd.Scene(solid, *parts), 1 / 30, 100, solver, tolerance=0.05, progress=False)
     assert "tolerance 0.0001 stops a step with about 0.0005 of" in repr(beam(1e4, 5, tolerance=1e-4))
     assert "still to go" not in repr(beam(1e4, 5))
 

@@ -146,6 +146,9 @@ def test_what_is_not_doubted_is_not_audited(monkeypatch: pytest.MonkeyPatch) -> 
     found = promise.audit(sim, state, after, info=told)
     assert float(found[0]) == pytest.approx(0.5 * promise.error)
     assert torch.equal(found[1:], full[1:])
+    promise.doubt(True)
+    assert torch.equal(promise.audit(sim, state, after, info=told), full)
+    promise.doubt(False)
     calls: list[object] = []
     monkeypatch.setattr(pd.Simulator, "forward", lambda *given, **more: calls.append(given))
     calm = info._replace(residual=torch.full((3,), 0.5 * edge, dtype=torch.float64))

@@ -43,7 +43,7 @@ FAR_TOO_FEW = 0.1  # error that is left
 
 
 class UnsolvedWarning(UserWarning):
-    """The default iterations are far too few for this scene, time step and material."""
+    """The default iterations are far too few for this scene, time step and material, or a tolerance says little."""
 
 
 class Spectrum(NamedTuple):
@@ -152,29 +152,30 @@ def has_friction(sim: Model) -> bool:
     return any(bool((getattr(sim, name)[..., 4] > 0.0).any()) for name in ("planes", "spheres"))
 
 
-def warn_of_few_iterations(sim: Model) -> None:
-    """Say so when the default number of iterations leaves most of the error: the user may not know of the setting.
+def warn_of_few_iterations(sim: Model, *, default: bool) -> None:
+    """Say so when the default number of iterations leaves most of the error, or a tolerance most of the way.
 
-    With a tolerance, which makes that number a limit, when the tolerance does.
+    Args:
+        sim: as it was made.
+        default: the user gave no iterations, and may not know of the setting.
     """
     expected = forecast(sim)
     if expected is None:
         return
-    if sim.tolerance > 0.0:
-        left = expected.left_by(sim.tolerance)
-        if left > FAR_TOO_FEW:
-            warn_user(
-                f"Simulator: tolerance={sim.tolerance:g} may stop a step here that has about {min(left, 1.0):.1g} of "
-                f"its way still to go, for an iteration takes {math.expm1(expected.rate):.1g} of what is left. Give a "
-                "smaller one, or solver=torchpd.Multilevel()",
-                UnsolvedWarning,
-            )
-        return
-    if expected.error(sim.iterations) <= FAR_TOO_FEW:
-        return
-    warn_user(
-        f"Simulator: the default of {sim.iterations} iterations leaves an error of about "
-        f"{expected.error(sim.iterations):.1g} of a step here (1: nothing solved); {expected.words(1e-2)} "
-        'reach 1e-2. Give iterations=..., or take solver="auto", or ask sim.tune(error=1e-2)',
-        UnsolvedWarning,
-    )
+    if default and expected.error(sim.iterations) > FAR_TOO_FEW:
+        warn_user(
+            f"Simulator: the default of {sim.iterations} iterations leaves an error of about "
+            f"{expected.error(sim.iterations):.1g} of a step here (1: nothing solved); {expected.words(1e-2)} "
+            'reach 1e-2. Give iterations=..., or take solver="auto", or ask sim.tune(error=1e-2)',
+            UnsolvedWarning,
+        )
+    left = expected.left_by(sim.tolerance)
+    if left > FAR_TOO_FEW:
+        # what leaves more of it in an iteration stops later
+        other = "" if isinstance(sim.solver, Multilevel) or has_contacts(sim) else ", or solver=torchpd.Multilevel()"
+        warn_user(
+            f"Simulator: tolerance={sim.tolerance:g} may stop a step here that has about {min(left, 1.0):.1g} of its "
+            f"way still to go, for an iteration takes {math.expm1(expected.rate):.1g} of what is left. Give a smaller "
+            f"one{other}",
+            UnsolvedWarning,
+        )

@@ -84,7 +84,7 @@ class Model(nn.Module):
         else:
             self.solver = given
             if iterations is None or self.tolerance > 0.0:
-                warn_of_few_iterations(self)
+                warn_of_few_iterations(self, default=iterations is None)
 
     @property
     def vertices(self) -> int:

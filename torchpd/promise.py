@@ -92,12 +92,12 @@ class Promise:
             after: where it ended.
             forces: that the step was given.
             targets: that it was given.
-            info: of the step. Environments that `estimate` does not doubt get their estimate, and where it doubts none,
-                as in two of three steps that keep the promise, nothing is solved; that awaits a GPU.
+            info: of the step. Environments that `estimate` does not doubt get their estimate, and where it doubts none
+                of the batch, as in two of three steps that keep the promise, nothing is solved; that awaits a GPU.
         """
         if info is not None:
             estimate = self.estimate(info)
-            trusted = estimate <= self.error  # not a number is doubtful
+            trusted = (estimate <= self.error) & (not self.other_material)  # not a number is doubtful
             if bool(trusted.all()):
                 return estimate
             return torch.where(trusted, estimate, self.audit(sim, state, after, forces, targets))

@@ -52,7 +52,8 @@ class Simulator(Model):
             steps; `print(sim)` says why. It chooses anew when the simulator moves to another device and in
             `prepare_solver`.
         dtype: precision, torch.float32 or torch.float64.
-        tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never.
+        tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never. What that
+            leaves `print(sim)` tells; where it is a tenth of the way or more an `UnsolvedWarning` says so.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "cluster", "grid" or "stream", see
             `torchpd.regimes`; "auto" takes the first that fits. Changes nothing on the CPU.
         batch: environments that a step will have, where you know it: a GPU's kernel for a small mesh, the patches and
