@@ -64,8 +64,9 @@ class Costs(NamedTuple):
 
 # Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers,
 # those of further environments with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were
-# measured on "block" with 1024 environments of 256 and 936 vertices, on "cluster" and "grid" with 16 of 936 to 10,309;
-# the squares fit these sizes. `Multilevel` runs alike on "grid" and "stream".
+# measured on "block" with 1024 environments of 256 and 936 vertices, on "grid" with 16 of 3,321 and 10,309, and on
+# "cluster" with Chebyshev by `benchmarks/few_environments.py`; the squares fit these sizes. Of `Multilevel`, which has
+# a kernel of its own, "block" and "cluster" share a fit, and so do "grid" and "stream".
 COSTS: dict[str, Costs] = {
     "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
     "block": Costs(Cost(2.6, 5.0, 0.033, 0.022), Cost(31.0, 3.0, 0.6, 0.79)),

@@ -171,7 +171,7 @@ def warn_of_few_iterations(sim: Model, *, default: bool) -> None:
         )
     left = expected.left_by(sim.tolerance)
     if left > FAR_TOO_FEW:
-        # what leaves more of it in an iteration stops later
+        # contacts leave Multilevel to Jacobi iterations, whose changes are as small
         other = "" if isinstance(sim.solver, Multilevel) or has_contacts(sim) else ", or solver=torchpd.Multilevel()"
         warn_user(
             f"Simulator: tolerance={sim.tolerance:g} may stop a step here that has about {min(left, 1.0):.1g} of its "

@@ -265,27 +265,26 @@ def _draw_cost(rows: list[Row], path: Path, subject: str) -> Path:
     figure, (axis,) = _figure(1, title, width=8.2)
     shades = dict(zip(sorted({row.youngs for row in own}), _SHADES, strict=False))
     methods = list(dict.fromkeys(row.method for row in own))
+    dashes = {method: "-" if method == DEFAULT else (0, (2.2, 1.4)) for method in methods}
     for (youngs, color), method in itertools.product(shades.items(), methods):
         of_both = (row for row in own if (row.youngs, row.method) == (youngs, method))
         curve = sorted(of_both, key=lambda row: row.iterations)
-        main = method == DEFAULT
         xs = [row.milliseconds for row in curve]
         axis.fill_betweenx(
             _drawn(curve), [row.milliseconds_p5 for row in curve], [row.milliseconds_p95 for row in curve], color=color,
             alpha=0.15, linewidth=0,
         )  # fmt: skip
         axis.plot(
-            xs, _drawn(curve), color=color, linewidth=2.6, linestyle="-" if main else (0, (2.2, 1.4)),
-            label=_pascals(youngs) if main else "",
+            xs, _drawn(curve), color=color, linewidth=2.6, linestyle=dashes[method],
+            label=_pascals(youngs) if method == methods[0] else "",
         )  # fmt: skip
         _mark_failures(axis, xs, curve, color)
         for row in (row for row in curve if row.default):
             axis.plot(
                 [row.milliseconds], _drawn([row]), "*", color=color, markersize=18, markeredgecolor="white", zorder=6
             )
-    for method in methods:
-        style = "-" if method == DEFAULT else (0, (2.2, 1.4))
-        axis.plot([], [], color=_INK, linewidth=2.0, linestyle=style, label=method)
+    for method, dash in dashes.items():
+        axis.plot([], [], color=_INK, linewidth=2.0, linestyle=dash, label=method)
     axis.plot([], [], "*", color=_INK, markersize=14, markeredgecolor="white", label="the default: 64 iterations")
     axis.axvline(1e3 * first.time_step, color=_INK, linewidth=1.0, linestyle=(0, (2, 3)))
     axis.annotate(

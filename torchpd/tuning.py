@@ -142,9 +142,10 @@ def tune(
     if not promise.attained:
         warn_user(f"tune: {promise}", TuningWarning)
     elif min(study.roundings) > promise.error:
+        finer = "; a simulator with dtype=torch.float64 has far less" if sim.dtype == torch.float32 else ""
         warn_user(
-            f"tune: {promise}: more than the error, in every state of the study, which therefore shows little of it; "
-            "a simulator with dtype=torch.float64 has none",
+            f"tune: {promise}: more than the error, in every state of the study, which therefore shows little of "
+            f"it{finer}",
             TuningWarning,
         )
     return promise

@@ -13,7 +13,7 @@ _NOT_USERS = (__package__, "torch", "")  # code that torch generates has no name
 
 
 class TuningWarning(UserWarning):
-    """The target of `Simulator.tune` cannot be reached; the promise says what can."""
+    """The target of `Simulator.tune` cannot be reached, and the promise says what can; or rounding hides it."""
 
 
 def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
