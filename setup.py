@@ -110,7 +110,7 @@ def make_extension():
         depends=[path for suffix in ("h", "cuh", "inl", "def") for path in relative(f"**/*.{suffix}")],
         include_dirs=[str(ROOT / "csrc")],
         define_macros=[("TORCHPD_CUDA", None)] if cuda else [],
-        extra_compile_args={"cxx": cxx, "nvcc": list(TOOLKIT["NVCC_FLAGS"])},
+        extra_compile_args={"cxx": cxx, "nvcc": [*TOOLKIT["NVCC_FLAGS"], *TOOLKIT["NVCC_PACKING"]]},
         extra_link_args=threads,
     )
 

@@ -89,7 +89,9 @@ def compile_on(scene: GpuScene, dtype: torch.dtype, device: torch.device) -> tup
     torch.cuda.reset_peak_memory_stats(device)
     kernel = kernel_on(scene.kernel, device)
     begin = time.perf_counter()
-    sim = pd.Simulator(parts, TIME_STEP, scene.iterations, dtype=dtype, progress=False, kernel=kernel).to(device)
+    sim = pd.Simulator(
+        parts, TIME_STEP, scene.iterations, dtype=dtype, progress=False, kernel=kernel, batch=scene.batch
+    ).to(device)
     torch.cuda.synchronize(device)
     facts = {
         "kernel": sim.plan.kernel,

@@ -31,7 +31,7 @@ from tqdm import tqdm
 
 import torchpd as pd
 from torchpd.accuracy import problem_of
-from torchpd.automatic import COSTS
+from torchpd.automatic import CPU_CHEBYSHEV, Cost, multilevel_cost
 from torchpd.forecast import forecast
 from torchpd.solvers import Solver
 from torchpd.study_bench import clock_of
@@ -252,24 +252,32 @@ def _plain(number: float) -> str:
     return f"{number:,.1f}" if number < 10.0 else f"{float(f'{number:.2g}'):,.0f}"
 
 
+def cost_in_use(name: str, row: Row) -> Cost | None:
+    """What `torchpd.automatic` holds for a solver; None for Chebyshev on a GPU: see `kernels_by_batch.py`."""
+    if name == "Multilevel":
+        return multilevel_cost(row["vertices"], on_gpu=row["kernel"] is not None)
+    return CPU_CHEBYSHEV if row["kernel"] is None else None
+
+
 def costs_of_batches(rows: list[Row]) -> str:
-    """What `torchpd.automatic.COSTS` holds of environments beside the first, for which the table's number is taken."""
+    """What `torchpd.automatic` holds of environments beside the first, for which its own number is taken."""
     lines = []
     for row in rows:
-        kernel, vertices = row["kernel"] or "cpu", row["vertices"]
+        vertices, batch = row["vertices"], row["batch"]
         for name, own in row["solvers"].items():
-            cost, took = getattr(COSTS[kernel], name.lower()), own["microseconds_an_iteration"]
-            other = (took - cost.first(vertices)) / (row["batch"] - 1)
-            lines.append(
-                f"{kernel}: {name}, {row['batch']} of {vertices:,} vertices: {took:.3g} us an iteration, "
-                f"{cost.iteration(vertices, row['batch']):.3g} by the table; every environment but the first adds "
-                f"{other:.2g} us, {cost.other(vertices):.2g} by the table"
-            )
+            cost, took = cost_in_use(name, row), own["microseconds_an_iteration"]
+            line = f"{row['kernel'] or 'cpu'}: {name}, {batch} of {vertices:,} vertices: {took:.3g} us an iteration"
+            if cost is not None:
+                line += (
+                    f", {cost.iteration(vertices, batch):.3g} by the table; every environment but the first adds "
+                    f"{(took - cost.first(vertices)) / (batch - 1):.2g} us, {cost.other(vertices):.2g} by the table"
+                )
+            lines.append(line)
     return "\n".join(lines)
 
 
 def costs(rows: list[Row]) -> str:
-    """Microseconds of an iteration by kernel and size: what `torchpd.automatic.COSTS` holds."""
+    """Microseconds of an iteration by kernel and size: what `torchpd.automatic` holds."""
     lines = []
     for kernel in sorted({row["kernel"] or "cpu" for row in rows}):
         for name in SOLVERS:
@@ -281,8 +289,9 @@ def costs(rows: list[Row]) -> str:
             # relative errors count: the table serves every size
             design = np.stack([1.0 / times, sizes / times], axis=1)
             latency, each = np.linalg.lstsq(design, np.ones(len(own)), rcond=None)[0]
-            table_has = getattr(COSTS[kernel], name.lower())
-            lines.append(f"{kernel}: {name}: Cost({latency:.2g}, {each:.3g}) measured, {table_has} in use")
+            cost = cost_in_use(name, own[0])
+            in_use = "" if cost is None else f", {cost} in use"
+            lines.append(f"{kernel}: {name}: Cost({latency:.2g}, {each:.3g}) measured{in_use}")
     return "\n".join(lines)
 
 

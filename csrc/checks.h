@@ -1,5 +1,6 @@
 // Tensors to views: every check of an op's arguments, and nothing else.
 #pragma once
+#include "plan/shared_memory.h"
 #include "plan/views.h"
 
 #include <ATen/ATen.h>
@@ -212,6 +213,9 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
                     "plan.sizes must name a kernel, 0 to 3, and at least one patch, one alone for "
                     "kernel 0, got kernel ",
                     plan.kernel, " and ", plan.patches, " patches; compile the scene again");
+  TORCH_CHECK_VALUE(plan.environments >= 0 && plan.environments <= most_environments,
+                    "plan.sizes must have a multiprocessor work on 0 to ", most_environments,
+                    " environments, got ", plan.environments, "; compile the scene again");
   TORCH_CHECK_VALUE(plan.blocks <= most_blocks, "plan.sizes must count up to ", most_blocks,
                     " blocks of 32 pairs of tetrahedra, whose corners 32 bits count, got ",
                     plan.blocks, "; compile the scene again, with fewer patches");

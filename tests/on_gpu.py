@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -126,6 +128,20 @@ def poll() -> None:
     reached.record()
     while not reached.query():
         pass
+
+
+def threads_of(call: Callable[[], object], folder: Path) -> set[int]:
+    """Threads a block of the kernels that a call gives to the device; empty where the profiler sees none."""
+    call()
+    torch.cuda.synchronize()
+    activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=activities) as profile:
+        call()
+        torch.cuda.synchronize()
+    trace = folder / "trace.json"
+    profile.export_chrome_trace(str(trace))
+    events = json.loads(trace.read_text())["traceEvents"]
+    return {event["args"]["block"][0] for event in events if event.get("cat") == "kernel"}
 
 
 def device_work(call: Callable[[], object]) -> list[str]:

@@ -180,15 +180,21 @@ def test_costs_are_fitted_to_the_times_of_iterations() -> None:
 
 @pytest.mark.usefixtures("on_path")
 def test_costs_of_a_batch_come_beside_the_first_environment() -> None:
-    from time_to_error import COSTS, costs_of_batches
+    from time_to_error import CPU_CHEBYSHEV, cost_in_use, costs_of_batches, multilevel_cost
 
-    row = {**_time_to_error_row(300, 20, "Multilevel"), "kernel": "block", "vertices": 500, "batch": 11}
-    for own, cost in zip(row["solvers"].values(), COSTS["block"], strict=True):
+    row = {**_time_to_error_row(300, 20, "Multilevel"), "kernel": None, "vertices": 500, "batch": 11}
+    table = CPU_CHEBYSHEV, multilevel_cost(500, on_gpu=False)
+    for own, cost in zip(row["solvers"].values(), table, strict=True):
         own["microseconds_an_iteration"] = cost.iteration(500) + 10 * 0.15
     lines = costs_of_batches([row]).splitlines()
     assert [line.split(" adds ")[1].split(" us, ")[0] for line in lines] == ["0.15", "0.15"]
-    table = [f"{cost.other(500):.2g} by the table" for cost in COSTS["block"]]
-    assert [line.split(" us, ")[-1] for line in lines] == table
+    assert [line.split(" us, ")[-1] for line in lines] == [f"{cost.other(500):.2g} by the table" for cost in table]
+    # of a GPU Chebyshev's are elsewhere
+    row["kernel"] = "block"
+    plain, levels = costs_of_batches([row]).splitlines()
+    assert plain.endswith("us an iteration")
+    assert f"{multilevel_cost(500, on_gpu=True).other(500):.2g} by the table" in levels
+    assert cost_in_use("Multilevel", {**row, "vertices": 5000}) == multilevel_cost(5000, on_gpu=True)
 
 
 @pytest.mark.usefixtures("on_path")

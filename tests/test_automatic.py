@@ -15,8 +15,10 @@ from runs import same_bits
 import torchpd as pd
 from torchpd import automatic, model
 from torchpd.accuracy import exact_steps
-from torchpd.automatic import AIM, COSTS, Cost, Costs
-from torchpd.plan import KERNELS
+from torchpd.automatic import AIM, CPU_CHEBYSHEV, Cost, multilevel_cost
+from torchpd.gpu import H100
+from torchpd.kernel_costs import iteration_microseconds
+from torchpd.regimes import choose_plan
 from torchpd.subjects import SUBJECTS
 
 
@@ -25,6 +27,11 @@ def beam(youngs: float, cells: int = 5, **options: Any) -> pd.Simulator:
     body = pd.Solid(mesh, youngs=youngs)
     scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
     return pd.Simulator(scene, 1 / 30, progress=False, **{"solver": "auto", **options})
+
+
+def set_costs(monkeypatch: pytest.MonkeyPatch, chebyshev: Cost, multilevel: Cost) -> None:
+    monkeypatch.setattr(automatic, "CPU_CHEBYSHEV", chebyshev)
+    monkeypatch.setattr(automatic, "CPU_MULTILEVEL", multilevel)
 
 
 def swinging(sim: pd.Simulator) -> pd.State:
@@ -92,34 +99,35 @@ def test_a_tolerance_leaves_hard_steps_their_iterations() -> None:
 
 def test_costs_decide(monkeypatch: pytest.MonkeyPatch) -> None:
     """At 1e6 Pa some 370 iterations stand against 19: Chebyshev wins when one of Multilevel costs 100 of its."""
-    monkeypatch.setitem(automatic.COSTS, "cpu", Costs(Cost(1.0, 1.0), Cost(100.0, 100.0)))
+    set_costs(monkeypatch, Cost(1.0, 1.0), Cost(100.0, 100.0))
     assert isinstance(beam(1e6).solver, pd.Chebyshev)
-    monkeypatch.setitem(automatic.COSTS, "cpu", Costs(Cost(1.0, 1.0), Cost(1.0, 1.0)))
+    set_costs(monkeypatch, Cost(1.0, 1.0), Cost(1.0, 1.0))
     assert isinstance(beam(1e4).solver, pd.Multilevel)
 
 
 @pytest.mark.parametrize(("youngs", "outer"), [(1e4, "lbfgs"), (1e6, "corotated")])
 def test_short_steps_do_without_the_small_problem(youngs: float, outer: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(automatic.COSTS, "cpu", Costs(Cost(1.0, 1.0), Cost(1.0, 1.0)))
+    set_costs(monkeypatch, Cost(1.0, 1.0), Cost(1.0, 1.0))
     assert beam(youngs).solver == pd.Multilevel(outer)  # type: ignore[arg-type]
 
 
-def test_every_kind_of_device_has_costs() -> None:
-    assert set(COSTS) == {"cpu", *KERNELS}
-    for costs in COSTS.values():
-        for batch in (1, 1024):
-            times = [cost.iteration(10_000, batch) for cost in (costs.chebyshev, costs.multilevel)]
-            assert times[1] > times[0] > 0.0
-
-
-def test_costs_of_clusters_are_those_that_were_measured() -> None:
-    """Within a factor of 1.6: clusters run in waves, whose length goes by their number of blocks."""
-    file = Path(__file__).parent.parent / "benchmarks" / "results" / "few-environments-h100.json"
-    for row in json.loads(file.read_text())["rows"]:
-        for batch, took in zip(row["batches"], row["microseconds"]["cluster"], strict=True):
-            if batch > 1:
-                estimate = 64 * COSTS["cluster"].chebyshev.iteration(row["vertices"], batch)
-                assert 1 / 1.6 < took / estimate < 1.6, (row["tets"], batch)
+@pytest.mark.parametrize("multiprocessors", [20, 132, 170])
+def test_multilevel_costs_more_than_chebyshev_everywhere(
+    multiprocessors: int, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An iteration has the same local step: on every GPU, in both precisions, for any number of environments."""
+    for cells in (3, 9, 10, 20):
+        scene = pd.Scene(pd.Solid(pd.shapes.box((1.0, 1.0, 1.0), (cells,) * 3), 1e5))
+        sim = pd.Simulator(scene, 1 / 60, dtype=dtype, progress=False)
+        times = [
+            cost.iteration(sim.vertices, 16) for cost in (CPU_CHEBYSHEV, multilevel_cost(sim.vertices, on_gpu=False))
+        ]
+        assert [automatic._chebyshev_time(sim, 16), automatic._multilevel_time(sim, 16)] == times
+        assert times[1] > 2.0 * times[0] > 0.0
+        for batch in (1, 16, 1024):
+            gpu = H100._replace(multiprocessors=multiprocessors)
+            sim.plan = choose_plan(scene.values(), dtype, gpu, batch=batch, progress=False)
+            assert automatic._multilevel_time(sim, batch) > 2.0 * automatic._chebyshev_time(sim, batch) > 0.0
 
 
 def test_time_of_a_batch() -> None:
@@ -136,14 +144,23 @@ def test_time_of_a_batch() -> None:
 
 @pytest.mark.parametrize("size", ["1k", "3k"])
 def test_few_environments_get_the_solver_that_was_faster(size: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the measured steps of 16 beams on a GPU; here the CPU has the costs of their kernel."""
+    """Of the measured steps of 16 beams on a GPU, with the costs of one: the choice itself is the same on the CPU."""
     file = Path(__file__).parent.parent / "benchmarks" / "results" / "time-to-error-cuda-batch-16.json"
     rows = [row for row in json.loads(file.read_text())["rows"] if row["size"] == size]
     subject = SUBJECTS["beam"]()
     mesh = subject.mesh({"1k": 5, "3k": 8}[size])
+
+    def chebyshev_time(sim: pd.Simulator, batch: int) -> float:
+        plan = choose_plan(sim.scene.values(), sim.dtype, H100, batch=batch, progress=False)
+        return iteration_microseconds(plan, len(mesh.tets), batch, H100)
+
+    def multilevel_time(sim: pd.Simulator, batch: int) -> float:
+        return multilevel_cost(sim.vertices, on_gpu=True).iteration(sim.vertices, batch)
+
+    monkeypatch.setattr(automatic, "_chebyshev_time", chebyshev_time)
+    monkeypatch.setattr(automatic, "_multilevel_time", multilevel_time)
     chosen = []
     for row in rows:
-        monkeypatch.setitem(automatic.COSTS, "cpu", COSTS[row["kernel"]])
         scene = subject.scene(mesh, row["youngs"])
         sim = pd.Simulator(scene, subject.time_step, solver="auto", batch=row["batch"], progress=False)
         took = [row["solvers"][name]["milliseconds"]["median"] for name in ("Chebyshev", "Multilevel")]
@@ -159,7 +176,7 @@ def test_few_environments_get_the_solver_that_was_faster(size: str, monkeypatch:
 
 def test_the_batch_decides_where_environments_share_a_device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """As on a GPU: Multilevel's iteration costs 9 times as much for one environment, 30 times for a thousand."""
-    monkeypatch.setitem(automatic.COSTS, "cpu", Costs(Cost(1.0, 0.0, 0.04), Cost(9.0, 0.0, 1.22)))
+    set_costs(monkeypatch, Cost(1.0, 0.0, 0.04), Cost(9.0, 0.0, 1.22))
     unknown, alone, many = beam(1e6), beam(1e6, batch=1), beam(1e6, batch=1024)
     assert isinstance(unknown.solver, pd.Multilevel)
     assert isinstance(alone.solver, pd.Multilevel)

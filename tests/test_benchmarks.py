@@ -348,7 +348,7 @@ def test_a_gpu_that_is_missing_is_refused() -> None:
     ended = run("--device", "cuda", "--quick")
     assert ended.returncode == 2
     assert "torch finds no CUDA device" in ended.stderr
-    ended = run(script="few_environments.py")
+    ended = run(script="kernels_by_batch.py")
     assert ended.returncode == 2
     assert "torch finds no CUDA device" in ended.stderr
 

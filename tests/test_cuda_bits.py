@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -18,6 +20,7 @@ from on_gpu import (
     moved,
     on_gpu,
     small_on_gpu,
+    threads_of,
 )
 from runs import moving, noise, same_bits, state_of
 from test_determinism import assert_same_bits, different_environments, run
@@ -63,6 +66,33 @@ def test_runs_and_batches_do_not_matter(
         assert_same_bits([t[item : item + 1] for t in together], alone)
     some = torch.tensor([5, 3, 4000, 16, 0], device=GPU)
     assert_same_bits(run(sim, state, forces, some), [t[some] for t in together])
+
+
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize("cells", [(3, 3, 3), (8, 5, 5), (6, 6, 6)])
+def test_the_shape_of_a_block_does_not_matter(cells: tuple[int, int, int], precision: str, tmp_path: Path) -> None:
+    """It follows from the batch that a simulator is told, whatever comes then; only sums over vertices differ by it."""
+    dtype, rows = DTYPES[precision], 700
+    case = bar(cells, pd.Gravity(), pd.Ground(-0.02, friction=0.4), pd.Damping(0.5), pinned=False)
+
+    def made(solver: pd.Jacobi | pd.Chebyshev, batch: int | None) -> pd.Simulator:
+        return on_gpu(case, dtype, "block", iterations=14, solver=solver, batch=batch)
+
+    for solver in (pd.Jacobi(), pd.Chebyshev()):
+        plain = made(solver, None)
+        state, forces = unlike(plain, rows)
+        expected = run(plain, state, forces)
+        shapes = set()
+        for batch in (1, 200, 2000, 10_000):
+            sim = made(solver, batch)
+            assert sim.plan.size("environments") == -(-batch // properties_of(GPU).multiprocessors)
+            together = run(sim, state, forces)
+            # an iterate asks for a sum only where the energy rises, and for the translation of a free body
+            near = 200 * torch.finfo(dtype).eps
+            torch.testing.assert_close(together[0], expected[0], rtol=0.0, atol=near)
+            assert_same_bits(run(sim, state, forces, slice(3, 4)), [t[3:4] for t in together])
+            shapes.add(frozenset(threads_of(partial(sim, state, forces), tmp_path)))
+        assert len(shapes) > 1 or shapes == {frozenset()}
 
 
 @pytest.mark.usefixtures("poisoned")

@@ -332,7 +332,7 @@ def test_a_mesh_that_does_not_fit_is_refused_and_auto_finds_a_kernel() -> None:
     # what few environments get is what one may ask for
     few = simulator(small, torch.float32, GPU, batch=1)
     assert few.plan.kernel == ("cluster" if has_clusters() else "block")
-    asked = simulator(small, torch.float32, GPU, kernel=few.plan.kernel)
+    asked = simulator(small, torch.float32, GPU, kernel=few.plan.kernel, batch=1)
     assert same_bits(few(few.rest_state()), asked(asked.rest_state()))
     assert "; for a batch of 1; " in str(few)
     assert simulator(small, torch.float32, GPU, batch=1024).plan.kernel == "block"

@@ -265,6 +265,7 @@ def test_sizes_count_the_arrays(kernel: int, case: tuple[str, int], values: Scen
         "most_interior": np.diff(plan.patch_vertex).max(),
         "most_shared": shared.max(),
         "most_parts": np.diff(plan.patch_part).max() if len(free) else 0,
+        "environments": 0,
     }
     assert dict(zip(SIZES, plan.sizes.tolist(), strict=True)) == expected
 

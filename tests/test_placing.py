@@ -11,13 +11,12 @@ from runs import simulate, simulator, small_case
 
 import torchpd as pd
 from torchpd import model, placing
-from torchpd.gpu import Properties
+from torchpd.gpu import H100
 from torchpd.material import material_of
 from torchpd.plan import Plan, compile_plan
 from torchpd.regimes import choose_plan
 
 GPU = torch.device("cuda", 0)
-H100 = Properties(132, 232_448, cluster=16)
 STEP = 123_456  # bytes
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import pickle
 import re
 import runpy
@@ -15,15 +14,15 @@ import torch
 from cases import box
 
 import torchpd as pd
-from torchpd import _C, model, placing, regimes
-from torchpd.gpu import Properties, refuse_full_memory, why_not
+from torchpd import _C, kernel_costs, model, placing, regimes
+from torchpd.gpu import H100, Properties, refuse_full_memory, why_not
 from torchpd.multilevel import precondition_plan
 from torchpd.plan import KERNELS, Plan, compile_plan
 from torchpd.regimes import choose_plan, shared_bytes
 from torchpd.scene import SceneValues
 from torchpd.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 
-H100, A100 = Properties(132, 232_448, cluster=16), Properties(108, 166_912)
+A100 = Properties(108, 166_912)
 SMALL = Properties(20, 101_376)
 REAL = {torch.float32: 4, torch.float64: 8}
 
@@ -269,41 +268,6 @@ def test_many_environments_of_several_patches_get_levels() -> None:
     assert is_direct(4, 1024)
 
 
-@pytest.mark.parametrize("cells", [(15, 3, 3), (8, 5, 5), (25, 5, 5)])
-def test_few_environments_are_those_that_clusters_are_sooner_done_with(cells: tuple[int, int, int]) -> None:
-    """For no batch that was measured on an H100 is the kernel that "auto" takes a fifth slower than the other."""
-    vertices, tets = box((0.1 * cells[0], 0.1 * cells[1], 0.1 * cells[2]), cells)
-    values = pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e5)).values()
-    file = Path(__file__).parent.parent / "benchmarks" / "results" / "few-environments-h100.json"
-    (row,) = (row for row in json.loads(file.read_text())["rows"] if row["tets"] == len(tets))
-    assert row["vertices"] == len(vertices)
-    for number, batch in enumerate(row["batches"]):
-        times = {kernel: series[number] for kernel, series in row["microseconds"].items()}
-        kernel = choose_plan(values, torch.float32, H100, batch=batch).kernel
-        assert times[str(kernel)] <= 1.2 * min(times.values()), (batch, kernel)
-        # nor would it be another with fewer environments, or the same one with all of them
-        assert kernel == ("cluster" if batch <= 16 else "block" if batch >= 96 else kernel)
-
-
-def test_clusters_in_three_waves_come_before_a_block(dtype: torch.dtype) -> None:
-    """By hand: of 132 multiprocessors with a block each 115 have room for whole clusters of ten, eleven of them."""
-    values = values_of((5, 5, 5))
-    plan = choose_plan(values, dtype, H100, "cluster")
-    threads = _C.cluster_threads(REAL[dtype], plan.size("most_pairs"), plan.size("most_interior"))
-    assert (plan.patches, threads) == (10, 224)  # two blocks would want more registers than there are
-    kernels = [choose_plan(values, dtype, H100, batch=batch).kernel for batch in (None, 1, 33, 34, 1024)]
-    assert kernels == ["block", "cluster", "cluster", "block", "block"]
-    # on a small GPU one cluster runs at a time, and no environment more than there are multiprocessors is one of few
-    tiny = H100._replace(multiprocessors=10)
-    kernels = [choose_plan(values_of((2, 2, 2)), dtype, tiny, batch=batch).kernel for batch in (10, 11)]
-    assert kernels == ["cluster", "block"]
-    # what is asked for counts, and what fits
-    assert choose_plan(values, dtype, H100, "block", batch=1).kernel == "block"
-    assert choose_plan(values, dtype, H100._replace(cluster=1), batch=1).kernel == "block"
-    large = values_of((14, 14, 14))
-    assert choose_plan(large, dtype, H100, batch=1, progress=False).kernel == "grid"
-
-
 @pytest.mark.parametrize(("source", "dtype"), [("float", torch.float32), ("double", torch.float64)])
 def test_registers_of_clusters_are_those_of_the_table(source: str, dtype: torch.dtype) -> None:
     """Of sm_90, the first that has clusters; a multiprocessor hands them out in eights."""
@@ -314,7 +278,7 @@ def test_registers_of_clusters_are_those_of_the_table(source: str, dtype: torch.
         for row in rows
         if row["source"] == f"cuda-fused_{source}.cu" and row["architecture"] == "90" and "Blocks)1," in row["kernel"]
     ]
-    assert -(-max(used) // 8) * 8 == regimes._CLUSTER_REGISTERS[dtype]
+    assert -(-max(used) // 8) * 8 == kernel_costs._CLUSTER_REGISTERS[dtype]
 
 
 def test_a_simulator_passes_its_batch_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,8 +131,9 @@ def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...], mo
     told = simulator(bare(pd.Ground()), torch.float32, batch=7)
     told.plan = sim.plan
     assert "; for a batch of 7; " in str(told)
-    told.kernel = "block"
-    assert "for a batch" not in str(told)
+    for kernel, depends in (("block", True), ("grid", True), ("cluster", False), ("stream", False)):
+        told.kernel = kernel
+        assert ("; for a batch of 7; " in str(told)) == depends
 
 
 @pytest.mark.parametrize("kernel", ["block", "stream"])

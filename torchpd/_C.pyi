@@ -56,6 +56,7 @@ outer_static_bytes: int
 corotation_bytes: int
 known_inertia: float
 pass_static_bytes: int
+most_environments: int
 
 def pass_shared_bytes(real: int, slots: int, entries: int, fields: int) -> int: ...
 def outer_shared_bytes(real: int, slots: int, entries: int) -> int: ...

@@ -12,13 +12,18 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+import torch
+
 from .forecast import Forecast, Spectrum, forecast, has_contacts, spectrum_of
+from .gpu import H100
+from .kernel_costs import iteration_microseconds
+from .multilevel import MOST_DIRECT
 from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
 
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["AIM", "COSTS", "Choice", "Cost", "Costs", "choose_solver", "runs"]
+__all__ = ["AIM", "CPU_CHEBYSHEV", "Choice", "Cost", "choose_solver", "multilevel_cost", "runs"]
 
 AIM = 1e-3  # error of a step that "auto" sets its iterations for
 MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes
@@ -55,25 +60,19 @@ class Cost(NamedTuple):
         return min(self.first(vertices), self.more * thousands + self.square * thousands**2)
 
 
-class Costs(NamedTuple):
-    """Of the two solvers where a scene runs; only their ratio matters."""
+# Float32. `benchmarks/time_to_error.py` measures these numbers, those of further environments with --batch. The CPU's
+# are of one AVX-512 core, the GPU's of an H100, where Chebyshev's are those of `torchpd.kernel_costs`.
+CPU_CHEBYSHEV, CPU_MULTILEVEL = Cost(0.5, 45.0), Cost(2.0, 170.0)
+# Batches were measured with 1024 environments of 256 and 936 vertices, and with 16 of 3,321 and 10,309; the squares fit
+# these sizes. Up to MOST_DIRECT vertices M is an inverse, without levels.
+_SMALL_MULTILEVEL, _LARGE_MULTILEVEL = Cost(31.0, 3.0, 0.6, 0.79), Cost(50.0, 2.4, 0.85, 0.073)
 
-    chebyshev: Cost
-    multilevel: Cost
 
-
-# Float32, by the kernel of a GPU (`torchpd.regimes`) or "cpu". `benchmarks/time_to_error.py` measures these numbers,
-# those of further environments with --batch. The CPU's are of one AVX-512 core, the GPU's of an H100. Batches were
-# measured on "block" with 1024 environments of 256 and 936 vertices, on "grid" with 16 of 3,321 and 10,309, and on
-# "cluster" with Chebyshev by `benchmarks/few_environments.py`; the squares fit these sizes. Of `Multilevel`, which has
-# a kernel of its own, "block" and "cluster" share a fit, and so do "grid" and "stream".
-COSTS: dict[str, Costs] = {
-    "cpu": Costs(Cost(0.5, 45.0), Cost(2.0, 170.0)),
-    "block": Costs(Cost(2.6, 5.0, 0.033, 0.022), Cost(31.0, 3.0, 0.6, 0.79)),
-    "cluster": Costs(Cost(0.8, 0.5, 0.3), Cost(28.0, 9.0, 0.6, 0.79)),
-    "grid": Costs(Cost(1.2, 0.13, 0.3), Cost(50.0, 2.4, 0.85, 0.073)),
-    "stream": Costs(Cost(6.0, 0.18), Cost(50.0, 2.4, 0.85, 0.073)),
-}
+def multilevel_cost(vertices: int, *, on_gpu: bool) -> Cost:
+    """Of an iteration of `Multilevel`."""
+    if not on_gpu:
+        return CPU_MULTILEVEL
+    return _SMALL_MULTILEVEL if vertices <= MOST_DIRECT else _LARGE_MULTILEVEL
 
 
 @dataclass(frozen=True)
@@ -119,10 +118,8 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     if not runs(multilevel, sim):
         where = f"{sim.device} with kernel={sim.kernel!r}" if sim.device.type == "cuda" else str(sim.device)
         return chebyshev, chosen(_enough(plain), f"{counts}, and Multilevel does not run on {where}")
-    costs = COSTS[sim.plan.kernel or "cpu"]
     batch = sim.batch or 1
-    times = [cost.iteration(sim.vertices, batch) for cost in (costs.chebyshev, costs.multilevel)]
-    ratio = times[1] / times[0]
+    ratio = _multilevel_time(sim, batch) / _chebyshev_time(sim, batch)
     both = f"{counts}, or {levels.words(AIM)} of Multilevel, each as long as {ratio:.2g}"
     both += f" in a batch of {batch}" if batch > 1 else ""
     if iterations is None:
@@ -133,6 +130,21 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     if better:
         return multilevel, chosen(_enough(levels), both)
     return chebyshev, chosen(_enough(plain), both)
+
+
+def _chebyshev_time(sim: Model, batch: int) -> float:
+    """Microseconds of an iteration of so many environments, in float32, on a GPU with its own plan on an H100.
+
+    So are those of Multilevel, whatever the GPU and precision are: only their ratio matters.
+    """
+    if sim.plan.kernel is None:
+        return CPU_CHEBYSHEV.iteration(sim.vertices, batch)
+    return iteration_microseconds(sim.plan, sim.stiffness.shape[-1], batch, H100, torch.float32)
+
+
+def _multilevel_time(sim: Model, batch: int) -> float:
+    """The same of `Multilevel`."""
+    return multilevel_cost(sim.vertices, on_gpu=sim.plan.kernel is not None).iteration(sim.vertices, batch)
 
 
 def _known(expected: Forecast | None) -> Forecast:

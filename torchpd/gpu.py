@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from .plan import Plan
 
 __all__ = [
+    "H100",
     "LEAST_CAPABILITY",
     "Properties",
     "free_memory",
@@ -32,6 +33,9 @@ class Properties(NamedTuple):
     multiprocessors: int
     shared: int  # bytes of shared memory that a block may have
     cluster: int = 1  # blocks that may reach each other's shared memory, at most
+
+
+H100 = Properties(132, 232_448, cluster=16)  # that of the measurements
 
 
 def properties_of(device: torch.device) -> Properties:
@@ -117,5 +121,5 @@ def refuse_full_memory(needed: int, free: int) -> None:
         raise RuntimeError(
             f"Simulator: plan, material and a step need {needed:,} B of memory on the GPU and {free:,} B are free: "
             "free some (torch.cuda.empty_cache(), other processes), take a coarser mesh, torch.float32 or a smaller "
-            "batch, or stay on the CPU"
+            'batch (kernel="grid" works on fewer environments at a time than "stream"), or stay on the CPU'
         )

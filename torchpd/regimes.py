@@ -6,8 +6,9 @@
     grid     a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
     stream   launches for every iteration: any mesh
 
-A few environments of a small mesh are done in two fifths of the time with "cluster" as with "block", which is for many
-(`Simulator(batch=...)` says which they are).
+Where the number of environments is known (`Simulator(batch=...)`), the kernel that fits and should take least is taken,
+by `kernel_costs`: a cluster for a few environments of a small mesh, launches for many of a large one, and between them
+a grid, of fewer and larger patches the more environments are to run at a time.
 Every vertex belongs to one patch of a cluster, and a patch has every tetrahedron that touches one of its own vertices:
 those at the borders are worked out by several. So no forces are exchanged, and once an iteration the new position of a
 vertex is sent into the shared memory of the patches that have a copy of it. Patches of the others share no tetrahedra,
@@ -29,9 +30,10 @@ import torch
 from . import _C
 from .device_plan import compile_device_plan
 from .gpu import Properties
+from .kernel_costs import block_microseconds, grid_microseconds, iteration_microseconds, stream_microseconds
 from .plan import KERNELS, Plan, any_of
 from .scene import SceneValues
-from .tables import DEVICE_PLAN_TABLE
+from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 
 __all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
@@ -39,13 +41,6 @@ _GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than th
 # "auto" looks at clusters for meshes of so many at most; where there are blocks, a patch of one for every so many
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
 _CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
-# waves of clusters that are done before blocks, an environment a multiprocessor, are: 64 iterations take a wave 71 to
-# 91 us, and blocks 213 to 457 (benchmarks/results/few-environments-h100.json)
-_CLUSTER_WAVES = 3
-# registers of a multiprocessor, and of a thread of a cluster (benchmarks/results/cuda-registers.csv): what a wave has
-# room for, but for the share of a GPU that whole clusters leave free
-_REGISTERS, _CLUSTER_REGISTERS = 65536, {torch.float32: 168, torch.float64: 256}
-_CLUSTER_SHARE = 7 / 8
 # with a multilevel solver environments are many where they have no more multiprocessors than so many each
 _MANY_SHARE = 4
 # with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block, of a mesh of so many at
@@ -114,7 +109,7 @@ class _Scene(NamedTuple):
             wanted = max(2, self.tets // _CLUSTER_EACH, math.ceil(self.vertices / (_CLUSTER_OWN * self.most_own())))
             return min(gpu.cluster, gpu.multiprocessors, wanted, self.vertices, self.tets)
         if kernel == "grid":
-            return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
+            return self.most_grid_patches(gpu)
         if kernel in _LEVELS:
             if self.tets <= (_FEW_ALONE if kernel == "few" else _LEVEL_ALONE):
                 return 1
@@ -130,6 +125,20 @@ class _Scene(NamedTuple):
         wave = _STREAM_TOGETHER[self.dtype] * gpu.multiprocessors
         return patches if patches <= wave else -(-patches // wave) * wave
 
+    def most_grid_patches(self, gpu: Properties) -> int:
+        """Of a grid: as many as leave each its least number of tetrahedra."""
+        return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
+
+    def grids(self, batch: int, gpu: Properties) -> list[tuple[float, int]]:
+        """Times that an iteration of so many environments should take with numbers of patches, and these; best first.
+
+        Of the numbers with which one environment, two, three... run at a time the largest.
+        """
+        most = self.most_grid_patches(gpu)
+        counts = {min(most, gpu.multiprocessors // together) for together in range(1, gpu.multiprocessors // 2 + 1)}
+        timed = [(grid_microseconds(self.tets, count, batch, self.dtype, gpu), count) for count in counts or {most}]
+        return sorted(timed, key=lambda offer: (offer[0], -offer[1]))
+
     def most_own(self) -> int:
         """Vertices that a block of a cluster has threads for."""
         return next(count - 1 for count in itertools.count(1) if not _C.fits_cluster(self.real, 1, count))
@@ -137,17 +146,6 @@ class _Scene(NamedTuple):
     def considers(self, kernel: str, gpu: Properties) -> bool:
         """Whether "auto" looks at a kernel."""
         return kernel != "cluster" or (gpu.cluster > 1 and self.tets <= _CLUSTER_TETS)
-
-    def are_few(self, batch: int | None, gpu: Properties) -> bool:
-        """Whether so many environments are done sooner with clusters than with blocks."""
-        if batch is None or batch > gpu.multiprocessors or not self.considers("cluster", gpu):
-            return False
-        plan, _ = _fused_plan(self, "cluster", gpu)
-        if plan is None:
-            return False
-        threads = _C.cluster_threads(self.real, plan.size("most_pairs"), plan.size("most_interior"))
-        blocks = max(1, _REGISTERS // (threads * _CLUSTER_REGISTERS[self.dtype])) * gpu.multiprocessors
-        return batch <= _CLUSTER_WAVES * max(1, int(_CLUSTER_SHARE * blocks) // plan.patches)
 
     def refuse_unbuilt(self, kernel: str, patches: int, gpu: Properties) -> str:
         """What is too much of a kernel whatever the plan, which need not be built then; empty where nothing is."""
@@ -167,9 +165,11 @@ class _Scene(NamedTuple):
         return f"patches smaller than {pairs} pairs of tetrahedra and {interior} vertices"
 
 
-def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | None, str]:
-    """The plan, and what it needs; None where there is not as much."""
-    patches = scene.patches(kernel, gpu)
+def _fused_plan(
+    scene: _Scene, kernel: str, gpu: Properties, batch: int | None = None, patches: int | None = None
+) -> tuple[Plan | None, str]:
+    """The plan, of so many patches if they are given, and what it needs; None where there is not as much."""
+    patches = scene.patches(kernel, gpu) if patches is None else patches
     refusal = scene.refuse_unbuilt(kernel, patches, gpu)
     if refusal:
         return None, refusal
@@ -181,8 +181,52 @@ def _fused_plan(scene: _Scene, kernel: str, gpu: Properties) -> tuple[Plan | Non
         refusal = scene.refuse_patch(plan.size("most_pairs"), plan.size("most_interior"))
         if refusal:
             return None, refusal
+    if kernel == "block" and batch is not None:
+        each = -(-batch // gpu.multiprocessors)
+        plan.sizes[DEVICE_SIZES.index("environments")] = min(each, _C.most_environments)
     needed = scene.shared_bytes(plan)
     return (plan if needed <= gpu.shared else None), f"{needed:,} B"
+
+
+def _grid_plan(scene: _Scene, gpu: Properties, batch: int | None) -> tuple[Plan | None, str]:
+    """As `_fused_plan`, of as many patches as are best for so many environments, and fit."""
+    if batch is None:
+        return _fused_plan(scene, "grid", gpu)
+    plan, needed, too_few = None, "", 0
+    for _, patches in scene.grids(batch, gpu):
+        if plan is None and patches > too_few:
+            plan, needed = _fused_plan(scene, "grid", gpu, patches=patches)
+            too_few = patches
+    return plan, needed
+
+
+def _quickest_plan(scene: _Scene, gpu: Properties, batch: int) -> Plan:
+    """Of the kernels that fit the one that should take least for so many environments."""
+    cluster = _fused_plan(scene, "cluster", gpu)[0] if scene.considers("cluster", gpu) else None
+    offers = [
+        (block_microseconds(scene.tets, batch, scene.dtype, gpu), "block", 1),
+        *((time, "grid", patches) for time, patches in scene.grids(batch, gpu)),
+        (stream_microseconds(scene.tets, batch, scene.dtype, gpu), "stream", 0),
+    ]
+    if cluster is not None:
+        offers.append((iteration_microseconds(cluster, scene.tets, batch, gpu), "cluster", cluster.patches))
+    too_few = 0  # patches of a grid
+    for time, kernel, patches in sorted(offers, key=lambda offer: offer[0]):
+        if kernel == "stream":
+            plan: Plan | None = _stream_plan(scene, gpu)
+        elif kernel == "grid" and patches <= too_few:
+            continue
+        else:
+            plan = cluster if kernel == "cluster" else _fused_plan(scene, kernel, gpu, batch, patches)[0]
+        if plan is not None:
+            return replace(plan, why=f"should be the quickest that fits, {_microseconds(time)} an iteration on an H100")
+        if kernel == "grid":
+            too_few = patches
+    raise AssertionError("a stream fits always")
+
+
+def _microseconds(time: float) -> str:
+    return f"about {time:.1f} us" if time < 10.0 else f"about {time:,.0f} us"
 
 
 def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
@@ -234,8 +278,8 @@ def choose_plan(
         values: the flat arrays of `Scene.values`.
         dtype: torch.float32 or torch.float64.
         gpu: what the device has.
-        kernel: "auto" takes the first of "block", "cluster", "grid" and "stream" that fits; a "cluster" where the GPU
-            has them, and for a small mesh alone, and before a "block" for few environments.
+        kernel: "auto" takes the first of "block", "cluster", "grid" and "stream" that fits, and where the batch is
+            known the quickest for it; a "cluster" where the GPU has them, and for a small mesh alone.
         levels: for a multilevel solver, which runs as "stream" does but for its iterations.
         batch: environments that a step will have; None: not known, which is between few and many.
         progress: show a bar when the mesh is large.
@@ -252,15 +296,16 @@ def choose_plan(
     if kernel == "cluster" and gpu.cluster == 1:
         raise ValueError(
             'Simulator: kernel="cluster" needs thread blocks that reach each other\'s shared memory (NVIDIA compute '
-            'capability 9.0), and this GPU has none; take "block", "grid" or "stream", or "auto", which takes the '
-            "first that fits"
+            'capability 9.0), and this GPU has none; take "block", "grid" or "stream", or "auto", which takes one '
+            "that fits"
         )
+    if kernel == "auto" and batch is not None:
+        return _quickest_plan(scene, gpu, batch)
     needs = []
-    few = kernel == "auto" and scene.are_few(batch, gpu)
-    for name in ("cluster", "block", "grid") if few else ("block", "cluster", "grid"):
+    for name in ("block", "cluster", "grid"):
         if kernel != name and not (kernel == "auto" and scene.considers(name, gpu)):
             continue
-        plan, needed = _fused_plan(scene, name, gpu)
+        plan, needed = _grid_plan(scene, gpu, batch) if name == "grid" else _fused_plan(scene, name, gpu, batch)
         needs.append(f"{name} needs {needed}")
         if plan is not None:
             return replace(plan, why=_reason(kernel, needs, gpu))
@@ -269,7 +314,7 @@ def choose_plan(
             others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.considers(other, gpu)]
             raise ValueError(
                 f"Simulator: kernel={kernel!r} does not fit this GPU: {_facts(needs, gpu)}; take {any_of(others)}, or "
-                '"auto", which takes the first that fits'
+                '"auto", which takes one that fits'
             )
     return replace(_stream_plan(scene, gpu), why=_reason(kernel, needs, gpu))
 

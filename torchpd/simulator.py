@@ -55,12 +55,13 @@ class Simulator(Model):
         tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never. What that
             leaves `print(sim)` tells; where it is a tenth of the way or more an `UnsolvedWarning` says so.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "cluster", "grid" or "stream", see
-            `torchpd.regimes`; "auto" takes the first that fits. Changes nothing on the CPU.
-        batch: environments that a step will have, where you know it: a GPU's kernel for a small mesh, the patches and
-            preconditioner of `Multilevel` and the choice of "auto" are for so many. States of any batch may come, and
-            an environment has the same bits in all of them, but takes longer in some. None: not known: a small mesh
-            gets "block", which is for many, and "auto" chooses for one. `sim.batch` may be set later. Changes nothing
-            on the CPU.
+            `torchpd.regimes`; "auto" takes the first that fits, and with `batch` the quickest. Changes nothing on the
+            CPU.
+        batch: environments that a step will have, where you know it: a GPU's kernel, its patches and thread blocks, the
+            patches and preconditioner of `Multilevel` and the choice of "auto" are for so many. States of any batch may
+            come, and an environment has the same bits in all of them, but takes longer in some. None: not known: a
+            small mesh gets "block", which is for many, and "auto" chooses for one. `sim.batch` may be set later.
+            Changes nothing on the CPU.
         progress: show a bar while a large scene compiles.
     """
 

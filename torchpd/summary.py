@@ -132,8 +132,9 @@ def _kernel_lines(sim: Simulator) -> list[str]:
     others = any_of([name for name in _LAUNCHES if name != kernel])
     if kernel == "block" and sim.batch is None:
         others = others.replace('"cluster"', '"cluster", sooner done with a few environments (batch=1)')
-    chosen = sim.kernel == "auto" or plan.for_levels
-    batch = f"; for a batch of {sim.batch}" if sim.batch and chosen else ""
+    # those whose plan is the same for every batch
+    fixed = sim.kernel in ("cluster", "stream") and not plan.for_levels
+    batch = f"; for a batch of {sim.batch}" if sim.batch and not fixed else ""
     asked = "" if plan.for_levels else f"; Simulator(..., kernel=...) may ask for {others}"
     return [
         f"kernel {kernel}: {launches}",

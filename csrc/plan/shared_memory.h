@@ -8,6 +8,9 @@ namespace pd {
 constexpr std::size_t fused_control_bytes = 1024;
 
 // `bytes` and what fills them up to a multiple of 16
+// Of a multiprocessor, which the shape of a block is chosen for: with more of them the choice is the same.
+constexpr int most_environments = 1 << 20;
+
 constexpr std::size_t aligned(std::size_t bytes) { return (bytes + 15) / 16 * 16; }
 
 // one vector of every slot in four numbers, or two in six (cuda/slots.h)

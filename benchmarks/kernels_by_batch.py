@@ -1,0 +1,120 @@
+"""Which kernel of a GPU is the quickest for how many environments, and whether "auto" takes it.
+
+Bars that are held at one end and swing, 64 guarded iterations. A time is that of a CUDA graph of one step, so the start
+of the graph is in it; medians. Every kernel that fits is made for the batch, as "auto" makes it, and the times stand
+beside those that `torchpd.kernel_costs` expects.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import statistics
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from gpu_scenes import GpuScene
+from gpu_timing import event_times, recorded
+from machine import describe_run
+from scenes import TIME_STEP
+from tqdm import tqdm
+
+import torchpd as pd
+from torchpd.gpu import properties_of
+from torchpd.kernel_costs import iteration_microseconds
+from torchpd.plan import KERNELS
+
+Row = dict[str, Any]
+
+# cells
+MESHES = ((3, 3, 3), (15, 3, 3), (8, 5, 5), (15, 4, 4), (25, 5, 5), (19, 8, 8), (40, 8, 8), (39, 15, 15), (60, 24, 24))
+BATCHES = (1, 2, 4, 8, 16, 32, 64, 132, 264, 1024, 8192)
+IRREGULAR = ((3, 3, 3), (15, 4, 4), (9, 9, 9), (40, 8, 8), (60, 24, 24))  # in float32
+MOST_TETS = 8_000_000  # of all environments
+REPETITIONS = 5
+
+
+def measured(scene: GpuScene, dtype: torch.dtype) -> Row | None:
+    """Of one kernel: what it takes, what is expected, and its patches. None where it does not fit."""
+    try:
+        sim = pd.Simulator(
+            scene.build(), TIME_STEP, scene.iterations, dtype=dtype, progress=False, kernel=scene.kernel,
+            batch=scene.batch,
+        ).to("cuda")  # fmt: skip
+    except ValueError as error:
+        if re.search("does not fit this GPU|needs thread blocks that reach", str(error)) is None:
+            raise
+        return None
+    state = scene.start(sim)
+    graph = recorded(lambda: sim(state), 1)
+    seconds = statistics.median(event_times(graph.replay, repetitions=REPETITIONS, seconds=0.0))
+    tets = sum(len(body.mesh.tets) for body in sim.scene.solids)
+    return {
+        "patches": sim.plan.patches,
+        "microseconds": 1e6 * seconds / scene.iterations,
+        "expected": iteration_microseconds(sim.plan, tets, scene.batch, properties_of(sim.device)),
+    }
+
+
+def measure_batch(mesh: str, cells: tuple[int, int, int], batch: int, dtype: torch.dtype) -> Row:
+    """One row of the result: microseconds of an iteration by kernel, and the kernel that "auto" took."""
+    scene = GpuScene("bars", cells, batch, mesh=mesh)
+    sim = pd.Simulator(scene.build(), TIME_STEP, 1, dtype=dtype, progress=False, batch=batch).to("cuda")
+    made = {kernel: measured(replace(scene, kernel=kernel), dtype) for kernel in KERNELS}
+    fits = {kernel: row for kernel, row in made.items() if row is not None}
+    best = min(fits, key=lambda kernel: fits[kernel]["microseconds"])
+    return {
+        "dtype": str(dtype).removeprefix("torch."),
+        "mesh": mesh,
+        "vertices": sim.vertices,
+        "tets": sim.stiffness.shape[-1],
+        "batch": batch,
+        "kernels": fits,
+        "auto": sim.plan.kernel,
+        "quickest": best,
+        "auto_takes_longer": fits[str(sim.plan.kernel)]["microseconds"] / fits[best]["microseconds"],
+    }
+
+
+def line_of(row: Row) -> str:
+    """For a reader."""
+    times = ", ".join(
+        f"{kernel} ({own['patches']}) {own['microseconds']:.3g} ({own['expected']:.3g})"
+        for kernel, own in row["kernels"].items()
+    )
+    wrong = f": {row['auto_takes_longer']:.2f} times as long" if row["auto"] != row["quickest"] else ""
+    scene = f"{row['dtype']}, {row['mesh']}, {row['batch']} of {row['vertices']:,} vertices"
+    return f"{scene}: {times}; auto took {row['auto']}{wrong}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--dtype", nargs="*", choices=("float32", "float64"), default=["float32"])
+    parser.add_argument("--batches", nargs="*", type=int, default=BATCHES, help="environments")
+    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    options = parser.parse_args()
+    if not torch.cuda.is_available():
+        parser.error("torch finds no CUDA device")
+    meshes = [(name, "regular", cells) for name in options.dtype for cells in MESHES]
+    meshes += [("float32", "irregular", cells) for cells in IRREGULAR if "float32" in options.dtype]
+    jobs = [
+        (mesh, cells, batch, getattr(torch, dtype))
+        for dtype, mesh, cells in meshes
+        for batch in options.batches
+        if batch * len(GpuScene("bars", cells, mesh=mesh).build().values().tets) <= MOST_TETS
+    ]
+    with torch.no_grad():
+        rows = [measure_batch(*job) for job in tqdm(jobs, desc="measuring", unit="batch", leave=False)]
+    print("microseconds of an iteration by kernel (patches), and what was expected")
+    for row in rows:
+        print(line_of(row))
+    if options.out:
+        result = {**describe_run(torch.device("cuda"), torch.get_num_threads()), "rows": rows}
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
