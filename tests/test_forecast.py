@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import warnings
 from typing import Any
 
@@ -147,46 +146,6 @@ def test_a_default_that_is_far_too_small_is_said_once_and_printed() -> None:
     assert "the default of 64 iterations" in str(limited.message)
     assert "64 leave about 0.3: far too few" in repr(beam(1e6, 5))
     assert "far too few" not in repr(beam(1e4, 5))
-
-
-def test_what_a_tolerance_leaves() -> None:
-    """Halving the error, the last change is as large as what is left; keeping 0.99 of it, a 99th of that."""
-    assert Forecast(math.log(2.0)).left_by(1e-3) == pytest.approx(1e-3)
-    assert Forecast(-math.log(0.99)).left_by(1e-3) == pytest.approx(99e-3)
-
-
-@pytest.mark.parametrize(
-    ("youngs", "solver"),
-    [(1e4, pd.Chebyshev()), (1e5, pd.Chebyshev()), (1e4, pd.Jacobi()), (1e6, pd.Multilevel())],
-    ids=["1e4", "1e5", "Jacobi", "Multilevel"],
-)
-@pytest.mark.parametrize("tolerance", [1e-3, 1e-4])
-def test_a_tolerance_leaves_what_is_foretold(youngs: float, solver: Any, tolerance: float) -> None:
-    """No more, and no less than a tenth of it: the largest of the way from the start, not of the first error."""
-    sim = beam(youngs, 5, solver=solver, iterations=1000, tolerance=tolerance)
-    state = swinging(sim)
-    after = sim(state).positions
-    solution = beam(youngs, 5, solver=pd.Multilevel(), iterations=60)(state).positions
-    left = float((after - solution).norm() / (after - state.positions).norm())
-    expected = forecast(sim)
-    assert expected is not None
-    assert 0.1 < left / expected.left_by(tolerance) < 1.0
-
-
-def test_a_tolerance_that_says_nothing_is_said() -> None:
-    """An iteration of Jacobi takes 9e-5 of the error at 1e6 Pa: the change is below 1e-3 of the way at once."""
-    with pytest.warns(UnsolvedWarning, match=r"tolerance=0.001 may stop a step here that has about 1 of its way"):
-        sim = beam(1e6, 5, solver=pd.Jacobi(), tolerance=1e-3)
-    assert "tolerance 0.001 stops a step with about 1 of its way still to go" in repr(sim)
-    solid = pd.Solid(pd.shapes.box((1.0, 0.2, 0.2), (5, 1, 1)), 1e8)
-    for solver, parts, advice in (
-        (pd.Jacobi(), [], ", or solver=torchpd.Multilevel()"),
-        (pd.Multilevel(), [pd.Ground()], ""),
-    ):
-        with pytest.warns(UnsolvedWarning, match=rf"Give a smaller one{re.escape(advice)}$"):
-            pd.Simulator(pd.Scene(solid, *parts), 1 / 30, 100, solver, tolerance=0.05, progress=False)
-    assert "tolerance 0.0001 stops a step with about 0.0005 of" in repr(beam(1e4, 5, tolerance=1e-4))
-    assert "still to go" not in repr(beam(1e4, 5))
 
 
 def test_an_error_is_never_reached_before_the_first_iteration() -> None:

@@ -43,7 +43,7 @@ FAR_TOO_FEW = 0.1  # error that is left
 
 
 class UnsolvedWarning(UserWarning):
-    """The default iterations are far too few for this scene, time step and material, or a tolerance says little."""
+    """The default iterations are far too few for this scene, time step and material."""
 
 
 class Spectrum(NamedTuple):
@@ -70,10 +70,6 @@ class Forecast(NamedTuple):
     def error(self, iterations: int) -> float:
         """About what so many leave; 1 is the first iterate."""
         return math.exp(-self.rate * iterations)
-
-    def left_by(self, tolerance: float) -> float:
-        """About |x - x*| / |x - x_t| where a tolerance stops: the last change was (exp(rate) - 1) |x - x*|."""
-        return tolerance / math.expm1(self.rate)
 
 
 @torch.no_grad()
@@ -152,30 +148,13 @@ def has_friction(sim: Model) -> bool:
     return any(bool((getattr(sim, name)[..., 4] > 0.0).any()) for name in ("planes", "spheres"))
 
 
-def warn_of_few_iterations(sim: Model, *, default: bool) -> None:
-    """Say so when the default number of iterations leaves most of the error, or a tolerance most of the way.
-
-    Args:
-        sim: as it was made.
-        default: the user gave no iterations, and may not know of the setting.
-    """
+def warn_of_few_iterations(sim: Model) -> None:
+    """Say so when the default number of iterations leaves most of the error: who gave none may not know of them."""
     expected = forecast(sim)
-    if expected is None:
-        return
-    if default and expected.error(sim.iterations) > FAR_TOO_FEW:
+    if expected is not None and expected.error(sim.iterations) > FAR_TOO_FEW:
         warn_user(
             f"Simulator: the default of {sim.iterations} iterations leaves an error of about "
             f"{expected.error(sim.iterations):.1g} of a step here (1: nothing solved); {expected.words(1e-2)} "
             'reach 1e-2. Give iterations=..., or take solver="auto", or ask sim.tune(error=1e-2)',
-            UnsolvedWarning,
-        )
-    left = expected.left_by(sim.tolerance)
-    if left > FAR_TOO_FEW:
-        # contacts leave Multilevel to Jacobi iterations, whose changes are as small
-        other = "" if isinstance(sim.solver, Multilevel) or has_contacts(sim) else ", or solver=torchpd.Multilevel()"
-        warn_user(
-            f"Simulator: tolerance={sim.tolerance:g} may stop a step here that has about {min(left, 1.0):.1g} of its "
-            f"way still to go, for an iteration takes {math.expm1(expected.rate):.1g} of what is left. Give a smaller "
-            f"one{other}",
             UnsolvedWarning,
         )

@@ -83,8 +83,8 @@ class Model(nn.Module):
             self._choose_solver(None if iterations is None else self.iterations)
         else:
             self.solver = given
-            if iterations is None or self.tolerance > 0.0:
-                warn_of_few_iterations(self, default=iterations is None)
+            if iterations is None:
+                warn_of_few_iterations(self)
 
     @property
     def vertices(self) -> int:
@@ -148,7 +148,7 @@ class Model(nn.Module):
 
     @property
     def tolerance(self) -> float:
-        """An environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never."""
+        """An environment stops iterating when about so much is left of the way that elasticity takes it; 0 never."""
         return self._tolerance
 
     @tolerance.setter

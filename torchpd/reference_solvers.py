@@ -107,6 +107,8 @@ def _iterate(
 ) -> Iterates:
     """u_{k+1} = P(u_{k-1} + omega_k (u_k - theta g / D - u_{k-1})), u_{-1} = u_0."""
     result = Iterates(first, 1.0, 0)
+    least = float((problem.weight / diagonal)[problem.free].min(initial=1.0))
+    slowest = min(max(1.0 - relaxation * least, 0.0), 0.99999)
     previous = current = first
     coming = schedule.omega(0)
     for k in range(iterations):
@@ -123,7 +125,7 @@ def _iterate(
         result.iterations = k + 1
         if observe is not None:
             observe(k + 1, current)
-        if tolerance > 0.0 and np.linalg.norm(current - previous) <= tolerance * np.linalg.norm(current):
+        if tolerance > 0.0 and _error_left(problem, previous, current - previous, slowest, omega) <= tolerance:
             result.converged = True
             break
     result.displacement = problem.shift_momentum(current)
@@ -131,6 +133,19 @@ def _iterate(
     last = float(np.linalg.norm(problem.residual(result.displacement, diagonal)))
     result.residual = last / scale if scale > 0.0 else 0.0
     return result
+
+
+def _error_left(problem: StepProblem, before: Array, change: Array, slowest: float, omega: float) -> float:
+    """About |u - u*| over what elasticity and contacts have done, or gravity if that is more.
+
+    An iteration of weight omega changes at least 1 - |r| of it, r the larger root of r^2 - omega g r + omega - 1, where
+    one of Jacobi's leaves g of the slowest mode.
+    """
+    kept = float(np.abs(np.roots([1.0, -omega * slowest, omega - 1.0])).max())
+    fall = problem.time_step**2 * float(np.linalg.norm(problem.values.gravity)) * len(before) ** 0.5
+    way = max(float(np.linalg.norm(before - problem.target)), fall)
+    error = float(np.linalg.norm(change)) / (1.0 - kept)
+    return error / way if way > 0.0 else 0.0 if error == 0.0 else np.inf
 
 
 def jacobi(

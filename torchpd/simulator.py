@@ -52,8 +52,10 @@ class Simulator(Model):
             steps; `print(sim)` says why. It chooses anew when the simulator moves to another device and in
             `prepare_solver`.
         dtype: precision, torch.float32 or torch.float64.
-        tolerance: an environment stops iterating when |x_{k+1} - x_k| <= tolerance |x_{k+1} - x_t|; 0 never. What that
-            leaves `print(sim)` tells; where it is a tenth of the way or more an `UnsolvedWarning` says so.
+        tolerance: an environment stops iterating when |x - x*| is about tolerance |x - s| or less, s being where
+            inertia, forces and springs alone would take the vertices, so that |x - s| is what elasticity and contacts
+            do, or what gravity does if that is more; 0 never. The error is judged by the last change and by how slowly
+            the solver changes what is left, from the weights of the step: see the limits in the README.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "cluster", "grid" or "stream", see
             `torchpd.regimes`; "auto" takes the first that fits, and with `batch` the quickest. Changes nothing on the
             CPU.

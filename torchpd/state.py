@@ -54,7 +54,7 @@ class Info(NamedTuple):
     energy: Tensor  # objective of the step at the last iterate [J]; NaN unless asked for
     iterations: Tensor  # used
     restarts: Tensor  # of the acceleration, because the energy rose
-    converged: Tensor  # bool: the tolerance was met before the iterations ran out
+    converged: Tensor  # bool: the error was judged to be within the tolerance before the iterations ran out
     rho: Tensor  # spectral radius that the schedule used
 
     @classmethod

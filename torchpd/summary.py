@@ -54,9 +54,6 @@ def _expectation_lines(sim: Simulator) -> list[str]:
         verdict = f"; {sim.iterations} leave about {left:.1g}: far too few" if left > FAR_TOO_FEW else ""
         counts = " and ".join(f"{error:g} after {expected.words(error)}" for error in (1e-2, 1e-3))
         lines.append(f"expected: an error of {counts} iterations, from the weights alone{verdict}")
-        if sim.tolerance:
-            left = min(expected.left_by(sim.tolerance), 1.0)
-            lines.append(f"tolerance {sim.tolerance:g} stops a step with about {left:.1g} of its way still to go")
     return lines
 
 

@@ -117,7 +117,10 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       o_.base[i] = choose(w_.u[i], o_.base[i]);
       o_.pull[i] = choose(o_.fresh[i], o_.pull[i]);
       sum[2 * history] = multiply_add(change, change, sum[2 * history]);
-      sum[2 * history + 1] = multiply_add(w_.u[i], w_.u[i], sum[2 * history + 1]);
+      if (set_.tolerance > 0) {
+        const Value way = w_.u[i] - w_.target[i];
+        sum[2 * history + 1] = multiply_add(way, way, sum[2 * history + 1]);
+      }
       if (!lbfgs_) return;
       // a trial out of range must not poison sums in which it has no part
       o_.s[newest_][i] = pick(finite_, s, none_);
@@ -191,6 +194,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       const double limit = accelerates ? schedule_[lane].limit : Outer::momentum_limit();
       const double b =
           accelerates || (goes && !lbfgs_ && !outer.plain) ? outer.extrapolation(limit) : 0;
+      outer.send(b, has_[lane]);
       Lanes::set_lane(beta, lane, T(b));
       Lanes::set_lane(length, lane, T(goes ? (1 + b) * outer.length() : 0));
       Lanes::set_lane(plain, lane, T(goes && outer.plain ? 1 : 0));
@@ -366,10 +370,11 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     });
   }
 
-  // the soft stop of an environment, by a trial that it went on from
-  void stop(int lane, int k, double change, double length) {
-    const bool kept = k > 0 && outer_[lane].accepted && !done_[lane];
-    if (kept && is_still(set_.tolerance, change, length)) done_[lane] = true;
+  // The soft stop of an environment, by a trial that it went on from, or went back from: at rest rounding decides which.
+  void stop(int lane, int k, double change, double way) {
+    const Outer& outer = outer_[lane];
+    if (!(set_.tolerance > 0) || k == 0 || done_[lane]) return;
+    done_[lane] = this->is_still(lane, outer.share_changed(schedule_[lane]), change, way);
   }
 
   // how far the material is from that of M, per lane

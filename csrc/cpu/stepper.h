@@ -172,6 +172,9 @@ class Stepper {
       if (call_.forces) w_.force[i] = in_.at_vertex(call_.forces, i);
     }
     gravity_ = in_.vector(call_.material.gravity, 0);
+    for (int lane = 0; lane < width; ++lane) {
+      fall_[lane] = square_of_fall(plan_.vertices, set_.time_step, Lanes::get_lane(gravity_, lane));
+    }
     damping_ = in_.number(call_.material.damping, 0);
     const Material<T>& material = call_.material;
     contacts_ = {w_.planes, w_.balls, material.planes_count, material.spheres_count};
@@ -245,9 +248,10 @@ class Stepper {
     Value next = vertex(i).next(contacts_, u, before, force, Real(theta_), omega_);
     if (set_.tolerance > 0) {
       next = freeze(u, next);
-      const Value change = next - u;
+      // nothing of both where a pin holds the vertex on its target
+      const Value change = next - u, way = u - w_.target[i];
       sums.first = multiply_add(change, change, sums.first);
-      sums.second = multiply_add(next, next, sums.second);
+      sums.second = multiply_add(way, way, sums.second);
     }
     w_.before[i] = u;
     w_.u[i] = next;
@@ -274,8 +278,10 @@ class Stepper {
   // every thread adds up the same parts in the same order, so all come to the same decisions
   void conclude(int k, bool guard) {
     const bool soft = set_.tolerance > 0;
+    double omega[width];  // of this iteration
     for (int lane = 0; lane < width; ++lane) {
       used_[lane] += done_[lane] ? 0 : 1;
+      omega[lane] = coming_[lane];
       coming_[lane] = schedule_[lane].next(k + 1);
     }
     if (!guard && !soft) return;
@@ -283,9 +289,15 @@ class Stepper {
     for (int lane = 0; lane < width; ++lane) {
       if (done_[lane]) continue;
       if (guard) schedule_[lane].check(Lanes::lane(sum.energy, lane));
-      const double change = Lanes::lane(sum.first, lane), length = Lanes::lane(sum.second, lane);
-      if (is_still(set_.tolerance, change, length)) done_[lane] = true;
+      if (!soft) continue;
+      const double change = Lanes::lane(sum.first, lane), way = Lanes::lane(sum.second, lane);
+      done_[lane] = is_still(lane, schedule_[lane].share_changed(omega[lane]), change, way);
     }
+  }
+
+  // the soft stop of an environment, see solver/step.h
+  bool is_still(int lane, double share, double change, double way) const {
+    return pd::is_still(set_.tolerance, share, change, way, fall_[lane]);
   }
 
   void store(int record) {
@@ -335,6 +347,7 @@ class Stepper {
   double least_[width] = {}, course_[width] = {};
   Schedule schedule_[width];
   double coming_[width] = {};  // the next omega
+  double fall_[width] = {};    // square_of_fall
   int used_[width] = {};
   bool done_[width] = {};
 };

@@ -96,6 +96,7 @@ class FusedRunner {
       control_.progress.schedule =
           Schedule(set_, control_.progress.least, contacts_.friction() > T(0));
       if constexpr (Clustered) control_.omega = T(control_.progress.schedule.next(0));
+      if (set_.tolerance > 0) control_.progress.fall = in_.fall();
       control_.progress.used = 0;
       control_.progress.done = false;
     }
@@ -137,6 +138,7 @@ class FusedRunner {
     const auto lead = [&] {
       if (is_leader()) {
         if (!Many || k == 0) coming_ = T(control_.progress.schedule.next(k));
+        if (stops) control_.turn_omega[k % 2] = coming_;
         control_.omega = coming_;
       }
       if (pending_ && (stops || !Many)) conclude();
@@ -258,11 +260,12 @@ class FusedRunner {
   }
 
   PD_DEVICE void update(const Seat& at, const Seen& seen, const Vec3<T>& force) {
+    const bool counts = set_.tolerance > 0 && at.owned();
+    if (counts) second_ += seen.square_of_way();
     const Vec3<T> next = seen.next(contacts_, force, theta_, omega_);
-    if (set_.tolerance > 0 && at.owned()) {
+    if (counts) {
       const Vec3<T> change = next - seen.u;
       first_ += double(dot(change, change));
-      second_ += double(dot(next, next));
     }
     v_.set_before(at.slot, seen.u);
     v_.set(at.slot, next);
@@ -401,12 +404,20 @@ class FusedRunner {
   // and sent once it has made its own visits.
   PD_DEVICE bool leaves_early() const { return Many && AtHand && !(set_.tolerance > 0); }
 
+  // The weight of the last iteration that was counted, whose sums are concluded.
+  PD_DEVICE double omega_of_sums() const {
+    return double(control_.turn_omega[(control_.progress.used - 1) & 1]);
+  }
+
   // Leading warp: what follows from the sums of the last iteration.
   PD_DEVICE void conclude() {
     sums_.receive(Add{});
     if (lane() == 0) {
-      if (guarding_) control_.progress.schedule.check(sums_.total(0));
-      if (is_still(set_.tolerance, sums_.total(1), sums_.total(2))) control_.progress.done = true;
+      Progress& progress = control_.progress;
+      if (guarding_) progress.schedule.check(sums_.total(0));
+      if (set_.tolerance > 0 &&
+          progress.is_still(set_.tolerance, omega_of_sums(), sums_.total(1), sums_.total(2)))
+        progress.done = true;
     }
     __syncwarp();
   }

@@ -66,8 +66,9 @@ template <class T>
 struct Control {
   Progress progress;
   T omega;
-  // of a cluster: of even and of odd iterations; where the first vertex of the mesh is when a call begins
+  // of even and of odd iterations, of a cluster and where they may stop
   T turn_omega[2];
+  // of a cluster: where the first vertex of the mesh is when a call begins
   Vec3<T> anchor;
   TeamTotals totals;
 };

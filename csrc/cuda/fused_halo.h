@@ -106,12 +106,12 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::iterate_own(int k) {
   if (has_own()) {
     const T omega = control_.turn_omega[k % 2];
     const Vec3<T> force = OwnHalo::sum_entries(entries, row_);
+    if (Stops && is_first()) second_ = seen_.square_of_way();
     const Vec3<T> next = seen_.next(contacts_, force, theta_, omega);
     halo_.send(at_.origin + next, round_);
     if (Stops && is_first()) {
       const Vec3<T> change = next - seen_.u;
       first_ = double(dot(change, change));
-      second_ = double(dot(next, next));
     }
     seen_.before = seen_.u;
     seen_.u = next;

@@ -13,8 +13,14 @@ namespace pd::inline PD_TARGET {
 struct Progress {
   Schedule schedule;
   double least, energy, residual, course;  // least: smallest a / D; residual and course: squares
+  double fall;                             // square_of_fall, with a tolerance
   int used;                                // iterations
   bool done;
+
+  // the soft stop, by sums of an iteration of weight omega
+  PD_HD bool is_still(double tolerance, double omega, double change, double way) const {
+    return pd::is_still(tolerance, schedule.share_changed(omega), change, way, fall);
+  }
 };
 
 template <class T>
@@ -63,6 +69,11 @@ struct Inputs {
     const T weight = inertia_weight(mass(vertex), damping(), stiffness, h);
     const Vec3<T> gravity = read3(call->material.gravity.of(environment));
     return inertia_target(weight, mass(vertex), velocity, gravity, force, stiffness, offset, h);
+  }
+
+  PD_DEVICE double fall() const {
+    const Vec3<T> gravity = read3(call->material.gravity.of(environment));
+    return square_of_fall(call->plan.vertices, call->settings.time_step, gravity);
   }
 
   PD_DEVICE void read_contacts(Plane<T>* planes, Ball<T>* balls) const {

@@ -109,7 +109,10 @@ class MultilevelRunner {
       const bool accepted = c_.accepted;
       const Vec3<T> left = accepted ? fresh : pull;
       sum[2 * history] += dot(change, change);
-      sum[2 * history + 1] += dot(u, u);
+      if (w_.settings().tolerance > 0) {
+        const Vec3<T> way = u - vec3(w_.v.target[i]);
+        sum[2 * history + 1] += dot(way, way);
+      }
       const auto keep = [&] {
         // what momentum goes on along
         if (accepted || k == 0) w_.v.set_before(i, base);
@@ -194,7 +197,10 @@ class MultilevelRunner {
     const bool extrapolates = accelerates || (!lbfgs_ && !plain);
     const double limit = accelerates ? w_.progress.schedule.limit : Outer::momentum_limit();
     __syncthreads();
-    if (threadIdx.x == 0) c_.total[0] = extrapolates ? c_.outer.extrapolation(limit) : 0;
+    if (threadIdx.x == 0) {
+      c_.total[0] = extrapolates ? c_.outer.extrapolation(limit) : 0;
+      c_.outer.send(c_.total[0], corotated_);
+    }
     ++used_;
     __syncthreads();
     const T beta = T(c_.total[0]), length = T((1 + c_.total[0]) * c_.outer.length());
@@ -318,9 +324,12 @@ class MultilevelRunner {
     __syncthreads();
   }
 
-  // the soft stop, by a trial that it went on from
-  PD_DEVICE void stop(int k, double change, double length) {
-    if (k > 0 && c_.accepted && is_still(w_.settings().tolerance, change, length)) c_.done = true;
+  // the soft stop, by a trial that it went on from or went back from
+  PD_DEVICE void stop(int k, double change, double way) {
+    const double tolerance = w_.settings().tolerance;
+    if (!(tolerance > 0) || k == 0) return;
+    const double share = c_.outer.share_changed(w_.progress.schedule);
+    c_.done = is_still(tolerance, share, change, way, w_.progress.fall);
   }
 
   PD_DEVICE void remember(int k) {

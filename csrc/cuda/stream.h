@@ -127,13 +127,13 @@ PD_DEVICE void visit(const StreamWork<T, Touching>& w, int i,
     sum[1] += seen.residual(w.contacts, force);
   } else {
     if constexpr (What == Visit::update_guarded) sum[0] += seen.energy();
+    if (!alternates(w.settings())) sum[2] += seen.square_of_way();
     const Vec3<T> next = seen.next(w.contacts, force, T(w.settings().relaxation), w.omega(k));
     if (alternates(w.settings())) {
       w.v.set_in_place_of_before(i, seen, next);
     } else {
       const Vec3<T> change = next - seen.u;
       sum[1] += double(dot(change, change));
-      sum[2] += double(dot(next, next));
       w.v.set_before(i, seen.u);
       w.v.set(i, next);
     }
@@ -328,6 +328,7 @@ __global__ void __launch_bounds__(decide_threads)
   } else if constexpr (What == Decision::start) {
     p.schedule = Schedule(set, p.least, w.contacts.friction() > T(0));
     p.used = set.tolerance > 0 ? 0 : set.iterations;
+    if (set.tolerance > 0) p.fall = w.in.fall();
     p.done = false;
     // read with the rest, whether or not anybody has measured them
     if (!set.report) p.energy = p.residual = p.course = 0;
@@ -336,7 +337,7 @@ __global__ void __launch_bounds__(decide_threads)
     const bool soft = set.tolerance > 0;
     if (p.done) return;
     p.used += soft;
-    p.done = is_still(set.tolerance, total[1], total[2]);
+    p.done = soft && p.is_still(set.tolerance, omega[k % guard_period], total[1], total[2]);
     const auto set_omega = [&](int next) { omega[next % guard_period] = p.schedule.next(next); };
     set_omega(k + 1);
     if (p.schedule.wants_energy(k)) p.schedule.check(total[0]);

@@ -25,6 +25,12 @@ struct Vertices {
       return double(dot(r, r));
     }
 
+    // |u - s|^2, with which a soft stop compares
+    PD_DEVICE double square_of_way() const {
+      const Vec3<T> way = u - vertex.target;
+      return double(dot(way, way));
+    }
+
     PD_DEVICE Vec3<T> next(const Contacts<T>& contacts, const Vec3<T>& force, T theta,
                            T omega) const {
       return vertex.next(contacts, u, before, force, theta, omega);

@@ -5,6 +5,9 @@
 //           n counted from the last restart; a restart whenever the energy rose between two checks. With n = 0 the step
 //           is plain descent on the weighted diagonal, which never raises the energy. E(u_k) decides on omega from k + 2
 //           on, so that blocks of threads need not wait for each other's sums.
+//
+// With a weight omega an iteration leaves of a mode, of which one of Jacobi's leaves g, the larger root |r| of
+// r^2 - omega g r + omega - 1 = 0 (Young 1971, chapter 5), and so changes 1 - r of it.
 #pragma once
 #include "math/scalar.h"
 #include "plan/views.h"
@@ -21,6 +24,7 @@ constexpr double largest_rho = 0.99999;
 struct Schedule {
   ScheduleKind kind;
   double rho;
+  double slowest;  // g of the slowest mode, as far as is known
   int delay;
   double slack = guard_slack;
   double limit = 0, omega = 1, last_energy = HUGE_VAL;
@@ -34,9 +38,9 @@ struct Schedule {
         rho(settings.rho),
         delay(settings.delay),
         slack(friction ? guard_slack_friction : guard_slack) {
-    if (!(rho > 0)) rho = 1 - settings.relaxation * mu;
-    rho = rho < largest_rho ? rho : largest_rho;
-    rho = rho > 0 ? rho : 0;
+    const double bound = 1 - settings.relaxation * mu;
+    slowest = in_range(bound);
+    rho = in_range(rho > 0 ? rho : bound);
     const double ratio = rho > 0 ? (1 - sqrt(1 - rho * rho)) / rho : 0;
     limit = ratio * ratio;
   }
@@ -51,6 +55,19 @@ struct Schedule {
       ++momentum;
     }
     return omega;
+  }
+
+  // 1 - r of the slowest mode: the least share of an error that an iteration of weight omega changes.
+  PD_HD double share_changed(double omega) const {
+    const double sum = omega * slowest, discriminant = sum * sum - 4 * (omega - 1);
+    // at the limit it is zero but for rounding, of a float's omega too
+    const bool real = discriminant > 1e-6;
+    return 1 - ((real ? sum : 0) + sqrt(real ? discriminant : 4 * (omega - 1))) / 2;
+  }
+
+  PD_HD static double in_range(double rho) {
+    rho = rho < largest_rho ? rho : largest_rho;
+    return rho > 0 ? rho : 0;
   }
 
   PD_HD bool wants_energy(int k) const {

@@ -12,6 +12,7 @@
 #pragma once
 #include "math/config.h"
 #include "math/scalar.h"
+#include "math/vec.h"
 #include "plan/views.h"
 
 namespace pd::inline PD_TARGET {
@@ -25,9 +26,22 @@ PD_HD double relative_residual(double last, double course, double energy, double
   return course == 0 && last == 0 ? 0.0 : NAN;
 }
 
-// The soft stop, of the squares of an iteration's change and of the displacement; where either overflows it goes on.
-PD_HD bool is_still(double tolerance, double change, double length) {
-  return tolerance > 0 && length < HUGE_VAL && change <= tolerance * tolerance * length;
+// The soft stop, of the squares of an iteration's change, which is about this share of the error, and of the way
+// |u - s| from the targets: what elasticity and contacts have done, the same however fast all vertices move together. It
+// counts as no less than `fall`, or free fall would compare rounding with rounding. Where a square overflows it goes on.
+PD_HD bool is_still(double tolerance, double share, double change, double way, double fall) {
+  way = way < fall ? fall : way;
+  const double most = tolerance * share;
+  return tolerance > 0 && way < HUGE_VAL && change <= most * most * way;
+}
+
+// Square of the way that gravity takes so many vertices in a step.
+template <class R>
+PD_HD double square_of_fall(int vertices, double time_step, const Vec3<R>& gravity) {
+  const double way = time_step * time_step;
+  const double x = way * double(gravity.x), y = way * double(gravity.y),
+               z = way * double(gravity.z);
+  return vertices * (x * x + y * y + z * z);
 }
 
 // The runner's own functions say where it runs: in a kernel, or on the host.
