@@ -242,9 +242,9 @@ def verdicts(errors: Sequence[float], uncertainty: float = 0.0, energies: Sequen
 
 @torch.no_grad()
 def solved_step(sim: Simulator, state: State) -> tuple[State, bool]:
-    """A step in float64, solved until iterations change it by 1e-9 of its way; and whether that was reached.
+    """A step in float64, solved until about 1e-9 of its way is left; and whether that was reached.
 
-    That says more of Multilevel, whose iterations do much, than of Chebyshev, which goes on from there where it fails.
+    By Multilevel, and by Chebyshev, which goes on from there where that fails.
     """
     sim.tolerance = SOLVED
     guess: str | torch.Tensor = "velocity"

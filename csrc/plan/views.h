@@ -148,7 +148,7 @@ struct Settings {
   double time_step = 0;   // s
   double relaxation = 1;  // theta
   double rho = 0;         // spectral radius; 0: derived from the weights of the step
-  double tolerance = 0;   // relative change that ends an environment's iterations; 0: never
+  double tolerance = 0;   // relative error that ends an environment's iterations; 0: never
   int delay = 0;          // iterations before the classic schedule accelerates
   bool weighted = true;   // the diagonal that cannot diverge, else the plain one
   bool report = false;    // residual and energy cost two more local steps
