@@ -109,18 +109,19 @@ struct BlockShape {
   }
 };
 
-// Time that a multiprocessor takes for so many environments with blocks of a shape, in units of what a round of a warp takes
-// to issue. Up to two rounds a thread has its pairs at hand, and what a block waits for is the rest of an iteration; from three
-// on it waits in each. Fitted to an H100, 64 to 400 vertices in batches of 1 to 8192, where the shape that this chooses was up
-// to 6 % slower than the best; blocks of more rounds than three were not, and have the shape for many.
-inline double shape_cost(int environments, int threads, int together, int rounds) {
-  const int waves = (environments + together - 1) / together, warps = threads / warp_size;
+// Time that a multiprocessor takes for so many environments at a time, in units of what a round of a warp takes to issue. Up to
+// two rounds a thread has its pairs at hand, and what a block waits for is the rest of an iteration; with three it waits in
+// each. Fitted to an H100, 64 to 400 vertices in batches that it has at a time, where the shape that this chooses was up to 6 %
+// slower than the best; blocks of more rounds were not.
+inline double shape_cost(int environments, int warps, int rounds) {
   const int wait = rounds <= 2 ? 26 : 15 * rounds;
-  return waves * (wait + 0.25 * warps + double(warps * rounds) * together);
+  return wait + 0.25 * warps + double(warps * rounds) * environments;
 }
+constexpr int most_fitted_rounds = 3;
 
-// The best one for a mesh, given the shared memory that it wants. The batch of a call does not enter, so that an environment
-// gives the same bits alone and in any batch; that of the plan does.
+// The best one for a mesh, given the shared memory that it wants: for as many environments as a multiprocessor has room for, or
+// for those of the plan where they are fewer. The batch of a call does not enter, so that an environment gives the same bits
+// alone and in any batch.
 template <class T>
 BlockShape block_shape(const DevicePlan<T>& plan, std::size_t shared) {
   BlockShape best, cheapest;
@@ -131,11 +132,9 @@ BlockShape block_shape(const DevicePlan<T>& plan, std::size_t shared) {
     const int rounds = (plan.most_pairs + threads - 1) / threads;
     BlockShape shape = {threads, together, double(together) * plan.most_pairs / rounds};
     if (shape.rank() > best.rank()) best = shape;
-    if (plan.environments == 0 || together == 0 || rounds > 3) continue;
-    // even_teams
-    const int waves = (plan.environments + together - 1) / together;
-    shape.together = (plan.environments + waves - 1) / waves;
-    shape.cost = shape_cost(plan.environments, threads, shape.together, rounds);
+    const bool few = plan.environments > 0 && plan.environments <= together;
+    if (!few || rounds > most_fitted_rounds) continue;
+    shape.cost = shape_cost(plan.environments, threads / warp_size, rounds);
     if (shape.cost < cheapest.cost) cheapest = shape;
   }
   return cheapest.together > 0 ? cheapest : best;
@@ -151,14 +150,6 @@ int patch_threads(const DevicePlan<T>& plan) {
 template <class T>
 bool near_with(const DevicePlan<T>& plan, int threads) {
   return is_near(sizeof(T), plan.most_slots, plan.most_pairs, threads);
-}
-
-// Environments that are worked on at a time, where there is room for `most`: as many in the last wave as in the others, so that
-// blocks that share a multiprocessor are fewer in all of them.
-inline int even_teams(std::int64_t batch, int most) {
-  if (batch <= most) return int(batch);
-  const std::int64_t waves = (batch + most - 1) / most;
-  return int((batch + waves - 1) / waves);
 }
 
 template <class T>
@@ -187,7 +178,7 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
         "torchpd: this device runs " + std::to_string(resident) + " blocks of " +
         std::to_string(shared) + " bytes of shared memory at once, and the plan has " +
         std::to_string(patches) + " patches; build the simulator with kernel=\"stream\"");
-  teams = even_teams(step.batch, resident / patches);
+  teams = int(std::min<std::int64_t>(step.batch, resident / patches));
 }
 
 // As many arrays in shared memory as leave a multiprocessor no less busy, or its environments no later.
@@ -225,7 +216,7 @@ void FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
         std::to_string(threads) + " threads and " + std::to_string(shared) +
         " bytes of shared memory each; build the simulator with kernel=\"grid\"");
   kept = vertex_arrays;
-  teams = even_teams(step.batch, clusters);
+  teams = int(std::min<std::int64_t>(step.batch, clusters));
 }
 
 // The most blocks of a cluster that this device runs, however much shared memory they want, and that this build has code for; 1:

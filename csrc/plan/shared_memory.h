@@ -8,7 +8,7 @@ namespace pd {
 constexpr std::size_t fused_control_bytes = 1024;
 
 // `bytes` and what fills them up to a multiple of 16
-// Of a multiprocessor, which the shape of a block is chosen for: with more of them the choice is the same.
+// Of a multiprocessor, which the shape of a block is chosen for: of more of them it has no room for all.
 constexpr int most_environments = 1 << 20;
 
 constexpr std::size_t aligned(std::size_t bytes) { return (bytes + 15) / 16 * 16; }
