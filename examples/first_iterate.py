@@ -46,7 +46,7 @@ def main() -> None:
         ends = [sim(state, start=start).positions for start in ("velocity", "inertial", guess)]
         print(f"{count:10d} " + "".join(f"{float((end - exact.positions).norm() / moved):12.1e}" for end in ends))
 
-    print("\nstopping at a relative change of an iteration:")
+    print("\nstopping where about so much of the way from the targets is left:")
     print(" tolerance  iterations       error    residual")
     for tolerance in (1e-2, 1e-3, 1e-4, 1e-5):
         end, info = build(options.youngs, 2000, tolerance)(state, return_info=True)

@@ -48,7 +48,7 @@ def unlike(sim: pd.Simulator, batch: int) -> tuple[pd.State, Tensor]:
 
 
 @pytest.mark.usefixtures("poisoned")
-@pytest.mark.parametrize(("iterations", "tolerance"), [(14, 0.0), (260, 0.6)])
+@pytest.mark.parametrize(("iterations", "tolerance"), [(14, 0.0), (1300, 0.3)])
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_runs_and_batches_do_not_matter(
     kernel: str, iterations: int, tolerance: float, precision: str, monkeypatch: pytest.MonkeyPatch

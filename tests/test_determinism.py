@@ -58,7 +58,7 @@ def assert_same_bits(found: list[torch.Tensor], expected: list[torch.Tensor]) ->
         assert not one.isnan().any(), f"output {number}"
 
 
-@pytest.mark.parametrize(("iterations", "tolerance"), [(28, 0.0), (400, 0.3)], ids=["all iterations", "soft stop"])
+@pytest.mark.parametrize(("iterations", "tolerance"), [(28, 0.0), (1300, 0.3)], ids=["all iterations", "soft stop"])
 @pytest.mark.parametrize("batch", [2, 7, 8, ITEMS])
 def test_an_item_does_not_feel_its_batch(
     batch: int, iterations: int, tolerance: float, dtype: torch.dtype, device: torch.device

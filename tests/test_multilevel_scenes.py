@@ -267,7 +267,7 @@ def test_some_environments_held_and_others_not() -> None:
 
 
 @pytest.mark.usefixtures("two_threads")
-@pytest.mark.parametrize(("iterations", "tolerance"), [(14, 0.0), (40, 0.6)], ids=["all iterations", "soft stop"])
+@pytest.mark.parametrize(("iterations", "tolerance"), [(14, 0.0), (1000, 0.9)], ids=["all iterations", "soft stop"])
 @pytest.mark.parametrize("solver", SOLVERS, ids=IDS)
 def test_batch_and_threads_do_not_matter(
     solver: pd.Multilevel, iterations: int, tolerance: float, dtype: torch.dtype
@@ -280,6 +280,8 @@ def test_batch_and_threads_do_not_matter(
     torch.set_num_threads(1)
     for items in (slice(0, 19), slice(3, 4)):
         assert_same_bits([t[items] for t in together], outputs(sim, state, forces, items))
+    if tolerance:
+        assert len(sim(state, forces, return_info=True)[1].iterations.unique()) > 1
 
 
 def test_material_of_an_environment_is_that_of_its_own_simulator(dtype: torch.dtype) -> None:

@@ -27,7 +27,7 @@ def left(sim: pd.Simulator, state: pd.State, after: pd.State, solution: Any = No
     """|u - u*| / |u* - s|, the way being at least that of gravity."""
     problem = problem_of(sim, state)
     solution = newton(problem) if solution is None else solution
-    fall = sim.time_step**2 * float(sim.gravity.norm()) * problem.free.sum() ** 0.5
+    fall = sim.time_step**2 * float(sim.gravity.norm()) * len(problem.free) ** 0.5
     way = max(float(np.linalg.norm(solution - problem.target)), fall)
     return float(np.linalg.norm(displacement(sim, after) - solution)) / way
 
@@ -69,13 +69,92 @@ def test_a_landing_plate_goes_on(youngs: float, device: torch.device) -> None:
     sim.iterations = 6000
     solution = displacement(sim, sim(state))
     sim, state = sim.to(device), state.to(device)
-    sim.tolerance, sim.iterations = 1e-2, 1000
+    sim.tolerance, sim.iterations = 1e-2, 4000
     after, info = sim(state, return_info=True)
     assert bool(info.converged)
     assert left(sim, state, after, solution) < 1e-2
 
 
+def hung(kind: str, youngs: float) -> tuple[pd.Simulator, pd.State, Any]:
+    """A bar at rest that begins to swing about an edge or a corner, the state, and the solution of its step."""
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (10, 2, 2))
+    body, end = pd.Solid(mesh, youngs), mesh.vertices[:, 0] == 0.0
+    edge = end & (mesh.vertices[:, 1] == 0.0)
+    pin = {
+        "hinge": pd.Pin(body, edge),
+        "soft hinge": pd.Pin(body, edge, stiffness=1e5),
+        "corner": pd.Pin(body, edge & (mesh.vertices[:, 2] == 0.0)),
+    }[kind]
+    sim = pd.Simulator(pd.Scene(body, pin, pd.Gravity()), 1 / 30, 2000, dtype=torch.float64, progress=False)
+    state = sim.rest_state()
+    return sim, state, newton(problem_of(sim, state), tolerance=1e-8)
+
+
+@pytest.mark.parametrize(("kind", "stiffest"), [("hinge", 1e9), ("soft hinge", 1e9), ("corner", 1e8)])
+def test_parts_that_turn_are_not_taken_for_still(kind: str, stiffest: float, device: torch.device) -> None:
+    """The matrix of projective dynamics resists their turning, and first iterates hardly move: 0.8 were left.
+
+    From a corner, at 1e9 Pa, iterations stall on their way, with 28 times the tolerance left: see the README.
+    """
+    for youngs in (1e7, stiffest):
+        sim, state, solution = hung(kind, youngs)
+        sim, state = sim.to(device), state.to(device)
+        sim.solver = pd.Multilevel()
+        for sim.tolerance in (1e-1, 1e-2, 1e-3):
+            after, info = sim(state, return_info=True)
+            assert bool(info.converged)
+            assert left(sim, state, after, solution) < 3 * sim.tolerance, youngs
+
+
+def test_stops_at_no_turning_point(device: torch.device) -> None:
+    """Modes swing under Chebyshev, and some iterations change little of a large error: up to 31 times the tolerance."""
+    case = beam(1e6)
+    sim = simulator(case, torch.float64, device, iterations=2000)
+    state = state_of(case, sim)
+    for _ in range(3):
+        solution = newton(problem_of(sim, state))
+        for sim.tolerance in np.geomspace(0.1, 1e-4, 25):
+            after, info = sim(state, return_info=True)
+            assert bool(info.converged)
+            assert left(sim, state, after, solution) < 1.2 * sim.tolerance
+        state = after
+
+
+def test_very_slow_modes_are_known_to_be(device: torch.device) -> None:
+    """Slower than the most momentum is for: the first iteration was a stop, with three times the tolerance left."""
+    sim, state, solution = hung("hinge", 1e9)
+    sim, state = sim.to(device), state.to(device)
+    sim.iterations = 20_000
+    for sim.tolerance in (0.3, 0.1):
+        after, info = sim(state, return_info=True)
+        assert bool(info.converged)
+        assert left(sim, state, after, solution) < sim.tolerance
+
+
+@pytest.mark.parametrize("outer", ["corotated", "lbfgs", "momentum"])
+def test_material_that_changes_is_judged_as_such(outer: Any, device: torch.device) -> None:
+    """One tetrahedron a thousand times as stiff: up to seventy times the tolerance were left."""
+    case = beam(1e5)
+    sim = simulator(case, torch.float64, device, solver=pd.Multilevel(outer), iterations=2000)
+    state = state_of(case, sim)
+    stiffness = sim.stiffness.clone()
+    stiffness[..., stiffness.shape[-1] // 2] *= 1000.0
+    sim.set_material(stiffness=stiffness)
+    exact = simulator(case, torch.float64, solver=pd.Chebyshev(), iterations=20_000)
+    exact.set_material(stiffness=stiffness.cpu())
+    solution = displacement(exact, exact(state.to("cpu")))
+    for sim.tolerance in (1e-2, 1e-3):
+        after, info = sim(state, return_info=True)
+        assert bool(info.converged)
+        assert left(sim, state, after, solution) < 3 * sim.tolerance
+
+
 SOLVERS = [pd.Jacobi(), pd.Chebyshev(), pd.Multilevel()]
+
+
+def at_once(solver: pd.Solver) -> int:
+    """Iterations of a step that is solved when it begins: until the small problem is there nobody knows."""
+    return 4 if isinstance(solver, pd.Multilevel) else 2
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=str)
@@ -108,7 +187,7 @@ def test_a_body_at_rest_stops(solver: pd.Solver, dtype: torch.dtype, device: tor
     assert float(state.velocities.norm()) < 1e-9
     _, info = sim(state, return_info=True)
     assert bool(info.converged)
-    assert int(info.iterations) <= 2
+    assert int(info.iterations) <= at_once(solver)
 
 
 @pytest.mark.parametrize("solver", SOLVERS, ids=str)
@@ -118,7 +197,7 @@ def test_free_fall_stops(solver: pd.Solver, dtype: torch.dtype, device: torch.de
     sim = simulator(case, dtype, device, solver=solver, tolerance=1e-3, iterations=100)
     _, info = sim(state_of(case, sim), return_info=True)
     assert bool(info.converged)
-    assert int(info.iterations) <= 2
+    assert int(info.iterations) <= at_once(solver)
 
 
 def test_a_restart_is_no_stop(device: torch.device) -> None:

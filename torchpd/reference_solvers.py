@@ -108,7 +108,7 @@ def _iterate(
     """u_{k+1} = P(u_{k-1} + omega_k (u_k - theta g / D - u_{k-1})), u_{-1} = u_0."""
     result = Iterates(first, 1.0, 0)
     least = float((problem.weight / diagonal)[problem.free].min(initial=1.0))
-    slowest = min(max(1.0 - relaxation * least, 0.0), 0.99999)
+    slowest, left = max(1.0 - relaxation * least, 0.0), 0.0
     previous = current = first
     coming = schedule.omega(0)
     for k in range(iterations):
@@ -125,9 +125,11 @@ def _iterate(
         result.iterations = k + 1
         if observe is not None:
             observe(k + 1, current)
-        if tolerance > 0.0 and _error_left(problem, previous, current - previous, slowest, omega) <= tolerance:
-            result.converged = True
-            break
+        if tolerance > 0.0:
+            left = _error_left(float(np.linalg.norm(current - previous)), left, slowest, omega)
+            if left <= tolerance * _way(problem, previous):
+                result.converged = True
+                break
     result.displacement = problem.shift_momentum(current)
     scale = float(np.linalg.norm(problem.residual(problem.course(), diagonal)))
     last = float(np.linalg.norm(problem.residual(result.displacement, diagonal)))
@@ -135,17 +137,25 @@ def _iterate(
     return result
 
 
-def _error_left(problem: StepProblem, before: Array, change: Array, slowest: float, omega: float) -> float:
-    """About |u - u*| over what elasticity and contacts have done, or gravity if that is more.
+def _error_left(change: float, before: float, slowest: float, omega: float) -> float:
+    """About |u - u*|, by the change of an iteration of weight omega and what was left before.
 
-    An iteration of weight omega changes at least 1 - |r| of it, r the larger root of r^2 - omega g r + omega - 1, where
-    one of Jacobi's leaves g of the slowest mode.
+    An iteration leaves |r| of the slowest mode, r the larger root of r^2 - omega g r + omega - 1, where one of Jacobi's
+    leaves g, and changes 1 - r of it where r is real. Where it is complex the mode swings and turns: what was left
+    before counts on, times |r|.
     """
-    kept = float(np.abs(np.roots([1.0, -omega * slowest, omega - 1.0])).max())
-    fall = problem.time_step**2 * float(np.linalg.norm(problem.values.gravity)) * len(before) ** 0.5
-    way = max(float(np.linalg.norm(before - problem.target)), fall)
-    error = float(np.linalg.norm(change)) / (1.0 - kept)
-    return error / way if way > 0.0 else 0.0 if error == 0.0 else np.inf
+    square = (omega * slowest) ** 2 - 4.0 * (omega - 1.0)
+    if square > 1e-6:
+        kept = (omega * slowest + square**0.5) / 2.0
+        return change / (1.0 - kept) if kept < 1.0 else np.inf
+    kept = (omega - 1.0) ** 0.5
+    return max(change / (1.0 - kept), kept * before)
+
+
+def _way(problem: StepProblem, displacement: Array) -> float:
+    """What elasticity and contacts have done, or gravity if that is more."""
+    fall = problem.time_step**2 * float(np.linalg.norm(problem.values.gravity)) * len(displacement) ** 0.5
+    return max(float(np.linalg.norm(displacement - problem.target)), fall)
 
 
 def jacobi(

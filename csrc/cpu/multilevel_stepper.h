@@ -50,10 +50,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     corotated_ = false;
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
-      outer_[lane] = {};
-      outer_[lane].scale = misfit_[lane].scale;
-      outer_[lane].friction = Lanes::lane(friction, lane) > 0;
-      outer_[lane].slack = energy_noise<T>();
+      const bool rough = Lanes::lane(friction, lane) > 0;
+      outer_[lane].begin(misfit_[lane], rough, energy_noise<T>(), this->stop_[lane].fall);
       pairs_[lane] = {};
       made_[lane] = doubted_[lane] = 0;
       has_[lane] = false;
@@ -194,7 +192,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       const double limit = accelerates ? schedule_[lane].limit : Outer::momentum_limit();
       const double b =
           accelerates || (goes && !lbfgs_ && !outer.plain) ? outer.extrapolation(limit) : 0;
-      outer.send(b, has_[lane]);
+      outer.send(b, has_[lane], corotates_ && made_[lane] == 0);
       Lanes::set_lane(beta, lane, T(b));
       Lanes::set_lane(length, lane, T(goes ? (1 + b) * outer.length() : 0));
       Lanes::set_lane(plain, lane, T(goes && outer.plain ? 1 : 0));
@@ -372,9 +370,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   // The soft stop of an environment, by a trial that it went on from, or went back from: at rest rounding decides which.
   void stop(int lane, int k, double change, double way) {
-    const Outer& outer = outer_[lane];
     if (!(set_.tolerance > 0) || k == 0 || done_[lane]) return;
-    done_[lane] = this->is_still(lane, outer.share_changed(schedule_[lane]), change, way);
+    done_[lane] = outer_[lane].ends(set_.tolerance, schedule_[lane], change, way);
   }
 
   // how far the material is from that of M, per lane

@@ -173,7 +173,8 @@ class Stepper {
     }
     gravity_ = in_.vector(call_.material.gravity, 0);
     for (int lane = 0; lane < width; ++lane) {
-      fall_[lane] = square_of_fall(plan_.vertices, set_.time_step, Lanes::get_lane(gravity_, lane));
+      stop_[lane] = {
+          square_of_fall(plan_.vertices, set_.time_step, Lanes::get_lane(gravity_, lane))};
     }
     damping_ = in_.number(call_.material.damping, 0);
     const Material<T>& material = call_.material;
@@ -291,13 +292,9 @@ class Stepper {
       if (guard) schedule_[lane].check(Lanes::lane(sum.energy, lane));
       if (!soft) continue;
       const double change = Lanes::lane(sum.first, lane), way = Lanes::lane(sum.second, lane);
-      done_[lane] = is_still(lane, schedule_[lane].share_changed(omega[lane]), change, way);
+      const Share share = schedule_[lane].share_of(omega[lane]);
+      done_[lane] = stop_[lane].ends(set_.tolerance, share, change, way);
     }
-  }
-
-  // the soft stop of an environment, see solver/step.h
-  bool is_still(int lane, double share, double change, double way) const {
-    return pd::is_still(set_.tolerance, share, change, way, fall_[lane]);
   }
 
   void store(int record) {
@@ -347,7 +344,7 @@ class Stepper {
   double least_[width] = {}, course_[width] = {};
   Schedule schedule_[width];
   double coming_[width] = {};  // the next omega
-  double fall_[width] = {};    // square_of_fall
+  SoftStop stop_[width];
   int used_[width] = {};
   bool done_[width] = {};
 };

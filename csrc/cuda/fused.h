@@ -96,7 +96,7 @@ class FusedRunner {
       control_.progress.schedule =
           Schedule(set_, control_.progress.least, contacts_.friction() > T(0));
       if constexpr (Clustered) control_.omega = T(control_.progress.schedule.next(0));
-      if (set_.tolerance > 0) control_.progress.fall = in_.fall();
+      if (set_.tolerance > 0) control_.progress.stop = {in_.fall()};
       control_.progress.used = 0;
       control_.progress.done = false;
     }
@@ -416,7 +416,7 @@ class FusedRunner {
       Progress& progress = control_.progress;
       if (guarding_) progress.schedule.check(sums_.total(0));
       if (set_.tolerance > 0 &&
-          progress.is_still(set_.tolerance, omega_of_sums(), sums_.total(1), sums_.total(2)))
+          progress.ends(set_.tolerance, omega_of_sums(), sums_.total(1), sums_.total(2)))
         progress.done = true;
     }
     __syncwarp();

@@ -13,13 +13,13 @@ namespace pd::inline PD_TARGET {
 struct Progress {
   Schedule schedule;
   double least, energy, residual, course;  // least: smallest a / D; residual and course: squares
-  double fall;                             // square_of_fall, with a tolerance
-  int used;                                // iterations
+  SoftStop stop;
+  int used;  // iterations
   bool done;
 
   // the soft stop, by sums of an iteration of weight omega
-  PD_HD bool is_still(double tolerance, double omega, double change, double way) const {
-    return pd::is_still(tolerance, schedule.share_changed(omega), change, way, fall);
+  PD_HD bool ends(double tolerance, double omega, double change, double way) {
+    return stop.ends(tolerance, schedule.share_of(omega), change, way);
   }
 };
 

@@ -27,10 +27,9 @@ class MultilevelRunner {
     strangers_ = misfit.strangers;
     trusted_ = T(misfit.trusted);
     if (threadIdx.x == 0) {
-      c_.outer = {};
-      c_.outer.scale = misfit.scale;
-      c_.outer.friction = w_.contacts.friction() > T(0);
-      c_.outer.slack = energy_noise<T>();
+      const bool stops = w_.settings().tolerance > 0;
+      c_.outer.begin(misfit, w_.contacts.friction() > T(0), energy_noise<T>(),
+                     stops ? w_.progress.stop.fall : 0);
       c_.pairs = {};
       c_.done = false;
     }
@@ -199,7 +198,7 @@ class MultilevelRunner {
     __syncthreads();
     if (threadIdx.x == 0) {
       c_.total[0] = extrapolates ? c_.outer.extrapolation(limit) : 0;
-      c_.outer.send(c_.total[0], corotated_);
+      c_.outer.send(c_.total[0], corotated_, corotates_ && made_ == 0);
     }
     ++used_;
     __syncthreads();
@@ -328,8 +327,7 @@ class MultilevelRunner {
   PD_DEVICE void stop(int k, double change, double way) {
     const double tolerance = w_.settings().tolerance;
     if (!(tolerance > 0) || k == 0) return;
-    const double share = c_.outer.share_changed(w_.progress.schedule);
-    c_.done = is_still(tolerance, share, change, way, w_.progress.fall);
+    c_.done = c_.outer.ends(tolerance, w_.progress.schedule, change, way);
   }
 
   PD_DEVICE void remember(int k) {

@@ -328,7 +328,7 @@ __global__ void __launch_bounds__(decide_threads)
   } else if constexpr (What == Decision::start) {
     p.schedule = Schedule(set, p.least, w.contacts.friction() > T(0));
     p.used = set.tolerance > 0 ? 0 : set.iterations;
-    if (set.tolerance > 0) p.fall = w.in.fall();
+    if (set.tolerance > 0) p.stop = {w.in.fall()};
     p.done = false;
     // read with the rest, whether or not anybody has measured them
     if (!set.report) p.energy = p.residual = p.course = 0;
@@ -337,7 +337,7 @@ __global__ void __launch_bounds__(decide_threads)
     const bool soft = set.tolerance > 0;
     if (p.done) return;
     p.used += soft;
-    p.done = soft && p.is_still(set.tolerance, omega[k % guard_period], total[1], total[2]);
+    p.done = soft && p.ends(set.tolerance, omega[k % guard_period], total[1], total[2]);
     const auto set_omega = [&](int next) { omega[next % guard_period] = p.schedule.next(next); };
     set_omega(k + 1);
     if (p.schedule.wants_energy(k)) p.schedule.check(total[0]);

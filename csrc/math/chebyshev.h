@@ -7,7 +7,8 @@
 //           on, so that blocks of threads need not wait for each other's sums.
 //
 // With a weight omega an iteration leaves of a mode, of which one of Jacobi's leaves g, the larger root |r| of
-// r^2 - omega g r + omega - 1 = 0 (Young 1971, chapter 5), and so changes 1 - r of it.
+// r^2 - omega g r + omega - 1 = 0 (Young 1971, chapter 5). A real one changes 1 - r of it. Where the roots are complex the mode
+// swings, and at its turning points an iteration changes nothing of it, however large it is; but what it can be falls by |r|.
 #pragma once
 #include "math/scalar.h"
 #include "plan/views.h"
@@ -21,10 +22,16 @@ constexpr double guard_slack_friction =
     1e-2;  // the energy lacks the work of friction, and may rise by it
 constexpr double largest_rho = 0.99999;
 
+// What the change of an iteration says of the error: the least share of it that this is, and how much is left of the error that
+// an earlier change showed.
+struct Share {
+  double changed = 1, kept = 0;
+};
+
 struct Schedule {
   ScheduleKind kind;
   double rho;
-  double slowest;  // g of the slowest mode, as far as is known
+  double slowest;  // no mode has more than this g: A >= mu D
   int delay;
   double slack = guard_slack;
   double limit = 0, omega = 1, last_energy = HUGE_VAL;
@@ -32,14 +39,14 @@ struct Schedule {
 
   Schedule() = default;
 
-  // `mu` is the smallest ratio of inertia to diagonal; 1 - theta mu bounds the spectral radius from below.
+  // `mu` is the smallest ratio of inertia to diagonal
   PD_HD Schedule(const Settings& settings, double mu, bool friction)
       : kind(settings.schedule),
         rho(settings.rho),
         delay(settings.delay),
         slack(friction ? guard_slack_friction : guard_slack) {
     const double bound = 1 - settings.relaxation * mu;
-    slowest = in_range(bound);
+    slowest = bound > 0 ? bound : 0;
     rho = in_range(rho > 0 ? rho : bound);
     const double ratio = rho > 0 ? (1 - sqrt(1 - rho * rho)) / rho : 0;
     limit = ratio * ratio;
@@ -57,12 +64,13 @@ struct Schedule {
     return omega;
   }
 
-  // 1 - r of the slowest mode: the least share of an error that an iteration of weight omega changes.
-  PD_HD double share_changed(double omega) const {
+  // Of an iteration of weight omega, by the slowest mode.
+  PD_HD Share share_of(double omega) const {
     const double sum = omega * slowest, discriminant = sum * sum - 4 * (omega - 1);
     // at the limit it is zero but for rounding, of a float's omega too
     const bool real = discriminant > 1e-6;
-    return 1 - ((real ? sum : 0) + sqrt(real ? discriminant : 4 * (omega - 1))) / 2;
+    const double r = ((real ? sum : 0) + sqrt(real ? discriminant : 4 * (omega - 1))) / 2;
+    return {1 - r, real ? 0 : r};
   }
 
   PD_HD static double in_range(double rho) {

@@ -17,6 +17,7 @@
 #include "math/chebyshev.h"
 #include "math/scalar.h"
 #include "plan/views.h"
+#include "solver/step.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -225,10 +226,11 @@ constexpr double sufficient = 1e-4;        // of the decrease that the slope pro
 constexpr double least_curvature = 1e-12;  // s.y of a pair, in |s| |y|
 constexpr double momentum_rho = 0.9995;    // that of M A is not known, and this limit serves all
 
-// About the least share of an error that a full step with M changes where turning parts have no small problem, of which M
-// knows least. At stops without this factor 0.02 to 15 times the change were left, mostly 0.2 to 3 (random scenes, beams up
-// to 1e7 Pa).
+// About the share of an error that a full step with M changes where turning parts have no small problem, of which M knows
+// least, or where M holds other vertices than the step: no bound. What an earlier trial showed counts on for some trials, as
+// one that changes little may stand between two that change much.
 constexpr double share_of_turns = 0.25;
+constexpr double kept_by_turns = 0.5, kept_by_corotation = 0.25;
 
 // Rounding of E, relative: a rise that says nothing.
 template <class T>
@@ -242,8 +244,11 @@ struct Outer {
   double energy = 0, slope = 0;  // at the base; g.d of the direction from there
   double slack = 0;
   int failures = 0, restarts = 0, momentum = 0;
-  // of the trial that is out: its weight where 1 / D makes it, else 0 and the share of the error that it changes
-  double omega = 0, share = 1;
+  double fits = 1;  // least share of the error that M changes for being of another material
+  // of the trial that is out: its weight where 1 / D makes it, else 0 and what its change says of the error
+  double omega = 0;
+  Share share;
+  SoftStop stop;
   int detour = 0, doublings = 0;  // iterations left of a detour; how long the next one is
   bool plain = false, friction = false, accepted = true, known = false;
   // momentum with 1 / D in place of M: to the end of the step, of L-BFGS while a detour lasts
@@ -288,14 +293,25 @@ struct Outer {
     return accepted;
   }
 
-  // Of the trial that goes out next, with momentum b, and by a direction that has the small problem's part or not.
-  PD_HD void send(double b, bool corotated) {
-    omega = plain || diagonal ? 1 + b : 0;
-    share = (corotated ? 1 : share_of_turns) * length();
+  PD_HD void begin(const Misfit& misfit, bool has_friction, double noise, double fall) {
+    *this = {};
+    scale = misfit.scale;
+    fits = misfit.spread < 1 ? 1 - misfit.spread : share_of_turns;
+    friction = has_friction;
+    slack = noise;
+    stop.fall = fall;
   }
 
-  PD_HD double share_changed(const Schedule& schedule) const {
-    return omega > 0 ? schedule.share_changed(omega) : share;
+  // Of the trial that goes out next, with momentum b, by a direction that has the small problem's part or not; `waits`: that is
+  // still to be made, and until then a part that turns may hardly move at all.
+  PD_HD void send(double b, bool corotated, bool waits) {
+    omega = plain || diagonal ? 1 + b : 0;
+    const double full = corotated ? 1 : waits ? 0 : share_of_turns;
+    share = {full * fits * length(), corotated ? kept_by_corotation : kept_by_turns};
+  }
+
+  PD_HD bool ends(double tolerance, const Schedule& schedule, double change, double way) {
+    return stop.ends(tolerance, omega > 0 ? schedule.share_of(omega) : share, change, way);
   }
 
   PD_HD void start_detour() {

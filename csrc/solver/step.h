@@ -10,6 +10,7 @@
 // included. Projection onto one plane keeps this, since D is one number a vertex;
 // several contacts of a vertex are projected on one after another, and a ball acts as a plane within an iteration.
 #pragma once
+#include "math/chebyshev.h"
 #include "math/config.h"
 #include "math/scalar.h"
 #include "math/vec.h"
@@ -26,14 +27,22 @@ PD_HD double relative_residual(double last, double course, double energy, double
   return course == 0 && last == 0 ? 0.0 : NAN;
 }
 
-// The soft stop, of the squares of an iteration's change, which is about this share of the error, and of the way
-// |u - s| from the targets: what elasticity and contacts have done, the same however fast all vertices move together. It
-// counts as no less than `fall`, or free fall would compare rounding with rounding. Where a square overflows it goes on.
-PD_HD bool is_still(double tolerance, double share, double change, double way, double fall) {
-  way = way < fall ? fall : way;
-  const double most = tolerance * share;
-  return tolerance > 0 && way < HUGE_VAL && change <= most * most * way;
-}
+// The soft stop of an environment: whether the error that is left, by the changes of iterations, is within a tolerance of the way
+// |u - s| from the targets: what elasticity and contacts have done, the same however fast all vertices move together.
+struct SoftStop {
+  double fall =
+      0;  // square_of_fall; the way counts as no less, or free fall would compare rounding with rounding
+  double left = 0;  // of the error
+
+  // By the squares of the last change and of the way; where one overflows it goes on. Share {0, ..}: the change says nothing.
+  PD_HD bool ends(double tolerance, const Share& share, double change, double way) {
+    if (!(share.changed > 0)) return false;
+    const double shown = sqrt(change) / share.changed, before = share.kept * left;
+    left = shown < before ? before : shown;
+    way = way < fall ? fall : way;
+    return tolerance > 0 && way < HUGE_VAL && left <= tolerance * sqrt(way);
+  }
+};
 
 // Square of the way that gravity takes so many vertices in a step.
 template <class R>
