@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -146,15 +147,15 @@ def _error_left(change: float, before: float, slowest: float, omega: float) -> f
     """
     square = (omega * slowest) ** 2 - 4.0 * (omega - 1.0)
     if square > 1e-6:
-        kept = (omega * slowest + square**0.5) / 2.0
-        return change / (1.0 - kept) if kept < 1.0 else np.inf
-    kept = (omega - 1.0) ** 0.5
+        kept = (omega * slowest + math.sqrt(square)) / 2.0
+        return change / (1.0 - kept) if kept < 1.0 else math.inf
+    kept = math.sqrt(omega - 1.0)
     return max(change / (1.0 - kept), kept * before)
 
 
 def _way(problem: StepProblem, displacement: Array) -> float:
     """What elasticity and contacts have done, or gravity if that is more."""
-    fall = problem.time_step**2 * float(np.linalg.norm(problem.values.gravity)) * len(displacement) ** 0.5
+    fall = problem.time_step**2 * float(np.linalg.norm(problem.values.gravity)) * math.sqrt(len(displacement))
     return max(float(np.linalg.norm(displacement - problem.target)), fall)
 
 
