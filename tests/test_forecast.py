@@ -56,6 +56,15 @@ def test_the_worst_environment_counts() -> None:
     assert both.least == pytest.approx(soft.least / (soft.least + 100.0 * (1.0 - soft.least)), rel=1e-6)
 
 
+def test_a_tolerance_beyond_the_iterations_is_said() -> None:
+    expected = forecast(beam(1e6, 5, iterations=64))
+    assert expected is not None
+    text = repr(beam(1e6, 5, iterations=64, tolerance=1e-3))
+    assert f"tolerance 0.001 asks for {expected.words(1e-3)} iterations: few steps will meet it in 64" in text
+    assert "asks for" not in repr(beam(1e6, 5, iterations=expected.iterations(1e-3), tolerance=1e-3))
+    assert "asks for" not in repr(beam(1e6, 5, iterations=64))
+
+
 @pytest.mark.parametrize("least", [1e-1, 1e-3])
 def test_rates_are_those_of_the_textbook(least: float) -> None:
     """Jacobi: 1 - theta mu. Chebyshev: (1 - sqrt(1 - rho^2)) / rho. Both lose one decade in ln 10 / -ln rate."""

@@ -54,6 +54,11 @@ def _expectation_lines(sim: Simulator) -> list[str]:
         verdict = f"; {sim.iterations} leave about {left:.1g}: far too few" if left > FAR_TOO_FEW else ""
         counts = " and ".join(f"{error:g} after {expected.words(error)}" for error in (1e-2, 1e-3))
         lines.append(f"expected: an error of {counts} iterations, from the weights alone{verdict}")
+        if sim.tolerance and expected.iterations(sim.tolerance) > sim.iterations:
+            words = expected.words(sim.tolerance)
+            lines.append(
+                f"tolerance {sim.tolerance:g} asks for {words} iterations: few steps will meet it in {sim.iterations}"
+            )
     return lines
 
 
