@@ -194,9 +194,12 @@ def _grid_plan(scene: _Scene, gpu: Properties, batch: int | None) -> tuple[Plan 
         return _fused_plan(scene, "grid", gpu)
     plan, needed, too_few = None, "", 0
     for _, patches in scene.grids(batch, gpu):
-        if plan is None and patches > too_few:
-            plan, needed = _fused_plan(scene, "grid", gpu, patches=patches)
-            too_few = patches
+        if patches <= too_few:
+            continue
+        plan, needed = _fused_plan(scene, "grid", gpu, patches=patches)
+        if plan is not None:
+            break
+        too_few = patches
     return plan, needed
 
 
