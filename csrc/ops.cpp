@@ -37,6 +37,12 @@ struct Cpu {
   static void precondition(const PreconditionCall<double>& call, const Tensor&) {
     kernels().precondition64(call, threads());
   }
+  static void conjugate(const ConjugateCall<float>& call, const Tensor&) {
+    kernels().conjugate32(call, threads());
+  }
+  static void conjugate(const ConjugateCall<double>& call, const Tensor&) {
+    kernels().conjugate64(call, threads());
+  }
   static void rotation(const RotationCall<float>& call, const Tensor&) {
     kernels().rotation32(call, threads());
   }
@@ -82,6 +88,11 @@ TORCH_LIBRARY(torchpd, m) {
       "-> Tensor");
   with_plan("elastic_diagonal(Tensor stiffness, Tensor[] plan, *, bool weighted) -> Tensor");
   with_plan("precondition(Tensor field, Tensor[] plan) -> Tensor");
+  with_plan(
+      "conjugate_gradients_(Tensor(a!) solution, Tensor(b!) residual, Tensor(c!) direction, "
+      "Tensor(d!) "
+      "progress, Tensor positions, Tensor inertia, Tensor inverse, Tensor? projector, Tensor "
+      "stiffness, Tensor[] plan, *, float tolerance, int iterations) -> ()");
   m.def("nearest_rotation(Tensor matrices) -> Tensor");
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }

@@ -1,13 +1,14 @@
 // What every op does on either device: checks, views, one call of the backend.
 //
 // A Backend has `Plan<T>`, the plan that its kernels see; `plan_view<T>(arrays, place)`; and `step`, `field`,
-// `precondition` and `rotation`, which run a call on the device of the tensor they are given.
+// `precondition`, `conjugate` and `rotation`, which run a call on the device of the tensor they are given.
 #pragma once
 #include "checks.h"
 
 #include <ATen/ATen.h>
 #include <torch/library.h>
 
+#include <limits>
 #include <optional>
 
 namespace pd {
@@ -238,6 +239,92 @@ Tensor precondition(const Tensor& field, at::TensorList plan) {
   return out;
 }
 
+struct ConjugateTensors {
+  Tensor solution, residual, direction, progress, positions, inertia, inverse;
+  OptionalTensor projector;
+  Tensor stiffness;
+  at::TensorList plan;
+};
+
+template <class Backend, class T>
+void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t iterations) {
+  ConjugateCall<T, typename Backend::template Plan<T>> call;
+  const Place place{t.positions.device()};
+  call.plan = Backend::template plan_view<T>(t.plan, place);
+  call.batch = t.positions.size(0);
+  check_vertices(t.positions, call.plan.vertices);
+  check_tets(t.stiffness, call.plan.tets);
+  const Tensor x = t.positions.contiguous(), w = t.stiffness.contiguous();
+  const Tensor a = t.inertia.contiguous(), inverse = t.inverse.contiguous();
+  const Tensor p = t.projector ? t.projector->contiguous() : Tensor();
+  const auto of_vertices = [&](const Tensor& values, const char* name, const char* meaning) {
+    TORCH_CHECK_TYPE(values.scalar_type() == t.positions.scalar_type(), name, " must be ",
+                     at::toString(t.positions.scalar_type()), " like positions (", meaning,
+                     "), got ", describe(values));
+    const bool own = values.dim() == 2 && (values.size(0) == 1 || values.size(0) == call.batch);
+    TORCH_CHECK_VALUE((own || values.dim() == 1) && values.size(-1) == call.plan.vertices &&
+                          values.device() == place.device,
+                      name, " must be [vertices] or [batch, vertices] beside positions (", meaning,
+                      "), got ", describe(values));
+    return values_view<T>(values, call.plan.vertices, 1, false, call.batch, place, name, meaning);
+  };
+  call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
+                                  "Young's modulus [Pa]");
+  call.inertia = of_vertices(a, "inertia", "N/m");
+  call.inverse = of_vertices(inverse, "inverse", "of the diagonal [m/N], 0 for what is held");
+  call.positions = x.const_data_ptr<T>();
+  call.projector = p.defined() ? p.const_data_ptr<T>() : nullptr;
+  call.solution = t.solution.mutable_data_ptr<T>();
+  call.residual = t.residual.mutable_data_ptr<T>();
+  call.direction = t.direction.mutable_data_ptr<T>();
+  call.progress = t.progress.mutable_data_ptr<double>();
+  call.tolerance = tolerance;
+  call.iterations = int(iterations);
+  if (call.batch > 0 && iterations > 0) Backend::conjugate(call, t.positions);
+}
+
+template <class Backend>
+void conjugate_gradients(const Tensor& solution, const Tensor& residual, const Tensor& direction,
+                         const Tensor& progress, const Tensor& positions, const Tensor& inertia,
+                         const Tensor& inverse, const OptionalTensor& projector,
+                         const Tensor& stiffness, at::TensorList plan, double tolerance,
+                         std::int64_t iterations) {
+  check_positions(positions, "positions");
+  const Place place{positions.device()};
+  const auto check_vectors = [&](const Tensor& t, const char* name, const char* meaning) {
+    check_state(t, positions, name, meaning);
+    check_storage(t, positions.scalar_type(), place, name, meaning);
+  };
+  check_vectors(solution, "solution", "m");
+  check_vectors(residual, "residual", "N");
+  check_vectors(direction, "direction", "m");
+  check_array(progress, at::kDouble, positions.size(0), progress_count, place, "progress",
+              "r . z, |right side|, 1 while it goes on", "make it for this batch");
+  if (projector) {
+    const at::IntArrayRef sizes = positions.sizes();
+    TORCH_CHECK_TYPE(projector->scalar_type() == positions.scalar_type(), "projector must be ",
+                     at::toString(positions.scalar_type()), " like positions, got ",
+                     describe(*projector));
+    TORCH_CHECK_VALUE(projector->sizes() == at::IntArrayRef({sizes[0], sizes[1], 3, 3}) &&
+                          projector->device() == positions.device(),
+                      "projector must be [batch, vertices, 3, 3] beside positions, got ",
+                      describe(*projector));
+  }
+  TORCH_CHECK_VALUE(tolerance >= 0, "tolerance must be >= 0, got ", tolerance);
+  TORCH_CHECK_VALUE(iterations >= 0 && iterations <= std::numeric_limits<int>::max(),
+                    "iterations must be in [0, 2^31), got ", iterations);
+  const ConjugateTensors tensors{solution, residual, direction, progress,  positions,
+                                 inertia,  inverse,  projector, stiffness, plan};
+  if (positions.scalar_type() == at::kFloat) {
+    conjugate_typed<Backend, float>(tensors, tolerance, iterations);
+  } else {
+    conjugate_typed<Backend, double>(tensors, tolerance, iterations);
+  }
+  for (const Tensor& t : {solution, residual, direction, progress}) {
+    if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
+  }
+}
+
 template <class Backend, class T>
 void rotation_typed(const Tensor& matrices, const Tensor& direction, const Tensor& out) {
   const Tensor f = matrices.contiguous(),
@@ -282,6 +369,7 @@ void register_ops(torch::Library& m) {
   m.impl("element_energy_product", &element_energy_product<Backend>);
   m.impl("elastic_diagonal", &elastic_diagonal<Backend>);
   m.impl("precondition", &precondition<Backend>);
+  m.impl("conjugate_gradients_", &conjugate_gradients<Backend>);
   m.impl("nearest_rotation", &nearest_rotation<Backend>);
   m.impl("rotation_differential", &rotation_differential<Backend>);
 }

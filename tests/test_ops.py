@@ -51,6 +51,21 @@ def samples(
         "element_energy": ((wanted(x), w, plan), {}),
         "element_energy_product": ((wanted(x), wanted(direction), w, plan), {}),
         "hessian_product": ((x, wanted(direction), w.detach(), plan), {}),
+        "conjugate_gradients_": (
+            (
+                0 * x,
+                f.clone(),
+                f.clone(),
+                torch.ones(BATCH, 3, dtype=torch.float64, device=device),
+                x,
+                sim.masses,
+                1 / sim.masses,
+                None,
+                sim.stiffness.detach(),
+                plan,
+            ),
+            {"tolerance": 1e-3, "iterations": 2},
+        ),
         "elastic_diagonal": ((w.detach(), plan), {"weighted": True}),
         "nearest_rotation": ((wanted(matrices),), {}),
         "rotation_differential": ((wanted(matrices), wanted(matrices.flip(0))), {}),
@@ -60,7 +75,7 @@ def samples(
 
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
-    "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp",
+    "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "conjugate_gradients_",
 )  # fmt: skip
 
 

@@ -158,7 +158,13 @@ def fields(sim: pd.Simulator, batch: int) -> None:
         ops.hessian_product(x, d, w, plan)
         ops.element_energy_product(x, d, w, plan)
         for weighted in (False, True):
-            ops.elastic_diagonal(w, plan, weighted=weighted)
+            diagonal = ops.elastic_diagonal(w, plan, weighted=weighted)
+        inertia, inverse = 0.1 * diagonal, 1.0 / (1.1 * diagonal)
+        active = torch.ones(batch, 3, dtype=torch.float64, device=x.device)
+        projector = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape, 3)
+        for held in (None, projector):
+            vectors = [torch.zeros_like(x), d.clone(), d.clone(), active.clone()]
+            ops.conjugate_gradients_(*vectors, x, inertia, inverse, held, w, plan, tolerance=0.0, iterations=2)
 
 
 def rotations(dtype: torch.dtype) -> None:

@@ -15,7 +15,7 @@ moves with its start. A sliding vertex counts as frictionless: its friction forc
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -31,6 +31,7 @@ __all__ = ["AdjointCall", "step_adjoint", "step_gradient"]
 _TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 _MOST_ITERATIONS = 2000
 _ASKED_EVERY = 10  # iterations: asking whether any environment goes on waits for a GPU
+_MOST_OF_A_BLOCK = 16384  # vertices of an environment that one thread block is quick enough with
 # A body stretched this much turns so little that its Hessian is the constant, positive majoriser but for 1e-4.
 _STRETCH = 1e4
 _SPANNED = 1e-6  # square of what earlier normals leave of one that they span
@@ -84,7 +85,59 @@ def conjugate_gradients(
         last, rho = rho, _dot(residual, preconditioned)
         ratio = torch.where(active, rho / last.where(active, torch.ones_like(last)), torch.zeros_like(rho))
         direction = torch.where(active[:, None, None], preconditioned + ratio[:, None, None] * direction, direction)
-    return solution, _dot(residual, residual).sqrt() / torch.where(scale > 0, scale, torch.ones_like(scale))
+    return solution, _relative(residual, scale)
+
+
+def _relative(residual: Tensor, scale: Tensor) -> Tensor:
+    return _dot(residual, residual).sqrt() / torch.where(scale > 0, scale, torch.ones_like(scale))
+
+
+@dataclass(frozen=True)
+class _System:
+    """H of a step's objective, on what moves: P (inertia + elastic Hessian) P, and the diagonal for it."""
+
+    inertia: Tensor  # [V, 1] or [B, V, 1] N/m, without the curvature of what is slid on
+    inverse: Tensor  # 1 / D [B, V, 1], 0 where a vertex does not move
+    projector: Tensor | None  # of what contacts let through [B, V, 3, 3]
+    stiffness: Tensor
+    plan: list[Tensor]
+
+    def allowed(self, field: Tensor) -> Tensor:
+        """The part of a field [B, V, 3] that may move."""
+        field = torch.where(self.inverse != 0, field, torch.zeros_like(field))
+        return field if self.projector is None else (self.projector * field.unsqueeze(-2)).sum(-1)
+
+    def solve(self, positions: Tensor, right: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+        """As `conjugate_gradients`, with the elastic Hessian at some positions; `right` is `allowed`."""
+        if has_levels(self.plan) or (right.is_cuda and right.shape[1] > _MOST_OF_A_BLOCK):
+            return conjugate_gradients(lambda f: self._product(positions, f), self._precondition, right, tolerance)
+        # what many operations on small tensors would spend their time with
+        solution, residual, direction = torch.zeros_like(right), right.clone(), self.inverse * right
+        scale = _dot(right, right).sqrt()
+        progress = torch.stack((_dot(right, direction), scale, (scale > 0).to(right.dtype)), dim=-1).double()
+        steps = _ASKED_EVERY if right.is_cuda else _MOST_ITERATIONS
+        for _ in range(0, _MOST_ITERATIONS, steps):
+            torch.ops.torchpd.conjugate_gradients_(
+                solution, residual, direction, progress, positions, self.inertia.squeeze(-1),
+                self.inverse.squeeze(-1), self.projector, self.stiffness, self.plan,
+                tolerance=tolerance, iterations=steps,
+            )  # fmt: skip
+            if not right.is_cuda or not bool(progress[:, 2].any()):
+                break
+        return solution, _relative(residual, scale)
+
+    def _product(self, positions: Tensor, field: Tensor) -> Tensor:
+        elastic = torch.ops.torchpd.hessian_product(positions, field.contiguous(), self.stiffness, self.plan)
+        return self.allowed(self.inertia * field + elastic)
+
+    def _precondition(self, field: Tensor) -> Tensor:
+        plain = self.inverse * field
+        if not has_levels(self.plan):
+            return plain
+        # M has no say on vertices that were held when it was made
+        _, inertia_of_levels = reference_of_levels(self.plan)
+        known = torch.isfinite(inertia_of_levels).unsqueeze(-1)
+        return self.allowed(torch.where(known, torch.ops.torchpd.precondition(field, self.plan), plain))
 
 
 @dataclass(frozen=True)
@@ -180,30 +233,17 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
     contacts = material["planes"].shape[-2] + material["spheres"].shape[-2] > 0
     held = _held_by_contacts(call, step_gradient(call), diagonal) if contacts else None
 
-    def allowed(field: Tensor) -> Tensor:
-        moves = free if held is None else free & ~held.stuck
-        field = torch.where(moves, field, torch.zeros_like(field))
-        return field if held is None else held.off_normals(field)
-
-    def product(field: Tensor) -> Tensor:
-        image = inertia * field + _elastic_product(call, field, call.after)
-        return allowed(image if held is None else image - held.curvature * field)
-
-    def majoriser(field: Tensor) -> Tensor:
-        return allowed(inertia * field + _elastic_product(call, field, _STRETCH * call.after))
-
-    def precondition(field: Tensor) -> Tensor:
-        plain = field / diagonal
-        if not has_levels(call.plan):
-            return plain
-        # M has no say on vertices that were held when it was made
-        _, inertia_of_levels = reference_of_levels(call.plan)
-        known = torch.isfinite(inertia_of_levels).unsqueeze(-1)
-        return allowed(torch.where(known, torch.ops.torchpd.precondition(field, call.plan), plain))
-
+    moves = free if held is None else free & ~held.stuck
+    system = _System(
+        inertia=inertia if held is None else inertia - held.curvature,
+        inverse=torch.where(moves, 1.0 / diagonal, 0.0),
+        projector=None if held is None else held.projector,
+        stiffness=material["stiffness"],
+        plan=call.plan,
+    )
     tolerance = _TOLERANCE[right.dtype]
-    right = allowed(right)
-    multiplier, error = conjugate_gradients(product, precondition, right, tolerance)
+    right = system.allowed(right)
+    multiplier, error = system.solve(call.after, right, tolerance)
     # a loss or a state that is no number has a gradient that is none, as those who watch for it expect
     lost = ~(torch.isfinite(right) & torch.isfinite(call.after)).flatten(1).all(1)
     multiplier = torch.where(lost[:, None, None], torch.nan, multiplier)
@@ -216,7 +256,8 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
             "take the rotations as constant.",
         )
         wanted = torch.where(failed[:, None, None], right, 0.0)
-        instead, _ = conjugate_gradients(majoriser, precondition, wanted, tolerance)
+        # the curvature of what is slid on has no part in the majoriser either
+        instead, _ = replace(system, inertia=inertia).solve(_STRETCH * call.after, wanted, tolerance)
         multiplier = torch.where(failed[:, None, None], instead, multiplier)
     return multiplier.contiguous(), held
 

@@ -123,6 +123,11 @@ def _(field: Tensor, plan: Sequence[Tensor]) -> Tensor:
     return field.new_empty(field.shape)
 
 
+@_register_fake("conjugate_gradients_")
+def _(*_: Any, **__: Any) -> None:
+    return None
+
+
 @_register_fake("nearest_rotation")
 def _(matrices: Tensor) -> Tensor:
     return matrices.new_empty(matrices.shape)

@@ -18,6 +18,8 @@ struct Kernels {
   void (*rotation64)(const RotationCall<double>&, int threads);
   void (*precondition32)(const PreconditionCall<float>&, int threads);
   void (*precondition64)(const PreconditionCall<double>&, int threads);
+  void (*conjugate32)(const ConjugateCall<float>&, int threads);
+  void (*conjugate64)(const ConjugateCall<double>&, int threads);
   void (*flops)(float* seconds, std::int64_t* operations);  // multiply-add loop, for calibration
 };
 

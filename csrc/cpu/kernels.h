@@ -1,5 +1,6 @@
 // The compiled physics of one instruction set. Included once by each cpu/isa_*.cpp, after PD_TARGET is set.
 #pragma once
+#include "cpu/conjugate.h"
 #include "cpu/fields.h"
 #include "cpu/multilevel_stepper.h"
 #include "cpu/stepper.h"
@@ -114,6 +115,33 @@ void field_any(const FieldCall<T>& call, int threads) {
   });
 }
 
+// Environments side by side where their patches are too few to share.
+template <class T>
+void conjugate_any(const ConjugateCall<T>& call, int threads) {
+  using Lanes = Single<T>;
+  if (call.batch > 1 && call.plan.patches < 2 * threads) {
+    std::atomic<std::int64_t> next{0};
+    run_team(int(std::min<std::int64_t>(threads, call.batch)), [&](const Team&) {
+      const CleanRegisters clean;
+      Workspace<Lanes> work(call);
+      Turnings<T> turnings(call.plan);
+      Scratch<Lanes> scratch(call.plan.most_slots);
+      const Team alone;
+      ConjugatePass<T> pass(call, work, turnings, scratch, alone);
+      for (std::int64_t e = next++; e < call.batch; e = next++) pass.run(e);
+    });
+    return;
+  }
+  Workspace<Lanes> work(call);
+  Turnings<T> turnings(call.plan);
+  auto scratches = make_scratches<Lanes>(call.plan, threads);
+  run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
+    const CleanRegisters clean;
+    ConjugatePass<T> pass(call, work, turnings, scratches[team.rank], team);
+    for (std::int64_t e = 0; e < call.batch; ++e) pass.run(e);
+  });
+}
+
 // M of the fields, environment by environment.
 template <class T>
 void precondition_any(const PreconditionCall<T>& call, int threads) {
@@ -215,6 +243,8 @@ const Kernels PD_KERNELS = {PD_NAME,
                             &rotation_any<double>,
                             &precondition_any<float>,
                             &precondition_any<double>,
+                            &conjugate_any<float>,
+                            &conjugate_any<double>,
                             &multiply_add_loop};
 
 }  // namespace pd

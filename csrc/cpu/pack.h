@@ -55,6 +55,8 @@ struct Pack {
     return r;
   }
 
+  PD_HD void store(T* to) const { std::memcpy(to, &v, sizeof(Vector)); }
+
   PD_HD friend Pack operator+(Pack a, Pack b) { return a.v + b.v; }
   PD_HD friend Pack operator-(Pack a, Pack b) { return a.v - b.v; }
   PD_HD friend Pack operator*(Pack a, Pack b) { return a.v * b.v; }

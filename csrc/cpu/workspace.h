@@ -52,6 +52,8 @@ struct Workspace {
 
   explicit Workspace(const FieldCall<T>& call) : Workspace(call.plan, {}, true, false) {}
 
+  explicit Workspace(const ConjugateCall<T>& call) : Workspace(call.plan, {}, true, true) {}
+
  private:
   static constexpr std::size_t alignment = 64;
 

@@ -210,12 +210,17 @@ void run_vertices(const FieldWork<T>& work, cudaStream_t stream) {
 }
 
 template <bool Computed, class T>
-void run_field_with(const FieldWork<T>& work, cudaStream_t stream) {
-  const DeviceField<T>& field = work.field;
-  const std::int64_t sets = field.stiffness.stride ? field.batch : 1;
+void weigh_field(const FieldWork<T>& work, cudaStream_t stream) {
+  const std::int64_t sets = work.field.stiffness.stride ? work.field.batch : 1;
   field_weights<Computed, T>
-      <<<blocks_of(sets * field.plan.patches), field_threads, 0, stream>>>(work);
+      <<<blocks_of(sets * work.field.plan.patches), field_threads, 0, stream>>>(work);
   check(cudaGetLastError());
+}
+
+template <bool Computed, class T>
+void run_field_with(const FieldWork<T>& work, cudaStream_t stream) {
+  weigh_field<Computed>(work, stream);
+  const DeviceField<T>& field = work.field;
   switch (field.field) {
     case Field::gradient:
       return run_vertices<Computed, SolidGradient<false>, 1, 3>(work, stream);

@@ -1,7 +1,9 @@
-#include "cuda/fields.cuh"
+#include "cuda/conjugate.cuh"
 
 namespace pd {
 template std::int64_t field_bytes(const DeviceField<double>&);
 template void run_field(const DeviceField<double>&, void*, Stream);
+template std::int64_t conjugate_bytes(const DeviceConjugate<double>&);
+template void run_conjugate(const DeviceConjugate<double>&, void*, Stream);
 template void run_rotation(const RotationCall<double>&, Stream);
 }  // namespace pd

@@ -1,7 +1,9 @@
-#include "cuda/fields.cuh"
+#include "cuda/conjugate.cuh"
 
 namespace pd {
 template std::int64_t field_bytes(const DeviceField<float>&);
 template void run_field(const DeviceField<float>&, void*, Stream);
+template std::int64_t conjugate_bytes(const DeviceConjugate<float>&);
+template void run_conjugate(const DeviceConjugate<float>&, void*, Stream);
 template void run_rotation(const RotationCall<float>&, Stream);
 }  // namespace pd

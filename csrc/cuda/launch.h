@@ -45,6 +45,14 @@ template <class T>
 void run_field(const DeviceField<T>& call, void* memory, Stream stream);
 
 template <class T>
+using DeviceConjugate = ConjugateCall<T, DevicePlan<T>>;
+
+template <class T>
+std::int64_t conjugate_bytes(const DeviceConjugate<T>& call);
+template <class T>
+void run_conjugate(const DeviceConjugate<T>& call, void* memory, Stream stream);
+
+template <class T>
 std::int64_t precondition_bytes(const PreconditionCall<T>& call);
 template <class T>
 void run_precondition(const PreconditionCall<T>& call, void* memory, Stream stream);

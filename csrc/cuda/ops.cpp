@@ -35,6 +35,11 @@ struct Cuda {
   }
 
   template <class T>
+  static void conjugate(const DeviceConjugate<T>& call, const Tensor& like) {
+    run(like, call, conjugate_bytes<T>, run_conjugate<T>);
+  }
+
+  template <class T>
   static void rotation(const RotationCall<T>& call, const Tensor& like) {
     const c10::cuda::CUDAGuard guard(like.device());
     run_rotation(call, c10::cuda::getCurrentCUDAStream().stream());

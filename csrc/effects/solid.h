@@ -90,6 +90,14 @@ PD_HD void solid_hessian_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
   corner_forces(weight * (df - dr), rest_inverse, g);
 }
 
+// The same for many directions at one place, which `turning` holds.
+template <class R>
+PD_HD void solid_hessian_product(const Turning<R>& turning, const Vec3<R> (&dx)[4],
+                                 const Mat3<R>& rest_inverse, const R& weight, Vec3<R> (&g)[4]) {
+  const Mat3<R> df = deformation_gradient(dx, rest_inverse);
+  corner_forces(weight * (df - turning.differential(df)), rest_inverse, g);
+}
+
 // Derivative of the energy along `dx`: w V (F - R) : dF
 template <class R>
 PD_HD R element_energy_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],

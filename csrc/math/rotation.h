@@ -139,17 +139,22 @@ PD_HD Mat3<R> nearest_rotation(const Mat3<R>& f) {
   return r;
 }
 
-// (tr(S) I - S) x = axis for the symmetric part of S: how a small turn of R answers a torque.
+// tr(S) I - S for the symmetric part of S: what a small turn of R meets.
 template <class R>
-PD_HD Vec3<R> solve_turn(const Mat3<R>& s, const Vec3<R>& axis) {
+PD_HD Mat3<R> turn_matrix(const Mat3<R>& s) {
   const R trace = s.row[0].x + s.row[1].y + s.row[2].z;
   const R minus_half(scalar_of<R>(-0.5));
   const R xy = minus_half * (s.row[0].y + s.row[1].x);
   const R xz = minus_half * (s.row[0].z + s.row[2].x);
   const R yz = minus_half * (s.row[1].z + s.row[2].y);
-  const Mat3<R> h = {
+  return {
       {{trace - s.row[0].x, xy, xz}, {xy, trace - s.row[1].y, yz}, {xz, yz, trace - s.row[2].z}}};
-  const Mat3<R> c = cofactor(h);
+}
+
+// (tr(S) I - S) x = axis: how a small turn of R answers a torque.
+template <class R>
+PD_HD Vec3<R> solve_turn(const Mat3<R>& s, const Vec3<R>& axis) {
+  const Mat3<R> h = turn_matrix(s), c = cofactor(h);
   return (R(scalar_of<R>(1)) / dot(h.row[0], c.row[0])) * (c * axis);
 }
 
@@ -173,6 +178,23 @@ PD_HD Mat3<R> rotation_differential(const Mat3<R>& f, const Mat3<R>& r, const Ma
   const Mat3<R> rt = transpose(r);
   return r * cross_matrix(solve_turn(rt * f, axis_of(rt * df)));
 }
+
+// All that this derivative takes of F, for many directions: R, and the inverse of tr(S) I - S.
+template <class R>
+struct Turning {
+  Mat3<R> rotation, answer;
+
+  Turning() = default;
+
+  PD_HD explicit Turning(const Mat3<R>& f) : rotation(nearest_rotation(f)) {
+    const Mat3<R> h = turn_matrix(transpose(rotation) * f), c = cofactor(h);
+    answer = (R(scalar_of<R>(1)) / dot(h.row[0], c.row[0])) * c;
+  }
+
+  PD_HD Mat3<R> differential(const Mat3<R>& df) const {
+    return rotation * cross_matrix(answer * axis_of(transpose(rotation) * df));
+  }
+};
 
 // One Newton step on the group of rotations, then one Newton-Schulz step back onto it: the last bits.
 template <class R>

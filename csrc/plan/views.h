@@ -210,6 +210,28 @@ struct FieldCall {
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, vertices] of the diagonal
 };
 
+// Numbers of an environment in the progress of a solve: r . z, |right side|, and 1 while it goes on, else 0.
+enum ConjugateProgress : int { progress_product, progress_scale, progress_active, progress_count };
+
+// Iterations of conjugate gradients on (inertia + elastic Hessian) solution = right side, preconditioned by a diagonal, for each
+// environment by itself.
+template <class T, class P = Plan<T>>
+struct ConjugateCall {
+  P plan;
+  Values<T> stiffness;
+  Values<T> inertia, inverse;  // [vertices]; inverse diagonal, 0 where a vertex does not move
+  std::int64_t batch = 0;
+  const T* positions = nullptr;  // [batch, vertices, 3]
+  const T* projector =
+      nullptr;            // [batch, vertices, 3, 3] of what contacts let through; may be null
+  T* solution = nullptr;  // [batch, vertices, 3] each
+  T* residual = nullptr;
+  T* direction = nullptr;
+  double* progress = nullptr;  // [batch, progress_count]
+  double tolerance = 0;        // of the residual, relative to the right side
+  int iterations = 0;
+};
+
 // The approximation of A^-1 of a vector for each vertex.
 template <class T>
 struct PreconditionCall {

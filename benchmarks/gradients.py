@@ -1,0 +1,103 @@
+"""What a gradient costs beside the step that it goes through: milliseconds forward, and backward.
+
+A held bar swings, float32, time step 1/60 s, 64 guarded iterations, from 1e6 Pa on 256; the loss is the sum of squares
+of the new positions, and the velocities before are asked for their gradients. Times are medians, as Python calls it,
+device awaited. `operations`: backward where the conjugate gradients are torch operations and Hessian products, as they
+are for large meshes on a GPU and with a multilevel preconditioner.
+
+    python benchmarks/gradients.py --threads 1
+    python benchmarks/gradients.py --device cuda --threads 16
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import torch
+from gpu_scenes import GpuScene
+from machine import describe_run, measure
+from tqdm import tqdm
+
+import torchpd as pd
+from torchpd.adjoint import _System, conjugate_gradients
+
+Row = dict[str, Any]
+
+# cells, batch
+SCENES = (((3, 3, 3), 1), ((3, 3, 3), 64), ((15, 3, 3), 1), ((15, 3, 3), 64), ((15, 3, 3), 1024), ((9, 9, 9), 64))
+YOUNGS = (1e4, 1e5, 1e6)
+
+
+def by_operations(system: _System, positions: torch.Tensor, right: torch.Tensor, tolerance: float) -> Any:
+    """`_System.solve` without the op."""
+    return conjugate_gradients(lambda field: system._product(positions, field), system._precondition, right, tolerance)
+
+
+def measure_scene(cells: tuple[int, int, int], batch: int, youngs: float, device: torch.device, seconds: float) -> Row:
+    """One row of the result."""
+    scene = GpuScene("bar", cells, batch)
+    sim = pd.Simulator(
+        scene.build(), 1 / 60, 64 if youngs < 1e6 else 256, solver=pd.Chebyshev(), progress=False, batch=batch
+    ).to(device)
+    sim.set_material(stiffness=sim.stiffness * (youngs / float(sim.stiffness.max())))
+    state = scene.start(sim)
+    state.velocities.requires_grad_()
+
+    def forward() -> torch.Tensor:
+        return sim(state).positions.square().sum()
+
+    def both() -> None:
+        torch.autograd.grad(forward(), state.velocities)
+
+    def median(work: Callable[[], object]) -> float:
+        return 1e3 * statistics.median(measure(work, device, repetitions=5, seconds=seconds))
+
+    once, all_of_it = median(forward), median(both)
+    with mock.patch.object(_System, "solve", by_operations):
+        operations = median(both)
+    return {
+        "vertices": sim.vertices, "batch": batch, "youngs": youngs, "iterations": sim.iterations,
+        "kernel": sim.plan.kernel, "forward": once, "backward": all_of_it - once, "operations": operations - once,
+    }  # fmt: skip
+
+
+def line_of(row: Row) -> str:
+    """For a reader."""
+    times = " | ".join(f"{row[name]:.3g}" for name in ("forward", "backward", "operations"))
+    share = row["backward"] / row["forward"]
+    return f"| {row['batch']} x {row['vertices']} | {row['youngs']:.0e} Pa | {times} | {share:.2g} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=0.5, help="of timing a scene (%(default)g)")
+    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    device = torch.device(options.device)
+    jobs = [(cells, batch, youngs) for cells, batch in SCENES for youngs in YOUNGS]
+    rows = [
+        measure_scene(cells, batch, youngs, device, options.seconds)
+        for cells, batch, youngs in tqdm(jobs, desc="measuring", unit="scene", leave=False)
+    ]
+    print(
+        "| batch x vertices | Young's modulus | forward ms | backward ms | by torch operations | backward / forward |"
+    )
+    print("|---|---|---|---|---|---|")
+    for row in rows:
+        print(line_of(row))
+    if options.out:
+        result = {"schema": 1, **describe_run(device, options.threads), "rows": rows}
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

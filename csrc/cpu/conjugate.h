@@ -1,0 +1,194 @@
+// Runner of solver/conjugate.h: one environment at a time, by one thread or by a team.
+#pragma once
+#include "cpu/sweep.h"
+#include "solver/conjugate.h"
+
+#include <cmath>
+
+namespace pd::inline PD_TARGET {
+
+// What the elements of a plan keep of a place: nine numbers of a rotation, nine of its answer, blocks of lanes side by side.
+template <class T>
+class Turnings {
+  static constexpr int W = native_width<T>, numbers = 18;
+
+ public:
+  explicit Turnings(const Plan<T>& plan)
+      : storage_(allocate_zeroed(std::int64_t(plan.blocks) * block_lanes * numbers * sizeof(T))),
+        data_(reinterpret_cast<T*>(storage_.get())) {}
+
+  void set(const BlockPart<T>& part, const Turning<Pack<T, W>>& turning) {
+    each(part, turning, [](auto& number, T* at) { number.store(at); });
+  }
+  Turning<Pack<T, W>> get(const BlockPart<T>& part) const {
+    Turning<Pack<T, W>> turning;
+    each(part, turning, [](auto& number, T* at) { number = Pack<T, W>::load(at); });
+    return turning;
+  }
+
+ private:
+  template <class Any, class Visit>
+  void each(const BlockPart<T>& part, Any& turning, const Visit& visit) const {
+    T* at = data_ + std::int64_t(part.block) * block_lanes * numbers + part.first_lane;
+    for (auto* matrix : {&turning.rotation, &turning.answer}) {
+      for (auto& row : matrix->row) {
+        for (auto* number : {&row.x, &row.y, &row.z}) {
+          visit(*number, at);
+          at += block_lanes;
+        }
+      }
+    }
+  }
+
+  Storage storage_;
+  T* data_;
+};
+
+template <class T>
+class ConjugatePass {
+  using Lanes = Single<T>;
+  using Sum = Sums<Lanes>;
+
+ public:
+  ConjugatePass(const ConjugateCall<T>& call, Workspace<Lanes>& work, Turnings<T>& turnings,
+                Scratch<Lanes>& scratch, const Team& team)
+      : call_(call),
+        plan_(call.plan),
+        w_(work),
+        turnings_(turnings),
+        team_(team),
+        sweep_{plan_, work, scratch, team} {}
+
+  void run(std::int64_t environment) {
+    Conjugate numbers(call_.progress + environment * progress_count);
+    if (!numbers.active) return;
+    environment_ = environment;
+    load();
+    for (int k = 0; k < call_.iterations && numbers.active; ++k) iterate(numbers);
+    store();
+    if (team_.rank == 0) numbers.write(call_.progress + environment * progress_count);
+    team_.barrier();
+  }
+
+ private:
+  std::int64_t row(std::int64_t i) const {
+    return (environment_ * plan_.vertices + plan_.vertex_order[i]) * 3;
+  }
+  Quad<T> read(const T* from, std::int64_t i) const {
+    return to_quad(from[row(i)], from[row(i) + 1], from[row(i) + 2]);
+  }
+
+  void load() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.x[i] = read(call_.positions, i);
+      solution()[i] = read(call_.solution, i);
+      residual()[i] = read(call_.residual, i);
+      direction()[i] = read(call_.direction, i);
+      w_.inertia[i] = call_.inertia.of(environment_)[plan_.vertex_order[i]];
+      w_.inverse[i] = call_.inverse.of(environment_)[plan_.vertex_order[i]];
+    }
+    const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;
+    for (std::int64_t e = team_.begin(elements); e < team_.end(elements); ++e) {
+      w_.weight[e] = plan_.tet_volume[e] * call_.stiffness.of(environment_)[plan_.tet_order[e]];
+    }
+    team_.barrier();
+    sweep_.set_origins();
+    team_.barrier();
+    const auto turn = one_by_one([&](const auto& elements, int s) {
+      using R = typename std::remove_cvref_t<decltype(elements)>::R;
+      Vec3<R> x[4];
+      elements.corners(s, 0, x);
+      turnings_.set(elements.part(s), Turning<R>(deformation_gradient(x, elements.rest(s))));
+    });
+    sweep_.run(0, turn, [](std::int64_t, const Quad<T>&, Sum&) {});
+  }
+
+  void iterate(Conjugate& numbers) {
+    const auto product = one_by_one([&](const auto& elements, int s) {
+      using R = typename std::remove_cvref_t<decltype(elements)>::R;
+      Vec3<R> dx[4], g[4];
+      elements.corners(s, 1, dx);
+      solid_hessian_product(turnings_.get(elements.part(s)), dx, elements.rest(s),
+                            elements.weight(s), g);
+      elements.add(s, g);
+    });
+    sweep_.template run<2>(0, product, [&](std::int64_t i, const Quad<T>& force, Sum& sums) {
+      const Quad<T> d = direction()[i];
+      const T* projector = call_.projector ? call_.projector + 3 * row(i) : nullptr;
+      const Vec3<T> moved = conjugate_image(to_vec3(force), to_vec3(d), w_.inertia[i],
+                                            w_.inverse[i] != T(0), projector);
+      image()[i] = Lanes::value(moved);
+      sums.first = multiply_add(d, image()[i], sums.first);
+    });
+    const T step = T(numbers.step(total(0).first));
+    if (!numbers.active) return;
+    each_part([&](std::int64_t i, Sum& sums) {
+      solution()[i] = multiply_add(step, direction()[i], solution()[i]);
+      const Quad<T> rest = subtract_product(residual()[i], step, image()[i]);
+      residual()[i] = rest;
+      sums.first = multiply_add(rest, rest, sums.first);
+      sums.second = multiply_add(rest, w_.inverse[i] * rest, sums.second);
+    });
+    const auto sum = total(1);
+    const T keep = T(numbers.keep(sum.first, sum.second, call_.tolerance));
+    if (!numbers.active) return;
+    // not part by part: others may still read the sums
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      direction()[i] = multiply_add(keep, direction()[i], w_.inverse[i] * residual()[i]);
+    team_.barrier();
+  }
+
+  void store() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      write(call_.solution, i, solution()[i]);
+      write(call_.residual, i, residual()[i]);
+      write(call_.direction, i, direction()[i]);
+    }
+  }
+  void write(T* to, std::int64_t i, const Quad<T>& a) const {
+    for (int c = 0; c < 3; ++c) to[row(i) + c] = a.q.v[c];
+  }
+
+  // The vertices of every part of a sweep, whose sums are left as it leaves them: in one order however many threads there are.
+  template <class Visit>
+  void each_part(const Visit& visit) {
+    for (int part = team_.begin(w_.part_count); part < team_.end(w_.part_count); ++part) {
+      const bool whole = part < plan_.patches;
+      const int first =
+          whole ? plan_.patch_vertex[part]
+                : plan_.patch_vertex[plan_.patches] + (part - plan_.patches) * shared_chunk;
+      const int end =
+          whole ? plan_.patch_vertex[part + 1] : std::min(first + shared_chunk, plan_.vertices);
+      Sum sums = sweep_.no_sums();
+      for (int i = first; i < end; ++i) visit(i, sums);
+      sweep_.record(1, part, sums, 0.0);
+    }
+    team_.barrier();
+  }
+
+  // every thread adds up the same parts in the same order, so all come to the same decisions
+  typename Workspace<Lanes>::Part total(int parity) const {
+    typename Workspace<Lanes>::Part sum = w_.parts[parity][0];
+    for (int part = 1; part < w_.part_count; ++part) {
+      sum.first += w_.parts[parity][part].first;
+      sum.second += w_.parts[parity][part].second;
+    }
+    return sum;
+  }
+
+  // the directions stand where a sweep looks for its second field
+  Quad<T>* direction() const { return w_.before; }
+  Quad<T>* solution() const { return w_.velocity; }
+  Quad<T>* residual() const { return w_.target; }
+  Quad<T>* image() const { return w_.force; }
+
+  const ConjugateCall<T>& call_;
+  const Plan<T>& plan_;
+  Workspace<Lanes>& w_;
+  Turnings<T>& turnings_;
+  const Team& team_;
+  Sweep<Lanes> sweep_;
+  std::int64_t environment_ = 0;
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,210 @@
+"""The op behind the adjoint: conjugate gradients on the Hessian of a step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchpd as pd
+from torchpd.adjoint import _System, conjugate_gradients
+
+pytestmark = pytest.mark.usefixtures("poisoned")
+
+ops = torch.ops.torchpd
+BATCH = 3
+
+
+def noise(shape: torch.Size, dtype: torch.dtype, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+
+
+def system(
+    dtype: torch.dtype, device: torch.device, *, cells: tuple[int, int, int] = (3, 2, 2), contacts: bool = False
+) -> tuple[_System, Tensor, Tensor]:
+    """A bar whose environments differ, three of its vertices held; positions, and a right side of what may move."""
+    mesh = pd.shapes.box((1.0, 0.4, 0.3), cells)
+    solid = pd.Solid(mesh, youngs=2e4, density=1000.0)
+    sim = pd.Simulator(pd.Scene(solid), 1 / 60, dtype=dtype, progress=False).to(device)
+    x = sim.rest_state(BATCH).positions.cpu()
+    spread = torch.tensor([1.0, 0.3, 2.5], dtype=dtype)[:, None]
+    moves = torch.ones(BATCH, sim.vertices, 1, dtype=dtype)
+    moves[:, :3] = 0.0
+    inertia = 0.5 * sim.masses.cpu()[:, None] / sim.time_step**2 * (1 + 0.1 * noise((BATCH, sim.vertices, 1), dtype))
+    normal = torch.nn.functional.normalize(noise((*x.shape[:2], 3), dtype, 1), dim=-1)
+    projector = (
+        torch.eye(3, dtype=dtype)
+        - normal[..., None] * normal[..., None, :] * (torch.arange(sim.vertices) % 2)[:, None, None]
+    )
+    stiffness = spread * sim.stiffness.cpu()
+    diagonal = (
+        inertia + ops.elastic_diagonal(stiffness.to(device), list(sim.plan.arrays), weighted=True).cpu()[..., None]
+    )
+    found = _System(
+        inertia.to(device), (moves / diagonal).to(device), projector.to(device) if contacts else None,
+        stiffness.to(device), list(sim.plan.arrays),
+    )  # fmt: skip
+    positions = (x + 0.01 * noise(x.shape, dtype, 2)).to(device)
+    return found, positions, found.allowed(noise(x.shape, dtype, 3).to(device))
+
+
+def start(s: _System, right: Tensor) -> list[Tensor]:
+    """Solution, residual, direction and progress before the first iteration."""
+    direction, scale = s.inverse * right, right.square().sum((1, 2)).sqrt()
+    progress = torch.stack(((right * direction).sum((1, 2)), scale, torch.ones_like(scale)), dim=-1).double()
+    return [torch.zeros_like(right), right.clone(), direction, progress]
+
+
+def iterate(s: _System, state: list[Tensor], positions: Tensor, iterations: int, tolerance: float = 0.0) -> None:
+    ops.conjugate_gradients_(
+        *state, positions, s.inertia.squeeze(-1), s.inverse.squeeze(-1), s.projector, s.stiffness, s.plan,
+        tolerance=tolerance, iterations=iterations,
+    )  # fmt: skip
+
+
+def environment(s: _System, e: int) -> _System:
+    """One of them, alone."""
+    own: dict[str, Any] = {name: getattr(s, name)[e : e + 1] for name in ("inertia", "inverse", "stiffness")}
+    return replace(s, projector=None if s.projector is None else s.projector[e : e + 1], **own)
+
+
+@pytest.mark.parametrize("contacts", [False, True])
+def test_the_solution_is_that_of_a_dense_matrix(contacts: bool, dtype: torch.dtype, device: torch.device) -> None:
+    s, positions, right = system(dtype, device, contacts=contacts)
+    solution, error = s.solve(positions, right, 1e-6 if dtype == torch.float32 else 1e-12)
+    exact, x, b = system(torch.float64, device, contacts=contacts)
+    units = torch.eye(x[0].numel(), dtype=torch.float64, device=device).reshape(-1, *x[0].shape)
+    for e in range(BATCH):
+        alone = environment(exact, e)
+        fields = [alone.allowed(unit[None]) for unit in units]
+        matrix = torch.stack([alone._product(x[e : e + 1], field).flatten() for field in fields])
+        outside = torch.stack([(unit - field[0]).flatten() for unit, field in zip(units, fields, strict=True)])
+        wanted = torch.linalg.solve(matrix + float(matrix.diagonal().max()) * outside, b[e].flatten()).reshape(
+            x[e].shape
+        )
+        assert float((solution[e] - wanted).norm() / wanted.norm()) < (1e-4 if dtype == torch.float32 else 1e-9)
+    assert float(error.max()) < (2e-6 if dtype == torch.float32 else 2e-12)
+
+
+def test_it_does_what_torch_operations_do(dtype: torch.dtype, device: torch.device) -> None:
+    """Iteration by iteration; ten of them leave a residual that rounding has little part in."""
+    s, positions, right = system(dtype, device, contacts=True)
+    state = start(s, right)
+    iterate(s, state, positions, 10)
+    wanted = torch.zeros_like(right)
+    # by hand, in float64
+    exact, x, b = system(torch.float64, device, contacts=True)
+    r, d = b, exact.inverse * b
+    wanted, rho = torch.zeros_like(b), (b * d).sum((1, 2), keepdim=True)
+    for _ in range(10):
+        image = exact._product(x, d)
+        length = rho / (d * image).sum((1, 2), keepdim=True)
+        wanted, r = wanted + length * d, r - length * image
+        z = exact.inverse * r
+        last, rho = rho, (r * z).sum((1, 2), keepdim=True)
+        d = z + rho / last * d
+    limit = 1e-4 if dtype == torch.float32 else 1e-11
+    assert float((state[0] - wanted).norm() / wanted.norm()) < limit
+    assert float((state[1] - r).norm() / b.norm()) < limit
+    assert torch.allclose(state[3][:, 0], rho.flatten(), rtol=100 * limit)
+    assert state[3][:, 2].tolist() == [1.0] * BATCH
+
+
+@pytest.mark.parametrize("cells", [(3, 2, 2), (40, 9, 9)], ids=["one patch", "several"])
+def test_an_environment_has_the_same_bits_alone(
+    cells: tuple[int, int, int], dtype: torch.dtype, device: torch.device
+) -> None:
+    s, positions, right = system(dtype, device, cells=cells, contacts=True)
+    threads = torch.get_num_threads()
+    together = start(s, right)
+    iterate(s, together, positions, 7)
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            for e in range(BATCH):
+                own = environment(s, e)
+                alone = start(own, right[e : e + 1])
+                iterate(own, alone, positions[e : e + 1], 7)
+                assert all(torch.equal(one[0], many[e]) for one, many in zip(alone, together, strict=True))
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_calls_go_on_where_the_last_one_ended(dtype: torch.dtype, device: torch.device) -> None:
+    s, positions, right = system(dtype, device)
+    once, twice = start(s, right), start(s, right)
+    iterate(s, once, positions, 9)
+    iterate(s, twice, positions, 4)
+    iterate(s, twice, positions, 5)
+    assert all(torch.equal(one, other) for one, other in zip(once, twice, strict=True))
+
+
+def test_an_environment_ends_by_itself(dtype: torch.dtype, device: torch.device) -> None:
+    """One is done, one not positive, one not to go on at all: the first has its solution, the others what they had."""
+    s, positions, right = system(dtype, device)
+    inertia = s.inertia.clone()
+    inertia[1] = -1e9
+    s = replace(s, inertia=inertia)
+    state = start(s, right)
+    state[3][2, 2] = 0.0
+    before = [part.clone() for part in state]
+    tolerance = 1e-4
+    iterate(s, state, positions, 500, tolerance)
+    assert state[3][:, 2].tolist() == [0.0, 0.0, 0.0]
+    own = environment(s, 0)
+    left = right[:1] - own._product(positions[:1], state[0][:1])
+    assert 1e-6 * float(right[0].norm()) < float(left.norm()) <= 1.1 * tolerance * float(right[0].norm())
+    for e in (1, 2):
+        assert all(torch.equal(now[e], then[e]) for now, then in zip(state[:3], before[:3], strict=True))
+
+
+def test_environments_that_are_lost_keep_to_themselves(dtype: torch.dtype, device: torch.device) -> None:
+    s, positions, right = system(dtype, device)
+    wanted, _ = s.solve(positions, right, 1e-5)
+    positions[1], right[2] = float("nan"), float("nan")
+    solution, _ = s.solve(positions, right, 1e-5)
+    assert torch.equal(solution[0], wanted[0])
+
+
+def test_the_general_way_agrees(dtype: torch.dtype, device: torch.device) -> None:
+    """By torch operations, as with levels and for large meshes on GPUs."""
+    s, positions, right = system(dtype, device, contacts=True)
+    tolerance = 1e-6 if dtype == torch.float32 else 1e-12
+    solution, _ = s.solve(positions, right, tolerance)
+    other, _ = conjugate_gradients(lambda f: s._product(positions, f), s._precondition, right, tolerance)
+    assert float((solution - other).norm() / other.norm()) < 100 * tolerance
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("solution", lambda t: t[:, :-1], "solution must be"),
+        ("residual", lambda t: t.to(torch.float16), "residual must be"),
+        ("direction", lambda t: t.transpose(0, 1).contiguous().transpose(0, 1), "direction must be contiguous"),
+        ("progress", lambda t: t.float(), "progress must be Double"),
+        ("progress", lambda t: t[:, :2].contiguous(), "progress must be"),
+        ("inertia", lambda t: t[:, :-1].contiguous(), "inertia must be"),
+        ("inverse", lambda t: t.to(torch.float16), "inverse must be"),
+        ("projector", lambda t: t[..., 0], "projector must be"),
+        ("stiffness", lambda t: t[..., :-1], "stiffness must be"),
+    ],
+)
+def test_bad_input(name: str, change: Any, said: str, device: torch.device) -> None:
+    s, positions, right = system(torch.float64, device, contacts=True)
+    assert s.projector is not None
+    arguments = dict(zip(("solution", "residual", "direction", "progress"), start(s, right), strict=True))
+    arguments |= {"positions": positions, "inertia": s.inertia.squeeze(-1), "inverse": s.inverse.squeeze(-1)}
+    arguments |= {"projector": s.projector, "stiffness": s.stiffness}
+    arguments[name] = change(arguments[name])
+    with pytest.raises((TypeError, ValueError), match=said):
+        ops.conjugate_gradients_(*arguments.values(), s.plan, tolerance=1e-3, iterations=1)
+
+
+@pytest.mark.parametrize(("numbers", "said"), [({"tolerance": -1.0}, "tolerance"), ({"iterations": -1}, "iterations")])
+def test_bad_numbers(numbers: dict[str, Any], said: str, device: torch.device) -> None:
+    s, positions, right = system(torch.float64, device)
+    with pytest.raises(ValueError, match=said):
+        iterate(s, start(s, right), positions, **{"iterations": 1, **numbers})
