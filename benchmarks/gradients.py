@@ -56,7 +56,7 @@ def measure_scene(cells: tuple[int, int, int], batch: int, youngs: float, device
         torch.autograd.grad(forward(), state.velocities)
 
     def median(work: Callable[[], object]) -> float:
-        return 1e3 * statistics.median(measure(work, device, repetitions=5, seconds=seconds))
+        return 1e3 * statistics.median(measure(work, device, repetitions=3, seconds=seconds))
 
     once, all_of_it = median(forward), median(both)
     with mock.patch.object(_System, "solve", by_operations):

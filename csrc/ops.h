@@ -299,7 +299,8 @@ void conjugate_gradients(const Tensor& solution, const Tensor& residual, const T
   check_vectors(residual, "residual", "N");
   check_vectors(direction, "direction", "m");
   check_array(progress, at::kDouble, positions.size(0), progress_count, place, "progress",
-              "r . z, |right side|, 1 while it goes on", "make it for this batch");
+              "r . z, |right side|, 1 while it goes on; -1: from the start",
+              "make it for this batch");
   if (projector) {
     const at::IntArrayRef sizes = positions.sizes();
     TORCH_CHECK_TYPE(projector->scalar_type() == positions.scalar_type(), "projector must be ",

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 ROOT = Path(__file__).parents[1]
 
@@ -288,3 +289,15 @@ def test_time_to_error_keeps_rows_of_every_batch(
         record["rows"][0].pop("batch", None)
         out.write_text(json.dumps(record))
     assert measured == [1, 4]
+
+
+@pytest.mark.usefixtures("on_path")
+def test_what_a_gradient_costs() -> None:
+    from gradients import line_of, measure_scene
+
+    row = measure_scene((2, 1, 1), 2, 1e5, torch.device("cpu"), 0.0)
+    assert (row["batch"], row["vertices"], row["iterations"]) == (2, 12, 64)
+    assert row["forward"] > 0
+    assert line_of({**row, "forward": 2.0, "backward": 3.0, "operations": 9.0}) == (
+        "| 2 x 12 | 1e+05 Pa | 2 | 3 | 9 | 1.5 |"
+    )

@@ -56,7 +56,7 @@ def samples(
                 0 * x,
                 f.clone(),
                 f.clone(),
-                torch.ones(BATCH, 3, dtype=torch.float64, device=device),
+                torch.full((BATCH, 3), -1.0, dtype=torch.float64, device=device),
                 x,
                 sim.masses,
                 1 / sim.masses,

@@ -160,7 +160,7 @@ def fields(sim: pd.Simulator, batch: int) -> None:
         for weighted in (False, True):
             diagonal = ops.elastic_diagonal(w, plan, weighted=weighted)
         inertia, inverse = 0.1 * diagonal, 1.0 / (1.1 * diagonal)
-        active = torch.ones(batch, 3, dtype=torch.float64, device=x.device)
+        active = torch.full((batch, 3), -1.0, dtype=torch.float64, device=x.device)
         projector = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape, 3)
         for held in (None, projector):
             vectors = [torch.zeros_like(x), d.clone(), d.clone(), active.clone()]

@@ -112,9 +112,8 @@ class _System:
         if has_levels(self.plan) or (right.is_cuda and right.shape[1] > _MOST_OF_A_BLOCK):
             return conjugate_gradients(lambda f: self._product(positions, f), self._precondition, right, tolerance)
         # what many operations on small tensors would spend their time with
-        solution, residual, direction = torch.zeros_like(right), right.clone(), self.inverse * right
-        scale = _dot(right, right).sqrt()
-        progress = torch.stack((_dot(right, direction), scale, (scale > 0).to(right.dtype)), dim=-1).double()
+        solution, residual, direction = torch.zeros_like(right), right.clone(), torch.empty_like(right)
+        progress = right.new_full((len(right), 3), -1.0, dtype=torch.float64)
         steps = _ASKED_EVERY if right.is_cuda else _MOST_ITERATIONS
         for _ in range(0, _MOST_ITERATIONS, steps):
             torch.ops.torchpd.conjugate_gradients_(
@@ -124,7 +123,7 @@ class _System:
             )  # fmt: skip
             if not right.is_cuda or not bool(progress[:, 2].any()):
                 break
-        return solution, _relative(residual, scale)
+        return solution, _relative(residual, progress[:, 1].to(right.dtype))
 
     def _product(self, positions: Tensor, field: Tensor) -> Tensor:
         elastic = torch.ops.torchpd.hessian_product(positions, field.contiguous(), self.stiffness, self.plan)

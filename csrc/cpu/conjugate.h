@@ -64,6 +64,7 @@ class ConjugatePass {
     if (!numbers.active) return;
     environment_ = environment;
     load();
+    if (numbers.begins) begin(numbers);
     for (int k = 0; k < call_.iterations && numbers.active; ++k) iterate(numbers);
     store();
     if (team_.rank == 0) numbers.write(call_.progress + environment * progress_count);
@@ -101,6 +102,18 @@ class ConjugatePass {
       turnings_.set(elements.part(s), Turning<R>(deformation_gradient(x, elements.rest(s))));
     });
     sweep_.run(0, turn, [](std::int64_t, const Quad<T>&, Sum&) {});
+  }
+
+  void begin(Conjugate& numbers) {
+    each_part([&](std::int64_t i, Sum& sums) {
+      const Quad<T> right = residual()[i];
+      direction()[i] = w_.inverse[i] * right;
+      sums.first = multiply_add(right, right, sums.first);
+      sums.second = multiply_add(right, direction()[i], sums.second);
+    });
+    const auto sum = total(1);
+    numbers.begin(sum.first, sum.second);
+    team_.barrier();  // before the next sums stand there
   }
 
   void iterate(Conjugate& numbers) {

@@ -31,6 +31,31 @@ __device__ void add_across_block(double (&sum)[Count],
   __syncthreads();
 }
 
+// Environments that have not begun get their first direction.
+template <class T>
+__global__ void __launch_bounds__(conjugate_threads)
+    conjugate_begin(const __grid_constant__ DeviceConjugate<T> call) {
+  __shared__ double warp_sums[conjugate_threads / warp_size][2];
+  const std::int64_t environment = blockIdx.x;
+  double* progress = call.progress + environment * progress_count;
+  Conjugate numbers(progress);
+  if (!numbers.begins) return;
+  const int vertices = call.plan.vertices;
+  const T* inverse = call.inverse.of(environment);
+  double sums[2] = {0, 0};
+  for (int i = threadIdx.x; i < vertices; i += conjugate_threads) {
+    const std::int64_t at = 3 * (environment * vertices + i);
+    const Vec3<T> right = read3(call.residual + at);
+    write3(call.direction + at, inverse[i] * right);
+    const double square = double(dot(right, right));
+    sums[0] += square;
+    sums[1] += double(inverse[i]) * square;
+  }
+  add_across_block(sums, warp_sums);
+  numbers.begin(sums[0], sums[1]);
+  if (threadIdx.x == 0) numbers.write(progress);
+}
+
 template <class T>
 __global__ void __launch_bounds__(conjugate_threads)
     conjugate_update(const __grid_constant__ ConjugateWork<T> work) {
@@ -108,6 +133,8 @@ std::int64_t conjugate_bytes(const DeviceConjugate<T>& call) {
 template <bool Computed, class T>
 void run_conjugate_with(const ConjugateWork<T>& work, cudaStream_t stream) {
   weigh_field<Computed>(work.product, stream);
+  conjugate_begin<T><<<blocks_of(work.call.batch), conjugate_threads, 0, stream>>>(work.call);
+  check(cudaGetLastError());
   for (int k = 0; k < work.call.iterations; ++k) {
     run_vertices<Computed, SolidHessian, 2, 3>(work.product, stream);
     conjugate_update<T><<<blocks_of(work.call.batch), conjugate_threads, 0, stream>>>(work);

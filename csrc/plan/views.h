@@ -210,7 +210,8 @@ struct FieldCall {
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, vertices] of the diagonal
 };
 
-// Numbers of an environment in the progress of a solve: r . z, |right side|, and 1 while it goes on, else 0.
+// Numbers of an environment in the progress of a solve: r . z, |right side|, and 1 while it goes on, 0 after, -1 before: then
+// the first iteration works out the others, by a residual that is the right side.
 enum ConjugateProgress : int { progress_product, progress_scale, progress_active, progress_count };
 
 // Iterations of conjugate gradients on (inertia + elastic Hessian) solution = right side, preconditioned by a diagonal, for each

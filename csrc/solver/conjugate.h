@@ -11,16 +11,25 @@ namespace pd::inline PD_TARGET {
 // One environment's numbers between iterations, as in ConjugateProgress.
 struct Conjugate {
   double product, scale;
-  bool active;
+  bool active, begins;
 
   PD_HD explicit Conjugate(const double* from)
       : product(from[progress_product]),
         scale(from[progress_scale]),
-        active(from[progress_active] != 0) {}
+        active(from[progress_active] != 0),
+        begins(from[progress_active] < 0) {}
 
   PD_HD void write(double* to) const {
     to[progress_product] = product;
+    to[progress_scale] = scale;
     to[progress_active] = active ? 1 : 0;
+  }
+
+  // by |b|^2 and b . b / D
+  PD_HD void begin(double square, double weighted) {
+    scale = sqrt(square);
+    product = weighted;
+    active = scale > 0;
   }
 
   // how far to go along the direction; along one without positive curvature H is not positive, and what there is stays
