@@ -152,12 +152,11 @@ class Rest:
     def of(cls, plan: Arrays, lanes: Lanes) -> Rest:
         """As the kernels read or compute them, StoredRest and ComputedRest of csrc/cuda/patch.h, but in float64."""
         if plan.sizes[SIZES.index("kernel")] == BLOCK:
-            rest = plan.pair_rest.reshape(-1, 18 * LANES).astype(np.float64)
-            quads, volume = np.split(rest, [16 * LANES], axis=1)
-            shapes = quads.reshape(-1, 4, LANES, 4).transpose(0, 2, 1, 3).reshape(-1, 16)
-            rows = np.concatenate([shapes[:, :15], shapes[:, 15:] * shapes[:, 6:9]], axis=1)
-            volumes = volume.reshape(-1, 2, LANES).transpose(0, 2, 1).reshape(-1, 2)
-            return cls(rows.reshape(-1, 2, 3, 3), volumes, np.zeros(len(rows)))
+            quads = plan.pair_rest.astype(np.float64).reshape(-1, 3, LANES, 4).transpose(0, 2, 1, 3).reshape(-1, 3, 4)
+            inverse = np.zeros((len(quads), 2, 3, 3))
+            inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 1, 1] = quads[:, :1, :3].transpose(2, 0, 1)
+            inverse[..., :, 2] = quads[:, 1:, :3]
+            return cls(inverse, quads[:, 1:, 3], np.zeros(len(quads)))
         slot, unit = plan.patch_slot[lanes.patch][:, None] + lanes.slot, plan.patch_unit[lanes.patch].astype(np.float64)
         if len(plan.slot_fixed):
             x, rounding = plan.slot_fixed[slot, :3].astype(np.float64), 0.75**0.5 * unit  # half a unit along each axis
@@ -168,6 +167,13 @@ class Rest:
         a, b, c = (x[:, BOTH][:, :, corner] - x[:, BOTH][:, :, 0] for corner in (1, 2, 3))
         cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-2)
         return cls(factor[..., None, None] * cofactors, (unit**2 / (6.0 * np.abs(factor.T))).T, rounding)
+
+
+def face_frames(Dm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Turns [n, 3, 3] into frames of the faces of corners 0, 1 and 2: x along the first edge, z normal."""
+    x, z = Dm[..., 0], np.cross(Dm[..., 0], Dm[..., 1])
+    x, z = (axis / np.linalg.norm(axis, axis=-1, keepdims=True) for axis in (x, z))
+    return np.stack([x, np.cross(z, x), z], axis=-2)
 
 
 def rows_of(plan: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

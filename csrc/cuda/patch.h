@@ -118,25 +118,19 @@ PD_DEVICE Vec3<T> at_corner(const Quad<T>* vectors, unsigned corner) {
   return vec3(*reinterpret_cast<const Quad<T>*>(bytes + slot_times_8 * (sizeof(Quad<T>) / 8)));
 }
 
-// Rest shapes as the plan of a small mesh has them.
+// Rest shapes as the plan of a small mesh has them, each pair's in the frame of its face.
 template <class T>
 struct StoredRest {
   const T* rests;  // pair_rest
 
   struct Numbers {
-    Quad<T> a, b, c, d;
+    FaceRest<T> face;
     T volume[2];
 
     // Dm^-1 [1/m]
     template <class Take>
     PD_HD Mat3<typename Take::R> inverse() const {
-      const Vec3<T> third = {b.z, b.w, c.x};
-      if constexpr (Take::which == 0) {
-        return {{{a.x, a.y, a.z}, {a.w, b.x, b.y}, {third.x, third.y, third.z}}};
-      } else {
-        const Vec3<T> own = d.w * third;
-        return {{{c.y, c.z, c.w}, {d.x, d.y, d.z}, {own.x, own.y, own.z}}};
-      }
+      return face.inverse(Take::which);
     }
     // w V
     template <class Take>
@@ -146,16 +140,11 @@ struct StoredRest {
   };
 
   PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>&) const {
-    constexpr unsigned width = pair_rest_numbers;
     // quads of a lane side by side
-    const unsigned own = 4 * place.pair + (width - 4) * place.before();
+    const unsigned own = 4 * place.pair + (pair_rest_numbers - 4) * place.before();
     const auto* const quad = reinterpret_cast<const Quad<T>*>(rests + own);
-    const T* const volume = rests + place.in(width) + 16 * pair_lanes;
-    return {quad[0],
-            quad[pair_lanes],
-            quad[2 * pair_lanes],
-            quad[3 * pair_lanes],
-            {volume[0], volume[pair_lanes]}};
+    const Quad<T> face = quad[0], one = quad[pair_lanes], other = quad[2 * pair_lanes];
+    return {{face.x, face.y, face.z, {vec3(one), vec3(other)}}, {one.w, other.w}};
   }
 };
 
@@ -301,10 +290,16 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
       read(now.corner[c], vectors);
       for (int f = 0; f < Fields; ++f) pair.corner[f][c] = vectors[f];
     }
-    element.template run<1>(PairElement<T, Fields, First>{pair, shape.template inverse<First>(),
-                                                          now.weight[0], energy});
-    element.template run<1>(PairElement<T, Fields, Second>{pair, shape.template inverse<Second>(),
-                                                           now.weight[1], energy});
+    if constexpr (requires {
+                    element.run_pair(pair.corner[0], shape.face, now.weight, pair.force, energy);
+                  }) {
+      element.run_pair(pair.corner[0], shape.face, now.weight, pair.force, energy);
+    } else {
+      element.template run<1>(PairElement<T, Fields, First>{pair, shape.template inverse<First>(),
+                                                            now.weight[0], energy});
+      element.template run<1>(PairElement<T, Fields, Second>{pair, shape.template inverse<Second>(),
+                                                             now.weight[1], energy});
+    }
     for (int c = 0; c < 4; ++c) leave(pair.force[c], entries[now.entry(c)]);
     if (now.entry(4) != no_entry) leave(pair.force[4], entries[now.entry(4)]);
     // here rather than at the top: fewer registers are spilled

@@ -5,7 +5,7 @@
 //
 // R is constant in the gradient: it maximises tr(R^T F), so its own change does no first-order work.
 #pragma once
-#include "math/rotation.h"
+#include "effects/solid_pair.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -49,6 +49,13 @@ template <bool Energy>
 struct SolidGradient {
   static constexpr int strip = 4;
   bool wanted = true;
+
+  // the same of two that share a face
+  template <class R>
+  PD_HD void run_pair(const Vec3<R> (&x)[5], const FaceRest<R>& rest, const R (&weight)[2],
+                      Vec3<R> (&g)[5], R& energy) const {
+    solid_pair_gradient<Energy>(x, rest, weight, wanted, g, energy);
+  }
 
   template <int N, class Elements>
   PD_HD void run(const Elements& elements) const {

@@ -9,6 +9,7 @@
 #include "plan/shared_memory.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <numeric>
 #include <stdexcept>
@@ -207,26 +208,21 @@ std::int32_t packed(std::int64_t low, std::int64_t high) {
 // Rest shapes and bounds of a pair in lane `lane` of `block`.
 void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, const Pair& pair,
                double unit, std::int64_t block, std::int64_t lane) {
-  const auto number = [&](int i) -> double& {
-    const std::int64_t first = block * pair_rest_numbers * lanes;
-    return plan.pair_rest[first + (i < 16 ? (i / 4 * lanes + lane) * 4 + i % 4 : i * lanes + lane)];
-  };
-  const auto vertex = [&](int c) { return std::int64_t(patch.vertex[pair.corner[c]]); };
-  const auto shape = [&](int which) {
-    return rest_of(mesh.positions, {vertex(0), vertex(1), vertex(2), vertex(3 + which)});
-  };
-  const Rest shapes[2] = {shape(0), shape(1)};
+  std::array<std::int64_t, 5> vertex;
+  for (int c = 0; c < 5; ++c) vertex[c] = patch.vertex[pair.corner[c]];
+  std::array<double, pair_rest_numbers> stored = {};
+  if (!plan.pair_rest.empty()) stored = face_rest(mesh.positions, vertex);
   for (int which = 0; which < 2; ++which) {
-    const Rest& rest = shapes[which];
+    const Rest rest = rest_of(mesh.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
     plan.pair_bound[(2 * block + which) * lanes + lane] = rest.bound;
     if (!plan.pair_factor.empty())
       plan.pair_factor[(2 * block + which) * lanes + lane] = unit * unit / (6 * rest.volume);
-    if (plan.pair_rest.empty()) continue;
-    // both third rows are normal to the shared face
-    for (int i = 0; i < (which == 0 ? 9 : 6); ++i) number(9 * which + i) = rest.inverse[i];
-    number(16 + which) = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
+    stored[7 + 4 * which] = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
   }
-  if (!plan.pair_rest.empty()) number(15) = shapes[0].volume / shapes[1].volume;
+  if (plan.pair_rest.empty()) return;
+  constexpr int quads = pair_rest_numbers / 4;
+  for (int i = 0; i < pair_rest_numbers; ++i)
+    plan.pair_rest[((block * quads + i / 4) * lanes + lane) * 4 + i % 4] = stored[i];
 }
 
 void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number,

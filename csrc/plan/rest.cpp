@@ -9,6 +9,11 @@ namespace pd {
 
 namespace {
 
+Vec3<double> row_of(const double* positions, std::int64_t vertex) {
+  const double* x = positions + 3 * vertex;
+  return {x[0], x[1], x[2]};
+}
+
 // Largest eigenvalue of a symmetric 3x3 matrix that is positive semidefinite, by Newton's method on its characteristic
 // polynomial, from above (its trace). Next to a multiple root that loses up to two thirds of the digits: singular values then.
 double largest_eigenvalue(const Mat3<double>& a) {
@@ -31,10 +36,7 @@ double largest_eigenvalue(const Mat3<double>& a) {
 }  // namespace
 
 Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet) {
-  const auto at = [&](int k) {
-    const double* x = positions + 3 * tet[k];
-    return Vec3<double>{x[0], x[1], x[2]};
-  };
+  const auto at = [&](int k) { return row_of(positions, tet[k]); };
   const Mat3<double> dm = from_columns(at(1) - at(0), at(2) - at(0), at(3) - at(0));
   const Mat3<double> adjoint = transpose(cofactor(dm));
   const double det = dot(dm.row[0], cofactor(dm).row[0]);
@@ -47,6 +49,29 @@ Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet) {
                           {n[0].x, n[0].y, n[0].z},
                           {n[1].x, n[1].y, n[1].z},
                           {n[2].x, n[2].y, n[2].z}}})};
+}
+
+std::array<double, 12> face_rest(const double* positions,
+                                 const std::array<std::int64_t, 5>& vertex) {
+  const auto edge = [&](int c) {
+    return row_of(positions, vertex[c]) - row_of(positions, vertex[0]);
+  };
+  const Vec3<double> first = edge(1), second = edge(2), normal = cross(first, second);
+  const double length = std::sqrt(dot(first, first)), area = std::sqrt(dot(normal, normal));
+  const double p = 1 / length, q = -dot(first, second) / (length * area), r = length / area;
+  std::array<double, 12> rest = {p, q, r};
+  for (int which = 0; which < 2; ++which) {
+    // where the apex stands along the axes of the face
+    const Vec3<double> apex = edge(3 + which);
+    const double along = dot(first, apex) / length;
+    const double across = dot(cross(normal, first), apex) / (area * length);
+    const double h = area / dot(normal, apex);
+    double* column = &rest[4 + 4 * which];
+    column[0] = -h * (p * along + q * across);
+    column[1] = -h * r * across;
+    column[2] = h;
+  }
+  return rest;
 }
 
 double element_bound(const std::array<std::array<double, 3>, 4>& gradients) {

@@ -76,7 +76,7 @@ struct Plan {
 };
 
 // Of a pair of tetrahedra in pair_rest, see device.def.
-constexpr int pair_rest_numbers = 18;
+constexpr int pair_rest_numbers = 12;
 
 // Numbers of DevicePlan::sizes, as DevicePlan itself has them too.
 enum DeviceSize : int {
