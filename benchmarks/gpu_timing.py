@@ -15,7 +15,7 @@ Work = Callable[[], object]
 
 DEFAULT_CLOCK = 1.98e9  # Hz, of an H100 SXM at its highest
 LANES = 4 * 32  # instructions that a multiprocessor issues a clock, times threads of a warp
-INSTRUCTIONS = 240.0  # a tetrahedron and iteration in float32, of kernel "block": tools/instructions.py fused_float
+INSTRUCTIONS = 202.0  # a tetrahedron and iteration in float32, of kernel "block": tools/instructions.py fused_float
 STREAM_BYTES = 244.0  # of a vertex and iteration in float32, with kernels for every iteration: the arrays of one-1M
 
 

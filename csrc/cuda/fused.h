@@ -276,13 +276,13 @@ class FusedRunner {
   PD_DEVICE T each_element(const Element& element) {
     if constexpr (Many) {
       // what small patches do not work out again they have registers for
-      const auto inverse_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4],
-                                  bool first) {
-        if (AtHand && (Once || first)) return inverse_;
+      const auto rest_of_half = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4],
+                                    bool first) {
+        if (AtHand && (Once || first)) return rest_;
         if constexpr (Clustered) {
-          return half_inverse(numbers, rest_of<true>(patch_).position);
+          return half_rest(numbers, rest_of<true>(patch_));
         } else {
-          return half_inverse(numbers, slots_, seen);
+          return half_rest(numbers, per_unit_, slots_, seen);
         }
       };
       const auto counts = [&](int number, T met) {
@@ -294,11 +294,11 @@ class FusedRunner {
 #pragma unroll 1
       for (int begin = 0, end = soon_;; begin = end, end = all) {
         if constexpr (Clustered) {
-          return each_half<Once>(patch_, halo_.positions(round_), inverse_of, counts, weights(),
+          return each_half<Once>(patch_, halo_.positions(round_), rest_of_half, counts, weights(),
                                  entries_of_round(), element, now, 0, all);
         }
-        energy += each_half<Once>(patch_, slots_, inverse_of, counts, weights(), entries_, element,
-                                  now, begin, end);
+        energy += each_half<Once>(patch_, slots_, rest_of_half, counts, weights(), entries_,
+                                  element, now, begin, end);
         if (Near || end == all) return energy;
         __syncthreads();
         post_shared();
@@ -489,7 +489,8 @@ class FusedRunner {
   Contacts<T> contacts_;
   OwnHalo halo_;         // of a cluster
   HalfNumbers<T> half_;  // with many patches: this thread's first tetrahedron
-  Mat3<T> inverse_;      // where they are near: its Dm^-1
+  FaceRest<T, 1> rest_;  // where they are near: its rest shape
+  T per_unit_ = T(1);    // of a grid: units of rest positions that make a metre
   int row_ =
       0;  // slot_row of a grid's first seat of this thread, of the vertex that it has in a cluster
   Seat at_;    // the seat that comes next,

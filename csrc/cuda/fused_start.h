@@ -124,12 +124,14 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::weigh_with(const T* stiffne
   __syncthreads();  // one lane has left the weights of two
   if constexpr (Many) half_ = read_half(patch_, weights(), threadIdx.x);
   if constexpr (Clustered) {
-    inverse_ = half_inverse(half_, rest_of<true>(patch_).position);
+    rest_ = half_rest(half_, rest_of<true>(patch_));
     counts_ = counts_energy(threadIdx.x);
-  } else if constexpr (Many && Near) {
+  } else if constexpr (Many) {
+    per_unit_ = T(1) / rest_of<true>(patch_).unit;
+    if constexpr (!Near) return;
     Quad<T> seen[4];
     look(half_, slots_, seen);
-    inverse_ = half_inverse(half_, slots_, seen);
+    rest_ = half_rest(half_, per_unit_, slots_, seen);
   }
 }
 
@@ -144,7 +146,7 @@ PD_DEVICE T FusedRunner<T, Touching, Kind, Near>::weigh_own(const T* stiffness, 
   const T plain =
       tet < 0 ? T(0) : tet_weight(patch_weight(rest.unit, stiffness[tet]), half_.factor);
   half_.weight = bound * plain;
-  inverse_ = half_inverse(half_, rest.position);
+  rest_ = half_rest(half_, rest);
   counts_ = counts_energy(threadIdx.x);
   return plain;
 }

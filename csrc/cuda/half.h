@@ -38,22 +38,22 @@ PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int 
   return numbers;
 }
 
-// Dm^-1 of a lane's tetrahedron, worked out from the rest positions of its slots, which were looked at.
+// Rest shape of a lane's tetrahedron, worked out from the rest positions of its slots, which were looked at.
 template <class T>
-PD_DEVICE Mat3<T> half_inverse(const HalfNumbers<T>& numbers, const Slots<T>& slots,
-                               const Quad<T> (&seen)[4]) {
+PD_DEVICE FaceRest<T, 1> half_rest(const HalfNumbers<T>& numbers, T per_unit, const Slots<T>& slots,
+                                   const Quad<T> (&seen)[4]) {
   RestPoint<T> point[4];
   for (int c = 0; c < 4; ++c)
     point[c] = RestPoint<T>::of(slots.second(numbers.slot_times_8(c), seen[c]));
-  return ComputedRest<T>::between(point, numbers.factor);
+  return ComputedRest<T>::between(point, per_unit, {numbers.factor});
 }
 
 // The same from the rest positions themselves.
 template <class T>
-PD_DEVICE Mat3<T> half_inverse(const HalfNumbers<T>& numbers, const RestPoint<T>* rest) {
+PD_DEVICE FaceRest<T, 1> half_rest(const HalfNumbers<T>& numbers, const ComputedRest<T>& rest) {
   RestPoint<T> point[4];
-  for (int c = 0; c < 4; ++c) point[c] = rest[numbers.slot_times_8(c) / 8];
-  return ComputedRest<T>::between(point, numbers.factor);
+  for (int c = 0; c < 4; ++c) point[c] = rest.position[numbers.slot_times_8(c) / 8];
+  return ComputedRest<T>::between(point, T(1) / rest.unit, {numbers.factor});
 }
 
 template <class T, class Slots>
@@ -89,11 +89,11 @@ PD_DEVICE Vec3<T> add_partner(const Vec3<T>& a) {
 
 // Runs an effect on the tetrahedra [begin, end) of all pairs; returns the sum of energies that this thread has met. `begin` and
 // an `end` before the last are multiples of the threads. `slots`: where positions are. `now`: what `read_half` gave for
-// this thread's first tetrahedron from `begin` on; after it from `end` on. `inverse_of(numbers, seen, first)`: Dm^-1 of a
+// this thread's first tetrahedron from `begin` on; after it from `end` on. `rest_of(numbers, seen, first)`: rest shape of a
 // tetrahedron, given what was seen of its slots, and whether it is the thread's first of all; `counts(number, met)`: whether its
 // energy does. `Once`: no thread has a second.
-template <bool Once, class T, class Slots, class Element, class InverseOf, class Counts>
-PD_DEVICE T each_half(const Patch<T>& patch, const Slots& slots, const InverseOf& inverse_of,
+template <bool Once, class T, class Slots, class Element, class RestOf, class Counts>
+PD_DEVICE T each_half(const Patch<T>& patch, const Slots& slots, const RestOf& rest_of,
                       const Counts& counts, const T* weights, Quad<T>* entries,
                       const Element& element, HalfNumbers<T>& now, int begin, int end) {
   T energy = T(0);
@@ -107,8 +107,12 @@ PD_DEVICE T each_half(const Patch<T>& patch, const Slots& slots, const InverseOf
     look(now, slots, seen);
     for (int c = 0; c < 4; ++c) x[c] = vec3(seen[c]);
     T met = T(0);
-    element.template run<1>(
-        HalfElement<T>{x, inverse_of(now, seen, first < int(blockDim.x)), now.weight, force, met});
+    const FaceRest<T, 1> rest = rest_of(now, seen, first < int(blockDim.x));
+    if constexpr (OnFaces<Element>) {
+      element.run_face(x, rest, {now.weight}, force, met, [](int) {});
+    } else {
+      element.template run<1>(HalfElement<T>{x, rest.inverse(0), now.weight, force, met});
+    }
     for (int c = 0; c < 3; ++c) force[c] = add_partner(force[c]);
     const bool here = first + lane < 2 * patch.pairs, second = lane & 1;
     // the first writes corners 0 and 1, the second corner 2, each its own apex

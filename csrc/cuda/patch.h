@@ -124,7 +124,7 @@ struct StoredRest {
   const T* rests;  // pair_rest
 
   struct Numbers {
-    FaceRest<T> face;
+    FaceRest<T, 2> face;
     T volume[2];
 
     // Dm^-1 [1/m]
@@ -200,13 +200,12 @@ struct ComputedRest {
   T unit;                        // of positions [m]
 
   struct Numbers {
-    RestPoint<T> corner[5];
+    FaceRest<T, 2> face;
     T factor[2], unit;
 
     template <class Take>
-    PD_HD Mat3<T> inverse() const {
-      constexpr int which = Take::which;
-      return between({corner[0], corner[1], corner[2], corner[3 + which]}, factor[which]);
+    PD_HD Mat3<typename Take::R> inverse() const {
+      return face.inverse(Take::which);
     }
     template <class Take>
     PD_HD T weight(T stiffness) const {
@@ -216,13 +215,24 @@ struct ComputedRest {
 
   PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>& pair) const {
     Numbers numbers;
-    for (int c = 0; c < 5; ++c) numbers.corner[c] = position[pair.slot(c)];
+    RestPoint<T> corner[5];
+    for (int c = 0; c < 5; ++c) corner[c] = position[pair.slot(c)];
     for (int e = 0; e < 2; ++e) numbers.factor[e] = (factor + place.in(2))[e * pair_lanes];
     numbers.unit = unit;
+    numbers.face = between(corner, T(1) / unit, numbers.factor);
     return numbers;
   }
 
-  PD_HD static Mat3<T> between(const RestPoint<T> (&corner)[4], T factor) {
+  template <int Corners>
+  PD_HD static auto between(const RestPoint<T> (&corner)[Corners], T per_unit,
+                            const T (&factor)[Corners - 3]) {
+    Vec3<T> edge[Corners - 1];
+    for (int c = 1; c < Corners; ++c) edge[c - 1] = corner[c] - corner[0];
+    return face_rest<T, Corners - 3>(edge, per_unit, factor);
+  }
+
+  // Dm^-1 of one tetrahedron, in no frame but its own
+  PD_HD static Mat3<T> inverse_between(const RestPoint<T> (&corner)[4], T factor) {
     const Vec3<T> edge[3] = {corner[1] - corner[0], corner[2] - corner[0], corner[3] - corner[0]};
     return rest_inverse(edge, factor);
   }
@@ -290,10 +300,8 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
       read(now.corner[c], vectors);
       for (int f = 0; f < Fields; ++f) pair.corner[f][c] = vectors[f];
     }
-    if constexpr (requires {
-                    element.run_pair(pair.corner[0], shape.face, now.weight, pair.force, energy);
-                  }) {
-      element.run_pair(pair.corner[0], shape.face, now.weight, pair.force, energy);
+    if constexpr (OnFaces<Element>) {
+      element.run_face(pair.corner[0], shape.face, now.weight, pair.force, energy, [](int) {});
     } else {
       element.template run<1>(PairElement<T, Fields, First>{pair, shape.template inverse<First>(),
                                                             now.weight[0], energy});

@@ -185,18 +185,19 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
   const Patch<T> patch(w.plan, number);
   HalfNumbers<T> now = read_half(patch, w.weights, int(threadIdx.x));
   const Slots<T> slots(shared, w.plan.most_slots);
-  const RestPoint<T>* rest = rest_of<true>(patch).position;
+  const ComputedRest<T> rest = rest_of<true>(patch);
+  const T per_unit = T(1) / rest.unit;
   auto* entries = reinterpret_cast<Quad<T>*>(shared + slots_bytes(sizeof(T), w.plan.most_slots, 2));
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const Vec3<T> position = vec3(w.origin[patch.first_slot + s]) + vec3(w.v.u[patch.vertex(s)]);
-    slots.set(s, position, rest[s].bits());
+    slots.set(s, position, rest.position[s].bits());
   }
   __syncthreads();
-  const auto inverse_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4], bool) {
-    return half_inverse(numbers, slots, seen);
+  const auto rest_of_half = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4], bool) {
+    return half_rest(numbers, per_unit, slots, seen);
   };
   const double energy = double(each_half<false>(
-      patch, slots, inverse_of, [](int, T) { return true; }, w.weights, entries, element, now, 0,
+      patch, slots, rest_of_half, [](int, T) { return true; }, w.weights, entries, element, now, 0,
       2 * patch.pairs));
   // on the way while the block meets
   int s = threadIdx.x, row = 0;

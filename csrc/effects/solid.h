@@ -5,7 +5,7 @@
 //
 // R is constant in the gradient: it maximises tr(R^T F), so its own change does no first-order work.
 #pragma once
-#include "effects/solid_pair.h"
+#include "effects/solid_face.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -48,13 +48,14 @@ PD_HD Mat3<R> strain(const Vec3<R> (&x)[4], const Mat3<R>& rest_inverse) {
 template <bool Energy>
 struct SolidGradient {
   static constexpr int strip = 4;
+  static constexpr bool on_faces = true;
   bool wanted = true;
 
-  // the same of two that share a face
-  template <class R>
-  PD_HD void run_pair(const Vec3<R> (&x)[5], const FaceRest<R>& rest, const R (&weight)[2],
-                      Vec3<R> (&g)[5], R& energy) const {
-    solid_pair_gradient<Energy>(x, rest, weight, wanted, g, energy);
+  template <class R, int Count, class After>
+  PD_HD void run_face(const Vec3<R> (&x)[3 + Count], const FaceRest<R, Count>& rest,
+                      const R (&weight)[Count], Vec3<R> (&g)[3 + Count], R& energy,
+                      const After& after) const {
+    solid_face_gradient<Energy>(x, rest, weight, wanted, g, energy, after);
   }
 
   template <int N, class Elements>

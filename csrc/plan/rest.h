@@ -15,7 +15,7 @@ struct Rest {
 // `tet` holds four rows of `positions` [vertices, 3].
 Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet);
 
-// Inverse rest matrices of two tetrahedra on one face, corners 0, 1 and 2, in the frame of effects/solid_pair.h: p, q, r and 0 of
+// Inverse rest matrices of two tetrahedra on one face, corners 0, 1 and 2, in the frame of effects/solid_face.h: p, q, r and 0 of
 // the face, then s, t, h and 0 of those with apexes 3 and 4 [1/m]. `vertex`: rows of `positions`.
 std::array<double, 12> face_rest(const double* positions,
                                  const std::array<std::int64_t, 5>& vertex);
