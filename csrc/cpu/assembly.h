@@ -1,6 +1,7 @@
 // Element work of one patch: corners in, forces on the slots of the patch out, in a fixed order.
 #pragma once
 #include "cpu/lanes.h"
+#include "effects/solid_face.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -13,15 +14,15 @@ struct BlockPart {
   PD_HD const int16* corner(int c) const {
     return plan->tet_corner + (std::int64_t(block) * 4 + c) * block_lanes + first_lane;
   }
-  PD_HD const T* rest(int entry) const {
-    return plan->tet_rest + (std::int64_t(block) * 9 + entry) * block_lanes + first_lane;
+  PD_HD const T* rest(int number) const {
+    return plan->tet_rest + (std::int64_t(block) * 6 + number) * block_lanes + first_lane;
   }
   PD_HD std::int64_t element() const { return std::int64_t(block) * block_lanes + first_lane; }
 };
 
 template <class R, class Read>
-PD_HD Mat3<R> read_matrix(Read read) {
-  return {{{read(0), read(1), read(2)}, {read(3), read(4), read(5)}, {read(6), read(7), read(8)}}};
+PD_HD FaceRest<R, 1> read_rest(Read read) {
+  return {read(0), read(1), read(2), {{read(3), read(4), read(5)}}};
 }
 
 // Corner of W elements, from vertices stored as quads: loads and shuffles beat the gather instructions.
@@ -193,8 +194,8 @@ struct ElementsAcross {
   PD_HD void corners(int s, int f, Vec3<R> (&x)[4]) const {
     for (int c = 0; c < 4; ++c) x[c] = gather_corner<T, W>(field[f], part(s).corner(c));
   }
-  PD_HD Mat3<R> rest(int s) const {
-    return read_matrix<R>([&](int entry) { return R::load(part(s).rest(entry)); });
+  PD_HD FaceRest<R, 1> rest(int s) const {
+    return read_rest<R>([&](int number) { return R::load(part(s).rest(number)); });
   }
   PD_HD R weight(int s) const { return R::load(weights + part(s).element()); }
   PD_HD R& sum(int s) const { return sums.part[(first + s) % parts]; }
@@ -225,8 +226,8 @@ struct EnvironmentsAcross {
   PD_HD void corners(int s, int f, Vec3<R> (&x)[4]) const {
     for (int c = 0; c < 4; ++c) x[c] = field[f][*part(s).corner(c)];
   }
-  PD_HD Mat3<R> rest(int s) const {
-    return read_matrix<R>([&](int entry) { return R(*part(s).rest(entry)); });
+  PD_HD FaceRest<R, 1> rest(int s) const {
+    return read_rest<R>([&](int number) { return R(*part(s).rest(number)); });
   }
   PD_HD R weight(int s) const {
     const std::int64_t e = part(s).element();

@@ -60,7 +60,7 @@ class TurningElements {
     elements.corners(s, 0, x);
     elements.corners(s, 1, some);
     elements.corners(s, 2, rest);
-    const Mat3<R> inverse = elements.rest(s);
+    const Mat3<R> inverse = elements.rest(s).inverse(0);
     const Mat3<R> back = transpose(nearest_rotation(deformation_gradient(x, inverse)));
     for (Vec3<R>& position : x) position = position + to_middle;
     TurningStrain<R> strain[turning_groups];

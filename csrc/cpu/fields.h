@@ -94,7 +94,7 @@ class FieldPass {
     for (int f = 0; f < Fields; ++f) {
       for (int c = 0; c < 4; ++c) corner[f][c] = gather_corner<T, W>(field[f], part.corner(c));
     }
-    const Mat3<R> rest = read_matrix<R>([&](int entry) { return R::load(part.rest(entry)); });
+    const auto rest = read_rest<R>([&](int number) { return R::load(part.rest(number)); });
     const R value = element(corner, rest, R::load(w_.weight + part.element()));
     for (int lane = 0; lane < W; ++lane) {
       // padding repeats an element of the patch with no volume: it must not write

@@ -214,7 +214,8 @@ class CorotationMaker {
       x[c] = vec3(m_.arm[vertex]);
       for (int k = 0; k < turning_groups; ++k) weight[k][c] = m_.numbers[at(k, vertex)].x;
     }
-    Mat3<T> inverse = half_rest(numbers, rest_of<true>(patch)).inverse(0);
+    const ComputedRest<T> rest = rest_of<true>(patch);
+    Mat3<T> inverse = half_rest(numbers, T(1) / rest.unit, rest.position).inverse(0);
     Mat3<T> f = deformation_gradient(x, inverse);
     // what is not there may be anything
     const auto keep = [&](T& a, T other) { a = select(there, a, other); };

@@ -146,8 +146,7 @@ __global__ void __launch_bounds__(field_threads)
     const PairPlace place = place_of(patch, number);
     const PairNumbers<T> pair = read_pair(patch, weights, number);
     const auto numbers = rest_of<Computed>(patch).read(place, pair);
-    const Mat3<T> rest[2] = {numbers.template inverse<OneOf<T, 0>>(),
-                             numbers.template inverse<OneOf<T, 1>>()};
+    const Mat3<T> rest[2] = {numbers.face.inverse(0), numbers.face.inverse(1)};
     for (int e = 0; e < 2; ++e) {
       const int tet = plan.pair_tet[place.in(2) + e * pair_lanes];
       if (tet < 0) continue;  // none, or written by another patch

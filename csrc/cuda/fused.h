@@ -276,11 +276,11 @@ class FusedRunner {
   PD_DEVICE T each_element(const Element& element) {
     if constexpr (Many) {
       // what small patches do not work out again they have registers for
-      const auto rest_of_half = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4],
-                                    bool first) {
+      const auto shape_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4],
+                                bool first) {
         if (AtHand && (Once || first)) return rest_;
         if constexpr (Clustered) {
-          return half_rest(numbers, rest_of<true>(patch_));
+          return half_rest(numbers, per_unit_, rest_of<true>(patch_).position);
         } else {
           return half_rest(numbers, per_unit_, slots_, seen);
         }
@@ -294,11 +294,11 @@ class FusedRunner {
 #pragma unroll 1
       for (int begin = 0, end = soon_;; begin = end, end = all) {
         if constexpr (Clustered) {
-          return each_half<Once>(patch_, halo_.positions(round_), rest_of_half, counts, weights(),
+          return each_half<Once>(patch_, halo_.positions(round_), shape_of, counts, weights(),
                                  entries_of_round(), element, now, 0, all);
         }
-        energy += each_half<Once>(patch_, slots_, rest_of_half, counts, weights(), entries_,
-                                  element, now, begin, end);
+        energy += each_half<Once>(patch_, slots_, shape_of, counts, weights(), entries_, element,
+                                  now, begin, end);
         if (Near || end == all) return energy;
         __syncthreads();
         post_shared();
@@ -489,8 +489,8 @@ class FusedRunner {
   Contacts<T> contacts_;
   OwnHalo halo_;         // of a cluster
   HalfNumbers<T> half_;  // with many patches: this thread's first tetrahedron
-  FaceRest<T, 1> rest_;  // where they are near: its rest shape
-  T per_unit_ = T(1);    // of a grid: units of rest positions that make a metre
+  FaceRest<T, 1> rest_;  // with near patches, or in a cluster: its rest shape
+  T per_unit_ = T(1);    // units of rest positions that make a metre
   int row_ =
       0;  // slot_row of a grid's first seat of this thread, of the vertex that it has in a cluster
   Seat at_;    // the seat that comes next,

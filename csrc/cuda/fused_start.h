@@ -122,13 +122,13 @@ template <class T, bool Touching, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::weigh_with(const T* stiffness, bool bounded) {
   weigh_pairs(patch_, rest_of<Many>(patch_), stiffness, bounded, weights());
   __syncthreads();  // one lane has left the weights of two
-  if constexpr (Many) half_ = read_half(patch_, weights(), threadIdx.x);
+  if constexpr (!Many) return;
+  half_ = read_half(patch_, weights(), threadIdx.x);
+  per_unit_ = T(1) / rest_of<true>(patch_).unit;
   if constexpr (Clustered) {
-    rest_ = half_rest(half_, rest_of<true>(patch_));
+    rest_ = half_rest(half_, per_unit_, rest_of<true>(patch_).position);
     counts_ = counts_energy(threadIdx.x);
-  } else if constexpr (Many) {
-    per_unit_ = T(1) / rest_of<true>(patch_).unit;
-    if constexpr (!Near) return;
+  } else if constexpr (Near) {
     Quad<T> seen[4];
     look(half_, slots_, seen);
     rest_ = half_rest(half_, per_unit_, slots_, seen);
@@ -146,7 +146,8 @@ PD_DEVICE T FusedRunner<T, Touching, Kind, Near>::weigh_own(const T* stiffness, 
   const T plain =
       tet < 0 ? T(0) : tet_weight(patch_weight(rest.unit, stiffness[tet]), half_.factor);
   half_.weight = bound * plain;
-  rest_ = half_rest(half_, rest);
+  per_unit_ = T(1) / rest.unit;
+  rest_ = half_rest(half_, per_unit_, rest.position);
   counts_ = counts_energy(threadIdx.x);
   return plain;
 }

@@ -50,10 +50,11 @@ PD_DEVICE FaceRest<T, 1> half_rest(const HalfNumbers<T>& numbers, T per_unit, co
 
 // The same from the rest positions themselves.
 template <class T>
-PD_DEVICE FaceRest<T, 1> half_rest(const HalfNumbers<T>& numbers, const ComputedRest<T>& rest) {
+PD_DEVICE FaceRest<T, 1> half_rest(const HalfNumbers<T>& numbers, T per_unit,
+                                   const RestPoint<T>* rest) {
   RestPoint<T> point[4];
-  for (int c = 0; c < 4; ++c) point[c] = rest.position[numbers.slot_times_8(c) / 8];
-  return ComputedRest<T>::between(point, T(1) / rest.unit, {numbers.factor});
+  for (int c = 0; c < 4; ++c) point[c] = rest[numbers.slot_times_8(c) / 8];
+  return ComputedRest<T>::between(point, per_unit, {numbers.factor});
 }
 
 template <class T, class Slots>
@@ -61,21 +62,16 @@ PD_DEVICE void look(const HalfNumbers<T>& numbers, const Slots& slots, Quad<T> (
   for (int c = 0; c < 4; ++c) seen[c] = slots.look(numbers.slot_times_8(c));
 }
 
+// A tetrahedron as effects see elements that work on rest shapes and weights alone.
 template <class T>
 struct HalfElement {
   using R = T;
-  const Vec3<T> (&position)[4];
   Mat3<T> inverse;
   T weighs;
   Vec3<T> (&force)[4];
-  T& energy;
 
-  PD_HD void corners(int, int, Vec3<T> (&x)[4]) const {
-    for (int c = 0; c < 4; ++c) x[c] = position[c];
-  }
   PD_HD const Mat3<T>& rest(int) const { return inverse; }
   PD_HD const T& weight(int) const { return weighs; }
-  PD_HD T& sum(int) const { return energy; }
   PD_HD void add(int, const Vec3<T> (&g)[4]) const {
     for (int c = 0; c < 4; ++c) force[c] = g[c];
   }
@@ -89,11 +85,11 @@ PD_DEVICE Vec3<T> add_partner(const Vec3<T>& a) {
 
 // Runs an effect on the tetrahedra [begin, end) of all pairs; returns the sum of energies that this thread has met. `begin` and
 // an `end` before the last are multiples of the threads. `slots`: where positions are. `now`: what `read_half` gave for
-// this thread's first tetrahedron from `begin` on; after it from `end` on. `rest_of(numbers, seen, first)`: rest shape of a
+// this thread's first tetrahedron from `begin` on; after it from `end` on. `shape_of(numbers, seen, first)`: rest shape of a
 // tetrahedron, given what was seen of its slots, and whether it is the thread's first of all; `counts(number, met)`: whether its
 // energy does. `Once`: no thread has a second.
-template <bool Once, class T, class Slots, class Element, class RestOf, class Counts>
-PD_DEVICE T each_half(const Patch<T>& patch, const Slots& slots, const RestOf& rest_of,
+template <bool Once, class T, class Slots, class Element, class ShapeOf, class Counts>
+PD_DEVICE T each_half(const Patch<T>& patch, const Slots& slots, const ShapeOf& shape_of,
                       const Counts& counts, const T* weights, Quad<T>* entries,
                       const Element& element, HalfNumbers<T>& now, int begin, int end) {
   T energy = T(0);
@@ -107,11 +103,11 @@ PD_DEVICE T each_half(const Patch<T>& patch, const Slots& slots, const RestOf& r
     look(now, slots, seen);
     for (int c = 0; c < 4; ++c) x[c] = vec3(seen[c]);
     T met = T(0);
-    const FaceRest<T, 1> rest = rest_of(now, seen, first < int(blockDim.x));
+    const FaceRest<T, 1> rest = shape_of(now, seen, first < int(blockDim.x));
     if constexpr (OnFaces<Element>) {
-      element.run_face(x, rest, {now.weight}, force, met, [](int) {});
+      element.run_face(x, rest, {now.weight}, force, met);
     } else {
-      element.template run<1>(HalfElement<T>{x, rest.inverse(0), now.weight, force, met});
+      element.template run<1>(HalfElement<T>{rest.inverse(0), now.weight, force});
     }
     for (int c = 0; c < 3; ++c) force[c] = add_partner(force[c]);
     const bool here = first + lane < 2 * patch.pairs, second = lane & 1;

@@ -127,11 +127,6 @@ struct StoredRest {
     FaceRest<T, 2> face;
     T volume[2];
 
-    // Dm^-1 [1/m]
-    template <class Take>
-    PD_HD Mat3<typename Take::R> inverse() const {
-      return face.inverse(Take::which);
-    }
     // w V
     template <class Take>
     PD_HD T weight(T stiffness) const {
@@ -192,7 +187,7 @@ PD_HD T tet_weight(T patch_weight, T factor) {
   return patch_weight * rough_reciprocal(absolute(factor));
 }
 
-// Rest shapes worked out from rest positions: a quarter of the bytes.
+// Rest shapes worked out from rest positions, which with pair_factor take half of the bytes.
 template <class T>
 struct ComputedRest {
   const RestPoint<T>* position;  // of every slot
@@ -203,10 +198,6 @@ struct ComputedRest {
     FaceRest<T, 2> face;
     T factor[2], unit;
 
-    template <class Take>
-    PD_HD Mat3<typename Take::R> inverse() const {
-      return face.inverse(Take::which);
-    }
     template <class Take>
     PD_HD T weight(T stiffness) const {
       return tet_weight(patch_weight(unit, stiffness), factor[Take::which]);
@@ -301,12 +292,12 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
       for (int f = 0; f < Fields; ++f) pair.corner[f][c] = vectors[f];
     }
     if constexpr (OnFaces<Element>) {
-      element.run_face(pair.corner[0], shape.face, now.weight, pair.force, energy, [](int) {});
+      element.run_face(pair.corner[0], shape.face, now.weight, pair.force, energy);
     } else {
-      element.template run<1>(PairElement<T, Fields, First>{pair, shape.template inverse<First>(),
-                                                            now.weight[0], energy});
-      element.template run<1>(PairElement<T, Fields, Second>{pair, shape.template inverse<Second>(),
-                                                             now.weight[1], energy});
+      element.template run<1>(
+          PairElement<T, Fields, First>{pair, shape.face.inverse(0), now.weight[0], energy});
+      element.template run<1>(
+          PairElement<T, Fields, Second>{pair, shape.face.inverse(1), now.weight[1], energy});
     }
     for (int c = 0; c < 4; ++c) leave(pair.force[c], entries[now.entry(c)]);
     if (now.entry(4) != no_entry) leave(pair.force[4], entries[now.entry(4)]);

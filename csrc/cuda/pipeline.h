@@ -2,8 +2,8 @@
 // work on the elements of a patch, while others add up the forces of the patch before and move its vertices, and others bring
 // the slots of the next and help with the forces. Two patches take turns in shared memory. So arithmetic and memory need not
 // wait for each other, as they do where every warp of a block goes through all of it; and a thread has both tetrahedra of a
-// pair, which costs a sixth fewer instructions than one each. It pays where a multiprocessor has many patches one after
-// another, to fill it but once.
+// pair, which share loads, the edges of their face and the sums of forces on it. It pays where a multiprocessor has many
+// patches one after another, to fill it but once.
 #pragma once
 #include "cuda/handoff.h"
 #include "cuda/stream.h"
@@ -15,10 +15,10 @@ namespace pd::inline PD_TARGET {
 // tetrahedra of a pair in a thread; movers and bringers as one task took more, and so did anything that spilled registers,
 // since hardly any cache is left for them. So did, for a million vertices, movers that also move the vertices that patches
 // share, as soon as their last patch is done (15 us more than with a kernel of their own); slots that are asked for a whole
-// turn before (3 us); rest positions behind origins, 24 bytes a slot in place of 32 (4 us); both tetrahedra in the frame of their
-// face, a seventh fewer instructions but ten registers spilled (9 us); and forces on shared vertices that the L2 cache is to let
-// go of last (16 us; u and the iterate before: no difference). What binds now is memory: without any
-// arithmetic an iteration would take 12 % less. A register that is written under a condition is kept from before, all around a
+// turn before (3 us); rest positions behind origins, 24 bytes a slot in place of 32 (4 us); both tetrahedra in the frame of
+// their face, a seventh fewer instructions, but ten spilled registers (9 us); and forces on shared vertices that the L2 cache
+// is to let go of last (16 us; u and the iterate before: no difference). What binds now is memory: without any arithmetic an
+// iteration would take 12 % less. A register that is written under a condition is kept from before, all around a
 // loop: so where a thread has no slot, it reads what is the first one's.
 constexpr int mover_threads = 128, bringer_threads = 128, element_threads = 384;
 constexpr int pipeline_slots = 1024;  // of a patch, at most: see SharedSlots

@@ -193,11 +193,11 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
     slots.set(s, position, rest.position[s].bits());
   }
   __syncthreads();
-  const auto rest_of_half = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4], bool) {
+  const auto shape_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4], bool) {
     return half_rest(numbers, per_unit, slots, seen);
   };
   const double energy = double(each_half<false>(
-      patch, slots, rest_of_half, [](int, T) { return true; }, w.weights, entries, element, now, 0,
+      patch, slots, shape_of, [](int, T) { return true; }, w.weights, entries, element, now, 0,
       2 * patch.pairs));
   // on the way while the block meets
   int s = threadIdx.x, row = 0;

@@ -14,6 +14,13 @@ PD_HD Mat3<R> deformation_gradient(const Vec3<R> (&x)[4], const Mat3<R>& rest_in
   return from_columns(x[1] - x[0], x[2] - x[0], x[3] - x[0]) * rest_inverse;
 }
 
+template <class R>
+PD_HD Mat3<R> deformation_gradient(const Vec3<R> (&x)[4], const FaceRest<R, 1>& rest) {
+  const Vec3<R> a = x[1] - x[0], b = x[2] - x[0], &apex = rest.apex[0];
+  return from_columns(rest.p * a, multiply_add(rest.r, b, rest.q * a),
+                      multiply_add(apex.z, x[3] - x[0], multiply_add(apex.y, b, apex.x * a)));
+}
+
 // Dm^-1 of the columns of Dm, the edges from corner 0 at rest, and of 1 / det Dm. The cofactors keep all bits, however flat
 // the tetrahedron; its determinant would not.
 template <class R>
@@ -36,9 +43,25 @@ PD_HD void corner_forces(const Mat3<R>& stress, const Mat3<R>& rest_inverse, Vec
   g[0] = (-g[1] - g[2]) - g[3];
 }
 
-// F - R: how far the element is from its rest shape
 template <class R>
-PD_HD Mat3<R> strain(const Vec3<R> (&x)[4], const Mat3<R>& rest_inverse) {
+PD_HD void shape_gradients(const FaceRest<R, 1>& rest, Vec3<R> (&n)[4]) {
+  shape_gradients(rest.inverse(0), n);
+}
+
+template <class R>
+PD_HD void corner_forces(const Mat3<R>& stress, const FaceRest<R, 1>& rest, Vec3<R> (&g)[4]) {
+  const Mat3<R> column = transpose(stress);
+  const Vec3<R>& apex = rest.apex[0];
+  g[1] = multiply_add(apex.x, column.row[2],
+                      multiply_add(rest.q, column.row[1], rest.p * column.row[0]));
+  g[2] = multiply_add(apex.y, column.row[2], rest.r * column.row[1]);
+  g[3] = apex.z * column.row[2];
+  g[0] = (-g[1] - g[2]) - g[3];
+}
+
+// F - R: how far the element is from its rest shape
+template <class R, class Rest>
+PD_HD Mat3<R> strain(const Vec3<R> (&x)[4], const Rest& rest_inverse) {
   const Mat3<R> f = deformation_gradient(x, rest_inverse);
   return f - nearest_rotation(f);
 }
@@ -51,11 +74,10 @@ struct SolidGradient {
   static constexpr bool on_faces = true;
   bool wanted = true;
 
-  template <class R, int Count, class After>
+  template <class R, int Count>
   PD_HD void run_face(const Vec3<R> (&x)[3 + Count], const FaceRest<R, Count>& rest,
-                      const R (&weight)[Count], Vec3<R> (&g)[3 + Count], R& energy,
-                      const After& after) const {
-    solid_face_gradient<Energy>(x, rest, weight, wanted, g, energy, after);
+                      const R (&weight)[Count], Vec3<R> (&g)[3 + Count], R& energy) const {
+    solid_face_gradient<Energy>(x, rest, weight, wanted, g, energy);
   }
 
   template <int N, class Elements>
@@ -89,9 +111,9 @@ struct SolidGradient {
 };
 
 // Second derivative of the energy along `dx`, on the four corners: w V (dF - dR) grad N_c.
-template <class R>
+template <class R, class Rest>
 PD_HD void solid_hessian_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
-                                 const Mat3<R>& rest_inverse, const R& weight, Vec3<R> (&g)[4]) {
+                                 const Rest& rest_inverse, const R& weight, Vec3<R> (&g)[4]) {
   const Mat3<R> f = deformation_gradient(x, rest_inverse),
                 df = deformation_gradient(dx, rest_inverse);
   const Mat3<R> dr = rotation_differential(f, nearest_rotation(f), df);
@@ -99,17 +121,17 @@ PD_HD void solid_hessian_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
 }
 
 // The same for many directions at one place, which `turning` holds.
-template <class R>
+template <class R, class Rest>
 PD_HD void solid_hessian_product(const Turning<R>& turning, const Vec3<R> (&dx)[4],
-                                 const Mat3<R>& rest_inverse, const R& weight, Vec3<R> (&g)[4]) {
+                                 const Rest& rest_inverse, const R& weight, Vec3<R> (&g)[4]) {
   const Mat3<R> df = deformation_gradient(dx, rest_inverse);
   corner_forces(weight * (df - turning.differential(df)), rest_inverse, g);
 }
 
 // Derivative of the energy along `dx`: w V (F - R) : dF
-template <class R>
+template <class R, class Rest>
 PD_HD R element_energy_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
-                               const Mat3<R>& rest_inverse, const R& weight) {
+                               const Rest& rest_inverse, const R& weight) {
   return weight * frobenius(strain(x, rest_inverse), deformation_gradient(dx, rest_inverse));
 }
 

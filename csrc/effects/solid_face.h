@@ -6,8 +6,8 @@
 //   F = Ds Dm^-1 = [p e_1,  q e_1 + r e_2,  s e_1 + t e_2 + h e_3],   e_c = x_c - x_0,
 //
 // p, q, r of the face, s, t, h of a tetrahedron. With Q the turn into the frame, F Q^T stands here in place of the F of
-// effects/solid.h and R Q^T in place of its R, so energies and forces are the same, for three quarters of the operations, or
-// nine tenths alone.
+// effects/solid.h and R Q^T in place of its R, so energies and forces are the same. What two tetrahedra share is worked out once:
+// that saves a GPU a sixth of the instructions (tools/instructions.py), and a tetrahedron alone a thirtieth.
 #pragma once
 #include "math/rotation.h"
 
@@ -15,7 +15,7 @@ namespace pd::inline PD_TARGET {
 
 // An effect that has a run_face, for one tetrahedron or two.
 template <class Effect>
-concept OnFaces = requires { Effect::on_faces; };
+concept OnFaces = requires { requires Effect::on_faces; };
 
 template <class R, int Count>
 struct FaceRest {
@@ -30,17 +30,23 @@ struct FaceRest {
   }
 };
 
-// That of edges from corner 0 in any unit, `per_unit` of which make a metre, and of unit^2 / det Dm of each tetrahedron.
-// s and t are -h times where the apex stands above the face, in the coordinates of its corners. Their errors are those of
-// an apex that is off by a rounding of itself; h has all its bits, however flat the tetrahedron.
+// That of edges from corner 0 in any unit, `per_unit` of which make a metre, and of unit^2 / det Dm of each tetrahedron. In
+// float32 edges are whole numbers up to 2^31: all squares and their inverses fit, and of a face that collapses in these
+// units everything stays finite.
+//
+// s and t are -h times where the apex stands above the face, in the coordinates of its corners. They are as far off as if the
+// apex were by roundings of itself times |e_1||e_2| / |e_1 x e_2|; h has all its bits, however flat the tetrahedron.
 template <class R, int Count>
 PD_HD FaceRest<R, Count> face_rest(const Vec3<R> (&edge)[2 + Count], const R& per_unit,
                                    const R (&per_determinant)[Count]) {
+  using T = scalar_of<R>;
+  const R least(sizeof(T) == 4 ? T(1) : smallest<T>());
+  const auto no_less = [&](const R& a) { return select(a < least, least, a); };
   const Vec3<R>&first = edge[0], &second = edge[1];
   const Vec3<R> normal = exact_cross(first, second), ahead = cross(normal, first);
-  const R length2 = dot(first, first), normal2 = dot(normal, normal), along = dot(first, second);
+  const R length2 = no_less(dot(first, first)), normal2 = no_less(dot(normal, normal));
   const R per_length2 = reciprocal(length2), per_normal2 = reciprocal(normal2);
-  const R height = rough_square_root(normal2);
+  const R height = rough_square_root(normal2), along = dot(first, second);
   FaceRest<R, Count> rest;
   rest.p = per_unit * rough_square_root(per_length2);
   rest.r = per_unit * rough_square_root(length2 * per_normal2);
@@ -113,12 +119,11 @@ PD_HD void finish_columns(const FaceColumns<R>& face, const Vec3<R>& third, cons
 }
 
 // Gradient on all corners; with `Energy` strains of weight one, whose halved squares times the weights are added to `energy`
-// where they are `wanted`. One tetrahedron after the other, which takes the fewest registers: after(e) is told when the force
-// on apex e is there.
-template <bool Energy, class R, int Count, class After>
+// where they are `wanted`. One tetrahedron after the other, which takes the fewest registers.
+template <bool Energy, class R, int Count>
 PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, Count>& rest,
                                const R (&weight)[Count], bool wanted, Vec3<R> (&g)[3 + Count],
-                               R& energy, const After& after) {
+                               R& energy) {
   const Vec3<R> edge[2] = {x[1] - x[0], x[2] - x[0]};
   const FaceColumns<R> face(edge, rest);
   Vec3<R> third[Count];
@@ -148,7 +153,6 @@ PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, 
     g[1] = e == 0 ? apex.x * stress[2] : multiply_add(apex.x, stress[2], g[1]);
     g[2] = e == 0 ? apex.y * stress[2] : multiply_add(apex.y, stress[2], g[2]);
     g[0] = e == 0 ? g[3] : g[0] + g[3 + e];
-    after(e);
   }
   g[1] = multiply_add(rest.q, second, multiply_add(rest.p, first, g[1]));
   g[2] = multiply_add(rest.r, second, g[2]);

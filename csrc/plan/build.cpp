@@ -40,17 +40,18 @@ void add_blocks(MeshPlan& plan, const double* x, const std::int64_t* tets,
     plan.tet_order.resize((block + 1) * lanes);
     plan.tet_volume.resize((block + 1) * lanes);
     plan.tet_bound.resize((block + 1) * lanes);
-    plan.tet_rest.resize((block + 1) * 9 * lanes);
+    plan.tet_rest.resize((block + 1) * 6 * lanes);
     plan.tet_corner.resize((block + 1) * 4 * lanes);
     for (int lane = 0; lane < lanes; ++lane) {
       const std::int64_t i = lane * blocks + b;
       const std::int32_t t = patch[std::min(i, count - 1)];
       const std::int64_t* corner = tets + 4 * std::int64_t(t);
       const Rest rest = rest_of(x, {corner[0], corner[1], corner[2], corner[3]});
+      const auto face = face_rest<4>(x, {corner[0], corner[1], corner[2], corner[3]});
       plan.tet_order[block * lanes + lane] = t;
       plan.tet_volume[block * lanes + lane] = i < count ? rest.volume : 0;
       plan.tet_bound[block * lanes + lane] = rest.bound;
-      for (int r = 0; r < 9; ++r) plan.tet_rest[(block * 9 + r) * lanes + lane] = rest.inverse[r];
+      for (int i = 0; i < 6; ++i) plan.tet_rest[(block * 6 + i) * lanes + lane] = face[i];
       for (int k = 0; k < 4; ++k) {
         plan.tet_corner[(block * 4 + k) * lanes + lane] = std::int16_t(slot_of[corner[k]]);
       }

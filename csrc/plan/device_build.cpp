@@ -210,19 +210,22 @@ void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, const
                double unit, std::int64_t block, std::int64_t lane) {
   std::array<std::int64_t, 5> vertex;
   for (int c = 0; c < 5; ++c) vertex[c] = patch.vertex[pair.corner[c]];
-  std::array<double, pair_rest_numbers> stored = {};
-  if (!plan.pair_rest.empty()) stored = face_rest(mesh.positions, vertex);
+  double volume[2];
   for (int which = 0; which < 2; ++which) {
     const Rest rest = rest_of(mesh.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
     plan.pair_bound[(2 * block + which) * lanes + lane] = rest.bound;
     if (!plan.pair_factor.empty())
       plan.pair_factor[(2 * block + which) * lanes + lane] = unit * unit / (6 * rest.volume);
-    stored[7 + 4 * which] = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
+    volume[which] = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
   }
   if (plan.pair_rest.empty()) return;
-  constexpr int quads = pair_rest_numbers / 4;
-  for (int i = 0; i < pair_rest_numbers; ++i)
-    plan.pair_rest[((block * quads + i / 4) * lanes + lane) * 4 + i % 4] = stored[i];
+  const std::array<double, 9> face = face_rest(mesh.positions, vertex);
+  const double fourth[3] = {0, volume[0], volume[1]};
+  for (int quad = 0; quad < 3; ++quad) {
+    double* to = &plan.pair_rest[((block * 3 + quad) * lanes + lane) * 4];
+    std::copy_n(&face[3 * quad], 3, to);
+    to[3] = fourth[quad];
+  }
 }
 
 void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number,

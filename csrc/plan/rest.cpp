@@ -51,28 +51,32 @@ Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet) {
                           {n[2].x, n[2].y, n[2].z}}})};
 }
 
-std::array<double, 12> face_rest(const double* positions,
-                                 const std::array<std::int64_t, 5>& vertex) {
+template <std::size_t Corners>
+std::array<double, 3 * (Corners - 2)> face_rest(const double* positions,
+                                                const std::array<std::int64_t, Corners>& vertex) {
   const auto edge = [&](int c) {
     return row_of(positions, vertex[c]) - row_of(positions, vertex[0]);
   };
   const Vec3<double> first = edge(1), second = edge(2), normal = cross(first, second);
   const double length = std::sqrt(dot(first, first)), area = std::sqrt(dot(normal, normal));
   const double p = 1 / length, q = -dot(first, second) / (length * area), r = length / area;
-  std::array<double, 12> rest = {p, q, r};
-  for (int which = 0; which < 2; ++which) {
+  std::array<double, 3 * (Corners - 2)> rest = {p, q, r};
+  for (int c = 3; c < int(Corners); ++c) {
     // where the apex stands along the axes of the face
-    const Vec3<double> apex = edge(3 + which);
+    const Vec3<double> apex = edge(c);
     const double along = dot(first, apex) / length;
     const double across = dot(cross(normal, first), apex) / (area * length);
     const double h = area / dot(normal, apex);
-    double* column = &rest[4 + 4 * which];
+    double* column = &rest[3 * (c - 2)];
     column[0] = -h * (p * along + q * across);
     column[1] = -h * r * across;
     column[2] = h;
   }
   return rest;
 }
+
+template std::array<double, 6> face_rest(const double*, const std::array<std::int64_t, 4>&);
+template std::array<double, 9> face_rest(const double*, const std::array<std::int64_t, 5>&);
 
 double element_bound(const std::array<std::array<double, 3>, 4>& gradients) {
   // the nonzero eigenvalues of S S^T, S the normalised gradients, are those of the 3x3 matrix S^T S

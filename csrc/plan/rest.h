@@ -15,10 +15,11 @@ struct Rest {
 // `tet` holds four rows of `positions` [vertices, 3].
 Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet);
 
-// Inverse rest matrices of two tetrahedra on one face, corners 0, 1 and 2, in the frame of effects/solid_face.h: p, q, r and 0 of
-// the face, then s, t, h and 0 of those with apexes 3 and 4 [1/m]. `vertex`: rows of `positions`.
-std::array<double, 12> face_rest(const double* positions,
-                                 const std::array<std::int64_t, 5>& vertex);
+// Inverse rest matrices of one or two tetrahedra on a face, corners 0, 1 and 2, in the frame of effects/solid_face.h: p, q and r of
+// the face, then s, t and h of those with apexes 3 and 4 [1/m]. `vertex`: rows of `positions`.
+template <std::size_t Corners>
+std::array<double, 3 * (Corners - 2)> face_rest(const double* positions,
+                                                const std::array<std::int64_t, Corners>& vertex);
 
 // l_e of shape gradients: the largest eigenvalue of diag(K)^-1/2 K diag(K)^-1/2, K = grad N grad N^T.
 double element_bound(const std::array<std::array<double, 3>, 4>& gradients);
