@@ -30,6 +30,9 @@ def test_every_tool_sees_every_kernel_and_an_error_in_it(tool: dict[str, Any]) -
     assert {check.wanted for check in found if check.kind != "plants"} == {0}
     assert len({(check.kind, check.name) for check in found}) == len(found)
     assert [check.kind for check in tool["checks"](["list"])] == ["list"]
+    some = tool["checks"](tool["KINDS"], ["block", "patches"])
+    assert [sum(check.kind == kind for check in some) for kind in ("clean", "plants", "list")] == [8, 5, 1]
+    assert {check.name.split(", ")[1] for check in some if check.kind != "list"} == {"block", "patches"}
 
 
 @pytest.mark.parametrize(("code", "wanted", "ok"), [(0, 0, True), (86, 0, False), (86, 86, True), (0, 86, False)])

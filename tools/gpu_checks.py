@@ -2,6 +2,7 @@
 
 python tools/gpu_checks.py --out benchmarks/results/gpu-checks-h100.json
 python tools/gpu_checks.py --only clean plants --jobs 16 --out ...                   # what --out has, stays
+python tools/gpu_checks.py --only clean --kernels block far --out ...                # those that a change touched
 
 suite     the tests that use a GPU, counted by pytest
 list      every kernel of benchmarks/results/cuda-registers.csv runs in tools/sanitize.py
@@ -63,7 +64,7 @@ class Check(NamedTuple):
         return {**row, "seconds": round(time.perf_counter() - begin, 1)}
 
 
-def checks(kinds: Sequence[str]) -> list[Check]:
+def checks(kinds: Sequence[str], kernels: Sequence[str] = RUNS) -> list[Check]:
     """Those of tools/sanitize.py, longest first."""
     program = [sys.executable, "tools/sanitize.py"]
 
@@ -74,13 +75,14 @@ def checks(kinds: Sequence[str]) -> list[Check]:
         Check("clean", f"{tool}, {kernel}", guarded(tool, "--kernel", kernel))
         for kernel in RUNS[::-1]
         for tool in TOOLS
+        if kernel in kernels
     ]
     found.append(Check("list", "all kernels run", [*program, "--list"]))
     found += [
         Check("plants", f"{tool}, {kernel}", guarded(tool, "--plant", tool, "--kernel", kernel), FOUND)
         for tool in TOOLS[:-1]
         for kernel in RUNS
-        if (tool, kernel) != ("racecheck", "patches")  # has no shared memory
+        if kernel in kernels and (tool, kernel) != ("racecheck", "patches")  # which has no shared memory
     ]
     return [check for check in found if check.kind in kinds]
 
@@ -125,6 +127,7 @@ def record(out: Path | None, command: str, rows: list[Row]) -> None:
 def main(words: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--kernels", nargs="+", choices=RUNS, default=RUNS, help="of sanitizers")
     parser.add_argument("--jobs", type=int, default=8, help="sanitizers at a time (%(default)s)")
     parser.add_argument("--pytest", type=shlex.split, default=[], help="more words for pytest, such as '-n 8'")
     parser.add_argument("--out", type=Path, help="file for the record (JSON)")
@@ -135,7 +138,7 @@ def main(words: list[str]) -> int:
     rows = [run_suite(options.pytest)] if "suite" in options.only else []
     record(options.out, command, rows)
     with ThreadPoolExecutor(options.jobs) as pool:
-        for row in pool.map(Check.run, checks(options.only)):
+        for row in pool.map(Check.run, checks(options.only, options.kernels)):
             rows.append(row)
             print(
                 f"{row['kind']}: {row['name']}: {'ok' if row['ok'] else 'NOT AS WANTED'}, {row['seconds']} s",
