@@ -51,7 +51,7 @@ void add_blocks(MeshPlan& plan, const double* x, const std::int64_t* tets,
       plan.tet_order[block * lanes + lane] = t;
       plan.tet_volume[block * lanes + lane] = i < count ? rest.volume : 0;
       plan.tet_bound[block * lanes + lane] = rest.bound;
-      for (int i = 0; i < 6; ++i) plan.tet_rest[(block * 6 + i) * lanes + lane] = face[i];
+      for (int n = 0; n < 6; ++n) plan.tet_rest[(block * 6 + n) * lanes + lane] = face[n];
       for (int k = 0; k < 4; ++k) {
         plan.tet_corner[(block * 4 + k) * lanes + lane] = std::int16_t(slot_of[corner[k]]);
       }
