@@ -8,7 +8,7 @@ beside those that `torchpd.kernel_costs` expects.
 from __future__ import annotations
 
 import argparse
-import json
+import math
 import re
 import statistics
 from dataclasses import replace
@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from gpu_scenes import GpuScene
 from gpu_timing import event_times, recorded
-from machine import describe_run
+from machine import describe_run, write_result
 from scenes import TIME_STEP
 from tqdm import tqdm
 
@@ -101,8 +101,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--dtype", nargs="*", choices=("float32", "float64"), default=["float32"])
     parser.add_argument("--batches", nargs="*", type=int, default=BATCHES, help="environments")
+    parser.add_argument("--most-vertices", type=int, help="leaves out larger meshes")
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--keep", action="store_true", help="what --out has, and this run does not, stays")
     options = parser.parse_args()
+    if options.keep and not options.out:
+        parser.error("--keep: is for the file that --out names")
     if not torch.cuda.is_available():
         parser.error("torch finds no CUDA device")
     meshes = [(name, "regular", cells) for name in options.dtype for cells in MESHES]
@@ -112,6 +116,7 @@ def main() -> None:
         for dtype, mesh, cells in meshes
         for batch in options.batches
         if batch * len(built(mesh, cells).solids[0].mesh.tets) <= MOST_TETS
+        and math.prod(count + 1 for count in cells) <= (options.most_vertices or math.inf)
     ]
     with torch.no_grad():
         rows = [measure_batch(*job) for job in tqdm(jobs, desc="measuring", unit="batch", leave=False)]
@@ -119,8 +124,21 @@ def main() -> None:
     for row in rows:
         print(line_of(row))
     if options.out:
-        result = {**describe_run(torch.device("cuda"), torch.get_num_threads()), "rows": rows}
-        options.out.write_text(json.dumps(result, indent=1) + "\n")
+        result = describe_run(torch.device("cuda"), torch.get_num_threads())
+        run = {name: result[name] for name in ("command", "created", "commit")}
+        result["rows"] = [{**row, "run": run} for row in rows]
+        write_result(options.out, result, with_earlier if options.keep else None)
+
+
+def with_earlier(new: Row, earlier: Row) -> Row:
+    """With the rows of an earlier run that a new one does not have, in the order of that."""
+
+    def of(row: Row) -> tuple[Any, ...]:
+        return row["dtype"], row["mesh"], row["vertices"], row["batch"]
+
+    run = {name: earlier[name] for name in ("command", "created", "commit")}
+    rows = {of(row): {"run": run, **row} for row in earlier["rows"]}
+    return {**new, "rows": [*(rows | {of(row): row for row in new["rows"]}).values()]}
 
 
 if __name__ == "__main__":

@@ -71,7 +71,10 @@ def test_runs_and_batches_do_not_matter(
 @pytest.mark.usefixtures("poisoned")
 @pytest.mark.parametrize("cells", [(3, 3, 3), (8, 5, 5), (6, 6, 6)])
 def test_the_shape_of_a_block_does_not_matter(cells: tuple[int, int, int], precision: str, tmp_path: Path) -> None:
-    """It follows from the batch that a simulator is told, whatever comes then; only sums over vertices differ by it."""
+    """It follows from the batch that a simulator is told, whatever comes then; only sums over vertices differ by it.
+
+    In float32 the smallest meshes follow the batch of a call: test_cuda_several.
+    """
     dtype, rows = DTYPES[precision], 700
     case = bar(cells, pd.Gravity(), pd.Ground(-0.02, friction=0.4), pd.Damping(0.5), pinned=False)
 
@@ -93,7 +96,7 @@ def test_the_shape_of_a_block_does_not_matter(cells: tuple[int, int, int], preci
             assert_same_bits(run(sim, state, forces, slice(3, 4)), [t[3:4] for t in together])
             shapes.add(frozenset(threads_of(partial(sim, state, forces), tmp_path)))
         # of larger meshes one shape may be the best for all
-        assert len(shapes) > 1 or cells != (3, 3, 3) or shapes == {frozenset()}
+        assert len(shapes) > 1 or cells != (3, 3, 3) or precision == "float32" or shapes == {frozenset()}
 
 
 @pytest.mark.usefixtures("poisoned")
@@ -135,12 +138,27 @@ def test_blocks_that_go_from_patch_to_patch(
     assert_same_bits(run(sim, state, forces), together)
     if tolerance:
         assert len(together[4].unique()) > 1
-    expected = other(state, forces).positions
-    torch.testing.assert_close(together[0], expected, rtol=0.0, atol=16 * torch.finfo(dtype).eps)
+    expected = run(other, state, forces)
+    if precision == "float64":
+        torch.testing.assert_close(together[0], expected[0], rtol=0.0, atol=16 * torch.finfo(dtype).eps)
+    else:
+        exact = on_gpu(bar(cells, pd.Gravity()), torch.float64, "stream", **options)
+        exact.set_material(stiffness=stiffness.double())
+        exact_run = run(exact, pd.State(*(t.double() for t in state)), forces.double())
+        assert_as_near(together, expected, exact_run)
     for item in (0, 1, batch // 2, batch - 1):
         sim.set_material(stiffness=stiffness[item : item + 1])
         alone = run(sim, state, forces, slice(item, item + 1))
         assert_same_bits([t[item : item + 1] for t in together], alone)
+
+
+def assert_as_near(found: list[Tensor], other: list[Tensor], exact: list[Tensor]) -> None:
+    """To a float64 step as another kernel is, which has its tetrahedra in other frames; the same iterates, not bits."""
+    # who stops elsewhere is elsewhere
+    same = (other[4] == exact[4]) & (found[4] == exact[4])
+    assert same.double().mean() > 0.9
+    error, allowed = (float((positions - exact[0])[same].abs().max()) for positions in (found[0], other[0]))
+    assert 0.0 < error <= 2.0 * allowed
 
 
 @pytest.mark.parametrize("kernel", ["cluster", "grid", "far", "stream"])

@@ -14,7 +14,7 @@ from test_regimes import values_of
 import torchpd as pd
 from torchpd import kernel_costs
 from torchpd.gpu import H100, Properties
-from torchpd.kernel_costs import clusters_together, grid_microseconds, iteration_microseconds
+from torchpd.kernel_costs import block_microseconds, clusters_together, grid_microseconds, iteration_microseconds
 from torchpd.regimes import choose_plan, shared_bytes
 
 # cells of those that benchmarks/kernels_by_batch.py measures
@@ -59,7 +59,7 @@ def test_on_meshes_that_nothing_was_fitted_to(measured: list[dict[str, Any]]) ->
 
 def test_time_of_an_iteration_by_hand(dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
     """Waves, turns and tetrahedra counted: 40 multiprocessors, 81 environments of 750 tetrahedra."""
-    fit = kernel_costs._Fit((1.0, 0.01), (2.0, 0.02), (3.0, 0.04), (4.0, 0.08), 20.0, (5.0, 0.01))
+    fit = kernel_costs._Fit((0.5, 0.005), (1.0, 0.01), (2.0, 0.02), (3.0, 0.04), (4.0, 0.08), 20.0, (5.0, 0.01))
     monkeypatch.setitem(kernel_costs._FITS, dtype, fit)
     values, gpu = values_of((5, 5, 5)), Properties(40, 232_448, 16)
     tets = len(values.tets)
@@ -73,6 +73,11 @@ def test_time_of_an_iteration_by_hand(dtype: torch.dtype, monkeypatch: pytest.Mo
     assert time("block", 81) == pytest.approx(2.0 + 0.02 * 3 * 750)
     monkeypatch.setitem(kernel_costs._FITS, dtype, fit._replace(block=(30.0, 0.01)))
     assert time("block", 40) == pytest.approx(30.0 + 0.01 * 750)
+    # of the smallest meshes they wait less; 384 tetrahedra are the most
+    waits = [block_microseconds(small, 40, dtype, gpu) for small in (384, 385)]
+    monkeypatch.setitem(kernel_costs._FITS, dtype, fit._replace(small_block=(20.0, 0.005), block=(30.0, 0.01)))
+    waits += [block_microseconds(small, 40, dtype, gpu) for small in (384, 385)]
+    assert waits == pytest.approx([2.0 + 0.02 * 384, 30.0 + 3.85, 20.0 + 1.92, 30.0 + 3.85])
     # ten patches, in two groups of 16 multiprocessors one such cluster each
     assert clusters_together(choose_plan(values, dtype, gpu, "cluster"), gpu) == 2
     assert time("cluster", 5) == pytest.approx(3 * (3.0 + 0.04 * 750))

@@ -19,6 +19,7 @@ TOOLS = Path(__file__).parent.parent / "tools"
 H100 = Properties(132, 232448, 16)
 FAR_THREADS = {torch.float32: 384, torch.float64: 192}  # far_threads of csrc/cuda/fused.cuh
 PIPELINE_SLOTS = 1024  # csrc/cuda/pipeline.h
+SHARING_PAIRS = 192  # csrc/cuda/several.cuh
 
 
 @pytest.fixture(name="tool", scope="module")
@@ -53,6 +54,8 @@ def test_patches_are_what_the_kernels_are_to_see(tool: dict[str, Any], dtype: to
         assert bool((far.patch_outer > 0).all())
         assert any(plan.size("most_slots") > PIPELINE_SLOTS for plan in plans["large"])
         assert {plan.patches > 8 for plan in plans["cluster"]} == {False, True}
+        assert all(plan.size("most_pairs") <= SHARING_PAIRS for plan in plans["several"])
+        assert [plan.size("most_pairs") > SHARING_PAIRS for plan in plans["block"]] == [True, True, False]
     assert vars(regimes) == constants
 
 

@@ -29,7 +29,8 @@ CSRC = ROOT / "csrc"
 REPORTS = ROOT / "build" / "cuda-check"
 TARGETS = ("80", "90")
 # to save time only the kernels that most steps run
-NEWER_TARGETS, NEWER_SOURCES = ("100",), ("fused_float.cu", "stream_float.cu", "multilevel_float.cu")
+NEWER_TARGETS = ("100",)
+NEWER_SOURCES = ("several_float.cu", "fused_float.cu", "stream_float.cu", "multilevel_float.cu")
 # C++ that only a CUDA build of torch compiles, and what has parts for it
 GLUE = ("cuda/ops.cpp", "cuda/freeform_ops.cpp", "module.cpp")
 # a torch without CUDA lacks the header that says how its CUDA part was built

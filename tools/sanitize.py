@@ -87,10 +87,13 @@ class Way(NamedTuple):
 BAR = bar(6, 2, 2)
 SMALL, LARGE = dict.fromkeys(DTYPES, 24), {torch.float32: 2304, torch.float64: 960}
 # The smallest that were found for all instantiations. "far" is a grid whose patches have several tetrahedra and several
-# vertices a thread, "large" a stream of such patches, and of one with more slots than a pipeline counts.
+# vertices a thread, "large" a stream of such patches, and of one with more slots than a pipeline counts. "several" is
+# "block" in float32 of meshes so small that many environments share blocks.
 WAYS = {
-    # not all vertex arrays are in shared memory: in float32, in float64
-    "block": (Way(bar(3, 2, 2), {}), Way(bar(4, 2, 2), {})),
+    # of several small ones a block: of each one with few registers, two of two rounds, two of one
+    "several": (Way(bar(4, 2, 2), {}), Way(BAR, {}), Way(bar(2, 2, 2), {})),
+    # all vertex arrays are in shared memory; not all: in float32, in float64
+    "block": (Way(bar(9, 2, 2), {}), Way(bar(40, 1, 1), {}), Way(bar(4, 2, 2), {})),
     # four lanes a vertex, in few threads and in many; eight, in few and in many
     "cluster": (
         Way(bar(4, 2, 2), {"_CLUSTER_EACH": 60}),
@@ -111,7 +114,7 @@ RUNS = (*KERNELS, "levels", "patches")  # and what the multilevel solver runs wi
 def compiled_for(kernel: str, way: Way) -> Iterator[str]:
     """The name that a simulator knows one of KERNELS by, which meanwhile has the patches of a way."""
     with mock.patch.dict(vars(regimes), way.constants):
-        yield {"far": "grid", "large": "stream"}.get(kernel, kernel)
+        yield {"far": "grid", "large": "stream", "several": "block"}.get(kernel, kernel)
 
 
 def scene(mesh: pd.TetMesh, *, contacts: bool, pieces: bool, pins: bool) -> pd.Scene:
@@ -299,12 +302,27 @@ def large_patches(dtype: torch.dtype) -> int:
     return len(WAYS["large"])
 
 
+def several_environments(dtype: torch.dtype) -> int:
+    """Few of them, and as many as share blocks on an H100. In float64 none do."""
+    if dtype == torch.float64:
+        return 0
+    ways = list(itertools.product(WAYS["several"], (False, True)))
+    for number, (way, contacts) in enumerate(ways):
+        built = scene(way.mesh, contacts=contacts, pieces=contacts, pins=True)
+        options: dict[str, Any] = {"solver": SOLVERS[number % len(SOLVERS)], "tolerance": 1e-2 * (number % 2)}
+        sim = pd.Simulator(built, 1 / 60, 5, kernel="block", progress=False, **options).to("cuda")
+        step_all_ways(sim, 3)
+        sim.set_material(stiffness=sim.stiffness[0], masses=sim.masses[0])
+        sim(sim.rest_state(6 * properties_of(sim.device).multiprocessors + 8), return_info=True)
+    return len(ways)
+
+
 def run(kernel: str) -> int:
     """How many simulators have run, in both precisions."""
     if kernel == "cluster" and properties_of(torch.device("cuda", 0)).cluster == 1:
         print("no clusters: this GPU has none (compute capability 9.0)")
         return 0
-    special = {"levels": levels, "patches": free_form, "large": large_patches}
+    special = {"levels": levels, "patches": free_form, "large": large_patches, "several": several_environments}
     count = 0
     for dtype in DTYPES:
         count += special[kernel](dtype) if kernel in special else every_way(kernel, dtype)
@@ -396,7 +414,7 @@ def plant_in_patches(tool: str) -> None:
 
 def planted_scene(kernel: str) -> pd.Scene:
     """Of a mesh that is not so small that a block has one warp, which has nobody to race with."""
-    mesh = WAYS[kernel][0].mesh if kernel in ("far", "large") else BAR
+    mesh = WAYS[kernel][0].mesh if kernel in ("block", "far", "large") else BAR
     return scene(mesh, contacts=False, pieces=True, pins=False)
 
 

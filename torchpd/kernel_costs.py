@@ -27,7 +27,8 @@ __all__ = [
 class _Fit(NamedTuple):
     """Microseconds of an iteration, and microseconds that each tetrahedron adds."""
 
-    block: tuple[float, float]  # alone, a block waits
+    small_block: tuple[float, float]  # alone, a block waits: of a mesh so small that many may share one
+    block: tuple[float, float]  # of others
     full_block: tuple[float, float]  # many are issued by one multiprocessor
     cluster: tuple[float, float]  # of one that runs with others, whatever the patches
     grid: tuple[float, float]  # of a patch
@@ -36,10 +37,11 @@ class _Fit(NamedTuple):
 
 
 _FITS = {
-    torch.float32: _Fit((1.5, 1.5e-3), (0.5, 2.0e-3), (1.1, 1.3e-4), (1.5, 2.8e-3), 2.0, (9.7, 2.0e-5)),
-    torch.float64: _Fit((2.0, 4.7e-3), (0.5, 6.4e-3), (1.5, 6.0e-4), (1.5, 9.4e-3), 2.6, (9.7, 7.0e-5)),
+    torch.float32: _Fit((1.2, 1.0e-3), (1.5, 1.5e-3), (0.5, 2.0e-3), (1.1, 1.3e-4), (1.5, 2.8e-3), 2.0, (9.7, 2.0e-5)),
+    torch.float64: _Fit((2.0, 4.7e-3), (2.0, 4.7e-3), (0.5, 6.4e-3), (1.5, 6.0e-4), (1.5, 9.4e-3), 2.6, (9.7, 7.0e-5)),
 }
 _MEASURED_ON = 132  # multiprocessors
+_SMALL_TETS = 384  # have at most as many pairs as share blocks (csrc/cuda/several.cuh), where all have partners
 # registers of a multiprocessor, and of a thread of a cluster (benchmarks/results/cuda-registers.csv)
 _REGISTERS, _CLUSTER_REGISTERS = 65536, {torch.float32: 168, torch.float64: 256}
 # multiprocessors that blocks of a cluster are neighbours in, and the share of a GPU that has as many together
@@ -62,9 +64,11 @@ def clusters_together(plan: Plan, gpu: Properties) -> int:
 
 
 def block_microseconds(tets: int, batch: int, dtype: torch.dtype, gpu: Properties) -> float:
-    """With a block an environment."""
+    """With a block an environment, or several small ones."""
     each = -(-batch // gpu.multiprocessors)
-    return max(_line(_FITS[dtype].block, tets), _line(_FITS[dtype].full_block, each * tets))
+    fit = _FITS[dtype]
+    alone = fit.small_block if tets <= _SMALL_TETS else fit.block
+    return max(_line(alone, tets), _line(fit.full_block, each * tets))
 
 
 def grid_microseconds(tets: int, patches: int, batch: int, dtype: torch.dtype, gpu: Properties) -> float:

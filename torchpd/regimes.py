@@ -1,6 +1,7 @@
 """Which kernel of a GPU steps a scene, and the plan for it.
 
-    block    one thread block an environment, all iterations in one launch: the mesh fits a block's shared memory
+    block    one thread block an environment, or several small ones, all iterations in one launch: the mesh fits a
+             block's shared memory
     cluster  up to 16 blocks that reach each other's shared memory (compute capability 9.0), a patch each, all
              iterations in one launch: a small mesh
     grid     a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors

@@ -113,7 +113,7 @@ def _pass_line(sim: Simulator) -> str:
 
 
 _LAUNCHES = {
-    "block": "one thread block an environment, all iterations in one launch",
+    "block": "one thread block an environment, or several small ones, all iterations in one launch",
     "cluster": "a cluster of thread blocks, one for each patch, all iterations in one launch",
     "grid": "a thread block for each patch, all iterations in one launch",
     "stream": "a thread block for each patch, launches for every iteration",

@@ -265,6 +265,8 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaun
 
 template <class T>
 std::int64_t fused_bytes(const DeviceStep<T>& step) {
+  if constexpr (sizeof(T) == 4)
+    if (takes_several(step)) return several_bytes(step);
   Arena arena(nullptr);
   arrange(arena, step, FusedLaunch<T>(step));
   return arena.size();
@@ -272,6 +274,8 @@ std::int64_t fused_bytes(const DeviceStep<T>& step) {
 
 template <class T>
 void run_fused(const DeviceStep<T>& step, void* memory, Stream to) {
+  if constexpr (sizeof(T) == 4)
+    if (takes_several(step)) return run_several(step, memory, to);
   const auto stream = static_cast<cudaStream_t>(to);
   const FusedLaunch<T> launch(step);
   Arena arena(memory);

@@ -8,7 +8,7 @@ namespace pd {
 
 // How a plan is run, in DevicePlan::kernel.
 enum class DeviceKernel : int {
-  block = 0,  // one block an environment, all iterations in one launch
+  block = 0,  // one block an environment, or several small ones, all iterations in one launch
   cluster =
       1,  // one block a patch, which reach each other's shared memory, all iterations in one launch
   grid = 2,    // one block a patch, all iterations in one launch
@@ -22,6 +22,14 @@ template <class T>
 std::int64_t fused_bytes(const DeviceStep<T>& call);
 template <class T>
 void run_fused(const DeviceStep<T>& call, void* memory, Stream stream);
+// The same of kernel block for meshes so small that a block may have several environments, in float32.
+template <class T>
+bool takes_several(const DeviceStep<T>& call);
+template <class T>
+std::int64_t several_bytes(const DeviceStep<T>& call);
+template <class T>
+void run_several(const DeviceStep<T>& call, void* memory, Stream stream);
+
 // Blocks of the largest cluster that the current device runs; 1: it has none, or this build no code for them.
 int largest_cluster();
 

@@ -98,10 +98,9 @@ struct PairNumbers {
 
 // Without `Weighed` the weights are not known yet.
 template <bool Weighed = true, class T>
-PD_DEVICE PairNumbers<T> read_pair(const Patch<T>& patch, const T* weights, int pair) {
+PD_DEVICE PairNumbers<T> read_pair(const DevicePlan<T>& plan, const T* weights, PairPlace place) {
   PairNumbers<T> numbers;
-  const PairPlace place = place_of(patch, pair);
-  const int32* const corner = patch.plan.pair_corner + place.in(5);
+  const int32* const corner = plan.pair_corner + place.in(5);
   for (int c = 0; c < 5; ++c) numbers.corner[c] = unsigned(corner[c * pair_lanes]);
   for (int e = 0; e < 2; ++e) {
     numbers.weight[e] = T(0);
@@ -273,58 +272,73 @@ PD_DEVICE void leave(const Vec3<T>& force, Quad<T>& entry) {
   entry = quad(force, unwritten<T>());
 }
 
-// Runs an effect on every pair of a patch, a thread a pair; returns the sum of energies that this thread has met.
-// `read(corner, vectors)`: those that elements want of the slot of a corner, as pair_corner has it.
-template <int Fields, class T, class Read, class Rest, class Element>
-PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest, const T* weights,
-                      Quad<T>* entries, const Element& element) {
+// Runs an effect on one pair, adds what it meets of energy, and leaves the forces. `read(corner, vectors)`: those that elements
+// want of the slot of a corner, as pair_corner has it.
+template <int Fields, class T, class Read, class Shape, class Element>
+PD_DEVICE void work_on_pair(const Read& read, const Shape& shape, const PairNumbers<T>& numbers,
+                            Quad<T>* entries, const Element& element, T& energy) {
   using First = OneOf<T, 0>;
   using Second = OneOf<T, 1>;
   Pair<T, Fields> pair;
+  for (int c = 0; c < 5; ++c) {
+    Vec3<T> vectors[Fields];
+    read(numbers.corner[c], vectors);
+    for (int f = 0; f < Fields; ++f) pair.corner[f][c] = vectors[f];
+  }
+  if constexpr (OnFaces<Element>) {
+    element.run_face(pair.corner[0], shape.face, numbers.weight, pair.force, energy);
+  } else {
+    element.template run<1>(
+        PairElement<T, Fields, First>{pair, shape.face.inverse(0), numbers.weight[0], energy});
+    element.template run<1>(
+        PairElement<T, Fields, Second>{pair, shape.face.inverse(1), numbers.weight[1], energy});
+  }
+  for (int c = 0; c < 4; ++c) leave(pair.force[c], entries[numbers.entry(c)]);
+  if (numbers.entry(4) != no_entry) leave(pair.force[4], entries[numbers.entry(4)]);
+}
+
+// The same for every pair of a patch, a thread a pair; returns the sum of energies that this thread has met.
+template <int Fields, class T, class Read, class Rest, class Element>
+PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest, const T* weights,
+                      Quad<T>* entries, const Element& element) {
   T energy = T(0);
   weights = in_register(weights);
-  PairNumbers<T> now = read_pair(patch, weights, min(int(threadIdx.x), patch.pairs - 1));
+  const auto read_numbers = [&](int number) {
+    return read_pair(patch.plan, weights, place_of(patch, min(number, patch.pairs - 1)));
+  };
+  PairNumbers<T> now = read_numbers(threadIdx.x);
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const typename Rest::Numbers shape = rest.read(place_of(patch, number), now);
-    for (int c = 0; c < 5; ++c) {
-      Vec3<T> vectors[Fields];
-      read(now.corner[c], vectors);
-      for (int f = 0; f < Fields; ++f) pair.corner[f][c] = vectors[f];
-    }
-    if constexpr (OnFaces<Element>) {
-      element.run_face(pair.corner[0], shape.face, now.weight, pair.force, energy);
-    } else {
-      element.template run<1>(
-          PairElement<T, Fields, First>{pair, shape.face.inverse(0), now.weight[0], energy});
-      element.template run<1>(
-          PairElement<T, Fields, Second>{pair, shape.face.inverse(1), now.weight[1], energy});
-    }
-    for (int c = 0; c < 4; ++c) leave(pair.force[c], entries[now.entry(c)]);
-    if (now.entry(4) != no_entry) leave(pair.force[4], entries[now.entry(4)]);
+    work_on_pair<Fields>(read, shape, now, entries, element, energy);
     // here rather than at the top: fewer registers are spilled
-    now = read_pair(patch, weights, min(number + int(blockDim.x), patch.pairs - 1));
+    now = read_numbers(number + int(blockDim.x));
   }
   return energy;
 }
 
-// w V of every pair of a patch, times l_e when `bounded`.
+// w V of a pair, times l_e when `bounded`.
+template <class T, class Rest>
+PD_DEVICE void weigh_pair(const DevicePlan<T>& plan, const Rest& rest, PairPlace place,
+                          const T* stiffness, bool bounded, T* weights) {
+  const typename Rest::Numbers numbers =
+      rest.read(place, read_pair<false, T>(plan, nullptr, place));
+  const auto weigh = [&](auto take) {
+    using Take = decltype(take);
+    const unsigned at = place.in(2) + Take::which * pair_lanes;
+    const int tet = tet_of(plan, place, Take::which);
+    const T bound = bounded ? plan.pair_bound[at] : T(1);
+    weights[at] = tet < 0 ? T(0) : bound * numbers.template weight<Take>(stiffness[tet]);
+  };
+  weigh(OneOf<T, 0>{});
+  weigh(OneOf<T, 1>{});
+}
+
+// of every pair of a patch
 template <class T, class Rest>
 PD_DEVICE void weigh_pairs(const Patch<T>& patch, const Rest& rest, const T* stiffness,
                            bool bounded, T* weights) {
-  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
-    const PairPlace place = place_of(patch, number);
-    const typename Rest::Numbers numbers =
-        rest.read(place, read_pair<false, T>(patch, nullptr, number));
-    const auto weigh = [&](auto take) {
-      using Take = decltype(take);
-      const unsigned at = place.in(2) + Take::which * pair_lanes;
-      const int tet = tet_of(patch.plan, place, Take::which);
-      const T bound = bounded ? patch.plan.pair_bound[at] : T(1);
-      weights[at] = tet < 0 ? T(0) : bound * numbers.template weight<Take>(stiffness[tet]);
-    };
-    weigh(OneOf<T, 0>{});
-    weigh(OneOf<T, 1>{});
-  }
+  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x)
+    weigh_pair(patch.plan, rest, place_of(patch, number), stiffness, bounded, weights);
 }
 
 // The stiffness of all of a patch, which all threads of the block ask for, or -1 where there are several.

@@ -139,19 +139,21 @@ void launch(const void* kernel, unsigned blocks, int threads, void** arguments,
   check(cudaLaunchKernelExC(&how.config, kernel, arguments));
 }
 
-static std::size_t shared_memory(cudaDeviceAttr which) {
-  int device = 0, bytes = 0;
+static int fact(cudaDeviceAttr which) {
+  int device = 0, value = 0;
   check(cudaGetDevice(&device));
-  check(cudaDeviceGetAttribute(&bytes, which, device));
-  return std::size_t(bytes);
+  check(cudaDeviceGetAttribute(&value, which, device));
+  return value;
 }
 
+int multiprocessors() { return fact(cudaDevAttrMultiProcessorCount); }
+
 std::size_t shared_memory_per_multiprocessor() {
-  return shared_memory(cudaDevAttrMaxSharedMemoryPerMultiprocessor);
+  return std::size_t(fact(cudaDevAttrMaxSharedMemoryPerMultiprocessor));
 }
 
 std::size_t shared_memory_per_block() {
-  return shared_memory(cudaDevAttrMaxSharedMemoryPerBlockOptin);
+  return std::size_t(fact(cudaDevAttrMaxSharedMemoryPerBlockOptin));
 }
 
 unsigned blocks_of(std::int64_t count) {

@@ -26,6 +26,7 @@ bool runs_code_for_90(const void* kernel);
 void launch(const void* kernel, unsigned blocks, int threads, void** arguments,
             std::size_t shared_bytes, int cluster, cudaStream_t stream);
 
+int multiprocessors();  // of the current device
 std::size_t shared_memory_per_multiprocessor();
 std::size_t shared_memory_per_block();  // the most that one may ask for
 

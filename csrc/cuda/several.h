@@ -1,0 +1,490 @@
+// Runner of solver/step.h inside a kernel, for meshes so small that a block has several environments: their pairs of tetrahedra
+// fill its warps, one environment after the other, where the pairs of one would leave lanes idle.
+//
+// Which threads work on an environment, and which others there are in its block, never decides in which order something is
+// added up, so neither decides the bits: whoever launches it may choose both by the batch.
+#pragma once
+#include "cuda/momentum.h"
+#include "cuda/patch.h"
+#include "cuda/several_call.h"
+#include "cuda/vertices.h"
+#include "solver/step.h"
+
+namespace pd::inline PD_TARGET {
+
+// `Once`: no thread has a second pair, so that each keeps what the plan says of its own. `Lean`: there are too few registers to
+// ask for all forces on a vertex at once.
+template <class T, bool Touching, bool Once, bool Lean>
+class SeveralRunner {
+  using Seen = typename Vertices<T, Touching>::Seen;
+
+  // A pair or a vertex of one of the environments.
+  struct Seat {
+    int environment, at;
+  };
+
+ public:
+  // `shared`: SeveralLayout::bytes
+  PD_DEVICE SeveralRunner(const SeveralCall<T>& call, std::byte* shared)
+      : call_(call.step),
+        plan_(call.step.plan),
+        set_(call.step.settings),
+        memory_(call.scratch),
+        pair_stride_(call.pair_stride),
+        slot_stride_(call.slot_stride),
+        first_of_block_(blockIdx.x * unsigned(call.together)),
+        h_(T(call.step.settings.time_step)),
+        theta_(call.relaxation) {
+    const SeveralLayout<T> layout(call.step, call.together);
+    course_ = reinterpret_cast<Course<T>*>(shared);
+    position_ = reinterpret_cast<Quad<T>*>(shared + layout.vectors);
+    const int all = call.together * plan_.most_slots;
+    const std::int64_t far = std::int64_t(first_of_block_) * plan_.most_slots;
+    v_ = {memory_.x + far, memory_.velocity + far, position_ + all, position_ + 2 * all,
+          position_ + 3 * all};
+    origin_ = position_ + 4 * all;
+    entries_ = reinterpret_cast<Quad<T>*>(shared + layout.entries);
+    pair_energy_ = reinterpret_cast<T*>(shared + layout.energies);
+    vertex_sum_ = pair_energy_ + call.together * plan_.most_pairs;
+    balls_ = reinterpret_cast<Ball<T>*>(shared + layout.contacts);
+    planes_ = reinterpret_cast<Plane<T>*>(balls_ + call.together * call_.material.spheres_count);
+    vertex_sums_ = all;
+    first_pair_ = seat_of(threadIdx.x, pairs());
+    first_slot_ = seat_of(threadIdx.x, slots());
+  }
+
+  // All steps of environments `first` to `first + here - 1`.
+  PD_DEVICE void roll(std::int64_t first, int here) {
+    first_ = first;
+    here_ = here;
+    load();
+    weigh();
+    for (int t = 0; t < set_.steps; ++t) {
+      step(*this, set_);
+      if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
+      move_balls();
+    }
+    __syncthreads();
+  }
+
+  PD_DEVICE void predict() {
+    __syncthreads();
+    each_slot([&](const Seat& seat, int i) {
+      v_.predict(i, inputs(seat.environment), seat.at, h_);
+      origin_[i] = quad(vec3(v_.x[i]) - vec3(v_.x[i - seat.at]));
+    });
+  }
+
+  PD_DEVICE void start() {
+    each_slot([&](const Seat& seat, int i) {
+      const Vec3<T> u = v_.first(i, inputs(seat.environment), seat.at, contacts(seat.environment));
+      move(i, u);
+      v_.set_before(i, u);
+    });
+    for (int e = threadIdx.x; e < here_; e += blockDim.x) {
+      Course<T>& course = course_[e];
+      Progress& progress = course.progress;
+      progress.schedule = Schedule(set_, progress.least, contacts(e).friction() > T(0));
+      course.omega[0] = T(progress.schedule.next(0));
+      if (stops()) progress.stop = {inputs(e).fall()};
+      progress.used = set_.iterations;
+      progress.done = false;
+    }
+    finished_ = pending_ = started_ = false;
+    __syncthreads();
+  }
+
+  // Exact minimum of E along the translation of every piece that nothing holds or touches: its momentum is then right
+  // however few iterations follow.
+  PD_DEVICE void translate() {
+    settle();
+    const bool given_first = set_.start == StartKind::given && !started_;
+    const bool first = !started_;
+    started_ = true;
+    if (plan_.pieces == 0 || given_first) return;
+    find_shifts();
+    if constexpr (Touching) drop_touching_shifts();
+    each_slot([&](const Seat& seat, int i) {
+      const int piece = plan_.slot_piece[seat.at];
+      if (piece < 0) return;
+      const Vec3<T> u = vec3(v_.u[i]) + vec3(shift(seat.environment, piece));
+      move(i, u);
+      if (first) v_.set_before(i, u);
+    });
+    __syncthreads();
+  }
+
+  PD_DEVICE void iterate(int k) {
+    if (k % guard_period == 0 && set_.schedule == ScheduleKind::guarded) {
+      iterate_with<true>(k);
+    } else {
+      iterate_with<false>(k);
+    }
+  }
+
+  PD_DEVICE bool finished() const { return finished_; }
+
+  // The gradient on the straight course x + h v is what residuals are relative to, whatever the first iterate.
+  PD_DEVICE void measure_course() {
+    each_slot([&](const Seat& seat, int i) {
+      move(i, v_.at(i).first(contacts(seat.environment), v_.straight(i, h_)));
+    });
+    measure();
+    each_environment([&](int e) {
+      Progress& progress = course_[e].progress;
+      if (lane() == 0) progress.course = progress.residual;
+    });
+    __syncthreads();
+  }
+
+  // |grad E|^2 without what contacts balance, and E
+  PD_DEVICE void measure() {
+    settle();
+    __syncthreads();
+    each_pair<true>(SolidGradient<true>{});
+    __syncthreads();
+    each_slot([&](const Seat& seat, int i) {
+      const Seen seen = v_.see(i);
+      const Vec3<T> force = force_on(seat);
+      leave(energy_sum, i, seen.energy());
+      leave(change_sum, i, seen.residual(contacts(seat.environment), force));
+    });
+    __syncthreads();
+    each_environment([&](int e) {
+      const double energy = energy_of(e), residual = over_vertices(change_sum, e, Add{});
+      if (lane() != 0) return;
+      course_[e].progress.energy = energy;
+      course_[e].progress.residual = residual;
+    });
+    __syncthreads();
+  }
+
+  PD_DEVICE void finish() {
+    each_slot([&](const Seat&, int i) { v_.finish(i, h_); });
+  }
+
+ private:
+  // What vertices leave of themselves for the sums of their environment.
+  enum VertexSum { energy_sum, change_sum, way_sum };
+
+  PD_DEVICE bool stops() const { return stops_; }
+  // of the plan's one patch
+  PD_DEVICE int pairs() const { return plan_.most_pairs; }
+  PD_DEVICE int slots() const { return plan_.most_slots; }
+  PD_DEVICE static int lane() { return int(threadIdx.x) % warp_size; }
+  PD_DEVICE Inputs<T> inputs(int environment) const { return {&call_, first_ + environment}; }
+  PD_DEVICE Contacts<T> contacts(int environment) const {
+    const int planes = call_.material.planes_count, balls = call_.material.spheres_count;
+    return {planes_ + environment * planes, balls_ + environment * balls, planes, balls};
+  }
+  PD_DEVICE T* weights(int environment) const {
+    return memory_.weights +
+           (first_of_block_ + environment) * unsigned(2 * pair_lanes * plan_.blocks);
+  }
+  PD_DEVICE Quad<T>& shift(int environment, int piece) const {
+    return memory_.shift[std::int64_t(first_of_block_ + environment) * plan_.pieces + piece];
+  }
+  PD_DEVICE double* part_sum(int environment, int part) const {
+    return memory_.part_sum +
+           (std::int64_t(first_of_block_ + environment) * plan_.parts + part) * 4;
+  }
+
+  // ---- who works on what
+
+  PD_DEVICE static Seat seat_of(int number, int each) { return {number / each, number % each}; }
+  // the one of this thread after it
+  PD_DEVICE static Seat after(const Seat& seat, int each, const Stride& stride) {
+    const int at = seat.at + stride.rest;
+    const bool next = at >= each;
+    return {seat.environment + stride.whole + next, next ? at - each : at};
+  }
+
+  // visit(seat, number in arrays of all)
+  template <class Visit>
+  PD_DEVICE void each_slot(const Visit& visit) {
+    for (Seat seat = first_slot_; seat.environment < here_;
+         seat = after(seat, slots(), slot_stride_))
+      visit(seat, seat.environment * slots() + seat.at);
+  }
+  // A warp for each; the last ones, whose pairs are the fewest.
+  template <class Visit>
+  PD_DEVICE void each_environment(const Visit& visit) {
+    const int warps = blockDim.x / warp_size;
+    for (int e = warps - 1 - int(threadIdx.x) / warp_size; e < here_; e += warps) visit(e);
+  }
+  template <class Visit>
+  PD_DEVICE void each_part(const Visit& visit) const {
+    const int warps = blockDim.x / warp_size;
+    for (int n = int(threadIdx.x) / warp_size; n < here_ * plan_.parts; n += warps) {
+      const Seat part = seat_of(n, plan_.parts);
+      visit(part.environment, part.at, plan_.part_start[part.at], plan_.part_start[part.at + 1]);
+    }
+  }
+  template <class Visit>
+  PD_DEVICE void each_piece(const Visit& visit) const {
+    const int warps = blockDim.x / warp_size;
+    for (int n = int(threadIdx.x) / warp_size; n < here_ * plan_.pieces; n += warps) {
+      const Seat piece = seat_of(n, plan_.pieces);
+      visit(piece.environment, piece.at);
+    }
+  }
+
+  // ---- elements and vertices
+
+  PD_DEVICE void move(int i, const Vec3<T>& u) {
+    v_.set(i, u);
+    position_[i] = quad(vec3(origin_[i]) + u);
+  }
+
+  PD_DEVICE Vec3<T> force_on(const Seat& seat) const {
+    const Quad<T>* entries = entries_ + seat.environment * plan_.most_entries;
+    const int row = plan_.slot_row[seat.at];
+    return Lean ? sum_entries(entries, row) : sum_entries_soon<T>(entries, row);
+  }
+
+  // of this thread's next one, or again of its first
+  PD_DEVICE void read_ahead(const Seat& next) {
+    if (first_pair_.environment >= here_) return;
+    const Seat& seat = next.environment < here_ ? next : first_pair_;
+    now_ = read_pair(plan_, weights(seat.environment), PairPlace{unsigned(seat.at)});
+  }
+
+  // Runs an effect on all pairs, a thread a pair.
+  template <bool Energies, class Element>
+  PD_DEVICE void each_pair(const Element& element) {
+    const StoredRest<T> rest{plan_.pair_rest};
+    for (Seat seat = first_pair_; seat.environment < here_;) {
+      const Quad<T>* position = position_ + seat.environment * slots();
+      Quad<T>* entries = entries_ + seat.environment * plan_.most_entries;
+      const auto read = [&](unsigned corner, Vec3<T>(&x)[1]) {
+        x[0] = at_corner(position, corner);
+      };
+      T energy = T(0);
+      work_on_pair<1>(read, rest.read(PairPlace{unsigned(seat.at)}, now_), now_, entries, element,
+                      energy);
+      if constexpr (Energies) pair_energy_[seat.environment * pairs() + seat.at] = energy;
+      if constexpr (Once) break;
+      seat = after(seat, pairs(), pair_stride_);
+      read_ahead(seat);
+    }
+  }
+
+  template <bool Guard>
+  PD_DEVICE void iterate_with(int k) {
+    each_pair<Guard>(SolidGradient<Guard>{});
+    if (stops() && pending_) conclude(k, [](int) {});
+    __syncthreads();
+    if (stops() && all_done()) {
+      finished_ = true;
+      pending_ = false;
+      return;
+    }
+    each_slot([&](const Seat& seat, int i) {
+      const Course<T>& course = course_[seat.environment];
+      if (stops() && course.progress.done) return;
+      const Seen seen = v_.see(i);
+      const Vec3<T> force = force_on(seat);
+      if constexpr (Guard) leave(energy_sum, i, seen.energy());
+      const Vec3<T> next =
+          seen.next(contacts(seat.environment), force, theta_, course.omega[k & 1]);
+      if (stops()) {
+        const Vec3<T> change = next - seen.u;
+        leave(change_sum, i, double(dot(change, change)));
+        leave(way_sum, i, seen.square_of_way());
+      }
+      v_.set_before(i, seen.u);
+      v_.set(i, next);
+      position_[i] = quad(vec3(origin_[i]) + next);
+    });
+    // by those who have the fewest vertices, while others move theirs
+    const auto look_ahead = [&](int e) { course_[e].look_ahead(k + 1); };
+    if (!stops() && pending_) {
+      conclude(k, look_ahead);
+    } else if (threadIdx.x + warp_size >= blockDim.x && lane() < here_) {
+      look_ahead(lane());
+    }
+    pending_ = stops() || Guard;
+    __syncthreads();
+  }
+
+  PD_DEVICE bool all_done() const {
+    for (int e = 0; e < here_; ++e)
+      if (!course_[e].progress.done) return false;
+    return true;
+  }
+
+  // ---- sums
+
+  // a number of T, kept as such
+  PD_DEVICE void leave(VertexSum which, int i, double value) {
+    vertex_sum_[int(which) * vertex_sums_ + i] = T(value);
+  }
+
+  template <class Op>
+  PD_DEVICE double over_vertices(VertexSum which, int environment, Op op) const {
+    const T* values = vertex_sum_ + int(which) * vertex_sums_ + environment * slots();
+    double sum = Op::none;
+    for (int s = lane(); s < slots(); s += warp_size) sum = op(sum, double(values[s]));
+    return across_warp(sum, op);
+  }
+  PD_DEVICE double energy_of(int environment) const {
+    const T* values = pair_energy_ + environment * pairs();
+    double sum = 0;
+    for (int p = lane(); p < pairs(); p += warp_size) sum += double(values[p]);
+    return across_warp(sum, Add{}) + over_vertices(energy_sum, environment, Add{});
+  }
+
+  // What follows from the sums of iteration k - 1, and then for one thread of each environment.
+  template <class Then>
+  PD_DEVICE void conclude(int k, const Then& then) {
+    const bool guarded = (k - 1) % guard_period == 0 && set_.schedule == ScheduleKind::guarded;
+    each_environment([&](int e) {
+      Course<T>& course = course_[e];
+      Progress& progress = course.progress;
+      if (stops() && progress.done) return;
+      const double energy = guarded ? energy_of(e) : 0;
+      const double change = stops() ? over_vertices(change_sum, e, Add{}) : 0;
+      const double way = stops() ? over_vertices(way_sum, e, Add{}) : 0;
+      if (lane() == 0) {
+        if (guarded) progress.schedule.check(energy);
+        if (stops() &&
+            progress.ends(set_.tolerance, double(course.omega[(k - 1) & 1]), change, way)) {
+          progress.done = true;
+          progress.used = k;
+        }
+        then(e);
+      }
+    });
+    __syncwarp();
+  }
+
+  // The last iteration's sums, which no iteration follows.
+  PD_DEVICE void settle() {
+    if (!pending_) return;
+    conclude(set_.iterations, [](int) {});
+    pending_ = false;
+    __syncthreads();
+  }
+
+  // ---- start of a call
+
+  PD_DEVICE void load() {
+    for (int e = threadIdx.x; e < here_; e += blockDim.x)
+      inputs(e).read_contacts(planes_ + e * call_.material.planes_count,
+                              balls_ + e * call_.material.spheres_count);
+    each_slot([&](const Seat& seat, int i) {
+      v_.load(i, inputs(seat.environment), seat.at, h_);
+      position_[i] = {T(0), T(0), T(0), T(0)};
+    });
+    __syncthreads();
+  }
+
+  PD_DEVICE void move_balls() {
+    if constexpr (!Touching) return;
+    __syncthreads();
+    for (int b = threadIdx.x; b < here_ * call_.material.spheres_count; b += blockDim.x)
+      balls_[b].center = balls_[b].center + balls_[b].motion;
+    __syncthreads();
+  }
+
+  // a and 1 / D of every vertex, w V of every element, and the smallest a / D
+  PD_DEVICE void weigh() {
+    weigh_with(set_.weighted);
+    for (int e = threadIdx.x; e < here_; e += blockDim.x) course_[e].progress.done = false;
+    pending_ = false;
+    each_pair<false>(SolidDiagonal{});
+    __syncthreads();
+    each_slot(
+        [&](const Seat& seat, int i) { leave(energy_sum, i, v_.weigh(i, force_on(seat).x)); });
+    __syncthreads();
+    each_environment([&](int e) {
+      const double least = over_vertices(energy_sum, e, Least{});
+      if (lane() == 0) course_[e].progress.least = least;
+    });
+    if (set_.weighted) weigh_with(false);
+    __syncthreads();
+  }
+
+  PD_DEVICE void weigh_with(bool bounded) {
+    const StoredRest<T> rest{plan_.pair_rest};
+    for (Seat seat = first_pair_; seat.environment < here_;
+         seat = after(seat, pairs(), pair_stride_))
+      weigh_pair(plan_, rest, PairPlace{unsigned(seat.at)},
+                 call_.material.stiffness.of(first_ + seat.environment), bounded,
+                 weights(seat.environment));
+    // each thread reads what it has written itself
+    read_ahead(first_pair_);
+  }
+
+  // ---- momentum: cuda/momentum.h
+
+  PD_DEVICE void find_shifts() {
+    each_part([&](int e, int part, int begin, int end) {
+      double sum[4];
+      sum_part(v_, begin, end, [&](int at) { return e * slots() + plan_.part_slot[at]; }, sum);
+      if (lane() == 0) {
+        for (int c = 0; c < 4; ++c) part_sum(e, part)[c] = sum[c];
+      }
+    });
+    __syncthreads();
+    each_piece([&](int e, int piece) {
+      double sum[4];
+      over_parts(plan_, piece, Add{}, [&](int part, int c) { return part_sum(e, part)[c]; }, sum);
+      if (lane() == 0) shift(e, piece) = shift_of<T>(sum);
+    });
+    __syncthreads();
+  }
+
+  // a piece that the shift would leave touching a contact gets none
+  PD_DEVICE void drop_touching_shifts() {
+    each_part([&](int e, int part, int begin, int end) {
+      const Vec3<T> moved = vec3(shift(e, plan_.slot_piece[plan_.part_slot[begin]]));
+      const auto index = [&](int at) { return e * slots() + plan_.part_slot[at]; };
+      const double least = least_gap(v_, contacts(e), begin, end, index, moved);
+      if (lane() == 0) part_sum(e, part)[0] = least;
+    });
+    __syncthreads();
+    each_piece([&](int e, int piece) {
+      double least[1];
+      over_parts(plan_, piece, Least{}, [&](int part, int) { return part_sum(e, part)[0]; }, least);
+      if (lane() == 0 && !(least[0] > 0)) shift(e, piece) = {};
+    });
+    __syncthreads();
+  }
+
+  // ---- results
+
+  PD_DEVICE void store(int record) {
+    each_slot([&](const Seat& seat, int i) {
+      inputs(seat.environment).write(record, seat.at, vec3(v_.x[i]), vec3(v_.velocity[i]));
+    });
+    for (int e = threadIdx.x; e < here_; e += blockDim.x)
+      inputs(e).write_info(record, course_[e].progress);
+  }
+
+  const DeviceStep<T>& call_;
+  const DevicePlan<T>& plan_;
+  const Settings& set_;
+  const SeveralScratch<T>& memory_;
+  const Stride &pair_stride_, &slot_stride_;
+  unsigned first_of_block_;  // in the scratch memory
+  std::int64_t first_ = 0;   // environment,
+  int here_ = 0;             // and how many
+  Course<T>* course_;        // of each
+  Quad<T>* position_;        // where elements read vertices
+  Quad<T>* origin_;          // start of the step, from the first vertex
+  Quad<T>* entries_;         // forces of elements
+  Vertices<T, Touching> v_;
+  T *pair_energy_, *vertex_sum_;  // of all environments, for sums; the latter for each of VertexSum
+  int vertex_sums_;
+  Ball<T>* balls_;
+  Plane<T>* planes_;
+  Seat first_pair_, first_slot_;  // of this thread
+  PairNumbers<T> now_;            // of its next pair
+  T h_;
+  const T& theta_;
+  int stops_ = in_register(int(set_.tolerance > 0));
+  bool finished_ = false, pending_ = false, started_ = false;
+};
+
+}  // namespace pd::inline PD_TARGET

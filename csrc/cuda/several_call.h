@@ -1,0 +1,62 @@
+// What the kernel for several environments a block is given, and what it keeps where.
+#pragma once
+#include "cuda/collect.h"
+#include "cuda/inputs.h"
+#include "plan/shared_memory.h"
+
+namespace pd::inline PD_TARGET {
+
+// How an environment goes on, in shared memory.
+template <class T>
+struct Course {
+  Progress progress;
+  T omega[2];  // of even and of odd iterations
+
+  PD_DEVICE void look_ahead(int k) { omega[k & 1] = T(progress.schedule.next(k)); }
+};
+
+// Device memory of the blocks.
+template <class T>
+struct SeveralScratch {
+  Quad<T>*x, *velocity;  // [blocks, together, slots]
+  T* weights;            // [blocks, together, blocks of pairs, 2, 32] w V
+  Quad<T>* shift;        // [blocks, together, pieces]
+  double* part_sum;      // [blocks, together, parts, 4]
+};
+
+// From one pair or vertex of a thread to its next one: environments, and what is left.
+struct Stride {
+  int whole, rest;
+
+  Stride() = default;
+  Stride(int threads, int each) : whole(threads / each), rest(threads % each) {}
+};
+
+template <class T>
+struct SeveralCall {
+  DeviceStep<T> step;
+  SeveralScratch<T> scratch;
+  int together;  // environments of a block
+  Stride pair_stride, slot_stride;
+  T relaxation;  // of the settings, in T
+};
+
+// Where the parts of a block's shared memory lie: courses; position, target, u, before and origin of every slot; entries;
+// energies of pairs, then three numbers of every slot; balls and planes.
+template <class T>
+struct SeveralLayout {
+  std::size_t vectors, entries, energies, contacts, bytes;
+
+  PD_HD SeveralLayout(const DeviceStep<T>& step, int together) {
+    const DevicePlan<T>& plan = step.plan;
+    const std::size_t many = together, slots = many * plan.most_slots;
+    vectors = aligned(many * sizeof(Course<T>));
+    entries = vectors + 5 * sizeof(Quad<T>) * slots;
+    energies = entries + sizeof(Quad<T>) * many * plan.most_entries;
+    contacts = aligned(energies + sizeof(T) * (many * plan.most_pairs + sums_count * slots));
+    bytes = contacts + many * (step.material.spheres_count * sizeof(Ball<T>) +
+                               step.material.planes_count * sizeof(Plane<T>));
+  }
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,122 @@
+"""Small meshes in float32 share blocks: how many have one follows from the batch of a call, and no bit from that."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from devices import require_gpu
+from on_gpu import GPU, bar, crowd, device_work, moved, on_gpu, relative, threads_of
+from runs import noise, simulator
+from test_determinism import assert_same_bits, run
+from torch import Tensor
+
+import torchpd as pd
+from torchpd.gpu import properties_of
+from torchpd.material import MATERIAL_ROWS
+
+require_gpu()
+
+MOST_PAIRS = 192  # that share blocks: csrc/cuda/several.cuh
+
+
+def unlike(sim: pd.Simulator, count: int) -> tuple[pd.State, Tensor, dict[str, Tensor]]:
+    """Environments no two of which are alike: states, forces, and all of the material."""
+    rest = sim.rest_state(count)
+    state = pd.State(rest.positions + 0.01 * noise(rest.positions, 1), noise(rest.positions, 2))
+    material = {}
+    for number, (name, array) in enumerate(zip(MATERIAL_ROWS, sim.material(), strict=True)):
+        own = array.detach().expand(count, *array.shape).clone()
+        if name in ("planes", "spheres"):  # height, or centre
+            moving = own[..., 3:4] if name == "planes" else own[..., :3]
+            moving += 0.01 * noise(moving, 10 + number)
+        elif name == "pin_targets":
+            own += 0.01 * noise(own, 10 + number)
+        else:
+            own *= torch.exp(0.3 * noise(own, 10 + number))
+        material[name] = own
+    return state, 0.1 * noise(rest.positions, 3), material
+
+
+def some(sim: pd.Simulator, everything: tuple[pd.State, Tensor, dict[str, Tensor]], items: slice) -> list[Tensor]:
+    state, forces, material = everything
+    sim.set_material(**{name: array[items] for name, array in material.items()})
+    return run(sim, state, forces, items)
+
+
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize(("iterations", "tolerance"), [(15, 0.0), (200, 0.1)])
+@pytest.mark.parametrize("pinned", [True, False])
+@pytest.mark.parametrize("cells", [(1, 1, 1), (2, 2, 2), (3, 3, 3), (4, 4, 4)])
+def test_how_many_share_a_block_does_not_matter(
+    cells: tuple[int, int, int], pinned: bool, iterations: int, tolerance: float, tmp_path: Path
+) -> None:
+    ball = pd.Sphere((0.6, -0.15, 0.1), 0.1, friction=0.3)
+    parts = (pd.Gravity(), pd.Damping(0.5), pd.Ground(-0.02, friction=0.4), ball)
+    sim = on_gpu(bar(cells, *parts, pinned=pinned), torch.float32, "block", iterations=iterations, tolerance=tolerance)
+    assert sim.plan.size("most_pairs") <= MOST_PAIRS
+    most = 23 * properties_of(GPU).multiprocessors + 2  # whose last block is not full, however many share one
+    everything = unlike(sim, most)
+    together, shapes = some(sim, everything, slice(None)), set()
+    assert_same_bits(some(sim, everything, slice(None)), together)
+    if tolerance:
+        assert len(together[4].unique()) > 1
+    for first, last in ((0, 1), (1, 3), (0, 131), (5, 305), (0, 1025), (most - 2, most), (0, most)):
+        items = slice(first, last)
+        assert_same_bits(some(sim, everything, items), [t[items] for t in together])
+        state, forces, _ = everything
+        step = partial(sim, pd.State(*(t[items] for t in state)), forces[items])
+        shapes.add(frozenset(threads_of(step, tmp_path)))
+    # of the smallest, one warp is the best for all
+    assert len(shapes) > 1 or cells == (1, 1, 1) or shapes == {frozenset()}
+
+
+@pytest.mark.parametrize("report", [False, True])
+@pytest.mark.parametrize("solver", [pd.Jacobi(), pd.Chebyshev(), pd.Chebyshev("classic", rho=0.95, delay=3)])
+def test_blocks_of_several_agree_with_float64(solver: pd.Jacobi | pd.Chebyshev, report: bool) -> None:
+    """A rollout, whose spheres move, against another kernel in float64."""
+    ball = pd.Sphere((0.6, -0.2, 0.1), 0.1)
+    case = bar((3, 3, 3), pd.Gravity(), pd.Damping(0.5), pd.Ground(-0.3, friction=0.4), ball)
+    options = {"iterations": 13, "solver": solver}
+    sim = on_gpu(case, torch.float32, "block", **options)
+    other = on_gpu(case, torch.float64, "cluster" if properties_of(GPU).cluster > 1 else "block", **options)
+    count = 4 * properties_of(GPU).multiprocessors + 1
+    state, _, material = unlike(sim, count)
+    sim.set_material(**material)
+    other.set_material(**{name: array.double() for name, array in material.items()})
+    found = sim.rollout(state, 3, return_info=report)
+    expected = other.rollout(moved(state, GPU, torch.float64), 3, return_info=report)
+    assert relative(found.positions, expected.positions) < 1e-5
+    if report:
+        assert torch.equal(found.info.iterations, expected.info.iterations)
+        assert relative(found.info.energy, expected.info.energy) < 1e-4
+        assert relative(found.info.residual, expected.info.residual) < 1e-3
+
+
+def test_many_pieces_share_a_block() -> None:
+    """More pieces than a block has warps, each shifted by itself, in more environments than a wave has."""
+    case = crowd()
+    sim = on_gpu(case, torch.float32, "block", iterations=6)
+    assert sim.plan.size("most_pairs") <= MOST_PAIRS
+    assert sim.plan.size("pieces") == 40
+    everything = unlike(sim, 3000)
+    together = some(sim, everything, slice(None))
+    for first, last in ((0, 1), (17, 400), (2999, 3000)):
+        assert_same_bits(some(sim, everything, slice(first, last)), [t[first:last] for t in together])
+    cpu = simulator(case, torch.float64, iterations=6)
+    state, forces, material = everything
+    cpu.set_material(**{name: array[:9].double().cpu() for name, array in material.items()})
+    expected = cpu(moved(pd.State(*(t[:9] for t in state)), "cpu", torch.float64), forces[:9].double().cpu())
+    assert relative(together[0][:9], expected.positions) < 1e-5
+
+
+@pytest.mark.parametrize(("cells", "share"), [((4, 4, 4), True), ((5, 4, 4), False)])
+def test_which_meshes_share_blocks(cells: tuple[int, int, int], share: bool) -> None:
+    for dtype in (torch.float32, torch.float64):
+        sim = on_gpu(bar(cells), dtype, "block")
+        assert (sim.plan.size("most_pairs") <= MOST_PAIRS) == share
+        state = sim.rest_state(3)
+        (name,) = device_work(partial(sim, state))
+        assert ("several_step" in name) == (share and dtype == torch.float32), name

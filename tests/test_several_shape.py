@@ -1,0 +1,116 @@
+"""How many environments share a block (csrc/cuda/several_shape.h), compiled for the host."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+# In: pairs, slots, batch, multiprocessors, shared memory of one and the most of a block, bytes of an environment.
+PROGRAM = """
+#include "cuda/several_shape.h"
+#include <cstdio>
+
+int main() {
+  long long n[7];
+  const auto read = [&] {
+    for (long long& number : n)
+      if (std::scanf("%lld", &number) != 1) return false;
+    return true;
+  };
+  while (read()) {
+    const pd::SmallMesh mesh{int(n[0]), int(n[1])};
+    const auto bytes = [&](int together) { return std::size_t(together * n[6]); };
+    const pd::SeveralShape shape = pd::several_shape(mesh, n[2], int(n[3]), n[4], n[5], bytes);
+    std::printf("%d %d %d\\n", shape.together, shape.threads, int(shape.lean));
+  }
+}
+"""
+
+
+class Asked(NamedTuple):
+    pairs: int
+    slots: int
+    batch: int
+    multiprocessors: int = 132
+    shared: int = 233472  # of a multiprocessor of an H100,
+    most: int = 232448  # and of a block
+    each: int = 0  # bytes of an environment; 0: as of a bar
+
+    @property
+    def bytes(self) -> int:
+        return self.each or 136 + 5 * 16 * self.slots + 6 * 16 * self.pairs + 4 * (self.pairs + 3 * self.slots)
+
+
+class Shape(NamedTuple):
+    together: int
+    threads: int
+    lean: bool
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    compiler = shlex.split(os.environ.get("CXX", "c++"))
+    if shutil.which(compiler[0]) is None:
+        pytest.skip("there is no C++ compiler")
+    folder = tmp_path_factory.mktemp("several_shape")
+    (folder / "program.cpp").write_text(PROGRAM)
+    flags = ["-std=c++20", "-O1", "-I", str(ROOT / "csrc")]
+    subprocess.run([*compiler, *flags, str(folder / "program.cpp"), "-o", str(folder / "program")], check=True)
+    return folder / "program"
+
+
+def shapes(program: Path, asked: list[Asked]) -> list[Shape]:
+    lines = [" ".join(map(str, (*a[:6], a.bytes))) for a in asked]
+    told = subprocess.run([program], input="\n".join(lines), stdout=subprocess.PIPE, text=True, check=True).stdout
+    found = [tuple(map(int, line.split())) for line in told.splitlines()]
+    assert len(found) == len(asked)
+    return [Shape(together, threads, bool(lean)) for together, threads, lean in found]
+
+
+def test_every_small_mesh_has_a_shape_that_fits(program: Path) -> None:
+    asked = [
+        Asked(pairs, slots, batch, *gpu)
+        for pairs in (1, 2, 31, 32, 33, 81, 96, 97, 144, 191, 192)
+        for slots in (4, pairs // 2 + 4, 5 * pairs)
+        for batch in (1, 2, 3, 4, 131, 132, 133, 1024, 2112, 8192, 1 << 20, 1 << 40)
+        for gpu in ((132,), (108, 167936, 166912), (20, 102400, 101376))  # H100, A100, a laptop's
+    ]
+    fits = [a for a in asked if a.bytes <= a.most]
+    assert len(fits) > 0.9 * len(asked)
+    for a, shape in zip(fits, shapes(program, fits), strict=True):
+        assert 1 <= shape.together <= min(4, a.batch), (a, shape)
+        assert shape.threads % 32 == 0, (a, shape)
+        assert 32 <= shape.threads <= 224, (a, shape)
+        rounds = -(-shape.together * a.pairs // shape.threads)
+        assert rounds <= (1 if shape.lean else 2), (a, shape)
+        assert shape.together * a.bytes <= a.most, (a, shape)
+
+
+def test_shapes_on_an_h100(program: Path) -> None:
+    """The fastest that was measured, of a bar of 64 vertices in few and in many environments, and of the smallest."""
+    expected = {
+        Asked(81, 64, 1): Shape(1, 96, lean=False),
+        Asked(81, 64, 132): Shape(1, 96, lean=False),
+        Asked(81, 64, 528): Shape(1, 96, lean=False),
+        Asked(81, 64, 1024): Shape(1, 96, lean=True),
+        Asked(81, 64, 8192): Shape(3, 128, lean=False),
+        Asked(3, 8, 8192): Shape(4, 32, lean=False),
+        Asked(192, 125, 1): Shape(1, 192, lean=False),
+        Asked(192, 125, 8192): Shape(1, 192, lean=True),
+    }
+    assert dict(zip(expected, shapes(program, list(expected)), strict=True)) == expected
+
+
+def test_memory_limits_how_many_share(program: Path) -> None:
+    asked = [Asked(24, 27, 8192, each=each) for each in (2_000, 80_000, 200_000)]
+    many, few, one = (shape.together for shape in shapes(program, asked))
+    assert many == 4
+    assert few <= 2
+    assert one == 1
