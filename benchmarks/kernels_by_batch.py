@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from gpu import PROVENANCE
 from gpu_scenes import GpuScene
 from gpu_timing import event_times, recorded
 from machine import describe_run, write_result
@@ -125,7 +126,7 @@ def main() -> None:
         print(line_of(row))
     if options.out:
         result = describe_run(torch.device("cuda"), torch.get_num_threads())
-        run = {name: result[name] for name in ("command", "created", "commit")}
+        run = {name: result[name] for name in PROVENANCE}
         result["rows"] = [{**row, "run": run} for row in rows]
         write_result(options.out, result, with_earlier if options.keep else None)
 
@@ -136,8 +137,8 @@ def with_earlier(new: Row, earlier: Row) -> Row:
     def of(row: Row) -> tuple[Any, ...]:
         return row["dtype"], row["mesh"], row["vertices"], row["batch"]
 
-    run = {name: earlier[name] for name in ("command", "created", "commit")}
-    rows = {of(row): {"run": run, **row} for row in earlier["rows"]}
+    known = earlier.get("rows", [])
+    rows = {of(row): {"run": {name: earlier[name] for name in PROVENANCE}, **row} for row in known}
     return {**new, "rows": [*(rows | {of(row): row for row in new["rows"]}).values()]}
 
 

@@ -320,6 +320,23 @@ def test_a_result_keeps_rows_of_earlier_runs() -> None:
 
 
 @pytest.mark.usefixtures("on_path")
+def test_a_run_of_some_batches_keeps_the_others() -> None:
+    by_batch = importlib.import_module("kernels_by_batch")
+
+    def row(batch: int, **more: Any) -> dict[str, Any]:
+        return {"dtype": "float32", "mesh": "regular", "vertices": 64, "batch": batch, **more}
+
+    first, second = ({"command": "c", "created": "d", "commit": commit} for commit in "12")
+    earlier = {**first, "versions": 1, "rows": [row(1), row(2, auto="grid")]}
+    new = {**second, "versions": 2, "rows": [row(2, auto="block", run=second), row(3, run=second)]}
+    whole = by_batch.with_earlier(new, earlier)
+    assert whole["rows"] == [row(1, run=first), row(2, auto="block", run=second), row(3, run=second)]
+    assert {**whole, "rows": 0} == {**second, "versions": 2, "rows": 0}
+    assert by_batch.with_earlier(earlier, whole)["rows"] == [row(1), row(2, auto="grid"), row(3, run=second)]
+    assert by_batch.with_earlier(new, {}) == new
+
+
+@pytest.mark.usefixtures("on_path")
 def test_runs_side_by_side_keep_each_others_rows(tmp_path: Path) -> None:
     gpu, machine = importlib.import_module("gpu"), importlib.import_module("machine")
     path = tmp_path / "deep" / "rows.json"
