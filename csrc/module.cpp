@@ -318,6 +318,7 @@ PYBIND11_MODULE(_C, m) {
   m.attr("corotation_bytes") = pd::corotation_bytes;
   m.attr("known_inertia") = pd::known_inertia;
   m.attr("most_environments") = pd::most_environments;
+  m.attr("most_sharing_pairs") = pd::most_sharing_pairs;
   m.attr("pass_static_bytes") = pd::pass_static_bytes;
   m.def("pass_shared_bytes", &pd::pass_shared_bytes, py::arg("real"), py::arg("slots"),
         py::arg("entries"), py::arg("fields"),

@@ -63,6 +63,19 @@ def test_a_step_takes_what_it_is_said_to(contacts: bool, kernel: str, precision:
     assert step_bytes(sim, sim.plan, 7, GPU) == bytes_taken(sim, 7)
 
 
+@pytest.mark.parametrize("cells", [(2, 1, 1), (2, 2, 2), (3, 3, 3), (4, 4, 4)])
+def test_environments_that_share_blocks_take_no_more_than_is_said(cells: tuple[int, int, int]) -> None:
+    """How many share one follows from the batch; what all of them take at most does not."""
+    sim = on_gpu(body(contacts=True, cells=cells), torch.float32, "block", iterations=2)
+    found = re.search(r"at most ([\d,]+) B in all", repr(sim))
+    assert found
+    most = int(found[1].replace(",", ""))
+    for batch in (1, 7, 529, 1025, 1585, 3169, 4225, 8185, 20_000):
+        taken = bytes_taken(sim, batch)
+        assert step_bytes(sim, sim.plan, batch, GPU) == taken
+        assert taken <= most
+
+
 @pytest.mark.parametrize("precision", DTYPES)
 @pytest.mark.parametrize("outer", SOLVERS)
 @pytest.mark.parametrize("batch", [None, 1024])

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from torchpd import regimes
+from torchpd import _C, regimes
 from torchpd.gpu import Properties
 from torchpd.plan import Plan
 
@@ -19,7 +19,6 @@ TOOLS = Path(__file__).parent.parent / "tools"
 H100 = Properties(132, 232448, 16)
 FAR_THREADS = {torch.float32: 384, torch.float64: 192}  # far_threads of csrc/cuda/fused.cuh
 PIPELINE_SLOTS = 1024  # csrc/cuda/pipeline.h
-SHARING_PAIRS = 192  # csrc/cuda/several.cuh
 
 
 @pytest.fixture(name="tool", scope="module")
@@ -54,8 +53,8 @@ def test_patches_are_what_the_kernels_are_to_see(tool: dict[str, Any], dtype: to
         assert bool((far.patch_outer > 0).all())
         assert any(plan.size("most_slots") > PIPELINE_SLOTS for plan in plans["large"])
         assert {plan.patches > 8 for plan in plans["cluster"]} == {False, True}
-        assert all(plan.size("most_pairs") <= SHARING_PAIRS for plan in plans["several"])
-        assert [plan.size("most_pairs") > SHARING_PAIRS for plan in plans["block"]] == [True, True, False]
+        assert all(plan.size("most_pairs") <= _C.most_sharing_pairs for plan in plans["several"])
+        assert [plan.size("most_pairs") > _C.most_sharing_pairs for plan in plans["block"]] == [True, True, False]
     assert vars(regimes) == constants
 
 

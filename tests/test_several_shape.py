@@ -27,8 +27,10 @@ int main() {
   while (read()) {
     const pd::SmallMesh mesh{int(n[0]), int(n[1])};
     const auto bytes = [&](int together) { return std::size_t(together * n[6]); };
-    const pd::SeveralShape shape = pd::several_shape(mesh, n[2], int(n[3]), n[4], n[5], bytes);
-    std::printf("%d %d %d\\n", shape.together, shape.threads, int(shape.lean));
+    const pd::Room room{int(n[3]), std::size_t(n[4]), std::size_t(n[5])};
+    const pd::SeveralShape shape = pd::several_shape(mesh, n[2], room, bytes);
+    const long long most = pd::most_at_work(mesh, room, bytes);
+    std::printf("%d %d %d %lld\\n", shape.together, shape.threads, int(shape.lean), most);
   }
 }
 """
@@ -66,12 +68,17 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "program"
 
 
-def shapes(program: Path, asked: list[Asked]) -> list[Shape]:
+def told(program: Path, asked: list[Asked]) -> list[tuple[Shape, int]]:
+    """Shapes, and how many environments are at work at most."""
     lines = [" ".join(map(str, (*a[:6], a.bytes))) for a in asked]
-    told = subprocess.run([program], input="\n".join(lines), stdout=subprocess.PIPE, text=True, check=True).stdout
-    found = [tuple(map(int, line.split())) for line in told.splitlines()]
+    words = subprocess.run([program], input="\n".join(lines), stdout=subprocess.PIPE, text=True, check=True).stdout
+    found = [tuple(map(int, line.split())) for line in words.splitlines()]
     assert len(found) == len(asked)
-    return [Shape(together, threads, bool(lean)) for together, threads, lean in found]
+    return [(Shape(together, threads, bool(lean)), most) for together, threads, lean, most in found]
+
+
+def shapes(program: Path, asked: list[Asked]) -> list[Shape]:
+    return [shape for shape, _ in told(program, asked)]
 
 
 def test_every_small_mesh_has_a_shape_that_fits(program: Path) -> None:
@@ -84,13 +91,17 @@ def test_every_small_mesh_has_a_shape_that_fits(program: Path) -> None:
     ]
     fits = [a for a in asked if a.bytes <= a.most]
     assert len(fits) > 0.9 * len(asked)
-    for a, shape in zip(fits, shapes(program, fits), strict=True):
+    for a, (shape, most) in zip(fits, told(program, fits), strict=True):
         assert 1 <= shape.together <= min(4, a.batch), (a, shape)
         assert shape.threads % 32 == 0, (a, shape)
         assert 32 <= shape.threads <= 224, (a, shape)
         rounds = -(-shape.together * a.pairs // shape.threads)
         assert rounds <= (1 if shape.lean else 2), (a, shape)
         assert shape.together * a.bytes <= a.most, (a, shape)
+        # no batch has more at work than memory is for
+        threads = 768 if shape.lean else 640
+        blocks = max(1, min(threads // shape.threads, 32, a.shared // (shape.together * a.bytes + 1024)))
+        assert shape.together * blocks * a.multiprocessors <= most, (a, shape, most)
 
 
 def test_shapes_on_an_h100(program: Path) -> None:
@@ -106,6 +117,23 @@ def test_shapes_on_an_h100(program: Path) -> None:
         Asked(192, 125, 8192): Shape(1, 192, lean=True),
     }
     assert dict(zip(expected, shapes(program, list(expected)), strict=True)) == expected
+
+
+def test_blocks_share_no_more_than_they_must(program: Path) -> None:
+    """As long as one wave is enough, fewer a block would leave some without any."""
+    for batch in (2, 66, 131, 400, 800, 1000):
+        for pairs in (3, 24, 81, 144):
+            a = Asked(pairs, pairs, batch)
+            (shape,) = shapes(program, [a])
+            threads = 768 if shape.lean else 640
+            blocks = 132 * min(threads // shape.threads, 32, a.shared // (shape.together * a.bytes + 1024))
+            assert batch > blocks * (shape.together - 1), (a, shape)
+
+
+def test_where_nothing_else_fits_one_block_does(program: Path) -> None:
+    (one,) = told(program, [Asked(24, 27, 8192, shared=65536, most=65536, each=65536)])
+    assert one[0].together == 1
+    assert one[1] == 132
 
 
 def test_memory_limits_how_many_share(program: Path) -> None:

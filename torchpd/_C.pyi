@@ -57,6 +57,7 @@ corotation_bytes: int
 known_inertia: float
 pass_static_bytes: int
 most_environments: int
+most_sharing_pairs: int
 
 def pass_shared_bytes(real: int, slots: int, entries: int, fields: int) -> int: ...
 def outer_shared_bytes(real: int, slots: int, entries: int) -> int: ...

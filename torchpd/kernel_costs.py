@@ -41,7 +41,7 @@ _FITS = {
     torch.float64: _Fit((2.0, 4.7e-3), (2.0, 4.7e-3), (0.5, 6.4e-3), (1.5, 6.0e-4), (1.5, 9.4e-3), 2.6, (9.7, 7.0e-5)),
 }
 _MEASURED_ON = 132  # multiprocessors
-_SMALL_TETS = 384  # have at most as many pairs as share blocks (csrc/cuda/several.cuh), where all have partners
+_SMALL_TETS = 2 * _C.most_sharing_pairs  # where all have partners
 # registers of a multiprocessor, and of a thread of a cluster (benchmarks/results/cuda-registers.csv)
 _REGISTERS, _CLUSTER_REGISTERS = 65536, {torch.float32: 168, torch.float64: 256}
 # multiprocessors that blocks of a cluster are neighbours in, and the share of a GPU that has as many together

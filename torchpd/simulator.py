@@ -61,9 +61,9 @@ class Simulator(Model):
             CPU.
         batch: environments that a step will have, where you know it: a GPU's kernel, its patches and thread blocks, the
             patches and preconditioner of `Multilevel` and the choice of "auto" are for so many. States of any batch may
-            come, and an environment has the same bits in all of them, but takes longer in some. None: not known: a
-            small mesh gets "block", which is for many, and "auto" chooses for one. `sim.batch` may be set later.
-            Changes nothing on the CPU.
+            come, and an environment has the same bits in all of them, but takes longer in some; thread blocks of the
+            smallest meshes in float32 are for the batch that comes. None: not known: a small mesh gets "block", which
+            is for many, and "auto" chooses for one. `sim.batch` may be set later. Changes nothing on the CPU.
         progress: show a bar while a large scene compiles.
     """
 

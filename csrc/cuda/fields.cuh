@@ -144,7 +144,7 @@ __global__ void __launch_bounds__(field_threads)
   const T* weights = work.weights_of(environment);
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const PairPlace place = place_of(patch, number);
-    const PairNumbers<T> pair = read_pair(patch.plan, weights, place_of(patch, number));
+    const PairNumbers<T> pair = read_pair(patch.plan, weights, place);
     const auto numbers = rest_of<Computed>(patch).read(place, pair);
     const Mat3<T> rest[2] = {numbers.face.inverse(0), numbers.face.inverse(1)};
     for (int e = 0; e < 2; ++e) {

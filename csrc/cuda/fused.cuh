@@ -112,7 +112,7 @@ struct BlockShape {
 // Time that a multiprocessor takes for so many environments at a time, in units of what a round of a warp takes to issue. Up to
 // two rounds a thread has its pairs at hand, and what a block waits for is the rest of an iteration; with three it waits in
 // each. Fitted to an H100, 64 to 400 vertices in batches that it has at a time, where the shape that this chooses was up to 6 %
-// slower than the best; blocks of more rounds were not.
+// slower than the best; blocks of more rounds were not. In float32 64 vertices are for cuda/several_shape.h now.
 inline double shape_cost(int environments, int warps, int rounds) {
   const int wait = rounds <= 2 ? 26 : 15 * rounds;
   return wait + 0.25 * warps + double(warps * rounds) * environments;

@@ -35,18 +35,24 @@ struct SeveralLaunch {
   void (*kernel)(SeveralCall<T>);
   int blocks;
   std::size_t shared;
+  // that device memory is for: with any batch no more than a large one has at work
+  std::int64_t environments;
 
   explicit SeveralLaunch(const DeviceStep<T>& step) {
     const SmallMesh mesh{step.plan.most_pairs, step.plan.most_slots};
+    const Room room{multiprocessors(), shared_memory_per_multiprocessor(),
+                    shared_memory_per_block()};
     const auto bytes = [&](int together) { return SeveralLayout<T>(step, together).bytes; };
-    shape = several_shape(mesh, step.batch, multiprocessors(), shared_memory_per_multiprocessor(),
-                          shared_memory_per_block(), bytes);
+    shape = several_shape(mesh, step.batch, room, bytes);
     shared = bytes(shape.together);
     const bool touching = step.material.planes_count + step.material.spheres_count > 0;
     kernel = touching ? kernel_for<true>(mesh) : kernel_for<false>(mesh);
     const int resident = resident_blocks(function(), shape.threads, shared);
     if (resident == 0) refuse_shared_memory(shared);
-    blocks = int(std::min<std::int64_t>(step.batch, resident));
+    const std::int64_t most = most_at_work(mesh, room, bytes), together = shape.together;
+    const std::int64_t wanted = (step.batch + together - 1) / together;
+    blocks = int(std::min({wanted, std::int64_t(resident), most / together}));
+    environments = std::min(wanted * together, most);
   }
 
   const void* function() const { return reinterpret_cast<const void*>(kernel); }
@@ -72,15 +78,15 @@ struct SeveralLaunch {
 // Few pairs, whose vertices all fit the shared memory of a block. The batch does not enter: the bits are those of this kernel.
 template <class T>
 bool takes_several(const DeviceStep<T>& step) {
-  constexpr int most_pairs = 192;
-  return step.plan.kernel == int(DeviceKernel::block) && step.plan.most_pairs <= most_pairs &&
+  return step.plan.kernel == int(DeviceKernel::block) &&
+         step.plan.most_pairs <= most_sharing_pairs &&
          SeveralLayout<T>(step, 1).bytes <= shared_memory_per_block();
 }
 
 template <class T>
 SeveralScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const SeveralLaunch<T>& launch) {
   const DevicePlan<T>& plan = step.plan;
-  const std::int64_t many = std::int64_t(launch.blocks) * launch.shape.together;
+  const std::int64_t many = launch.environments;
   SeveralScratch<T> s;
   arena.place(s.x, many * plan.slots);
   arena.place(s.velocity, many * plan.slots);

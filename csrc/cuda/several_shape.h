@@ -27,54 +27,84 @@ struct SeveralShape {
   bool once(const SmallMesh& mesh) const { return rounds(mesh.pairs) == 1; }
 
   // Time of an iteration of so many blocks on a multiprocessor, in units of what its warps' rounds of pairs take to issue: what a
-  // block waits for, and what all of them issue. Where no thread has a second pair a sixth less, with few registers a twelfth more.
-  double time(const SmallMesh& mesh, int blocks) const {
+  // block waits for, and what all of them issue. In a kernel for one pair a thread (`single`) they issue a sixth less; with few
+  // registers all takes a twelfth more.
+  double time(const SmallMesh& mesh, int blocks, bool single) const {
     const double many = together;
     const double waits = 6 + 8 * rounds(mesh.pairs) + 3.5 * rounds(mesh.slots) +
                          3 * std::ceil(many / warps()) + 0.5 * warps();
     const double issues =
-        std::ceil(many * mesh.pairs / lanes_of_warp) * (once(mesh) ? 1 : 1.2) + 0.1 * many;
+        std::ceil(many * mesh.pairs / lanes_of_warp) * (single ? 1 : 1.2) + 0.1 * many;
     return (waits + blocks * issues) * (lean ? 1.08 : 1);
   }
 };
 
-// The shape for a batch, of `bytes(together)` of shared memory. `time` is fitted to 1800 runs on an H100, of 3 to 192 pairs in
-// batches of 1 to 8192; what this chooses took 0.6 % more than the best shape on average and 6 % at most.
-template <class Bytes>
-SeveralShape several_shape(const SmallMesh& mesh, std::int64_t batch, int multiprocessors,
-                           std::size_t shared_memory, std::size_t most_shared, const Bytes& bytes) {
-  constexpr int most_together = 4, most_threads = 224, most_rounds = 2, most_blocks = 32;
+// What a device has for blocks.
+struct Room {
+  int multiprocessors;
+  std::size_t shared;        // memory of a multiprocessor,
+  std::size_t block_shared;  // and the most of a block
+};
+
+constexpr int most_together = 4;
+
+// visit(shape, blocks that a multiprocessor runs), for every shape that a device has room for; `bytes(together)`: of shared memory.
+template <class Bytes, class Visit>
+void each_shape(const SmallMesh& mesh, const Room& room, const Bytes& bytes, const Visit& visit) {
+  constexpr int most_threads = 224, most_rounds = 2, most_blocks = 32;
   constexpr std::size_t reserved = 1024;  // of shared memory, that the device keeps of every block
-  const auto whole = [](std::int64_t a, std::int64_t b) { return (a + b - 1) / b; };
-  SeveralShape best{};
-  double least = HUGE_VAL;
-  for (int together = 1; together <= std::min<std::int64_t>(most_together, batch); ++together) {
+  for (int together = 1; together <= most_together; ++together) {
     const std::size_t shared = bytes(together);
-    if (shared > most_shared) break;
+    if (shared > room.block_shared) return;
+    const int fit = std::max(1, int(room.shared / (shared + reserved)));
     for (int threads = lanes_of_warp; threads <= most_threads; threads += lanes_of_warp) {
       for (const bool lean : {false, true}) {
         const SeveralShape shape{together, threads, lean};
-        const int rounds = shape.rounds(mesh.pairs);
-        if (rounds > (lean ? 1 : most_rounds)) continue;
-        const int fit = std::min({(lean ? lean_threads : several_threads) / threads, most_blocks,
-                                  int(shared_memory / (shared + reserved))});
-        if (fit == 0) continue;
-        // the last of what blocks do together they share out equally
-        const std::int64_t blocks = std::int64_t(fit) * multiprocessors;
-        const std::int64_t waves = batch / (blocks * together);
-        const std::int64_t left = batch - waves * blocks * together, each = whole(left, blocks);
-        double time = double(waves) * shape.time(mesh, fit);
-        if (left > 0)
-          time += SeveralShape{int(each), threads, lean}.time(
-              mesh, int(whole(whole(left, each), multiprocessors)));
-        if (time < least) {
-          least = time;
-          best = shape;
-        }
+        if (shape.rounds(mesh.pairs) > (lean ? 1 : most_rounds)) continue;
+        const int resident = (lean ? lean_threads : several_threads) / threads;
+        visit(shape, std::min({fit, resident, most_blocks}));
       }
     }
   }
+}
+
+// The shape for a batch. `time` is fitted to 1800 runs on an H100, of 3 to 192 pairs in batches of 1 to 8192; what this chooses
+// took 0.6 % more than the best shape on average and 6 % at most.
+template <class Bytes>
+SeveralShape several_shape(const SmallMesh& mesh, std::int64_t batch, const Room& room,
+                           const Bytes& bytes) {
+  const auto whole = [](std::int64_t a, std::int64_t b) { return (a + b - 1) / b; };
+  SeveralShape best{};
+  double least = HUGE_VAL;
+  each_shape(mesh, room, bytes, [&](const SeveralShape& shape, int fit) {
+    if (shape.together > batch) return;
+    const bool single = shape.once(mesh);
+    // the last of what blocks do together they share out equally
+    const std::int64_t blocks = std::int64_t(fit) * room.multiprocessors;
+    const std::int64_t waves = batch / (blocks * shape.together);
+    const std::int64_t left = batch - waves * blocks * shape.together, each = whole(left, blocks);
+    double time = double(waves) * shape.time(mesh, fit, single);
+    if (left > 0) {
+      const SeveralShape last{int(each), shape.threads, shape.lean};
+      time += last.time(mesh, int(whole(whole(left, each), room.multiprocessors)), single);
+    }
+    // of as good ones the one that shares the least: the others would leave blocks without any
+    if (time < least) {
+      least = time;
+      best = shape;
+    }
+  });
   return best;
+}
+
+// Environments that a device works on at a time, at most, whatever the batch and so the shape.
+template <class Bytes>
+std::int64_t most_at_work(const SmallMesh& mesh, const Room& room, const Bytes& bytes) {
+  std::int64_t most = 0;
+  each_shape(mesh, room, bytes, [&](const SeveralShape& shape, int fit) {
+    most = std::max(most, std::int64_t(fit) * room.multiprocessors * shape.together);
+  });
+  return most;
 }
 
 }  // namespace pd

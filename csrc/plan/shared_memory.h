@@ -7,10 +7,13 @@ namespace pd {
 
 constexpr std::size_t fused_control_bytes = 1024;
 
-// `bytes` and what fills them up to a multiple of 16
 // Of a multiprocessor, which the shape of a block is chosen for: of more of them it has no room for all.
 constexpr int most_environments = 1 << 20;
 
+// Of meshes whose environments share blocks, in float32 with kernel block (cuda/several.h).
+constexpr int most_sharing_pairs = 192;
+
+// `bytes` and what fills them up to a multiple of 16
 constexpr std::size_t aligned(std::size_t bytes) { return (bytes + 15) / 16 * 16; }
 
 // one vector of every slot in four numbers, or two in six (cuda/slots.h)
