@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import shlex
-import shutil
 import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from programs import compiled
 
-ROOT = Path(__file__).resolve().parent.parent
 # In: pairs, slots, batch, multiprocessors, shared memory of one and the most of a block, bytes of an environment.
 PROGRAM = """
 #include "cuda/several_shape.h"
@@ -58,14 +55,7 @@ class Shape(NamedTuple):
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    compiler = shlex.split(os.environ.get("CXX", "c++"))
-    if shutil.which(compiler[0]) is None:
-        pytest.skip("there is no C++ compiler")
-    folder = tmp_path_factory.mktemp("several_shape")
-    (folder / "program.cpp").write_text(PROGRAM)
-    flags = ["-std=c++20", "-O1", "-I", str(ROOT / "csrc")]
-    subprocess.run([*compiler, *flags, str(folder / "program.cpp"), "-o", str(folder / "program")], check=True)
-    return folder / "program"
+    return compiled(PROGRAM, tmp_path_factory.mktemp("several_shape"))
 
 
 def told(program: Path, asked: list[Asked]) -> list[tuple[Shape, int]]:

@@ -5,9 +5,6 @@ The headers are compiled for the host, so that what a GPU runs is seen without o
 
 from __future__ import annotations
 
-import os
-import shlex
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,13 +13,13 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from programs import compiled
 from runs import ULP
 
 from torchpd.reference import nearest_rotation
 
 Array = NDArray[np.float64]
 
-ROOT = Path(__file__).resolve().parent.parent
 COUNT = 400
 # In: rest edges of corners 1 to 4 in a unit, unit^2 / det Dm and w V of both, five positions. Out: three times the five
 # forces and the energy of both: with an energy, with one that is not wanted, without; then those of the first alone,
@@ -104,14 +101,7 @@ int main(int count, char**) { count > 1 ? run_all<double>() : run_all<float>(); 
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    compiler = shlex.split(os.environ.get("CXX", "c++"))
-    if shutil.which(compiler[0]) is None:
-        pytest.skip("there is no C++ compiler")
-    folder = tmp_path_factory.mktemp("solid_face")
-    (folder / "program.cpp").write_text(PROGRAM)
-    flags = ["-std=c++20", "-O1", "-ffp-contract=off", "-I", str(ROOT / "csrc")]
-    subprocess.run([*compiler, *flags, str(folder / "program.cpp"), "-o", str(folder / "program")], check=True)
-    return folder / "program"
+    return compiled(PROGRAM, tmp_path_factory.mktemp("solid_face"))
 
 
 class Found(NamedTuple):

@@ -7,6 +7,7 @@
 #include "cuda/momentum.h"
 #include "cuda/patch.h"
 #include "cuda/several_call.h"
+#include "cuda/team.h"
 #include "cuda/vertices.h"
 #include "solver/step.h"
 
@@ -171,7 +172,6 @@ class SeveralRunner {
   // of the plan's one patch
   PD_DEVICE int pairs() const { return plan_.most_pairs; }
   PD_DEVICE int slots() const { return plan_.most_slots; }
-  PD_DEVICE static int lane() { return int(threadIdx.x) % warp_size; }
   PD_DEVICE Inputs<T> inputs(int environment) const { return {&call_, first_ + environment}; }
   PD_DEVICE Contacts<T> contacts(int environment) const {
     const int planes = call_.material.planes_count, balls = call_.material.spheres_count;
@@ -300,7 +300,7 @@ class SeveralRunner {
     const auto look_ahead = [&](int e) { course_[e].look_ahead(k + 1); };
     if (!stops() && pending_) {
       conclude(k, look_ahead);
-    } else if (threadIdx.x + warp_size >= blockDim.x && lane() < here_) {
+    } else if (leads() && lane() < here_) {
       look_ahead(lane());
     }
     pending_ = stops() || Guard;
