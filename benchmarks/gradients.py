@@ -3,7 +3,8 @@
 A held bar swings, float32, time step 1/60 s, 64 guarded iterations, from 1e6 Pa on 256; the loss is the sum of squares
 of the new positions, and the velocities before are asked for their gradients. Times are medians, as Python calls it,
 device awaited. `operations`: backward where the conjugate gradients are torch operations and Hessian products, as they
-are for large meshes on a GPU and with a multilevel preconditioner.
+are for large meshes on a GPU and with a multilevel preconditioner. `recorded`: both ways in a CUDA graph, with kernel
+"block", which alone allows that.
 
     python benchmarks/gradients.py --threads 1
     python benchmarks/gradients.py --device cuda --threads 16
@@ -21,6 +22,7 @@ from unittest import mock
 
 import torch
 from gpu_scenes import GpuScene
+from gpu_timing import graph_times
 from machine import describe_run, measure
 from tqdm import tqdm
 
@@ -32,6 +34,12 @@ Row = dict[str, Any]
 # cells, batch
 SCENES = (((3, 3, 3), 1), ((3, 3, 3), 64), ((15, 3, 3), 1), ((15, 3, 3), 64), ((15, 3, 3), 1024), ((9, 9, 9), 64))
 YOUNGS = (1e4, 1e5, 1e6)
+TIMES = {
+    "forward": "forward ms",
+    "backward": "backward ms",
+    "operations": "by torch operations",
+    "recorded": "both in a CUDA graph",
+}
 
 
 def by_operations(system: _System, positions: torch.Tensor, right: torch.Tensor, tolerance: float) -> Any:
@@ -42,12 +50,18 @@ def by_operations(system: _System, positions: torch.Tensor, right: torch.Tensor,
 def measure_scene(cells: tuple[int, int, int], batch: int, youngs: float, device: torch.device, seconds: float) -> Row:
     """One row of the result."""
     scene = GpuScene("bar", cells, batch)
-    sim = pd.Simulator(
-        scene.build(), 1 / 60, 64 if youngs < 1e6 else 256, solver=pd.Chebyshev(), progress=False, batch=batch
-    ).to(device)
-    sim.set_material(stiffness=sim.stiffness * (youngs / float(sim.stiffness.max())))
-    state = scene.start(sim)
-    state.velocities.requires_grad_()
+
+    def simulator(kernel: str) -> tuple[pd.Simulator, pd.State]:
+        sim = pd.Simulator(
+            scene.build(), 1 / 60, 64 if youngs < 1e6 else 256, solver=pd.Chebyshev(), progress=False, kernel=kernel,
+            batch=batch,
+        ).to(device)  # fmt: skip
+        sim.set_material(stiffness=sim.stiffness * (youngs / float(sim.stiffness.max())))
+        state = scene.start(sim)
+        state.velocities.requires_grad_()
+        return sim, state
+
+    sim, state = simulator("auto")
 
     def forward() -> torch.Tensor:
         return sim(state).positions.square().sum()
@@ -61,15 +75,21 @@ def measure_scene(cells: tuple[int, int, int], batch: int, youngs: float, device
     once, all_of_it = median(forward), median(both)
     with mock.patch.object(_System, "solve", by_operations):
         operations = median(both)
-    return {
+    row = {
         "vertices": sim.vertices, "batch": batch, "youngs": youngs, "iterations": sim.iterations,
         "kernel": sim.plan.kernel, "forward": once, "backward": all_of_it - once, "operations": operations - once,
+        "recorded": None,
     }  # fmt: skip
+    if device.type == "cuda":
+        sim, state = simulator("block")
+        row["recorded"] = 1e3 * statistics.median(graph_times(both, repetitions=3, seconds=seconds))
+    return row
 
 
 def line_of(row: Row) -> str:
     """For a reader."""
-    times = " | ".join(f"{row[name]:.3g}" for name in ("forward", "backward", "operations"))
+    names = [name for name in TIMES if row[name] is not None]
+    times = " | ".join(f"{row[name]:.3g}" for name in names)
     share = row["backward"] / row["forward"]
     return f"| {row['batch']} x {row['vertices']} | {row['youngs']:.0e} Pa | {times} | {share:.2g} |"
 
@@ -88,10 +108,9 @@ def main() -> None:
         measure_scene(cells, batch, youngs, device, options.seconds)
         for cells, batch, youngs in tqdm(jobs, desc="measuring", unit="scene", leave=False)
     ]
-    print(
-        "| batch x vertices | Young's modulus | forward ms | backward ms | by torch operations | backward / forward |"
-    )
-    print("|---|---|---|---|---|---|")
+    heads = [head for name, head in TIMES.items() if rows[0][name] is not None]
+    print("| " + " | ".join(["batch x vertices", "Young's modulus", *heads, "backward / forward"]) + " |")
+    print("|---|---|" + "---|" * (len(heads) + 1))
     for row in rows:
         print(line_of(row))
     if options.out:

@@ -8,6 +8,8 @@ H the exact Hessian of the step's objective (the rotations' derivative included)
 the weighted diagonal, or with the multilevel preconditioner of a plan that has one. The error of the gradient follows
 the error of the step: iterate far enough, and look at the residual.
 
+A GPU's kernel "block" solves every environment in one launch, whatever it takes, so a CUDA graph can record it.
+
 Contacts: the normal direction of a vertex that a contact holds is taken out of the system; a vertex that friction holds
 moves with its start. A sliding vertex counts as frictionless: its friction force is taken as constant.
 """
@@ -22,6 +24,7 @@ from torch import Tensor
 
 from .diagonal import named_material, pinned_vertices, step_diagonal
 from .multilevel import has_levels, reference_of_levels
+from .plan import kernel_of
 from .tables import MATERIAL_TABLE
 from .warn import warn_user
 
@@ -88,6 +91,16 @@ def conjugate_gradients(
     return solution, _relative(residual, scale)
 
 
+def recording(tensor: Tensor) -> bool:
+    """Whether what is done with a tensor is recorded for a CUDA graph, where nobody can ask what comes out."""
+    return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
+
+
+def _asks(plan: list[Tensor], right: Tensor) -> bool:
+    """Whether a solve on a GPU asks the host between its iterations; kernel "block" does all of them at once."""
+    return right.is_cuda and (has_levels(plan) or kernel_of(plan) != "block")
+
+
 def _relative(residual: Tensor, scale: Tensor) -> Tensor:
     return _dot(residual, residual).sqrt() / torch.where(scale > 0, scale, torch.ones_like(scale))
 
@@ -109,19 +122,26 @@ class _System:
 
     def solve(self, positions: Tensor, right: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
         """As `conjugate_gradients`, with the elastic Hessian at some positions; `right` is `allowed`."""
+        if recording(right) and _asks(self.plan, right):
+            raise RuntimeError(
+                "torchpd: a CUDA graph can record the gradient of a step where a block has a mesh to itself, without "
+                "levels, since any other asks the host whether to go on; for meshes of up to about a thousand vertices "
+                'make the simulator with kernel="block" and the Chebyshev or Jacobi solver, else leave backward out of '
+                "the graph"
+            )
         if has_levels(self.plan) or (right.is_cuda and right.shape[1] > _MOST_OF_A_BLOCK):
             return conjugate_gradients(lambda f: self._product(positions, f), self._precondition, right, tolerance)
         # what many operations on small tensors would spend their time with
         solution, residual, direction = torch.zeros_like(right), right.clone(), torch.empty_like(right)
         progress = right.new_full((len(right), 3), -1.0, dtype=torch.float64)
-        steps = _ASKED_EVERY if right.is_cuda else _MOST_ITERATIONS
+        steps = _ASKED_EVERY if _asks(self.plan, right) else _MOST_ITERATIONS
         for _ in range(0, _MOST_ITERATIONS, steps):
             torch.ops.torchpd.conjugate_gradients_(
                 solution, residual, direction, progress, positions, self.inertia.squeeze(-1),
                 self.inverse.squeeze(-1), self.projector, self.stiffness, self.plan,
                 tolerance=tolerance, iterations=steps,
             )  # fmt: skip
-            if not right.is_cuda or not bool(progress[:, 2].any()):
+            if steps == _MOST_ITERATIONS or not bool(progress[:, 2].any()):
                 break
         return solution, _relative(residual, progress[:, 1].to(right.dtype))
 
@@ -222,6 +242,15 @@ def step_gradient(call: AdjointCall) -> Tensor:
     return torch.where(held > 0, torch.zeros_like(gradient), gradient)
 
 
+def _warn_of(failed: Tensor, error: Tensor) -> None:
+    warn_user(
+        f"torchpd: the adjoint of a step has no solution in {int(failed.sum())} of {len(failed)} environments "
+        f"(relative residual {float(error[failed].max()):.1e}): their states are far from an equilibrium (more "
+        "iterations in the step help), at an unstable one, or have negative stiffness or masses. Their gradients "
+        "take the rotations as constant.",
+    )
+
+
 def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
     """The multiplier l of H l = dL/dx' on what moves, and what contacts hold."""
     inertia, diagonal = (t.unsqueeze(-1) for t in step_diagonal(call.plan, call.material, call.time_step))
@@ -247,13 +276,10 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
     lost = ~(torch.isfinite(right) & torch.isfinite(call.after)).flatten(1).all(1)
     multiplier = torch.where(lost[:, None, None], torch.nan, multiplier)
     failed = ~(error <= 1e3 * tolerance) & ~lost
-    if bool(failed.any()):
-        warn_user(
-            f"torchpd: the adjoint of a step has no solution in {int(failed.sum())} of {len(failed)} environments "
-            f"(relative residual {float(error[failed].max()):.1e}): their states are far from an equilibrium (more "
-            "iterations in the step help), at an unstable one, or have negative stiffness or masses. Their gradients "
-            "take the rotations as constant.",
-        )
+    unasked = recording(right)
+    if unasked or bool(failed.any()):
+        if not unasked:
+            _warn_of(failed, error)
         wanted = torch.where(failed[:, None, None], right, 0.0)
         # the curvature of what is slid on has no part in the majoriser either
         instead, _ = replace(system, inertia=inertia).solve(_STRETCH * call.after, wanted, tolerance)

@@ -17,11 +17,17 @@ from . import _C
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, PLAN_TABLE, PlanRow
 
-__all__ = ["KERNELS", "Plan", "any_of", "compile_plan", "compiling", "free_pieces", "internal_numbers"]
+__all__ = ["KERNELS", "Plan", "any_of", "compile_plan", "compiling", "free_pieces", "internal_numbers", "kernel_of"]
 
 _WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
 # by their number in the `sizes` of a GPU's plan
 KERNELS = ("block", "cluster", "grid", "stream")
+
+
+def kernel_of(arrays: Sequence[Tensor]) -> str:
+    """Which kernel the arrays of a GPU's plan are for."""
+    sizes, *_ = arrays
+    return KERNELS[int(sizes[DEVICE_SIZES.index("kernel")])]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +55,7 @@ class Plan:
     @property
     def kernel(self) -> str | None:
         """Which kernel of a GPU the plan is for: "block", "cluster", "grid" or "stream"; None for the CPU."""
-        return KERNELS[self.size("kernel")] if self.table[: len(DEVICE_PLAN_TABLE)] == DEVICE_PLAN_TABLE else None
+        return kernel_of(self.arrays) if self.table[: len(DEVICE_PLAN_TABLE)] == DEVICE_PLAN_TABLE else None
 
     def size(self, name: str) -> int:
         """A number of a GPU's plan by its name in DEVICE_SIZES."""

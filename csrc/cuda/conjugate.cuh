@@ -1,7 +1,10 @@
-// Iterations of solver/conjugate.h on any plan: products by the kernels of fields.cuh, and a block an environment for the rest.
+// Iterations of solver/conjugate.h. Where a block has a mesh in its shared memory it does all of them; on any other plan the
+// kernels of fields.cuh make the products, and a block an environment does the rest.
 #pragma once
 #include "cuda/fields.cuh"
 #include "solver/conjugate.h"
+
+#include <algorithm>
 
 namespace pd {
 
@@ -14,10 +17,11 @@ struct ConjugateWork {
   T* image;              // [batch, vertices, 3]
 };
 
+using WarpSums = double[conjugate_threads / warp_size][2];
+
 // Sums of a block, the same in all threads. `warp_sums` is free again when it returns.
 template <int Count>
-__device__ void add_across_block(double (&sum)[Count],
-                                 double (&warp_sums)[conjugate_threads / warp_size][2]) {
+__device__ void add_across_block(double (&sum)[Count], WarpSums& warp_sums) {
   add_across_warp(sum);
   const int warp = int(threadIdx.x) / warp_size, lane = int(threadIdx.x) % warp_size;
   if (lane == 0) {
@@ -26,7 +30,7 @@ __device__ void add_across_block(double (&sum)[Count],
   __syncthreads();
   for (int n = 0; n < Count; ++n) {
     sum[n] = 0;
-    for (int w = 0; w < conjugate_threads / warp_size; ++w) sum[n] += warp_sums[w][n];
+    for (int w = 0; w < int(blockDim.x) / warp_size; ++w) sum[n] += warp_sums[w][n];
   }
   __syncthreads();
 }
@@ -35,7 +39,7 @@ __device__ void add_across_block(double (&sum)[Count],
 template <class T>
 __global__ void __launch_bounds__(conjugate_threads)
     conjugate_begin(const __grid_constant__ DeviceConjugate<T> call) {
-  __shared__ double warp_sums[conjugate_threads / warp_size][2];
+  __shared__ WarpSums warp_sums;
   const std::int64_t environment = blockIdx.x;
   double* progress = call.progress + environment * progress_count;
   Conjugate numbers(progress);
@@ -59,7 +63,7 @@ __global__ void __launch_bounds__(conjugate_threads)
 template <class T>
 __global__ void __launch_bounds__(conjugate_threads)
     conjugate_update(const __grid_constant__ ConjugateWork<T> work) {
-  __shared__ double warp_sums[conjugate_threads / warp_size][2];
+  __shared__ WarpSums warp_sums;
   const DeviceConjugate<T>& call = work.call;
   const std::int64_t environment = blockIdx.x;
   double* progress = call.progress + environment * progress_count;
@@ -108,6 +112,90 @@ __global__ void __launch_bounds__(conjugate_threads)
   if (threadIdx.x == 0) numbers.write(progress);
 }
 
+// Threads of a block that has a multiprocessor to itself: as many as there are registers for.
+template <class T>
+constexpr int alone_threads = sizeof(T) == 4 ? 512 : 256;
+
+// All iterations of an environment, until it is done: no other one enters, and nobody asks in between. A thread has the same
+// vertices from the first loop to the last, so what it writes of them in device memory it finds there.
+template <class T>
+__global__ void __launch_bounds__(alone_threads<T>)
+    conjugate_alone(const __grid_constant__ ConjugateWork<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  __shared__ WarpSums warp_sums;
+  const DeviceConjugate<T>& call = work.call;
+  const DevicePlan<T>& plan = call.plan;
+  const std::int64_t environment = blockIdx.x;
+  double* progress = call.progress + environment * progress_count;
+  Conjugate numbers(progress);
+  if (!numbers.active) return;
+  const T *inertia = call.inertia.of(environment), *inverse = call.inverse.of(environment);
+  // visit(slot, vertex, where its vectors are)
+  const auto each_slot = [&](const auto& visit) {
+    for (int s = threadIdx.x; s < plan.slots; s += blockDim.x) {
+      const int i = plan.vertex_order[s];
+      visit(s, i, 3 * (environment * plan.vertices + i));
+    }
+  };
+
+  if (numbers.begins) {
+    double sums[2] = {0, 0};  // |b|^2, b . b / D
+    each_slot([&](int, int i, std::int64_t at) {
+      const Vec3<T> right = read3(call.residual + at);
+      write3(call.direction + at, inverse[i] * right);
+      const double square = double(dot(right, right));
+      sums[0] += square;
+      sums[1] += double(inverse[i]) * square;
+    });
+    add_across_block(sums, warp_sums);
+    numbers.begin(sums[0], sums[1]);
+  }
+  const PatchFields<2, T> fields(work.product.field, shared);
+  const auto direction_of = [&](int s) {
+    Vec3<T> vectors[2];
+    fields(unsigned(8 * s), vectors);
+    return vectors[1];
+  };
+  for (int k = 0; k < call.iterations && numbers.active; ++k) {
+    each_pair<2>(fields.patch, fields, rest_of<false>(fields.patch),
+                 work.product.weights_of(environment), fields.entries, SolidHessian{});
+    __syncthreads();
+    double curvature[1] = {0};
+    each_slot([&](int s, int i, std::int64_t at) {
+      const Vec3<T> direction = direction_of(s);
+      const Vec3<T> image = conjugate_image(sum_entries(fields.entries, plan.slot_row[s]),
+                                            direction, inertia[i], inverse[i] != T(0),
+                                            call.projector ? call.projector + 3 * at : nullptr);
+      write3(work.image + at, image);
+      curvature[0] += double(dot(direction, image));
+    });
+    add_across_block(curvature, warp_sums);
+    const T step = T(numbers.step(curvature[0]));
+    if (!numbers.active) break;
+    double sums[2] = {0, 0};  // |r|^2, r . r / D
+    each_slot([&](int s, int i, std::int64_t at) {
+      write3(call.solution + at,
+             multiply_add(step, direction_of(s), read3(call.solution + at)));
+      const Vec3<T> rest =
+          subtract_product(read3(call.residual + at), step, read3(work.image + at));
+      write3(call.residual + at, rest);
+      const double square = double(dot(rest, rest));
+      sums[0] += square;
+      sums[1] += double(inverse[i]) * square;
+    });
+    add_across_block(sums, warp_sums);
+    const T keep = T(numbers.keep(sums[0], sums[1], call.tolerance));
+    each_slot([&](int s, int i, std::int64_t at) {
+      fields.both.set_second(
+          s, multiply_add(keep, direction_of(s), inverse[i] * read3(call.residual + at)));
+    });
+    __syncthreads();
+  }
+  each_slot([&](int s, int, std::int64_t at) { write3(call.direction + at, direction_of(s)); });
+  // all have read what there was
+  if (threadIdx.x == 0) numbers.write(progress);
+}
+
 template <class T>
 ConjugateWork<T> arrange(Arena& arena, const DeviceConjugate<T>& call) {
   DeviceField<T> field;
@@ -130,13 +218,28 @@ std::int64_t conjugate_bytes(const DeviceConjugate<T>& call) {
   return arena.size();
 }
 
-template <bool Computed, class T>
-void run_conjugate_with(const ConjugateWork<T>& work, cudaStream_t stream) {
-  weigh_field<Computed>(work.product, stream);
+template <class T>
+void run_conjugate_alone(const ConjugateWork<T>& work, cudaStream_t stream) {
+  const DevicePlan<T>& plan = work.call.plan;
+  weigh_field<false>(work.product, stream);
+  const auto kernel = conjugate_alone<T>;
+  const std::size_t bytes = pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, 2);
+  const bool shares = 2 * bytes + 2 * pass_static_bytes <= shared_memory_per_multiprocessor();
+  const int most = shares ? alone_threads<T> / 2 : alone_threads<T>;
+  const int threads = std::min(int(whole_warps(plan.most_pairs)), most);
+  if (resident_blocks(reinterpret_cast<const void*>(kernel), threads, bytes) == 0)
+    refuse_shared_memory(bytes);
+  kernel<<<blocks_of(work.call.batch), threads, bytes, stream>>>(work);
+  check(cudaGetLastError());
+}
+
+template <class T>
+void run_conjugate_together(const ConjugateWork<T>& work, cudaStream_t stream) {
+  weigh_field<true>(work.product, stream);
   conjugate_begin<T><<<blocks_of(work.call.batch), conjugate_threads, 0, stream>>>(work.call);
   check(cudaGetLastError());
   for (int k = 0; k < work.call.iterations; ++k) {
-    run_vertices<Computed, SolidHessian, 2, 3>(work.product, stream);
+    run_vertices<true, SolidHessian, 2, 3>(work.product, stream);
     conjugate_update<T><<<blocks_of(work.call.batch), conjugate_threads, 0, stream>>>(work);
     check(cudaGetLastError());
   }
@@ -148,9 +251,9 @@ void run_conjugate(const DeviceConjugate<T>& call, void* memory, Stream to) {
   Arena arena(memory);
   const ConjugateWork<T> work = arrange(arena, call);
   if (call.plan.kernel == int(DeviceKernel::block)) {
-    run_conjugate_with<false>(work, stream);
+    run_conjugate_alone(work, stream);
   } else {
-    run_conjugate_with<true>(work, stream);
+    run_conjugate_together(work, stream);
   }
 }
 

@@ -39,6 +39,11 @@ class Slots {
     __builtin_memcpy(first_ + slot, &two, sizeof(two));
     first_[slot].z = first.z;
   }
+  // the first vector stays
+  PD_DEVICE void set_second(int slot, const Vec3<T>& second) const {
+    first_[slot].w = second.x;
+    behind_[slot] = {second.y, second.z};
+  }
 
  private:
   // as pair_corner has slots, for the fewest instructions

@@ -1,0 +1,155 @@
+"""Gradients on a GPU: by every kernel those of the CPU in float64, and by "block" in a CUDA graph, without the host."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+from devices import require_gpu
+from on_gpu import DTYPES, GPU, KERNELS, bar, device_work, host_waits, moved, on_gpu, relative, small_on_gpu
+from runs import noise, simulator, state_of
+from torch import Tensor
+
+import torchpd as pd
+from torchpd.adjoint import conjugate_gradients
+
+require_gpu()
+
+pytestmark = pytest.mark.parametrize("precision", DTYPES)
+
+SOLVED = 400  # iterations, after which the implicit function theorem holds
+
+
+def gradients(sim: pd.Simulator, state: pd.State, weight: Tensor) -> list[Tensor]:
+    """Of a weighted sum of all new positions: for positions, velocities and stiffness."""
+    inputs = [*(t.clone().requires_grad_() for t in state), sim.stiffness.requires_grad_()]
+    after = sim(pd.State(*inputs[:2]))
+    return list(torch.autograd.grad((weight * after.positions).sum(), inputs))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_gradients_are_those_of_the_cpu(kernel: str, precision: str) -> None:
+    case, dtype = bar((8, 2, 2), pd.Gravity(), pd.Damping(0.5)), DTYPES[precision]
+    sim = on_gpu(case, dtype, kernel, iterations=SOLVED)
+    exact = simulator(case, torch.float64, iterations=SOLVED)
+    state = state_of(case, sim, 3)
+    state.velocities.mul_(torch.tensor([1.0, -0.5, 0.2], dtype=dtype, device=GPU)[:, None, None])
+    start = moved(state, "cpu", torch.float64)
+    weight = noise(start.positions, 7)
+    found, wanted = gradients(sim, state, weight.to(state.positions)), gradients(exact, start, weight)
+    for one, other in zip(found, wanted, strict=True):
+        assert relative(one, other) < (1e-3 if dtype == torch.float32 else 1e-8)
+
+
+class Training:
+    """A step, its loss and the gradients of all that it learns, with tensors that a CUDA graph can know."""
+
+    def __init__(self, sim: pd.Simulator, state: pd.State) -> None:
+        self.sim, self.state = sim, state
+        self.forces = torch.zeros_like(state.positions).requires_grad_()
+        self.stiffness = sim.stiffness.requires_grad_()
+        self.speed = state.velocities.clone().requires_grad_()
+        self.weight = noise(state.positions)
+
+    def run(self) -> tuple[Tensor, ...]:
+        first = pd.State(self.state.positions, self.speed)
+        last = self.sim(self.sim(first, self.forces))
+        loss = (self.weight * last.positions).sum() + last.velocities.square().sum()
+        return loss, *torch.autograd.grad(loss, [self.forces, self.stiffness, self.speed])
+
+    def change(self, seed: int) -> None:
+        """New numbers in the same places."""
+        with torch.no_grad():
+            self.forces.copy_(noise(self.forces, seed))
+            self.speed.copy_(0.3 * noise(self.speed, seed + 1))
+            self.stiffness.mul_(1.0 + 0.1 * seed)
+
+    def record(self) -> tuple[torch.cuda.CUDAGraph, tuple[Tensor, ...]]:
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            self.run()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            results = self.run()
+        return graph, results
+
+
+def test_a_recorded_training_step_is_that_of_python(precision: str) -> None:
+    sim, state = small_on_gpu(DTYPES[precision], "block")
+    sim.iterations = SOLVED
+    training = Training(sim, state)
+    graph, results = training.record()
+    for seed in range(1, 4):
+        training.change(seed)
+        graph.replay()
+        own = [t.clone() for t in results]
+        wanted = training.run()
+        assert all(torch.equal(one, other) for one, other in zip(own, wanted, strict=True))
+        assert all(bool((t != 0).any()) for t in own)
+
+
+def test_a_replay_wants_nothing_of_the_host(precision: str) -> None:
+    sim, state = small_on_gpu(DTYPES[precision], "block")
+    sim.iterations = SOLVED
+    graph, _ = Training(sim, state).record()
+    assert not host_waits(graph.replay)
+
+
+def test_a_recording_takes_rotations_as_constant_where_python_would(precision: str) -> None:
+    """One environment is crumpled: Python is warned, a graph cannot be, and both take the same gradient."""
+    sim, state = small_on_gpu(DTYPES[precision], "block")
+    sim.iterations = 1
+    state.positions[1] = 0.02 * noise(state.positions[1], 5)
+    training = Training(sim, state)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # before it is recorded it runs once
+        graph, results = training.record()
+    graph.replay()
+    with pytest.warns(UserWarning, match="adjoint of a step has no solution"):
+        wanted = training.run()
+    assert all(torch.equal(one, other) for one, other in zip(results, wanted, strict=True))
+
+
+@pytest.mark.parametrize("kernel", [name for name in KERNELS if name != "block"])
+def test_other_kernels_are_refused_while_recording(kernel: str, precision: str) -> None:
+    sim, state = small_on_gpu(DTYPES[precision], kernel)
+    sim.iterations = SOLVED
+    with pytest.raises(RuntimeError, match="CUDA graph can record the gradient of a step where a block"):
+        Training(sim, state).record()
+    # the device is as it was
+    assert bool(sim(state).positions.isfinite().all())
+
+
+def test_a_solve_is_one_kernel_behind_its_weights(precision: str) -> None:
+    """However many iterations it takes."""
+    sim, state = small_on_gpu(DTYPES[precision], "block")
+    right = noise(state.positions)
+    diagonal = torch.ops.torchpd.elastic_diagonal(sim.stiffness, list(sim.plan.arrays), weighted=True)
+    inertia = 0.1 * diagonal
+    inverse = (1.0 / (inertia + diagonal)).contiguous()
+    plan = list(sim.plan.arrays)
+    rest = sim.rest_positions.expand_as(right).contiguous()
+    vectors = [torch.zeros_like(right), right.clone(), torch.zeros_like(right)]
+    progress = torch.full((len(right), 3), -1.0, dtype=torch.float64, device=GPU)
+
+    def solve() -> None:
+        for vector, first in zip(vectors, (0.0, right, 0.0), strict=True):
+            vector.copy_(torch.as_tensor(first, device=GPU))
+        progress.fill_(-1.0)
+        torch.ops.torchpd.conjugate_gradients_(
+            *vectors, progress, rest, inertia, inverse, None, sim.stiffness, plan, tolerance=1e-5, iterations=2000
+        )
+
+    names = [name for name in device_work(solve) if "pd::" in name]
+    assert len(names) == 2
+    assert "conjugate_alone" in names[1]
+    assert progress[:, 2].tolist() == [0.0] * len(right)
+    product = torch.ops.torchpd.hessian_product
+    wanted, _ = conjugate_gradients(
+        lambda f: inertia[..., None] * f + product(rest, f.contiguous(), sim.stiffness, plan),
+        lambda f: inverse[..., None] * f, right, 1e-5,
+    )  # fmt: skip
+    assert relative(vectors[0], wanted) < 1e-3
