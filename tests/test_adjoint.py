@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+from unittest import mock
+
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchpd as pd
+from torchpd import ops
+from torchpd.adjoint import step_adjoint
 
 # A central difference with relative step 1e-5 errs by about 1e-10 (truncation) and 1e-16 / 1e-5 (rounding), relative to
 # the largest terms; sums that cancel lose some digits more.
@@ -205,6 +211,66 @@ def test_rollout_is_differentiable() -> None:
     (expected,) = torch.autograd.grad(after.positions.square().sum(), sim.stiffness)
     assert torch.equal(gradient, expected)
     assert float(gradient.abs().max()) > 0.0
+
+
+class Calls(TorchDispatchMode):
+    """Names of the ops that are called."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.names.append(func.name())
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_what_nobody_wants_costs_nothing(steps: int) -> None:
+    """A gradient alone is that among all, bit by bit, and what the others need is not worked out."""
+    sim, state = body()
+    names = ["stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets"]
+    arrays = [getattr(sim, name).requires_grad_() for name in names]
+    start = pd.State(*(t.clone().requires_grad_() for t in state))
+
+    def gradients(*wanted: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], list[str]]:
+        loss, calls = sim.rollout(start, steps).positions.square().sum(), Calls()
+
+        def watched(*args: Any) -> list[torch.Tensor]:
+            with calls:
+                return step_adjoint(*args)
+
+        # from outside of an op nobody sees those that it calls
+        with mock.patch.object(ops, "step_adjoint", watched):
+            return torch.autograd.grad(loss, wanted), calls.names
+
+    everything, most = gradients(*start, *arrays)
+    for array in arrays:
+        array.requires_grad_(False)
+    for name, array, wanted in zip(names, arrays, everything[2:], strict=True):
+        (alone,), calls = gradients(array.requires_grad_())
+        array.requires_grad_(False)
+        assert torch.equal(alone, wanted)
+        assert ("torchpd::element_energy_product" in calls) == (name == "stiffness")
+        assert ("torchpd::hessian_product" in calls) == (name == "pin_targets")
+        assert len(calls) < 0.85 * len(most)
+    found, calls = gradients(*start)
+    assert all(torch.equal(one, other) for one, other in zip(found, everything, strict=False))
+    assert len(calls) < 0.65 * len(most)
+
+
+@pytest.mark.parametrize("wanted", [None, [True] * 3])
+def test_the_op_gives_all_gradients_or_wants_to_know_of_each(wanted: list[bool] | None) -> None:
+    sim, state = body()
+    after = sim(state).positions
+    arrays = [array.detach() for array in sim.material()]
+    arguments = (after, 0.0 * after, after, *state, None, arrays, list(sim.plan.arrays))
+    if wanted is None:
+        given = torch.ops.torchpd.step_vjp(*arguments, time_step=sim.time_step)
+        assert [t.shape for t in given[3:]] == [array.shape for array in arrays]
+        return
+    with pytest.raises(ValueError, match=f"of each of the {len(arrays)} arrays of the material .* got 3 numbers"):
+        torch.ops.torchpd.step_vjp(*arguments, time_step=sim.time_step, wanted=wanted)
 
 
 def test_unsolved_step_warns() -> None:

@@ -23,12 +23,18 @@ def noise(shape: torch.Size, dtype: torch.dtype, seed: int = 0) -> Tensor:
 
 
 def system(
-    dtype: torch.dtype, device: torch.device, *, cells: tuple[int, int, int] = (3, 2, 2), contacts: bool = False
+    dtype: torch.dtype,
+    device: torch.device,
+    *,
+    cells: tuple[int, int, int] = (3, 2, 2),
+    contacts: bool = False,
+    kernel: str = "auto",
 ) -> tuple[_System, Tensor, Tensor]:
     """A bar whose environments differ, three of its vertices held; positions, and a right side of what may move."""
     mesh = pd.shapes.box((1.0, 0.4, 0.3), cells)
     solid = pd.Solid(mesh, youngs=2e4, density=1000.0)
-    sim = pd.Simulator(pd.Scene(solid), 1 / 60, dtype=dtype, progress=False).to(device)
+    options: dict[str, Any] = {"kernel": kernel} if device.type == "cuda" else {}
+    sim = pd.Simulator(pd.Scene(solid), 1 / 60, dtype=dtype, progress=False, **options).to(device)
     x = sim.rest_state(BATCH).positions.cpu()
     spread = torch.tensor([1.0, 0.3, 2.5], dtype=dtype)[:, None]
     moves = torch.ones(BATCH, sim.vertices, 1, dtype=dtype)
@@ -47,7 +53,9 @@ def system(
         inertia.to(device), (moves / diagonal).to(device), projector.to(device) if contacts else None,
         stiffness.to(device), list(sim.plan.arrays),
     )  # fmt: skip
-    positions = (x + 0.01 * noise(x.shape, dtype, 2)).to(device)
+    # little enough for elements of any size to leave the Hessian positive
+    smallest = min(length / count for length, count in zip((1.0, 0.4, 0.3), cells, strict=True))
+    positions = (x + smallest / 15.0 * noise(x.shape, dtype, 2)).to(device)
     return found, positions, found.allowed(noise(x.shape, dtype, 3).to(device))
 
 
@@ -88,14 +96,23 @@ def test_the_solution_is_that_of_a_dense_matrix(contacts: bool, dtype: torch.dty
     assert float(error.max()) < (2e-6 if dtype == torch.float32 else 2e-12)
 
 
-def test_it_does_what_torch_operations_do(dtype: torch.dtype, device: torch.device) -> None:
+# "block" on a GPU: a thread has one pair, several, and several slots too; two blocks share a multiprocessor, or cannot
+SHAPES = {
+    torch.float32: {"any": (3, 2, 2), "one": (3, 2, 2), "pairs": (15, 3, 3), "slots": (29, 3, 3), "alone": (9, 9, 9)},
+    torch.float64: {"any": (3, 2, 2), "one": (3, 2, 2), "pairs": (9, 3, 3), "slots": (15, 3, 3), "alone": (6, 6, 6)},
+}
+
+
+@pytest.mark.parametrize("shape", ["any", "one", "pairs", "slots", "alone"])
+def test_it_does_what_torch_operations_do(shape: str, dtype: torch.dtype, device: torch.device) -> None:
     """Iteration by iteration; ten of them leave a residual that rounding has little part in."""
-    s, positions, right = system(dtype, device, contacts=True)
+    cells, kernel = SHAPES[dtype][shape], "auto" if shape == "any" else "block"
+    s, positions, right = system(dtype, device, contacts=True, cells=cells, kernel=kernel)
     state = start(s, right)
     iterate(s, state, positions, 10)
     wanted = torch.zeros_like(right)
     # by hand, in float64
-    exact, x, b = system(torch.float64, device, contacts=True)
+    exact, x, b = system(torch.float64, device, contacts=True, cells=cells)
     r, d = b, exact.inverse * b
     wanted, rho = torch.zeros_like(b), (b * d).sum((1, 2), keepdim=True)
     for _ in range(10):
@@ -112,11 +129,14 @@ def test_it_does_what_torch_operations_do(dtype: torch.dtype, device: torch.devi
     assert state[3][:, 2].tolist() == [1.0] * BATCH
 
 
-@pytest.mark.parametrize("cells", [(3, 2, 2), (40, 9, 9)], ids=["one patch", "several"])
+@pytest.mark.parametrize(
+    ("cells", "kernel"), [((3, 2, 2), "auto"), ((40, 9, 9), "auto"), ((15, 3, 3), "block")],
+    ids=["one patch", "several", "block"],
+)  # fmt: skip
 def test_an_environment_has_the_same_bits_alone(
-    cells: tuple[int, int, int], dtype: torch.dtype, device: torch.device
+    cells: tuple[int, int, int], kernel: str, dtype: torch.dtype, device: torch.device
 ) -> None:
-    s, positions, right = system(dtype, device, cells=cells, contacts=True)
+    s, positions, right = system(dtype, device, cells=cells, contacts=True, kernel=kernel)
     threads = torch.get_num_threads()
     together = start(s, right)
     iterate(s, together, positions, 7)

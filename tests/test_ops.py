@@ -46,7 +46,10 @@ def samples(
             (wanted(still), wanted(zero), wanted(0.01 * f), material, plan),
             {**numbers, "iterations": 400, "steps": 3, "every": 1},
         ),
-        "step_vjp": ((f, direction, still, still, zero, 0.01 * f, material, plan), {"time_step": sim.time_step}),
+        "step_vjp": (
+            (f, direction, still, still, zero, 0.01 * f, material, plan),
+            {"time_step": sim.time_step, "wanted": [number % 3 != 1 for number in range(len(material))]},
+        ),
         "gradient": ((wanted(x), w, plan), {}),
         "element_energy": ((wanted(x), w, plan), {}),
         "element_energy_product": ((wanted(x), wanted(direction), w, plan), {}),

@@ -281,7 +281,11 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
                     many = pd.Simulator(built, 1 / 60, 5, solver=solver, tolerance=tolerance, **options).to("cuda")
                     many(many.rest_state(7 * properties_of(sim.device).multiprocessors // sim.plan.patches))
                     count += 1
-    fields(sim, 3)
+        fields(sim, 3)
+    if kernel == "block":
+        # whose block has a multiprocessor to itself, and several slots a thread
+        mesh = bar(9, 9, 9) if dtype == torch.float32 else bar(6, 6, 6)
+        fields(pd.Simulator(pd.Scene(pd.Solid(mesh, 1e5)), 1 / 60, **options).to("cuda"), 2)
     with compiled_for(kernel, WAYS[kernel][0]):
         free = scene(WAYS[kernel][0].mesh, contacts=True, pieces=True, pins=False)
         step_all_ways(pd.Simulator(free, 1 / 60, 5, **options).to("cuda"), 2)

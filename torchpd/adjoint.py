@@ -16,7 +16,7 @@ moves with its start. A sliding vertex counts as frictionless: its friction forc
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -91,14 +91,17 @@ def conjugate_gradients(
     return solution, _relative(residual, scale)
 
 
-def recording(tensor: Tensor) -> bool:
+def _recording(tensor: Tensor) -> bool:
     """Whether what is done with a tensor is recorded for a CUDA graph, where nobody can ask what comes out."""
-    return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
+    if not tensor.is_cuda:
+        return False
+    with torch.cuda.device(tensor.device):
+        return torch.cuda.is_current_stream_capturing()
 
 
 def _asks(plan: list[Tensor], right: Tensor) -> bool:
-    """Whether a solve on a GPU asks the host between its iterations; kernel "block" does all of them at once."""
-    return right.is_cuda and (has_levels(plan) or kernel_of(plan) != "block")
+    """Whether a solve on a GPU asks the host between its iterations; "block", which has no levels, does all at once."""
+    return right.is_cuda and kernel_of(plan) != "block"
 
 
 def _relative(residual: Tensor, scale: Tensor) -> Tensor:
@@ -117,15 +120,16 @@ class _System:
 
     def allowed(self, field: Tensor) -> Tensor:
         """The part of a field [B, V, 3] that may move."""
-        field = torch.where(self.inverse != 0, field, torch.zeros_like(field))
+        field = torch.where(self.inverse != 0, field, 0.0)
         return field if self.projector is None else (self.projector * field.unsqueeze(-2)).sum(-1)
 
     def solve(self, positions: Tensor, right: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
         """As `conjugate_gradients`, with the elastic Hessian at some positions; `right` is `allowed`."""
-        if recording(right) and _asks(self.plan, right):
+        asks = _asks(self.plan, right)
+        if asks and _recording(right):
             raise RuntimeError(
-                "torchpd: a CUDA graph can record the gradient of a step where a block has a mesh to itself, without "
-                "levels, since any other asks the host whether to go on; for meshes of up to about a thousand vertices "
+                'torchpd: a CUDA graph can record the gradient of a step with kernel "block" alone, since others and '
+                "Multilevel ask the host whether to go on; for meshes of up to about a thousand vertices in float32 "
                 'make the simulator with kernel="block" and the Chebyshev or Jacobi solver, else leave backward out of '
                 "the graph"
             )
@@ -134,14 +138,14 @@ class _System:
         # what many operations on small tensors would spend their time with
         solution, residual, direction = torch.zeros_like(right), right.clone(), torch.empty_like(right)
         progress = right.new_full((len(right), 3), -1.0, dtype=torch.float64)
-        steps = _ASKED_EVERY if _asks(self.plan, right) else _MOST_ITERATIONS
+        steps = _ASKED_EVERY if asks else _MOST_ITERATIONS
         for _ in range(0, _MOST_ITERATIONS, steps):
             torch.ops.torchpd.conjugate_gradients_(
                 solution, residual, direction, progress, positions, self.inertia.squeeze(-1),
                 self.inverse.squeeze(-1), self.projector, self.stiffness, self.plan,
                 tolerance=tolerance, iterations=steps,
             )  # fmt: skip
-            if steps == _MOST_ITERATIONS or not bool(progress[:, 2].any()):
+            if not asks or not bool(progress[:, 2].any()):
                 break
         return solution, _relative(residual, progress[:, 1].to(right.dtype))
 
@@ -273,10 +277,10 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
     right = system.allowed(right)
     multiplier, error = system.solve(call.after, right, tolerance)
     # a loss or a state that is no number has a gradient that is none, as those who watch for it expect
-    lost = ~(torch.isfinite(right) & torch.isfinite(call.after)).flatten(1).all(1)
+    lost = ((right + call.after) * 0.0).sum((1, 2)).isnan()
     multiplier = torch.where(lost[:, None, None], torch.nan, multiplier)
     failed = ~(error <= 1e3 * tolerance) & ~lost
-    unasked = recording(right)
+    unasked = _recording(right)
     if unasked or bool(failed.any()):
         if not unasked:
             _warn_of(failed, error)
@@ -293,41 +297,73 @@ def _elastic_product(call: AdjointCall, field: Tensor, positions: Tensor) -> Ten
     return result
 
 
-def step_adjoint(call: AdjointCall, grad_after: Tensor, grad_velocities: Tensor) -> list[Tensor]:
-    """Gradients of a loss for positions, velocities, forces [B, V, 3], then every material array; contacts get zeros.
+def step_adjoint(
+    call: AdjointCall, grad_after: Tensor, grad_velocities: Tensor, wanted: Sequence[bool]
+) -> list[Tensor]:
+    """Gradients of a loss for positions, velocities, forces [B, V, 3], then material arrays; contacts get zeros.
 
     Args:
         call: the step.
         grad_after: dL/dx' [B, V, 3].
         grad_velocities: dL/dv' [B, V, 3].
+        wanted: which material arrays, in their order; the others are left out, and cost nothing.
     """
-    h, material, pins = call.time_step, named_material(call.material), pinned_vertices(call.plan)
+    h, material = call.time_step, named_material(call.material)
     masses, inertial = material["masses"].unsqueeze(-1), _inertial(material, h)
     right = grad_after + grad_velocities / h
     multiplier, held = _solve(call, right)
 
-    # what the vertices that are held would pass on: to the targets of pins, to the start of those that friction holds
-    passed_on = right - _elastic_product(call, multiplier, call.after)
+    def passed_on() -> Tensor:
+        """What vertices that are held pass on: to the targets of pins, to the start of those that friction holds."""
+        return right - _elastic_product(call, multiplier, call.after)
+
     grad_positions = inertial * multiplier - grad_velocities / h
     if held is not None:
-        grad_positions = grad_positions + torch.where(held.stuck, held.off_normals(passed_on), 0.0)
-    springs = material["pin_stiffness"].unsqueeze(-1)
-    hard = torch.isinf(springs)
-    at_pins, stretch = multiplier[:, pins], call.after[:, pins] - material["pin_targets"]
-    rate = (call.after - call.positions) / h
-    pull = inertial / masses * h * rate - call.velocities / h - material["gravity"].unsqueeze(-2)
-    by_name = {
-        "stiffness": -torch.ops.torchpd.element_energy_product(
-            call.after, multiplier, torch.ones_like(material["stiffness"]), call.plan
-        ),
-        "masses": -(multiplier * pull).sum(-1),
-        "gravity": (masses * multiplier).sum(1),
-        "damping": -(masses * multiplier * rate).sum((1, 2)),
-        "pin_stiffness": torch.where(hard, 0.0, -at_pins * stretch).sum(-1),
-        "pin_targets": torch.where(hard, passed_on[:, pins], torch.where(hard, 0.0, springs) * at_pins),
-    }
+        grad_positions = grad_positions + torch.where(held.stuck, held.off_normals(passed_on()), 0.0)
+    by_name = _for_material(call, multiplier)
+    by_name["pin_targets"] = lambda: _for_targets(call, multiplier, passed_on())
     grads = [
-        _reduce(by_name[row.name], array, row.dims) if row.name in by_name else torch.zeros_like(array)
-        for row, array in zip(MATERIAL_TABLE, call.material, strict=True)
+        _reduce(by_name[row.name](), array, row.dims) if row.name in by_name else torch.zeros_like(array)
+        for row, array, asked in zip(MATERIAL_TABLE, call.material, wanted, strict=True)
+        if asked
     ]
     return [grad_positions, masses / h * multiplier, multiplier, *grads]
+
+
+def _for_material(call: AdjointCall, multiplier: Tensor) -> dict[str, Callable[[], Tensor]]:
+    """-l . dr/dp of every environment for each array p of the material but the targets of pins."""
+    h, material = call.time_step, named_material(call.material)
+    masses = material["masses"].unsqueeze(-1)
+
+    def rate() -> Tensor:
+        return (call.after - call.positions) / h
+
+    def for_stiffness() -> Tensor:
+        unit = torch.ones_like(material["stiffness"])
+        product: Tensor = torch.ops.torchpd.element_energy_product(call.after, multiplier, unit, call.plan)
+        return -product
+
+    def for_masses() -> Tensor:
+        pull = _inertial(material, h) / masses * h * rate() - call.velocities / h - material["gravity"].unsqueeze(-2)
+        return -(multiplier * pull).sum(-1)
+
+    def for_pin_stiffness() -> Tensor:
+        pins = pinned_vertices(call.plan)
+        stretch = call.after[:, pins] - material["pin_targets"]
+        hard = torch.isinf(material["pin_stiffness"])
+        return torch.where(hard, 0.0, -(multiplier[:, pins] * stretch).sum(-1))
+
+    return {
+        "stiffness": for_stiffness,
+        "masses": for_masses,
+        "gravity": lambda: (masses * multiplier).sum(1),
+        "damping": lambda: -(masses * multiplier * rate()).sum((1, 2)),
+        "pin_stiffness": for_pin_stiffness,
+    }
+
+
+def _for_targets(call: AdjointCall, multiplier: Tensor, passed_on: Tensor) -> Tensor:
+    """The same for the targets of pins: hard ones take on what their vertices pass on."""
+    pins, springs = pinned_vertices(call.plan), named_material(call.material)["pin_stiffness"].unsqueeze(-1)
+    hard = torch.isinf(springs)
+    return torch.where(hard, passed_on[:, pins], torch.where(hard, 0.0, springs) * multiplier[:, pins])

@@ -99,9 +99,11 @@ def step_vjp_rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[
     ]
     grads = [t.unflatten(0, maps) for t in op(*state, each, plan, **numbers)]
     shapes = [_shape_of_one(t, d) for t, d in zip(args[-2], in_dims[-2], strict=True)]
+    asked = [True] * len(shapes) if numbers.get("wanted") is None else numbers["wanted"]
+    rows = [(shape, own) for shape, own, wanted in zip(shapes, _OWN, asked, strict=True) if wanted]
     summed = [
         grad.sum(1, keepdim=len(shape) > own) if len(shape) == own or shape[0] < maps[1] else grad
-        for grad, shape, own in zip(grads[3:], shapes, _OWN, strict=True)
+        for grad, (shape, own) in zip(grads[3:], rows, strict=True)
     ]
     return [*grads[:3], *summed], 0
 

@@ -255,7 +255,18 @@ def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | No
     return grads
 
 
-# it asks whether its solve has converged, which no recording can
+def _asked(wanted: Sequence[bool] | None, material: Sequence[Tensor]) -> Sequence[bool]:
+    if wanted is None:
+        return [True] * len(material)
+    if len(wanted) != len(material):
+        raise ValueError(
+            f"step_vjp: wanted must say of each of the {len(material)} arrays of the material whether its gradient is "
+            f"wanted, got {len(wanted)} numbers"
+        )
+    return wanted
+
+
+# as every op that takes a plan, see csrc/ops.cpp
 @torch.library.custom_op("torchpd::step_vjp", mutates_args=(), tags=[torch.Tag.cudagraph_unsafe])
 def step_vjp(
     grad_positions: Tensor,
@@ -268,12 +279,13 @@ def step_vjp(
     plan: Sequence[Tensor],
     *,
     time_step: float,
+    wanted: Sequence[bool] | None = None,
 ) -> list[Tensor]:
-    """The adjoint of a step: gradients for positions, velocities, forces and every material array."""
+    """The adjoint of a step: gradients for positions, velocities, forces and the wanted material arrays, else all."""
     call = AdjointCall(positions, velocities, forces, after, list(material), list(plan), time_step)
     # in the precision of the step, also where autocast asks for less
     with torch.autocast(after.device.type, enabled=False):
-        return step_adjoint(call, grad_positions, grad_velocities)
+        return step_adjoint(call, grad_positions, grad_velocities, _asked(wanted, material))
 
 
 @step_vjp.register_fake
@@ -288,9 +300,11 @@ def _(
     plan: Sequence[Tensor],
     *,
     time_step: float,
+    wanted: Sequence[bool] | None = None,
 ) -> list[Tensor]:
     state = [positions.new_empty(positions.shape) for _ in range(3)]
-    return [*state, *(array.new_empty(array.shape) for array in material)]
+    asked = zip(material, _asked(wanted, material), strict=True)
+    return [*state, *(array.new_empty(array.shape) for array, own in asked if own)]
 
 
 register_rule("step_vjp", step_vjp_rule)
@@ -309,12 +323,17 @@ def _step_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _:
     positions, velocities, forces, after, *rest = ctx.saved_tensors
     material, plan = rest[: len(MATERIAL_TABLE)], rest[len(MATERIAL_TABLE) :]
     _check_differentiable(wanted[4], material)
-    grads = _ops.step_vjp(
+    x, v, f, *values = _ops.step_vjp(
         grad_positions.contiguous(), grad_velocities.contiguous(), after, positions, velocities, forces, material, plan,
-        time_step=ctx.time_step,
+        time_step=ctx.time_step, wanted=list(wanted[4]),
     )  # fmt: skip
-    x, v, f, *values = grads
-    return x, v, f if wanted[2] else None, None, values, [None] * len(plan)
+    return x, v, f if wanted[2] else None, None, _in_places(wanted[4], values), [None] * len(plan)
+
+
+def _in_places(wanted: Sequence[bool], values: Sequence[Tensor]) -> list[Tensor | None]:
+    """For every array of the material its gradient, or None where nobody wants it."""
+    left = iter(values)
+    return [next(left) if asked else None for asked in wanted]
 
 
 def _step_vjp_backward(ctx: Any, *_: Any) -> None:
@@ -361,17 +380,19 @@ def _rollout_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor,
     x0, v0, given, positions, velocities, *rest = ctx.saved_tensors
     material, plan = rest[: len(MATERIAL_TABLE)], rest[len(MATERIAL_TABLE) :]
     _check_differentiable(ctx.needs_input_grad[3], material)
+    wanted = list(ctx.needs_input_grad[3])
     x, v, forces = torch.zeros_like(x0), torch.zeros_like(x0), torch.zeros_like(x0)
-    values = [torch.zeros_like(array) for array in material]
+    values = [torch.zeros_like(array) for array, asked in zip(material, wanted, strict=True) if asked]
     for step in reversed(range(len(positions))):
         before = (positions[step - 1], velocities[step - 1]) if step else (x0, v0)
         x, v = x + grad_positions[step], v + grad_velocities[step]
         x, v, f, *parts = _ops.step_vjp(
-            x, v, positions[step], *before, given, _at_step(material, step), plan, time_step=ctx.time_step
+            x, v, positions[step], *before, given, _at_step(material, step), plan,
+            time_step=ctx.time_step, wanted=wanted,
         )  # fmt: skip
         forces = forces + f
         values = [total + part for total, part in zip(values, parts, strict=True)]
-    return x, v, forces if ctx.needs_input_grad[2] else None, values, [None] * len(plan)
+    return x, v, forces if ctx.needs_input_grad[2] else None, _in_places(wanted, values), [None] * len(plan)
 
 
 _CONTACTS = ("planes", "spheres")

@@ -35,6 +35,41 @@ __device__ void add_across_block(double (&sum)[Count], WarpSums& warp_sums) {
   __syncthreads();
 }
 
+// The first direction of a vertex, 1 / D times the right side; adds to |b|^2 and b . b / D.
+template <class T>
+__device__ void begin_vertex(const DeviceConjugate<T>& call, std::int64_t at, T inverse,
+                             double (&sums)[2]) {
+  const Vec3<T> right = read3(call.residual + at);
+  write3(call.direction + at, inverse * right);
+  const double square = double(dot(right, right));
+  sums[0] += square;
+  sums[1] += double(inverse) * square;
+}
+
+// The product with a direction, kept for `move_vertex`; adds to the curvature along it.
+template <class T>
+__device__ void look_along(const ConjugateWork<T>& work, std::int64_t at, const Vec3<T>& elastic,
+                           const Vec3<T>& direction, T inertia, T inverse, double (&sum)[1]) {
+  const T* projector = work.call.projector;
+  const Vec3<T> image = conjugate_image(elastic, direction, inertia, inverse != T(0),
+                                        projector ? projector + 3 * at : nullptr);
+  write3(work.image + at, image);
+  sum[0] += double(dot(direction, image));
+}
+
+// Goes along a direction; adds to |r|^2 and r . r / D.
+template <class T>
+__device__ void move_vertex(const ConjugateWork<T>& work, std::int64_t at, T step,
+                            const Vec3<T>& direction, T inverse, double (&sums)[2]) {
+  const DeviceConjugate<T>& call = work.call;
+  write3(call.solution + at, multiply_add(step, direction, read3(call.solution + at)));
+  const Vec3<T> rest = subtract_product(read3(call.residual + at), step, read3(work.image + at));
+  write3(call.residual + at, rest);
+  const double square = double(dot(rest, rest));
+  sums[0] += square;
+  sums[1] += double(inverse) * square;
+}
+
 // Environments that have not begun get their first direction.
 template <class T>
 __global__ void __launch_bounds__(conjugate_threads)
@@ -47,14 +82,8 @@ __global__ void __launch_bounds__(conjugate_threads)
   const int vertices = call.plan.vertices;
   const T* inverse = call.inverse.of(environment);
   double sums[2] = {0, 0};
-  for (int i = threadIdx.x; i < vertices; i += conjugate_threads) {
-    const std::int64_t at = 3 * (environment * vertices + i);
-    const Vec3<T> right = read3(call.residual + at);
-    write3(call.direction + at, inverse[i] * right);
-    const double square = double(dot(right, right));
-    sums[0] += square;
-    sums[1] += double(inverse[i]) * square;
-  }
+  for (int i = threadIdx.x; i < vertices; i += conjugate_threads)
+    begin_vertex(call, 3 * (environment * vertices + i), inverse[i], sums);
   add_across_block(sums, warp_sums);
   numbers.begin(sums[0], sums[1]);
   if (threadIdx.x == 0) numbers.write(progress);
@@ -69,44 +98,30 @@ __global__ void __launch_bounds__(conjugate_threads)
   double* progress = call.progress + environment * progress_count;
   Conjugate numbers(progress);
   if (!numbers.active) return;
-  const int vertices = call.plan.vertices;
-  const std::int64_t first = environment * vertices;
   const T *inertia = call.inertia.of(environment), *inverse = call.inverse.of(environment);
-
+  // visit(vertex, where its vectors are)
+  const auto each_vertex = [&](const auto& visit) {
+    for (int i = threadIdx.x; i < call.plan.vertices; i += conjugate_threads)
+      visit(i, 3 * (environment * call.plan.vertices + i));
+  };
   double curvature[1] = {0};
-  for (int i = threadIdx.x; i < vertices; i += conjugate_threads) {
-    const std::int64_t at = 3 * (first + i);
-    const Vec3<T> direction = read3(call.direction + at);
-    const Vec3<T> image =
-        conjugate_image(read3(work.image + at), direction, inertia[i], inverse[i] != T(0),
-                        call.projector ? call.projector + 3 * at : nullptr);
-    write3(work.image + at, image);
-    curvature[0] += double(dot(direction, image));
-  }
+  each_vertex([&](int i, std::int64_t at) {
+    look_along(work, at, read3(work.image + at), read3(call.direction + at), inertia[i], inverse[i],
+               curvature);
+  });
   add_across_block(curvature, warp_sums);
-
   const T step = T(numbers.step(curvature[0]));
-  double sums[2] = {0, 0};  // |r|^2, r . r / D
   if (numbers.active) {
-    for (int i = threadIdx.x; i < vertices; i += conjugate_threads) {
-      const std::int64_t at = 3 * (first + i);
-      const Vec3<T> direction = read3(call.direction + at);
-      write3(call.solution + at, multiply_add(step, direction, read3(call.solution + at)));
-      const Vec3<T> rest =
-          subtract_product(read3(call.residual + at), step, read3(work.image + at));
-      write3(call.residual + at, rest);
-      const double square = double(dot(rest, rest));
-      sums[0] += square;
-      sums[1] += double(inverse[i]) * square;
-    }
+    double sums[2] = {0, 0};
+    each_vertex([&](int i, std::int64_t at) {
+      move_vertex(work, at, step, read3(call.direction + at), inverse[i], sums);
+    });
     add_across_block(sums, warp_sums);
     const T keep = T(numbers.keep(sums[0], sums[1], call.tolerance));
-    for (int i = threadIdx.x; i < vertices; i += conjugate_threads) {
-      const std::int64_t at = 3 * (first + i);
-      const Vec3<T> direction = read3(call.direction + at);
-      write3(call.direction + at,
-             multiply_add(keep, direction, inverse[i] * read3(call.residual + at)));
-    }
+    each_vertex([&](int i, std::int64_t at) {
+      write3(call.direction + at, multiply_add(keep, read3(call.direction + at),
+                                               inverse[i] * read3(call.residual + at)));
+    });
   }
   // all have read what there was
   if (threadIdx.x == 0) numbers.write(progress);
@@ -139,14 +154,8 @@ __global__ void __launch_bounds__(alone_threads<T>)
   };
 
   if (numbers.begins) {
-    double sums[2] = {0, 0};  // |b|^2, b . b / D
-    each_slot([&](int, int i, std::int64_t at) {
-      const Vec3<T> right = read3(call.residual + at);
-      write3(call.direction + at, inverse[i] * right);
-      const double square = double(dot(right, right));
-      sums[0] += square;
-      sums[1] += double(inverse[i]) * square;
-    });
+    double sums[2] = {0, 0};
+    each_slot([&](int, int i, std::int64_t at) { begin_vertex(call, at, inverse[i], sums); });
     add_across_block(sums, warp_sums);
     numbers.begin(sums[0], sums[1]);
   }
@@ -162,26 +171,15 @@ __global__ void __launch_bounds__(alone_threads<T>)
     __syncthreads();
     double curvature[1] = {0};
     each_slot([&](int s, int i, std::int64_t at) {
-      const Vec3<T> direction = direction_of(s);
-      const Vec3<T> image = conjugate_image(sum_entries(fields.entries, plan.slot_row[s]),
-                                            direction, inertia[i], inverse[i] != T(0),
-                                            call.projector ? call.projector + 3 * at : nullptr);
-      write3(work.image + at, image);
-      curvature[0] += double(dot(direction, image));
+      look_along(work, at, sum_entries(fields.entries, plan.slot_row[s]), direction_of(s),
+                 inertia[i], inverse[i], curvature);
     });
     add_across_block(curvature, warp_sums);
     const T step = T(numbers.step(curvature[0]));
     if (!numbers.active) break;
-    double sums[2] = {0, 0};  // |r|^2, r . r / D
+    double sums[2] = {0, 0};
     each_slot([&](int s, int i, std::int64_t at) {
-      write3(call.solution + at,
-             multiply_add(step, direction_of(s), read3(call.solution + at)));
-      const Vec3<T> rest =
-          subtract_product(read3(call.residual + at), step, read3(work.image + at));
-      write3(call.residual + at, rest);
-      const double square = double(dot(rest, rest));
-      sums[0] += square;
-      sums[1] += double(inverse[i]) * square;
+      move_vertex(work, at, step, direction_of(s), inverse[i], sums);
     });
     add_across_block(sums, warp_sums);
     const T keep = T(numbers.keep(sums[0], sums[1], call.tolerance));
@@ -224,11 +222,14 @@ void run_conjugate_alone(const ConjugateWork<T>& work, cudaStream_t stream) {
   weigh_field<false>(work.product, stream);
   const auto kernel = conjugate_alone<T>;
   const std::size_t bytes = pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, 2);
-  const bool shares = 2 * bytes + 2 * pass_static_bytes <= shared_memory_per_multiprocessor();
-  const int most = shares ? alone_threads<T> / 2 : alone_threads<T>;
+  // Half as many threads where two blocks then share a multiprocessor, which is for many environments. How many there are in
+  // this call does not enter, since the threads decide the order of sums.
+  const void* function = reinterpret_cast<const void*>(kernel);
+  const bool share = plan.environments != 1 && resident_blocks(function, alone_threads<T> / 2,
+                                                               bytes) >= 2 * multiprocessors();
+  const int most = share ? alone_threads<T> / 2 : alone_threads<T>;
   const int threads = std::min(int(whole_warps(plan.most_pairs)), most);
-  if (resident_blocks(reinterpret_cast<const void*>(kernel), threads, bytes) == 0)
-    refuse_shared_memory(bytes);
+  if (resident_blocks(function, threads, bytes) == 0) refuse_shared_memory(bytes);
   kernel<<<blocks_of(work.call.batch), threads, bytes, stream>>>(work);
   check(cudaGetLastError());
 }
