@@ -10,16 +10,24 @@
 
 namespace pd::inline PD_TARGET {
 
-// In this order: movers, bringers, elements. So many that each thread may have 96 registers, which elements want. Of the others
-// on an H100: 384, 512, 576 and 640 threads for elements with 64 to 320 for the rest took more time, with or without both
-// tetrahedra of a pair in a thread; movers and bringers as one task took more, and so did anything that spilled registers,
-// since hardly any cache is left for them. So did, for a million vertices, movers that also move the vertices that patches
-// share, as soon as their last patch is done (15 us more than with a kernel of their own); slots that are asked for a whole
-// turn before (3 us); rest positions behind origins, 24 bytes a slot in place of 32 (4 us); both tetrahedra in the frame of
-// their face, a seventh fewer instructions, but ten spilled registers (9 us); and forces on shared vertices that the L2 cache
-// is to let go of last (16 us; u and the iterate before: no difference). What binds now is memory: without any arithmetic an
-// iteration would take 12 % less. A register that is written under a condition is kept from before, all around a
-// loop: so where a thread has no slot, it reads what is the first one's.
+// In this order: movers, bringers, elements. So many that each thread may have 96 registers, which elements want. Of the
+// others on an H100: 384, 512, 576 and 640 threads for elements with 64 to 320 for the rest took more time, with or without
+// both tetrahedra of a pair in a thread; movers and bringers as one task took more, and so did anything that spilled
+// registers, since hardly any cache is left for them. So did, for a million vertices, movers that also move the vertices that
+// patches share, as soon as their last patch is done (15 us more than with a kernel of their own); slots that are asked for a
+// whole turn before (3 us); rest positions behind origins, 24 bytes a slot in place of 32 (4 us); both tetrahedra in the frame
+// of their face, a seventh fewer instructions, but ten spilled registers (9 us); and forces on shared vertices that the L2
+// cache is to let go of last (16 us; u and the iterate before: no difference).
+//
+// Without any arithmetic an iteration would take 12 % less; schedulers issue in 71 % of their cycles, and DRAM is busy for 46
+// % (by a profiler, at 1.6 GHz): they wait for each other. So fewer instructions and bytes of elements alone do not help:
+// determinants worked out from corners in the frame of their face, 537 instructions and 20 bytes a pair in place of 624 and
+// 28, took as long (130 to 133 us of 128). Nor did slots that one thread has copied in bulk (130), or all by copies of 16
+// bytes (138), or then 512 threads of 80 registers for elements (130). Corners copied to shared memory, and all sums left to
+// movers, saved 2 us.
+//
+// A register that is written under a condition is kept from before, all around a loop: so where a thread has no slot, it reads
+// what is the first one's.
 constexpr int mover_threads = 128, bringer_threads = 128, element_threads = 384;
 constexpr int pipeline_slots = 1024;  // of a patch, at most: see SharedSlots
 constexpr int pipeline_threads = mover_threads + bringer_threads + element_threads;
