@@ -214,7 +214,7 @@ def test_rollout_is_differentiable() -> None:
 
 
 class Calls(TorchDispatchMode):
-    """Names of the ops that are called."""
+    """Ops that the adjoint of a step calls: from outside of its own op nobody sees them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -223,6 +223,14 @@ class Calls(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         self.names.append(func.name())
         return func(*args, **(kwargs or {}))
+
+    def gradients(self, loss: torch.Tensor, inputs: list[torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        def watched(*args: Any) -> list[torch.Tensor]:
+            with self:
+                return step_adjoint(*args)
+
+        with mock.patch.object(ops, "step_adjoint", watched):
+            return torch.autograd.grad(loss, inputs)
 
 
 @pytest.mark.parametrize("steps", [1, 3])
@@ -234,15 +242,8 @@ def test_what_nobody_wants_costs_nothing(steps: int) -> None:
     start = pd.State(*(t.clone().requires_grad_() for t in state))
 
     def gradients(*wanted: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], list[str]]:
-        loss, calls = sim.rollout(start, steps).positions.square().sum(), Calls()
-
-        def watched(*args: Any) -> list[torch.Tensor]:
-            with calls:
-                return step_adjoint(*args)
-
-        # from outside of an op nobody sees those that it calls
-        with mock.patch.object(ops, "step_adjoint", watched):
-            return torch.autograd.grad(loss, wanted), calls.names
+        calls = Calls()
+        return calls.gradients(sim.rollout(start, steps).positions.square().sum(), list(wanted)), calls.names
 
     everything, most = gradients(*start, *arrays)
     for array in arrays:
@@ -257,6 +258,14 @@ def test_what_nobody_wants_costs_nothing(steps: int) -> None:
     found, calls = gradients(*start)
     assert all(torch.equal(one, other) for one, other in zip(found, everything, strict=False))
     assert len(calls) < 0.65 * len(most)
+
+
+def test_what_held_vertices_pass_on_is_worked_out_once() -> None:
+    """Both the start of those that friction holds and the targets of pins want it."""
+    sim, state = body(pd.Ground(-1.0, friction=0.5))
+    start, targets, calls = state.positions.requires_grad_(), sim.pin_targets.requires_grad_(), Calls()
+    calls.gradients(sim(pd.State(start, state.velocities)).positions.square().sum(), [start, targets])
+    assert calls.names.count("torchpd::hessian_product") == 1
 
 
 @pytest.mark.parametrize("wanted", [None, [True] * 3])

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -277,6 +278,7 @@ def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
     right = system.allowed(right)
     multiplier, error = system.solve(call.after, right, tolerance)
     # a loss or a state that is no number has a gradient that is none, as those who watch for it expect
+    # one of them is enough: 0 times what is no finite number is no number, and so is its sum
     lost = ((right + call.after) * 0.0).sum((1, 2)).isnan()
     multiplier = torch.where(lost[:, None, None], torch.nan, multiplier)
     failed = ~(error <= 1e3 * tolerance) & ~lost
@@ -313,6 +315,7 @@ def step_adjoint(
     right = grad_after + grad_velocities / h
     multiplier, held = _solve(call, right)
 
+    @cache
     def passed_on() -> Tensor:
         """What vertices that are held pass on: to the targets of pins, to the start of those that friction holds."""
         return right - _elastic_product(call, multiplier, call.after)
