@@ -193,8 +193,8 @@ constexpr int part_slot_array = int(DevicePlanArray::part_slot);
 // Lengths of the arrays, by the names in device.def.
 struct DevicePlanRows {
   std::int64_t size, vertex, pin, pinned_vertex, block, patch_end, patch, slot, shared_end,
-      shared_slot, piece_slot, part_patch_end, part_end, part_slot, piece_end, part, stored_block,
-      rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex;
+      shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, piece_end, part,
+      stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex;
 };
 
 template <class T>
@@ -233,6 +233,7 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.slot = plan.slots;
   count.shared_end = plan.shared + 1;
   count.shared_slot = cluster ? 0 : plan.slots - (plan.vertices - plan.shared);
+  count.stream_slot = plan.kernel == 3 ? count.shared_slot : 0;
   count.copied_vertex = cluster ? plan.vertices : 0;
   count.piece_slot = pieces ? plan.slots : 0;
   count.part_patch_end = pieces ? plan.patches + 1 : 0;

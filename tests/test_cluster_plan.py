@@ -90,7 +90,7 @@ def test_every_vertex_has_one_owner(case: tuple[str, int], plan: Arrays, values:
     assert len(plan.patch_vertex) == case[1] + 1
     assert (np.diff(plan.patch_vertex) > 0).all()
     assert plan.shared_start.tolist() == [0]
-    assert len(plan.shared_slot) == len(plan.slot_sender) == 0
+    assert len(plan.shared_slot) == len(plan.shared_place) == len(plan.slot_sender) == 0
 
 
 def test_a_patch_has_the_tetrahedra_of_its_vertices(lanes: Lanes, cut: Cut, plan: Arrays, values: SceneValues) -> None:

@@ -152,6 +152,29 @@ def test_blocks_that_go_from_patch_to_patch(
         assert_same_bits([t[item : item + 1] for t in together], alone)
 
 
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.parametrize("tolerance", [0.0, 0.9])
+@pytest.mark.parametrize("stops", [32, 33, 65, 90])
+def test_blocks_with_more_patches_than_they_know_of_at_a_time(
+    stops: int, tolerance: float, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They look for 32 more again and again, past environments that are done. Bits are those of small batches."""
+    dtype = DTYPES[precision]
+    monkeypatch.setitem(regimes._STREAM_TETS, dtype, 300)
+    sim = on_gpu(bar((8, 5, 5), pd.Gravity()), dtype, "stream", iterations=20, tolerance=tolerance)
+    assert sim.plan.patches == 4
+    blocks = properties_of(GPU).multiprocessors
+    few, batch = 11 * blocks // 4, -(-stops * blocks // 4)
+    state, forces = unlike(sim, batch)
+    state = pd.State(state.positions, state.velocities * torch.linspace(0.1, 1.0, batch, device=GPU)[:, None, None])
+    together = run(sim, state, forces)
+    if tolerance:
+        assert len(together[4].unique()) > 1
+    for first in range(0, batch, few):
+        part = slice(first, first + few)
+        assert_same_bits([t[part] for t in together], run(sim, state, forces, part))
+
+
 def assert_as_near(found: list[Tensor], other: list[Tensor], exact: list[Tensor]) -> None:
     """To a float64 step as another kernel is, which has its tetrahedra in other frames; the same iterates, not bits."""
     # who stops elsewhere is elsewhere

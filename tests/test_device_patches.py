@@ -10,8 +10,10 @@ from device_plans import (  # noqa: F401  (fixtures)
     SENDERS,
     SIZES,
     SLOT_STEP,
+    STREAM,
     Arrays,
     Lanes,
+    arrays_of,
     fixture_case,
     fixture_lanes,
     fixture_plan,
@@ -49,11 +51,14 @@ def test_the_first_patch_owns_a_vertex(plan: Arrays) -> None:
 
 
 def test_vertices_of_the_same_patches_are_neighbours(plan: Arrays) -> None:
-    """A patch reads what another sends in runs then. Slots of a small one follow; those of a large one save padding."""
+    """A patch reads what another sends in runs then. They follow the last patch of each, by which all forces are there.
+
+    Slots of a small patch follow; those of a large one save padding.
+    """
     first_shared = plan.patch_vertex[-1]
     patch = np.repeat(np.arange(len(plan.patch_slot) - 1), np.diff(plan.patch_slot))
     owners = [patch[plan.slot_vertex == v].tolist() for v in range(first_shared, len(plan.vertex_order))]
-    assert owners == sorted(owners)
+    assert owners == sorted(owners, key=lambda patches: patches[::-1])
     for p, (a, b) in enumerate(zip(plan.patch_slot[:-1], plan.patch_slot[1:], strict=True)):
         mine, forces = plan.slot_vertex[a:b], plan.slot_row[a:b] >> 16 & 0x7FFF
         shared = mine >= first_shared
@@ -84,6 +89,12 @@ def test_shared_slots_of_small_and_of_large_patches(patches: int, small: bool) -
     assert (plan.patch_outer < plan.patch_pairs).any() != small
     test_outer_pairs_come_first(plan)
     test_vertices_of_the_same_patches_are_neighbours(plan)
+
+
+def test_forces_on_a_shared_vertex_lie_side_by_side(case: tuple[str, int]) -> None:
+    """Where those of a stream go, slot by slot: the order of shared_slot."""
+    plan = arrays_of(case, STREAM)
+    np.testing.assert_array_equal(plan.shared_slot[plan.shared_place], shared_slots(plan))
 
 
 def sender_rows(plan: Arrays, number: int) -> list[int]:

@@ -53,16 +53,17 @@ def test_every_tetrahedron_is_in_one_lane(lanes: Lanes, values: SceneValues) -> 
     )
 
 
-def test_kernels_differ_in_rest_shapes_and_senders_alone(case: tuple[str, int]) -> None:
+def test_kernels_differ_in_rest_shapes_and_in_how_patches_exchange_alone(case: tuple[str, int]) -> None:
     """So that what is shown of the plan for one of them holds for all but a cluster: see test_cluster_plan.py."""
     plans = {kernel: arrays_of(case, kernel) for kernel in KERNELS if kernel != CLUSTER}
-    own = {"sizes", "pair_rest", "pair_factor", "slot_rest", "slot_fixed", "patch_unit", "slot_sender"}
+    own = {"sizes", "pair_rest", "pair_factor", "slot_rest", "slot_fixed", "patch_unit", "slot_sender", "shared_place"}
     for plan in plans.values():
         assert len(plan.slot_copy) == 0
         for row in DEVICE_PLAN_TABLE:
             if row.name not in own:
                 np.testing.assert_array_equal(getattr(plan, row.name), getattr(plans[GRID], row.name), row.name)
     assert len(plans[BLOCK].slot_sender) == len(plans[STREAM].slot_sender) == 0
+    assert len(plans[BLOCK].shared_place) == len(plans[GRID].shared_place) == 0
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

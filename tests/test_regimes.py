@@ -281,6 +281,23 @@ def test_registers_of_clusters_are_those_of_the_table(source: str, dtype: torch.
     assert -(-max(used) // 8) * 8 == kernel_costs._CLUSTER_REGISTERS[dtype]
 
 
+@pytest.mark.parametrize("architecture", ["90", "100"])
+def test_shared_vertices_have_room_beside_the_pipeline(architecture: str) -> None:
+    """Of the registers of a multiprocessor: else their kernel would come after it, and nothing but time would tell."""
+    tool = runpy.run_path(str(Path(__file__).parent.parent / "tools" / "cuda_check.py"))
+    _, rows = tool["read_table"](Path(__file__).parent.parent / "benchmarks" / "results" / "cuda-registers.csv")
+    used = {
+        row["kernel"]: -(-int(row["registers"]) // 8) * 8
+        for row in rows
+        if row["source"] == "cuda-stream_float.cu" and row["architecture"] == architecture
+    }
+    pipelines = [registers for kernel, registers in used.items() if "stream_pipeline" in kernel]
+    beside = [registers for kernel, registers in used.items() if "stream_shared" in kernel and "float, false" in kernel]
+    assert len(pipelines) == 2
+    assert len(beside) == 4
+    assert 640 * max(pipelines) + 128 * max(beside) <= 65536
+
+
 def test_a_simulator_passes_its_batch_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """When it moves, and when either the batch or the solver changes on a GPU."""
     asked = []

@@ -277,9 +277,9 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
                 step_all_ways(sim, 3)
                 count += 1
                 if kernel == "stream" and dtype == torch.float32 and not contacts:
-                    # so many patches that blocks go from one to another
+                    # so many patches that blocks go from one to another, and know of the next by turns
                     many = pd.Simulator(built, 1 / 60, 5, solver=solver, tolerance=tolerance, **options).to("cuda")
-                    many(many.rest_state(7 * properties_of(sim.device).multiprocessors // sim.plan.patches))
+                    many(many.rest_state(70 * properties_of(sim.device).multiprocessors // sim.plan.patches))
                     count += 1
         fields(sim, 3)
     if kernel == "block":

@@ -46,17 +46,21 @@ class Signal {
   SharedAddress at_;
 };
 
-// In a kernel that Launcher::run_early launched: until the kernel before has ended and what it wrote is there. What kernels of
-// the same step write or read comes after it, but for prefetches into L2, which sees all writes. A plan may come before, and
-// weights, of pairs and of patches, as long as kernels that nobody starts early stand between those that write them and the
-// first that is. All blocks wait, so that whoever waits for them waits for all before them.
+// Kernels that Launcher::run_early launches start before the one before them has ended. Two things hold of each of them:
+// some block ends only after it has waited (await_kernel_before), so that the end of a kernel is the end of all before it; and
+// some block lets the next one start only after it has waited, so that a kernel starts when all but the one before it have
+// ended. So what a kernel reads without waiting has to be of kernels before the one before it, by the L2 cache, which sees all
+// writes; or letters of the one before it; or a plan or weights, of pairs and of patches, as long as kernels that nobody starts
+// early stand between those that write them and the first that is. All but stream_shared wait for everything else.
+
+// Until the kernel before has ended and what it wrote is there.
 PD_DEVICE void await_kernel_before() {
 #if PD_HAS_CLUSTERS
   asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
 }
 
-// One thread of every block, once it has waited: the next kernel may start wherever there is room.
+// One thread of every block, see above: the next kernel may start wherever there is room.
 PD_DEVICE void let_next_kernel_start() {
 #if PD_HAS_CLUSTERS
   asm volatile("griddepcontrol.launch_dependents;" ::: "memory");

@@ -40,6 +40,13 @@ struct Patch {
   PD_DEVICE bool owns(int slot) const { return row(slot) >= 0; }
 };
 
+// Of kernel stream: where the force on a slot goes that is not inside the patch. `end_vertex`: that of its interior vertices, of
+// which earlier patches and it have as many slots.
+template <class T>
+PD_DEVICE int place_of_force(const DevicePlan<T>& plan, int first_slot, int end_vertex, int slot) {
+  return plan.shared_place[first_slot - end_vertex + slot];
+}
+
 // Two tetrahedra that share the face of corners 0, 1 and 2.
 template <class T, int Fields>
 struct Pair {
@@ -365,11 +372,11 @@ PD_DEVICE Vec3<T> sum_entries(const Quad<T>* entries, int row) {
   return sum;
 }
 
-// The same where somebody waits for it: eight entries are asked for at once. `Entries`: a pointer, or like one.
-template <class T, class Entries>
-PD_DEVICE Vec3<T> sum_entries_soon(const Entries& entries, int row) {
+// The same where somebody waits for it: eight entries are asked for at once.
+template <class T>
+PD_DEVICE Vec3<T> sum_entries_soon(const Quad<T>* entries, int row) {
   constexpr int together = 8;
-  Entries entry = entries + (unsigned(row) & 0xffff);
+  const Quad<T>* entry = entries + (unsigned(row) & 0xffff);
   const int count = row >> 16 & 0x7fff;
   Vec3<T> sum = {T(0), T(0), T(0)};
 #pragma unroll 1
@@ -383,6 +390,31 @@ PD_DEVICE Vec3<T> sum_entries_soon(const Entries& entries, int row) {
 #pragma unroll
     for (int i = 0; i < together; ++i) sum = sum + force[i];
   }
+  return sum;
+}
+
+// The same by few instructions, where a multiprocessor has no room for more. `Entries`: like a pointer.
+template <class T, class Entries>
+PD_DEVICE Vec3<T> sum_entries_briefly(const Entries& entries, int row) {
+  constexpr int together = 4;
+  Entries entry = entries + (unsigned(row) & 0xffff);
+  int left = row >> 16 & 0x7fff;
+  Vec3<T> sum = {T(0), T(0), T(0)};
+#pragma unroll 1
+  for (; left >= together; left -= together, entry += together * entry_stride) {
+    Vec3<T> force[together];
+#pragma unroll
+    for (int i = 0; i < together; ++i) force[i] = vec3(entry[entry_stride * i]);
+#pragma unroll
+    for (int i = 0; i < together; ++i) sum = sum + force[i];
+  }
+  Vec3<T> force[together - 1];
+#pragma unroll
+  for (int i = 0; i < together - 1; ++i)
+    if (i < left) force[i] = vec3(entry[entry_stride * i]);
+#pragma unroll
+  for (int i = 0; i < together - 1; ++i)
+    if (i < left) sum = sum + force[i];
   return sum;
 }
 

@@ -10,21 +10,28 @@
 
 namespace pd::inline PD_TARGET {
 
-// In this order: movers, bringers, elements. So many that each thread may have 96 registers, which elements want. Of the
-// others on an H100: 384, 512, 576 and 640 threads for elements with 64 to 320 for the rest took more time, with or without
-// both tetrahedra of a pair in a thread; movers and bringers as one task took more, and so did anything that spilled
-// registers, since hardly any cache is left for them. So did, for a million vertices, movers that also move the vertices that
-// patches share, as soon as their last patch is done (15 us more than with a kernel of their own); slots that are asked for a
-// whole turn before (3 us); rest positions behind origins, 24 bytes a slot in place of 32 (4 us); both tetrahedra in the frame
-// of their face, a seventh fewer instructions, but ten spilled registers (9 us); and forces on shared vertices that the L2
-// cache is to let go of last (16 us; u and the iterate before: no difference).
+// In this order: movers, bringers, elements (producer and consumer warps). So many that each thread may have 96 registers, which
+// elements want, and that a block of stream_shared has room beside: 640 x 96 + 128 x 32 registers are all 65,536. Of the others
+// on an H100: 384, 512, 576 and 640 threads
+// for elements with 64 to 320 for the rest took more time, with or without both tetrahedra of a pair in a thread; movers and
+// bringers as one task took more, and so did anything that spilled registers, since hardly any cache is left for them. So did,
+// for a million vertices, movers that also move the vertices that patches share, as soon as their last patch is done (15 us
+// more than with a kernel of their own after this one; beside it that takes 3 us less), and bringers that work out what these
+// are to be from the forces of the pass before (60 us); rest positions behind origins, 24 bytes a slot in place of 32 (4 us);
+// both tetrahedra in the frame of their face, a seventh fewer instructions, but ten spilled registers (9 us); and forces on
+// shared vertices that the L2 cache is to let go of last (16 us; u and the iterate before: no difference).
+//
+// Movers and bringers take about as long for a patch as elements do, so anything more that they do costs: slots that are asked
+// for a whole turn before (8 us), patches by tickets (6 us, though blocks end up to 9 us apart), other rows for movers and
+// bringers to add up (one more for movers 9 us, one fewer 4 us). What they no longer do is gained: a warp tells 32 stops at once
+// (2.5 us), and entries are added up by fewer instructions (1.5 us), though movers and bringers spill some registers for it: the
+// same without spills, but entry by entry where less than four are left, takes 1 us more. Patches of more or fewer tetrahedra
+// took 4 to 17 us more.
 //
 // Without any arithmetic an iteration would take 12 % less; schedulers issue in 71 % of their cycles, and DRAM is busy for 46
-// % (by a profiler, at 1.6 GHz): they wait for each other. So fewer instructions and bytes of elements alone do not help:
-// determinants worked out from corners in the frame of their face, 537 instructions and 20 bytes a pair in place of 624 and
-// 28, took as long (130 to 133 us of 128). Nor did slots that one thread has copied in bulk (130), or all by copies of 16
-// bytes (138), or then 512 threads of 80 registers for elements (130). Corners copied to shared memory, and all sums left to
-// movers, saved 2 us.
+// % (by a profiler, at 1.6 GHz). Fewer instructions and bytes of elements alone do not help: determinants worked out from
+// corners in the frame of their face, 537 instructions and 20 bytes a pair in place of 624 and 28, took as long. Nor did slots
+// that one thread has copied in bulk, or all by copies of 16 bytes, or then 512 threads of 80 registers for elements.
 //
 // A register that is written under a condition is kept from before, all around a loop: so where a thread has no slot, it reads
 // what is the first one's.
@@ -40,8 +47,8 @@ class Pipeline {
       "shared memory holds two patches in float32 alone, and SharedSlots knows no other numbers");
 
  public:
-  PD_DEVICE Pipeline(const StreamCall<T>& call, int k, std::byte* shared)
-      : call_(call), k_(k), shared_(shared) {}
+  PD_DEVICE Pipeline(const StreamCall<T>& call, int k, unsigned round, std::byte* shared)
+      : call_(call), k_(k), round_(round), shared_(shared) {}
 
   // All threads of the block, each its own task.
   PD_DEVICE void run() const {
@@ -49,10 +56,8 @@ class Pipeline {
     if (threadIdx.x == 0) open_signals();
     if (brings) {
       if (call_.step.settings.tolerance > 0) await_kernel_before();
-      const Found first = look_for(item_of(int(blockIdx.x)));
-      const Found second = look_for(after({first.environment, first.patch}), first.there);
-      tell(0, first);
-      tell(1, second);
+      if (bringer() == 0) ahead() = {int(blockIdx.x), 0};
+      if (bringer() < warp_size) tell_stops(0);
     }
     __syncthreads();
     if (told(0).blocks == 0) return await_kernel_before();
@@ -106,10 +111,6 @@ class Pipeline {
 
   // ---- stops of the block
 
-  struct Item {
-    int environment, patch;
-  };
-
   // Where a patch lies in the arrays.
   struct Stop {
     int environment, patch, first_vertex, interior, first_slot, slots, first_block;
@@ -119,73 +120,75 @@ class Pipeline {
     unsigned weights;  // blocks of them before those of its environment
   };
 
-  // What the plan says of an item, still on its way: whoever looks at it waits.
-  struct Found {
-    bool there;
-    int environment, patch, vertex[2], slot[2], block[2];
-    T patch_weight;
-  };
-
-  // of this item, or the next one whose environment goes on
-  PD_DEVICE Found look_for(Item item, bool there = true) const {
-    while (there && item.environment < call_.step.batch && skips<What>(work(item.environment)))
-      item = after(item);
-    Found f;
-    f.there = there && item.environment < call_.step.batch;
-    f.environment = f.there ? item.environment : 0;
-    f.patch = f.there ? item.patch : 0;
-    for (int i = 0; i < 2; ++i) {
-      f.vertex[i] = plan().patch_vertex[f.patch + i];
-      f.slot[i] = plan().patch_slot[f.patch + i];
-      f.block[i] = plan().patch_block[f.patch + i];
-    }
-    f.patch_weight = work(f.environment).patch_weight[f.patch];
-    return f;
-  }
-  PD_DEVICE Found look_for(const Stop& before) const {
-    return look_for(after({before.environment, before.patch}), before.blocks > 0);
-  }
-  PD_DEVICE Item after(Item item) const {
-    item.patch += int(gridDim.x);
-    // a division takes longer, but where there are far more blocks than patches
-    if (item.patch >= 4 * plan().patches)
-      return item_of(item.environment * plan().patches + item.patch);
-    for (; item.patch >= plan().patches; item.patch -= plan().patches) ++item.environment;
-    return item;
-  }
-  PD_DEVICE Item item_of(int number) const {
-    const int environment = number / plan().patches;
-    return {environment, number - environment * plan().patches};
-  }
   PD_DEVICE Work work(int environment) const { return Work(call_, environment); }
 
-  // Stop `n` of the block, told before the slots of the second before it are ready. Whoever wants to know reads it there, since
-  // registers for it would be too many; movers may be six behind the one that is told, so at least seven are kept.
+  // Stop `n` of the block. Whoever wants to know reads it there, since registers for it would be too many. A warp tells as many
+  // at once as it has lanes, in turn n of bringers those from n + 16 on, in place of n - 48 to n - 17: nobody is so far behind,
+  // since movers are past n - 4 and elements past n - 2 by then.
+  static constexpr unsigned told_at_once = warp_size;
   PD_DEVICE Stop& told(unsigned n) const {
-    constexpr unsigned kept = 8;
-    __shared__ Stop stops[kept];
-    return stops[n % kept];
+    __shared__ Stop stops[2 * told_at_once];
+    return stops[n % (2 * told_at_once)];
   }
-  PD_DEVICE void tell(unsigned n, const Found& found) const {
-    if (bringer() != 0) return;
-    Stop s{};
-    if (found.there) {
-      s.environment = found.environment;
-      s.patch = found.patch;
-      s.first_vertex = found.vertex[0];
-      s.interior = found.vertex[1] - found.vertex[0];
-      s.first_slot = found.slot[0];
-      s.slots = found.slot[1] - found.slot[0];
-      s.first_block = found.block[0];
-      s.blocks = found.block[1] - found.block[0];
+  // what comes after the stops that are told
+  struct Ahead {
+    int item, first_warp;
+  };
+  PD_DEVICE Ahead& ahead() const {
+    __shared__ Ahead stops;
+    return stops;
+  }
+
+  // Stops from `first` on, by a warp: items of environments that go on.
+  PD_DEVICE void tell_stops(unsigned first) const {
+    __syncwarp();
+    Ahead next = ahead();
+    const int lane = bringer(), patches = plan().patches, stride = int(gridDim.x);
+    const bool own = call_.step.material.stiffness.stride != 0;
+    int found = 0;
+    while (found < int(told_at_once)) {
+      const int item = next.item + lane * stride;
+      const int environment = item / patches, patch = item - environment * patches;
+      const bool there = environment < call_.step.batch;
+      const unsigned goes_on =
+          __ballot_sync(whole_warp, there && !skips<What>(work(there ? environment : 0)));
+      const int rank = found + __popc(goes_on & ((1u << lane) - 1));
+      const bool mine = (goes_on >> lane & 1) && rank < int(told_at_once);
+      Stop s{};
+      if (mine) {
+        s.environment = environment;
+        s.patch = patch;
+        s.first_vertex = plan().patch_vertex[patch];
+        s.interior = plan().patch_vertex[patch + 1] - s.first_vertex;
+        s.first_slot = plan().patch_slot[patch];
+        s.slots = plan().patch_slot[patch + 1] - s.first_slot;
+        s.first_block = plan().patch_block[patch];
+        s.blocks = plan().patch_block[patch + 1] - s.first_block;
+        s.weights = own ? unsigned(environment) * unsigned(plan().blocks) : 0;
+        s.patch_weight = work(environment).patch_weight[patch];
+      }
       // the guard's energies are summed alike in any batch
-      if (What == Visit::update && n > 0)
-        s.first_warp = (told(n - 1).first_warp + told(n - 1).blocks) % element_warps;
-      const bool own = call_.step.material.stiffness.stride != 0;
-      s.weights = own ? unsigned(found.environment) * unsigned(plan().blocks) : 0;
-      s.patch_weight = found.patch_weight;
+      if (What == Visit::update) {
+        int until = s.blocks;
+#pragma unroll
+        for (int distance = 1; distance < warp_size; distance *= 2) {
+          const int before = __shfl_up_sync(whole_warp, until, distance);
+          if (lane >= distance) until += before;
+        }
+        s.first_warp = (next.first_warp + until - s.blocks) % element_warps;
+        next.first_warp =
+            (next.first_warp + __shfl_sync(whole_warp, until, warp_size - 1)) % element_warps;
+      }
+      if (mine) told(first + unsigned(rank)) = s;
+      found += __popc(goes_on);
+      if (!__any_sync(whole_warp, there)) {
+        if (found + lane < int(told_at_once)) told(first + unsigned(found + lane)) = Stop{};
+        break;
+      }
+      next.item =
+          __reduce_max_sync(whole_warp, mine || found < int(told_at_once) ? item : 0) + stride;
     }
-    told(n) = s;
+    if (lane == 0) ahead() = next;
   }
 
   PD_DEVICE std::byte* half(unsigned n) const {
@@ -229,33 +232,48 @@ class Pipeline {
     await_kernel_before();
 #pragma unroll 1
     for (unsigned n = 0; n < 2 || told(n - 2).blocks > 0; ++n) {
-      const Found later = look_for(told(n + 1));
       Held held;
       ask(told(n), vertex, held);
       find(told(n + 1), vertex);
-      if (n >= 2) await(forces_ready, n - 2);
+      Left left{};
+      if (n >= 2) {
+        left = left_at(told(n - 2), first_left(told(n - 2)));
+        await(forces_ready, n - 2);
+      }
       put(told(n), held, n);
-      if (n >= 2) sum_shared(n - 2);
-      tell(n + 2, later);
+      if (n >= 2) sum_shared(n - 2, left);
       give(slots_ready, n);
-      meet_bringers();
+      if (n % told_at_once == told_at_once / 2 && bringer() < warp_size)
+        tell_stops(n + told_at_once / 2);
     }
-  }
-  PD_DEVICE static void meet_bringers() {
-    __syncwarp();
-    asm volatile("bar.sync 2, %0;" ::"n"(bringer_threads) : "memory");
   }
 
   // The forces that movers leave to bringers, who have the time.
-  PD_DEVICE void sum_shared(unsigned n) const {
+  struct Left {
+    int row, place;
+  };
+  PD_DEVICE static int first_left(const Stop& at) {
+    return max(left_slots, at.interior) + bringer();
+  }
+  PD_DEVICE Left left_at(const Stop& at, int s) const {
+    if (s >= at.slots) return {0, 0};
+    return {plan().slot_row[at.first_slot + s], place_of_force(at, s)};
+  }
+  PD_DEVICE void sum_shared(unsigned n, Left left) const {
     const Stop& at = told(n);
     const Work w = work(at.environment);
     const Entries entries = entries_of(n);
-    const int first_slot = at.first_slot, slots = at.slots;
+    const int slots = at.slots;
 #pragma unroll 1
-    for (int s = max(left_slots, at.interior) + bringer(); s < slots; s += bringer_threads)
-      w.shared_force[first_slot + s] =
-          quad(sum_entries_soon<T>(entries, w.plan.slot_row[first_slot + s]));
+    for (int s = first_left(at); s < slots;) {
+      w.leave_force(left.place, sum_entries_briefly<T>(entries, left.row), round_);
+      s += bringer_threads;
+      left = left_at(at, s);
+    }
+  }
+
+  PD_DEVICE int place_of_force(const Stop& at, int s) const {
+    return pd::place_of_force(plan(), at.first_slot, at.first_vertex + at.interior, s);
   }
 
   // What is on its way to the slots.
@@ -482,6 +500,7 @@ class Pipeline {
     for (unsigned n = 0; n < 2; ++n) give(slots_ready, n);
     bring_patch_near(0);
     await_kernel_before();
+    // not before, see handoff.h
     if (mover() == 0) let_next_kernel_start();
 #pragma unroll 1
     for (unsigned n = 0; told(n).blocks > 0; ++n) move_patch(n);
@@ -502,7 +521,7 @@ class Pipeline {
       if (s < interior) {
         visit<What>(w, first_vertex + s, seen_there(), force, k_, sums);
       } else if (s < slots) {
-        w.shared_force[first_slot + s] = quad(force);
+        w.leave_force(place_of_force(at, s), force, round_);
       }
     };
     int row[moved];
@@ -519,13 +538,13 @@ class Pipeline {
       sums.value[0] += energies_of(n)[mover()];
     // first what frees the half
 #pragma unroll
-    for (int r = 0; r < moved; ++r) force[r] = sum_entries_soon<T>(entries, row[r]);
+    for (int r = 0; r < moved; ++r) force[r] = sum_entries_briefly<T>(entries, row[r]);
     const auto visit_late = [&](int s, const Vec3<T>& summed) {
       visit_slot(s, summed, [&] { return see_slot(s); });
     };
 #pragma unroll 1
     for (int s = slot(moved); s < interior; s += mover_threads)
-      visit_late(s, sum_entries_soon<T>(entries, w.plan.slot_row[first_slot + s]));
+      visit_late(s, sum_entries_briefly<T>(entries, w.plan.slot_row[first_slot + s]));
     give(slots_ready, n);
 #pragma unroll
     for (int r = 0; r < soon; ++r) visit_slot(slot(r), force[r], [&] { return seen[r]; });
@@ -566,15 +585,16 @@ class Pipeline {
 
   const StreamCall<T>& call_;
   int k_;
+  unsigned round_;
   std::byte* shared_;
 };
 
 // Visit::update and Visit::update_guarded of stream_patches, without contacts.
 template <Visit What, class T>
 __global__ void __launch_bounds__(pipeline_threads, 1)
-    stream_pipeline(const __grid_constant__ StreamCall<T> call, int k) {
+    stream_pipeline(const __grid_constant__ StreamCall<T> call, int k, unsigned round) {
   extern __shared__ __align__(16) std::byte shared[];
-  Pipeline<T, What>(call, k, shared).run();
+  Pipeline<T, What>(call, k, round, shared).run();
 }
 
 }  // namespace pd::inline PD_TARGET

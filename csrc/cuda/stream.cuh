@@ -23,7 +23,8 @@ StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
   StreamMemory<T> m;
   for (Quad<T>** array : {&m.x, &m.velocity, &m.target, &m.u, &m.before})
     arena.place(*array, step.batch * plan.vertices);
-  for (Quad<T>** array : {&m.origin, &m.shared_force}) arena.place(*array, step.batch * plan.slots);
+  arena.place(m.origin, step.batch * plan.slots);
+  arena.place(m.shared_force, step.batch * call.places());
   arena.place(m.weights,
               (material.stiffness.stride ? step.batch : 1) * plan.blocks * 2 * pair_lanes);
   arena.place(m.patch_weight, (material.stiffness.stride ? step.batch : 1) * plan.patches);
@@ -173,17 +174,22 @@ class StreamRunner {
 
   template <Visit What>
   void pass(int k) {
-    if (!pipe<What>(k))
+    // Letters of a pipeline's pass have a number of their own, which none has from before: the first pass of a call, weigh,
+    // leaves 0 at every place. With a tolerance it is 0 too, and stream_shared waits for the whole pass, since environments that
+    // are done send nothing.
+    const unsigned round = set_.tolerance > 0 ? 0 : ++round_;
+    const bool piped = pipe<What>(k, round);
+    if (!piped)
       launcher_.run(stream_patches<What, T, Touching>, patches_, pass_threads, pass_shared_, call_,
                     k);
     launcher_.run_early(stream_shared<What, T, Touching>, call_.step.batch * call_.shared_blocks(),
-                        vertex_threads, 0, call_, k);
+                        shared_threads, 0, call_, k, piped ? round : 0u);
   }
 
   // The patches of an iteration as a pipeline, where a multiprocessor has room for two at once. How many patches there are
   // does not enter, since sums come in another order: an environment has the same bits in any batch.
   template <Visit What>
-  bool pipe(int k) {
+  bool pipe(int k, unsigned round) {
     constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
     if constexpr (updates && !Touching && sizeof(T) == 4) {
       const auto kernel = stream_pipeline<What, T>;
@@ -192,7 +198,8 @@ class StreamRunner {
           2 * pipeline_half_bytes(sizeof(T), plan_.most_slots, plan_.most_entries);
       const std::int64_t blocks =
           resident_blocks(reinterpret_cast<const void*>(kernel), pipeline_threads, shared);
-      launcher_.run_early(kernel, std::min(blocks, patches_), pipeline_threads, shared, call_, k);
+      launcher_.run_early(kernel, std::min(blocks, patches_), pipeline_threads, shared, call_, k,
+                          round);
       return blocks > 0;
     }
     return false;
@@ -241,6 +248,7 @@ class StreamRunner {
   std::int64_t patches_;  // of all environments
   std::size_t pass_shared_;
   bool started_ = false;
+  unsigned round_ = 0;
 };
 
 template <class T>

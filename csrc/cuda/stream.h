@@ -1,5 +1,6 @@
 // Kernels of one pass each, for meshes of any size: what a step does, patch by patch and vertex by vertex, in global memory.
 #pragma once
+#include "cuda/collect.h"
 #include "cuda/half.h"
 #include "cuda/handoff.h"
 #include "cuda/momentum.h"
@@ -9,6 +10,7 @@
 namespace pd::inline PD_TARGET {
 
 constexpr int vertex_threads = 256;  // of a block of the kernels over vertices
+constexpr int shared_threads = 128;  // over shared vertices: so many have room beside a pipeline's
 constexpr int pass_threads =
     384;  // of a block of the kernels over patches, two on a multiprocessor
 constexpr int decide_threads = 1024;  // at most, of the block that adds up an environment's sums
@@ -16,16 +18,17 @@ constexpr int decide_threads = 1024;  // at most, of the block that adds up an e
 template <class T>
 struct StreamMemory {
   Quad<T>*x, *velocity, *target, *u, *before;  // [batch, vertices]
-  Quad<T>*origin, *shared_force;               // [batch, slots]
-  T* weights;                                  // [batch or 1, blocks, 2, 32] w V
-  T* patch_weight;     // [batch or 1, patches] of patches with one stiffness above 0, else -1
-  double* sums;        // [batch, patches + blocks of shared vertices, sums_count]
-  Progress* progress;  // [batch]
-  double* omega;       // [batch, guard_period] of the next iterations
-  Quad<T>* shift;      // [batch, pieces]
-  double* part_sum;    // [batch, parts, 4]
-  Plane<T>* planes;    // [batch, planes]
-  Ball<T>* balls;      // [batch, balls]
+  Quad<T>* origin;                             // [batch, slots]
+  Quad<T>* shared_force;  // [batch, places]; letters in float32 (cuda/collect.h)
+  T* weights;             // [batch or 1, blocks, 2, 32] w V
+  T* patch_weight;        // [batch or 1, patches] of patches with one stiffness above 0, else -1
+  double* sums;           // [batch, patches + blocks of shared vertices, sums_count]
+  Progress* progress;     // [batch]
+  double* omega;          // [batch, guard_period] of the next iterations
+  Quad<T>* shift;         // [batch, pieces]
+  double* part_sum;       // [batch, parts, 4]
+  Plane<T>* planes;       // [batch, planes]
+  Ball<T>* balls;         // [batch, balls]
 };
 
 template <class T>
@@ -34,7 +37,11 @@ struct StreamCall {
   StreamMemory<T> memory;
 
   PD_HD int shared_blocks() const {
-    return (step.plan.shared + vertex_threads - 1) / vertex_threads;
+    return (step.plan.shared + shared_threads - 1) / shared_threads;
+  }
+  // of forces on shared vertices
+  PD_HD std::int64_t places() const {
+    return step.plan.slots - (step.plan.vertices - step.plan.shared);
   }
   PD_HD int sum_rows() const { return step.plan.patches + shared_blocks(); }
 };
@@ -61,7 +68,7 @@ struct StreamWork {
           c.memory.target + e * plan.vertices, c.memory.u + e * plan.vertices,
           c.memory.before + e * plan.vertices},
         origin(c.memory.origin + e * plan.slots),
-        shared_force(c.memory.shared_force + e * plan.slots),
+        shared_force(c.memory.shared_force + e * c.places()),
         weights(c.memory.weights +
                 (c.step.material.stiffness.stride ? e * plan.blocks * 2 * pair_lanes : 0)),
         patch_weight(c.memory.patch_weight +
@@ -75,7 +82,17 @@ struct StreamWork {
 
   PD_DEVICE const Settings& settings() const { return call.step.settings; }
   PD_DEVICE T omega(int k) const {
-    return T(call.memory.omega[environment * guard_period + k % guard_period]);
+    // from the L2 cache, see stream_shared
+    return T(__ldcg(call.memory.omega + environment * guard_period + k % guard_period));
+  }
+  PD_DEVICE Word* letters() const { return reinterpret_cast<Word*>(shared_force); }
+  // What a patch has of the force on a vertex that it shares; 0 is the `round` of a pass for which nobody waits.
+  PD_DEVICE void leave_force(int place, const Vec3<T>& force, unsigned round) const {
+    if constexpr (sizeof(T) == 4) {
+      Letter<T>::post(letters() + place, force, round);
+    } else {
+      shared_force[place] = quad(force);
+    }
   }
   PD_DEVICE double* sum_row(int row) const {
     return call.memory.sums + (environment * call.sum_rows() + row) * sums_count;
@@ -214,7 +231,8 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
     if (s < patch.interior) {
       here(patch.first_vertex + s, seen, force);
     } else {
-      w.shared_force[patch.first_slot + s] = quad(force);
+      const int end_vertex = patch.first_vertex + patch.interior;
+      w.leave_force(place_of_force(w.plan, patch.first_slot, end_vertex, s), force, 0);
     }
     s += blockDim.x;
     look_at_slot();
@@ -247,58 +265,118 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));
 }
 
-// Where patches leave the forces on a vertex that they share, in their order: two places at once, since few have more, and more
-// would keep other threads out for want of registers.
+// Where the forces of patches on a vertex that they share lie, in the order of patches.
 struct SharedPlaces {
-  static constexpr int together = 2;
-  int at, end, slot[together];
+  int at, end;
 
   template <class Plan>
   PD_DEVICE SharedPlaces(const Plan& plan, int shared)
-      : at(plan.shared_start[shared]), end(plan.shared_start[shared + 1]) {
-    look(plan);
-  }
-  template <class Plan>
-  PD_DEVICE void look(const Plan& plan) {
-    for (int i = 0; i < together; ++i) slot[i] = plan.shared_slot[min(at + i, end - 1)];
-  }
+      : at(plan.shared_start[shared]), end(plan.shared_start[shared + 1]) {}
 };
 
+// Their sum: two at once, since few have more, and more would keep other threads out for want of registers.
 template <class T, bool Touching>
 PD_DEVICE Vec3<T> shared_force(const StreamWork<T, Touching>& w, SharedPlaces place) {
-  constexpr int together = SharedPlaces::together;
+  constexpr int together = 2;
   Vec3<T> force = {T(0), T(0), T(0)};
 #pragma unroll 1
-  while (true) {
+  for (; place.at < place.end; place.at += together) {
     Vec3<T> part[together];
 #pragma unroll
-    for (int i = 0; i < together; ++i) part[i] = vec3(w.shared_force[place.slot[i]]);
+    for (int i = 0; i < together; ++i)
+      part[i] = vec3(w.shared_force[min(place.at + i, place.end - 1)]);
 #pragma unroll
     for (int i = 0; i < together; ++i)
       if (place.at + i < place.end) force = force + part[i];
+  }
+  return force;
+}
+
+// The same by whole warps, which wait for letters of a round where there are any.
+template <bool Touching>
+PD_DEVICE Vec3<double> await_force(const StreamWork<double, Touching>& w, SharedPlaces place,
+                                   unsigned) {
+  return shared_force(w, place);
+}
+template <bool Touching>
+PD_DEVICE Vec3<float> await_force(const StreamWork<float, Touching>& w, SharedPlaces place,
+                                  unsigned round) {
+  constexpr int together = 2;
+  const Word* box = w.letters();
+  Vec3<float> force = {0, 0, 0};
+  do {
+    Letter<float> letter[together];
+    bool waits;
+    do {
+#pragma unroll
+      for (int i = 0; i < together; ++i)
+        letter[i].look(box + place.at + i, place.at + i < place.end);
+      waits = false;
+#pragma unroll
+      for (int i = 0; i < together; ++i)
+        waits |= (place.at + i < place.end) & !letter[i].arrived(round);
+    } while (__any_sync(whole_warp, waits));
+#pragma unroll
+    for (int i = 0; i < together; ++i)
+      if (place.at + i < place.end) force = force + letter[i].vector();
     place.at += together;
-    if (place.at >= place.end) return force;
-    place.look(w.plan);
+  } while (__any_sync(whole_warp, place.at < place.end));
+  return force;
+}
+
+// Vertices are in the order of the last patch that has them, so this letter of a block's should come last.
+template <bool Touching>
+PD_DEVICE void await_last_letter(const StreamWork<float, Touching>& w, int place, unsigned round) {
+  Letter<float> letter;
+  while (true) {
+    letter.look(w.letters() + place, true);
+    if (letter.arrived(round)) return;
+    __nanosleep(200);
   }
 }
 
-// Vertices that patches share. As many threads as there can be where 32 registers are enough, since they wait for memory.
+// From the L2 cache, see handoff.h; x, which contacts alone want, is of the step's start.
+PD_DEVICE Quad<float> fresh(const Quad<float>& item) {
+  const float4 f = __ldcg(reinterpret_cast<const float4*>(&item));
+  return {f.x, f.y, f.z, f.w};
+}
+PD_DEVICE Quad<double> fresh(const Quad<double>& item) { return item; }
+
 template <Visit What, class T, bool Touching>
-__global__ void __launch_bounds__(vertex_threads, sizeof(T) == 4 && !Touching ? 8 : 1)
-    stream_shared(const __grid_constant__ StreamCall<T> call, int k) {
+PD_DEVICE typename Vertices<T, Touching>::Seen see_fresh(const StreamWork<T, Touching>& w, int i) {
+  if constexpr (What == Visit::weigh) return {};
+  const Quad<T> u = fresh(w.v.u[i]), before = fresh(w.v.before[i]), target = fresh(w.v.target[i]);
+  return {{vec3(w.v.x[i]), vec3(target), target.w, u.w}, vec3(u), vec3(before)};
+}
+
+// Vertices that patches share. As many threads as there can be where 32 registers are enough, since they wait for memory.
+//
+// With a `round` above 0 it works beside the pipeline of its pass, a block on each multiprocessor, for which that leaves
+// registers: it moves its vertices as soon as the letters on them have come. What else it reads is of kernels that had ended
+// before any block of the pipeline let it start; what it writes nobody makes use of before it has ended. Its last block waits for
+// the pipeline, so that whoever waits for it waits for both.
+template <Visit What, class T, bool Touching>
+__global__ void __launch_bounds__(shared_threads, sizeof(T) == 4 && !Touching ? 16 : 1)
+    stream_shared(const __grid_constant__ StreamCall<T> call, int k, unsigned round) {
   const int blocks = call.shared_blocks(), number = int(blockIdx.x % blocks);
   const StreamWork<T, Touching> w(call, blockIdx.x / blocks);
-  const int i = number * vertex_threads + int(threadIdx.x);
-  const SharedPlaces places(w.plan, min(i, w.plan.shared - 1));
-  await_kernel_before();
+  const int i = number * shared_threads + int(threadIdx.x), own = min(i, w.plan.shared - 1);
+  const SharedPlaces places(w.plan, own);
+  if (round == 0 || blockIdx.x == gridDim.x - 1) await_kernel_before();
   if (threadIdx.x == 0) let_next_kernel_start();
   if (skips<What>(w)) return;
-  ThreadSums sums = no_sums<What>();
-  if (i < w.plan.shared) {
-    const int vertex = w.plan.patch_vertex[w.plan.patches] + i;
-    const auto seen = see<What>(w, vertex);
-    visit<What>(w, vertex, seen, shared_force(w, places), k, sums);
+  const int vertex = w.plan.patch_vertex[w.plan.patches] + own;
+  if constexpr (sizeof(T) == 4) {
+    if (round > 0) {
+      const int end = min((number + 1) * shared_threads, w.plan.shared);
+      if (threadIdx.x == 0) await_last_letter(w, w.plan.shared_start[end] - 1, round);
+      __syncthreads();
+    }
   }
+  const auto seen = see_fresh<What>(w, vertex);
+  const Vec3<T> force = await_force(w, places, round);
+  ThreadSums sums = no_sums<What>();
+  if (i < w.plan.shared) visit<What>(w, vertex, seen, force, k, sums);
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(w.plan.patches + number));
 }
 

@@ -25,7 +25,7 @@ constexpr int small_pairs = 512;                          // of a patch
 constexpr std::int64_t none = 65535;                      // entries of a patch count up to one less
 constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
 // numbers of kernels, as DeviceKernel has them
-constexpr int block_kernel = 0, cluster_kernel = 1, grid_kernel = 2;
+constexpr int block_kernel = 0, cluster_kernel = 1, grid_kernel = 2, stream_kernel = 3;
 
 struct Mesh {
   const double* positions;
@@ -347,6 +347,16 @@ void link_slots(DeviceMeshPlan& plan) {
   }
 }
 
+// Forces on shared vertices lie vertex by vertex.
+void place_forces(DeviceMeshPlan& plan) {
+  const std::int32_t first_shared = plan.patch_vertex.back();
+  std::vector<std::int32_t> next(plan.shared_start.begin(), plan.shared_start.end() - 1);
+  plan.shared_place.reserve(plan.shared_slot.size());
+  for (const std::int32_t v : plan.slot_vertex) {
+    if (v >= first_shared) plan.shared_place.push_back(next[v - first_shared]++);
+  }
+}
+
 // The vertices of each piece without pins, patch by patch: every vertex in the first patch that has it.
 void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pieces) {
   plan.patch_part = plan.part_start = {0};
@@ -445,6 +455,7 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
   plan.shared_slot = std::move(shared.slot);
   mark_owners(plan);
   if (kernel == grid_kernel) link_slots(plan);
+  if (kernel == stream_kernel) place_forces(plan);
   if (kernel == cluster_kernel) link_copies(plan);
   const std::int32_t pieces = *std::max_element(piece, piece + vertices) + 1;
   if (pieces > 0) add_parts(plan, piece, pieces);

@@ -45,7 +45,7 @@ void divide(Partition& mesh, const std::vector<Point>& corners, std::int64_t beg
 }
 
 // Shared vertices in an order that puts those of the same patches side by side: what one patch reads of another lies together
-// then. `shared` keeps its order otherwise.
+// then. They follow the last patch of each, by which all forces on them are there. `shared` keeps its order otherwise.
 void gather_by_patches(const Partition& mesh, const std::int64_t* tets,
                        const std::vector<std::uint8_t>& is_shared,
                        std::vector<std::int64_t>& shared) {
@@ -61,7 +61,8 @@ void gather_by_patches(const Partition& mesh, const std::int64_t* tets,
     }
   }
   std::stable_sort(shared.begin(), shared.end(), [&](std::int64_t a, std::int64_t b) {
-    return patches[number[a]] < patches[number[b]];
+    const auto &one = patches[number[a]], &two = patches[number[b]];
+    return std::lexicographical_compare(one.rbegin(), one.rend(), two.rbegin(), two.rend());
   });
 }
 
