@@ -2,6 +2,7 @@
 // cpu/multilevel_stepper.h. What goes before and after them is a launch each, as in stream.h.
 #pragma once
 #include "cuda/corotation_maker.h"
+#include "cuda/shared_vertices.h"
 
 namespace pd::inline PD_TARGET {
 

@@ -10,31 +10,31 @@
 
 namespace pd::inline PD_TARGET {
 
-// In this order: movers, bringers, elements (producer and consumer warps). So many that each thread may have 96 registers, which
-// elements want, and that a block of stream_shared has room beside: 640 x 96 + 128 x 32 registers are all 65,536. Of the others
-// on an H100: 384, 512, 576 and 640 threads
-// for elements with 64 to 320 for the rest took more time, with or without both tetrahedra of a pair in a thread; movers and
-// bringers as one task took more, and so did anything that spilled registers, since hardly any cache is left for them. So did,
-// for a million vertices, movers that also move the vertices that patches share, as soon as their last patch is done (15 us
-// more than with a kernel of their own after this one; beside it that takes 3 us less), and bringers that work out what these
-// are to be from the forces of the pass before (60 us); rest positions behind origins, 24 bytes a slot in place of 32 (4 us);
-// both tetrahedra in the frame of their face, a seventh fewer instructions, but ten spilled registers (9 us); and forces on
-// shared vertices that the L2 cache is to let go of last (16 us; u and the iterate before: no difference).
+// In this order: movers, bringers, elements (producer and consumer warps). So many that each thread may have 96 registers,
+// which elements want, and that a block of stream_shared has room beside: 640 x 96 + 128 x 32 registers are all 65,536. Of
+// the others on an H100: 384, 512, 576 and 640 threads for elements with 64 to 320 for the rest took more time, with or
+// without both tetrahedra of a pair in a thread; movers and bringers as one task took more, and so did anything that spilled
+// registers, since hardly any cache is left for them. So did, for a million vertices, movers that also move the vertices that
+// patches share, as soon as their last patch is done (15 us more than with a kernel of their own after this one; beside it
+// that takes 3 us less), and bringers that work out what these are to be from the forces of the pass before (60 us); rest
+// positions behind origins, 24 bytes a slot in place of 32 (4 us); both tetrahedra in the frame of their face, a seventh
+// fewer instructions, but ten spilled registers (9 us); and forces on shared vertices that the L2 cache is to let go of last
+// (16 us; u and the iterate before: no difference).
 //
-// Movers and bringers take about as long for a patch as elements do, so anything more that they do costs: slots that are asked
-// for a whole turn before (8 us), patches by tickets (6 us, though blocks end up to 9 us apart), other rows for movers and
-// bringers to add up (one more for movers 9 us, one fewer 4 us). What they no longer do is gained: a warp tells 32 stops at once
-// (2.5 us), and entries are added up by fewer instructions (1.5 us), though movers and bringers spill some registers for it: the
-// same without spills, but entry by entry where less than four are left, takes 1 us more. Patches of more or fewer tetrahedra
-// took 4 to 17 us more.
+// Movers and bringers take about as long for a patch as elements do, so anything more that they do costs: slots that are
+// asked for a whole turn before (8 us), patches by tickets (6 us, though blocks end up to 9 us apart), other rows for movers
+// and bringers to add up (one more for movers 9 us, one fewer 4 us). What they no longer do is gained: a warp tells 32 stops
+// at once (2.5 us), and entries are added up by fewer instructions (1.5 us), though movers and bringers spill some registers
+// for it: the same without spills, but entry by entry where less than four are left, takes 1 us more. Patches of more or
+// fewer tetrahedra took 4 to 17 us more.
 //
 // Without any arithmetic an iteration would take 12 % less; schedulers issue in 71 % of their cycles, and DRAM is busy for 46
 // % (by a profiler, at 1.6 GHz). Fewer instructions and bytes of elements alone do not help: determinants worked out from
-// corners in the frame of their face, 537 instructions and 20 bytes a pair in place of 624 and 28, took as long. Nor did slots
-// that one thread has copied in bulk, or all by copies of 16 bytes, or then 512 threads of 80 registers for elements.
+// corners in the frame of their face, 537 instructions and 20 bytes a pair in place of 624 and 28, took as long. Nor did
+// slots that one thread has copied in bulk, or all by copies of 16 bytes, or then 512 threads of 80 registers for elements.
 //
-// A register that is written under a condition is kept from before, all around a loop: so where a thread has no slot, it reads
-// what is the first one's.
+// A register that is written under a condition is kept from before, all around a loop: so where a thread has no slot, it
+// reads what is the first one's.
 constexpr int mover_threads = 128, bringer_threads = 128, element_threads = 384;
 constexpr int pipeline_slots = 1024;  // of a patch, at most: see SharedSlots
 constexpr int pipeline_threads = mover_threads + bringer_threads + element_threads;

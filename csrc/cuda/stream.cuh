@@ -5,6 +5,7 @@
 #include "cuda/outer.h"
 #include "cuda/pipeline.h"
 #include "cuda/runtime.h"
+#include "cuda/shared_vertices.h"
 #include "cuda/stream.h"
 #include "plan/shared_memory.h"
 #include "solver/multilevel.h"
