@@ -381,6 +381,11 @@ inline void check_direction(const Tensor& direction, const Tensor& matrices) {
       "direction must be ", describe(matrices), " like matrices, got ", describe(direction));
 }
 
+inline void check_time_step(double time_step) {
+  TORCH_CHECK_VALUE(time_step > 0 && std::isfinite(time_step),
+                    "time_step must be positive and finite [s], got ", time_step);
+}
+
 // What a step is told besides tensors, in the order of the schemas.
 struct Numbers {
   std::int64_t schedule, iterations;
@@ -399,8 +404,7 @@ inline Settings settings_of(const Numbers& n, bool given, std::int64_t steps, st
                     n.schedule);
   TORCH_CHECK_VALUE(n.iterations >= 0 && n.iterations <= most, "iterations must be 0..1e9, got ",
                     n.iterations);
-  TORCH_CHECK_VALUE(n.time_step > 0 && std::isfinite(n.time_step),
-                    "time_step must be positive and finite [s], got ", n.time_step);
+  check_time_step(n.time_step);
   TORCH_CHECK_VALUE(n.relaxation > 0 && n.relaxation < 2, "relaxation must lie in (0, 2), got ",
                     n.relaxation);
   TORCH_CHECK_VALUE(n.rho >= 0 && n.rho < 1, "rho must lie in [0, 1), got ", n.rho);

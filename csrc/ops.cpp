@@ -43,6 +43,18 @@ struct Cpu {
   static void conjugate(const ConjugateCall<double>& call, const Tensor&) {
     kernels().conjugate64(call, threads());
   }
+  static void adjoint_system(const AdjointSystemCall<float>& call, const Tensor&) {
+    kernels().adjoint_system32(call, threads());
+  }
+  static void adjoint_system(const AdjointSystemCall<double>& call, const Tensor&) {
+    kernels().adjoint_system64(call, threads());
+  }
+  static void adjoint_result(const AdjointResultCall<float>& call, const Tensor&) {
+    kernels().adjoint_result32(call, threads());
+  }
+  static void adjoint_result(const AdjointResultCall<double>& call, const Tensor&) {
+    kernels().adjoint_result64(call, threads());
+  }
   static void rotation(const RotationCall<float>& call, const Tensor&) {
     kernels().rotation32(call, threads());
   }
@@ -88,6 +100,22 @@ TORCH_LIBRARY(torchpd, m) {
       "-> Tensor");
   with_plan("elastic_diagonal(Tensor stiffness, Tensor[] plan, *, bool weighted) -> Tensor");
   with_plan("precondition(Tensor field, Tensor[] plan) -> Tensor");
+  // its kernel, which comes from Python, runs on every device: torchpd/ops.py
+  with_plan(
+      "step_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor positions, "
+      "Tensor "
+      "velocities, Tensor? forces, Tensor[] material, Tensor[] plan, *, float time_step, bool[]? "
+      "wanted=None) -> Tensor[]");
+  with_plan(
+      "adjoint_system(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
+      "positions, Tensor "
+      "velocities, Tensor? forces, Tensor[] material, Tensor[] plan, *, float time_step) -> "
+      "(Tensor, Tensor, "
+      "Tensor, Tensor, Tensor)");
+  m.def(
+      "adjoint_result(Tensor multiplier, Tensor error, Tensor grad_velocities, Tensor masses, "
+      "Tensor "
+      "damping, *, float time_step) -> (Tensor, Tensor, Tensor)");
   with_plan(
       "conjugate_gradients_(Tensor(a!) solution, Tensor(b!) residual, Tensor(c!) direction, "
       "Tensor(d!) "

@@ -186,10 +186,55 @@ def test_forward_mode_is_refused() -> None:
         torch.func.jvp(pd.nearest_rotation, (F,), (F,))
 
 
+@pytest.mark.parametrize("steps", [0, 2])
+def test_functional_gradients_are_refused(steps: int) -> None:
+    sim, state = body(iterations=10)
+
+    def loss(x: torch.Tensor) -> torch.Tensor:
+        start = pd.State(x, state.velocities)
+        return (sim.rollout(start, steps) if steps else sim(start)).positions.sum()
+
+    for function in (torch.func.grad(loss), torch.func.jacrev(loss)):
+        with pytest.raises(RuntimeError, match=r"within torch.func.grad, vjp or jacrev; use torch.autograd.grad"):
+            function(state.positions)
+
+
 def test_info_is_no_function_to_differentiate() -> None:
     sim, state = body(iterations=10)
     _, info = sim(pd.State(state.positions.clone().requires_grad_(), state.velocities), return_info=True)
     assert not info.energy.requires_grad
+
+
+@pytest.mark.parametrize("steps", [0, 1])
+def test_of_a_plan_nothing_is_saved(steps: int) -> None:
+    """Whoever moves saved tensors elsewhere moves states and material alone, and one that a step is made of may go."""
+    sim, state = body(iterations=10)
+    saved: list[torch.Tensor] = []
+    x = state.positions.clone().requires_grad_()
+
+    def pack(tensor: torch.Tensor) -> torch.Tensor:
+        saved.append(tensor)
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        start = pd.State(x, state.velocities)
+        after = sim.rollout(start, steps) if steps else sim(start)
+    (found,) = torch.autograd.grad(after.positions.sum(), x)
+    assert len(saved) <= 5 + len(sim.material())
+    plan = {array.data_ptr() for array in sim.plan.arrays if array.numel()}
+    assert not plan & {tensor.data_ptr() for tensor in saved}
+    start = pd.State(x, state.velocities)
+    after = sim.rollout(start, steps) if steps else sim(start)
+    assert torch.equal(found, torch.autograd.grad(after.positions.sum(), x)[0])
+
+
+def test_a_state_that_changed_since_is_noticed() -> None:
+    sim, state = body(iterations=10)
+    velocities = state.velocities.clone()
+    after = sim(pd.State(state.positions.clone().requires_grad_(), velocities)).positions.sum()
+    velocities += 1.0
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        after.backward()
 
 
 def test_step_gradient_vanishes_at_the_solution() -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.adjoint import _System, conjugate_gradients
+from torchpd.adjoint import _System
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -37,18 +37,16 @@ def system(
     sim = pd.Simulator(pd.Scene(solid), 1 / 60, dtype=dtype, progress=False, **options).to(device)
     x = sim.rest_state(BATCH).positions.cpu()
     spread = torch.tensor([1.0, 0.3, 2.5], dtype=dtype)[:, None]
-    moves = torch.ones(BATCH, sim.vertices, 1, dtype=dtype)
+    moves = torch.ones(BATCH, sim.vertices, dtype=dtype)
     moves[:, :3] = 0.0
-    inertia = 0.5 * sim.masses.cpu()[:, None] / sim.time_step**2 * (1 + 0.1 * noise((BATCH, sim.vertices, 1), dtype))
+    inertia = 0.5 * sim.masses.cpu() / sim.time_step**2 * (1 + 0.1 * noise((BATCH, sim.vertices), dtype))
     normal = torch.nn.functional.normalize(noise((*x.shape[:2], 3), dtype, 1), dim=-1)
     projector = (
         torch.eye(3, dtype=dtype)
         - normal[..., None] * normal[..., None, :] * (torch.arange(sim.vertices) % 2)[:, None, None]
     )
     stiffness = spread * sim.stiffness.cpu()
-    diagonal = (
-        inertia + ops.elastic_diagonal(stiffness.to(device), list(sim.plan.arrays), weighted=True).cpu()[..., None]
-    )
+    diagonal = inertia + ops.elastic_diagonal(stiffness.to(device), list(sim.plan.arrays), weighted=True).cpu()
     found = _System(
         inertia.to(device), (moves / diagonal).to(device), projector.to(device) if contacts else None,
         stiffness.to(device), list(sim.plan.arrays),
@@ -60,14 +58,15 @@ def system(
 
 
 def start(s: _System, right: Tensor) -> list[Tensor]:
-    """Solution, residual, direction and progress before the first iteration."""
-    progress = torch.full((len(right), 3), -1.0, dtype=torch.float64, device=right.device)
-    return [torch.zeros_like(right), right.clone(), torch.full_like(right, float("nan")), progress]
+    """Solution, residual, direction and progress before the first iteration, which alone says what is in the others."""
+    progress = torch.full((len(right), 4), -1.0, dtype=torch.float64, device=right.device)
+    unwritten = torch.full_like(right, float("nan"))
+    return [unwritten.clone(), right.clone(), unwritten, progress]
 
 
 def iterate(s: _System, state: list[Tensor], positions: Tensor, iterations: int, tolerance: float = 0.0) -> None:
     ops.conjugate_gradients_(
-        *state, positions, s.inertia.squeeze(-1), s.inverse.squeeze(-1), s.projector, s.stiffness, s.plan,
+        *state, positions, s.inertia, s.inverse, s.projector, s.stiffness, s.plan,
         tolerance=tolerance, iterations=iterations,
     )  # fmt: skip
 
@@ -87,7 +86,7 @@ def test_the_solution_is_that_of_a_dense_matrix(contacts: bool, dtype: torch.dty
     for e in range(BATCH):
         alone = environment(exact, e)
         fields = [alone.allowed(unit[None]) for unit in units]
-        matrix = torch.stack([alone._product(x[e : e + 1], field).flatten() for field in fields])
+        matrix = torch.stack([alone.product_at(x[e : e + 1])(field).flatten() for field in fields])
         outside = torch.stack([(unit - field[0]).flatten() for unit, field in zip(units, fields, strict=True)])
         wanted = torch.linalg.solve(matrix + float(matrix.diagonal().max()) * outside, b[e].flatten()).reshape(
             x[e].shape
@@ -113,13 +112,14 @@ def test_it_does_what_torch_operations_do(shape: str, dtype: torch.dtype, device
     wanted = torch.zeros_like(right)
     # by hand, in float64
     exact, x, b = system(torch.float64, device, contacts=True, cells=cells)
-    r, d = b, exact.inverse * b
+    inverse = exact.inverse.unsqueeze(-1)
+    r, d = b, inverse * b
     wanted, rho = torch.zeros_like(b), (b * d).sum((1, 2), keepdim=True)
     for _ in range(10):
-        image = exact._product(x, d)
+        image = exact.product_at(x)(d)
         length = rho / (d * image).sum((1, 2), keepdim=True)
         wanted, r = wanted + length * d, r - length * image
-        z = exact.inverse * r
+        z = inverse * r
         last, rho = rho, (r * z).sum((1, 2), keepdim=True)
         d = z + rho / last * d
     limit = 1e-4 if dtype == torch.float32 else 1e-11
@@ -127,6 +127,7 @@ def test_it_does_what_torch_operations_do(shape: str, dtype: torch.dtype, device
     assert float((state[1] - r).norm() / b.norm()) < limit
     assert torch.allclose(state[3][:, 0], rho.flatten(), rtol=100 * limit)
     assert state[3][:, 2].tolist() == [1.0] * BATCH
+    assert float((state[3][:, 3] - r.norm(dim=(1, 2)) / b.norm(dim=(1, 2))).abs().max()) < limit
 
 
 @pytest.mark.parametrize(
@@ -168,25 +169,66 @@ def test_an_environment_ends_by_itself(dtype: torch.dtype, device: torch.device)
     inertia[1] = -1e9
     s = replace(s, inertia=inertia)
     state = start(s, right)
-    state[2][:] = s.inverse * right
+    state[2][:] = s.inverse.unsqueeze(-1) * right
     state[3][2, 2] = 0.0
     before = [part.clone() for part in state]
+    before[0][1] = 0.0
     tolerance = 1e-4
     iterate(s, state, positions, 500, tolerance)
     assert state[3][:, 2].tolist() == [0.0, 0.0, 0.0]
     own = environment(s, 0)
-    left = right[:1] - own._product(positions[:1], state[0][:1])
+    left = right[:1] - own.product_at(positions[:1])(state[0][:1])
     assert 1e-6 * float(right[0].norm()) < float(left.norm()) <= 1.1 * tolerance * float(right[0].norm())
     for e in (1, 2):
-        assert all(torch.equal(now[e], then[e]) for now, then in zip(state[:3], before[:3], strict=True))
+        assert all(
+            torch.equal(now[e].nan_to_num(7.0), then[e].nan_to_num(7.0))
+            for now, then in zip(state[:3], before[:3], strict=True)
+        )
+    assert float(state[3][0, 3]) <= tolerance
+    assert state[3][1:, 3].tolist() == [1.0, -1.0]
 
 
 def test_environments_that_are_lost_keep_to_themselves(dtype: torch.dtype, device: torch.device) -> None:
     s, positions, right = system(dtype, device)
-    wanted, _ = s.solve(positions, right, 1e-5)
+    wanted, error = s.solve(positions, right, 1e-5)
+    assert float(error.max()) <= 1e-5
     positions[1], right[2] = float("nan"), float("nan")
-    solution, _ = s.solve(positions, right, 1e-5)
+    solution, lost = s.solve(positions, right, 1e-5)
     assert torch.equal(solution[0], wanted[0])
+    assert torch.equal(lost[0], error[0])
+    assert lost[1:].isnan().all()
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("where", ["position", "right side"])
+@pytest.mark.parametrize("way", [_System.solve, _System.solve_by_operations])
+def test_one_number_that_is_none_leaves_no_error(
+    way: Any, where: str, number: float, dtype: torch.dtype, device: torch.device
+) -> None:
+    """Also a position that no right side shows: nothing is asked of its environment."""
+    s, positions, right = system(dtype, device)
+    right[1] = 0.0
+    (positions if where == "position" else right)[1, 5, 2] = number
+    _, error = way(s, positions, right, 1e-5)
+    assert error.isnan().tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("way", [_System.solve, _System.solve_by_operations])
+def test_nothing_asked_is_no_error(way: Any, dtype: torch.dtype, device: torch.device) -> None:
+    s, positions, right = system(dtype, device)
+    right[1] = 0.0
+    solution, error = way(s, positions, right, 1e-5)
+    assert float(error[1]) == 0.0
+    assert not solution[1].any()
+
+
+def test_what_overflows_on_the_way_is_an_error(device: torch.device) -> None:
+    """Everything that came was a number."""
+    s, positions, right = system(torch.float32, device)
+    right[1] *= 1e30
+    _, error = s.solve(positions, right, 1e-5)
+    assert not error.isnan().any()
+    assert float(error[0]) <= 1e-5
 
 
 def test_the_general_way_agrees(dtype: torch.dtype, device: torch.device) -> None:
@@ -194,7 +236,7 @@ def test_the_general_way_agrees(dtype: torch.dtype, device: torch.device) -> Non
     s, positions, right = system(dtype, device, contacts=True)
     tolerance = 1e-6 if dtype == torch.float32 else 1e-12
     solution, _ = s.solve(positions, right, tolerance)
-    other, _ = conjugate_gradients(lambda f: s._product(positions, f), s._precondition, right, tolerance)
+    other, _ = s.solve_by_operations(positions, right, tolerance)
     assert float((solution - other).norm() / other.norm()) < 100 * tolerance
 
 
@@ -216,7 +258,7 @@ def test_bad_input(name: str, change: Any, said: str, device: torch.device) -> N
     s, positions, right = system(torch.float64, device, contacts=True)
     assert s.projector is not None
     arguments = dict(zip(("solution", "residual", "direction", "progress"), start(s, right), strict=True))
-    arguments |= {"positions": positions, "inertia": s.inertia.squeeze(-1), "inverse": s.inverse.squeeze(-1)}
+    arguments |= {"positions": positions, "inertia": s.inertia, "inverse": s.inverse}
     arguments |= {"projector": s.projector, "stiffness": s.stiffness}
     arguments[name] = change(arguments[name])
     with pytest.raises((TypeError, ValueError), match=said):

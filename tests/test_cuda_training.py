@@ -122,7 +122,7 @@ def test_a_solve_is_one_kernel_behind_its_weights(precision: str) -> None:
     plan = list(sim.plan.arrays)
     rest = sim.rest_positions.expand_as(right).contiguous()
     vectors = [torch.zeros_like(right), right.clone(), torch.zeros_like(right)]
-    progress = torch.full((len(right), 3), -1.0, dtype=torch.float64, device=GPU)
+    progress = torch.full((len(right), 4), -1.0, dtype=torch.float64, device=GPU)
 
     def solve() -> None:
         for vector, first in zip(vectors, (0.0, right, 0.0), strict=True):

@@ -59,7 +59,7 @@ def samples(
                 0 * x,
                 f.clone(),
                 f.clone(),
-                torch.full((BATCH, 3), -1.0, dtype=torch.float64, device=device),
+                torch.full((BATCH, 4), -1.0, dtype=torch.float64, device=device),
                 x,
                 sim.masses,
                 1 / sim.masses,
@@ -68,6 +68,20 @@ def samples(
                 plan,
             ),
             {"tolerance": 1e-3, "iterations": 2},
+        ),
+        "adjoint_system": (
+            (f, direction, x, still, zero, 0.01 * f, [m.detach() for m in material], plan),
+            {"time_step": sim.time_step},
+        ),
+        "adjoint_result": (
+            (
+                f,
+                torch.tensor([0.0, 2.0, 1.0], dtype=torch.float64, device=device),
+                direction,
+                sim.masses,
+                sim.damping,
+            ),
+            {"time_step": sim.time_step},
         ),
         "elastic_diagonal": ((w.detach(), plan), {"weighted": True}),
         "nearest_rotation": ((wanted(matrices),), {}),
@@ -79,6 +93,7 @@ def samples(
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
     "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "conjugate_gradients_",
+    "adjoint_system", "adjoint_result",
 )  # fmt: skip
 
 

@@ -50,7 +50,7 @@ from torchpd.gpu import properties_of
 from torchpd.plan import KERNELS as PLAN_KERNELS
 from torchpd.plan import Plan
 from torchpd.render import Camera
-from torchpd.tables import DEVICE_PLAN_TABLE
+from torchpd.tables import DEVICE_PLAN_TABLE, MATERIAL_TABLE
 
 TABLE = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "cuda-registers.csv"
 DTYPES = (torch.float32, torch.float64)
@@ -163,11 +163,23 @@ def fields(sim: pd.Simulator, batch: int) -> None:
         for weighted in (False, True):
             diagonal = ops.elastic_diagonal(w, plan, weighted=weighted)
         inertia, inverse = 0.1 * diagonal, 1.0 / (1.1 * diagonal)
-        active = torch.full((batch, 3), -1.0, dtype=torch.float64, device=x.device)
+        active = torch.full((batch, 4), -1.0, dtype=torch.float64, device=x.device)
         projector = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape, 3)
         for held in (None, projector):
-            vectors = [torch.zeros_like(x), d.clone(), d.clone(), active.clone()]
+            vectors = [torch.empty_like(x), d.clone(), torch.empty_like(x), active.clone()]
             ops.conjugate_gradients_(*vectors, x, inertia, inverse, held, w, plan, tolerance=0.0, iterations=2)
+
+
+def adjoint(sim: pd.Simulator, batch: int) -> None:
+    """What stands around the solve, for a scene's contacts and without them."""
+    x, plan, h = sim.rest_state(batch).positions, list(sim.plan.arrays), sim.time_step
+    d, error = 0.01 * x, torch.zeros(batch, dtype=torch.float64, device=x.device)
+    material = [array.detach() for array in sim.material()]
+    names = [row.name for row in MATERIAL_TABLE]
+    freed = [t[..., :0, :] if name in ("planes", "spheres") else t for name, t in zip(names, material, strict=True)]
+    for arrays, forces in ((material, d), (material, None), (freed, None)):
+        right = ops.adjoint_system(d, d, x + d, x, d, forces, arrays, plan, time_step=h)[0]
+    ops.adjoint_result(right, error, d, sim.masses, sim.damping, time_step=h)
 
 
 def rotations(dtype: torch.dtype) -> None:
@@ -282,6 +294,7 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
                     many(many.rest_state(70 * properties_of(sim.device).multiprocessors // sim.plan.patches))
                     count += 1
         fields(sim, 3)
+        adjoint(sim, 3)
     if kernel == "block":
         # whose block has a multiprocessor to itself, and several slots a thread
         mesh = bar(9, 9, 9) if dtype == torch.float32 else bar(6, 6, 6)

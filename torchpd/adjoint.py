@@ -38,8 +38,6 @@ _ASKED_EVERY = 10  # iterations: asking whether any environment goes on waits fo
 _MOST_OF_A_BLOCK = 16384  # vertices of an environment that one thread block is quick enough with
 # A body stretched this much turns so little that its Hessian is the constant, positive majoriser but for 1e-4.
 _STRETCH = 1e4
-_SPANNED = 1e-6  # square of what earlier normals leave of one that they span
-_STICKING = 1e-3  # of what friction could take back: slip below it counts as none
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,8 @@ class AdjointCall:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return (a * b).sum((1, 2))
+    """Of every environment [B, 1, 1]."""
+    return torch.linalg.vecdot(a.flatten(1), b.flatten(1))[:, None, None]
 
 
 def conjugate_gradients(
@@ -70,26 +69,26 @@ def conjugate_gradients(
     An environment whose matrix turns out not to be positive along a direction keeps what it has by then, as does
     one that is done: the host asks every tenth iteration only whether any goes on.
     """
-    solution, residual = torch.zeros_like(right), right
-    preconditioned = precondition(residual)
-    direction, rho = preconditioned, _dot(residual, preconditioned)
-    scale = _dot(right, right).sqrt()
+    solution, residual = torch.zeros_like(right), right.clone()
+    direction = precondition(residual)
+    rho, scale = _dot(residual, direction), _dot(right, right).sqrt()
     active = scale > 0
     for iteration in range(_MOST_ITERATIONS):
         if iteration % _ASKED_EVERY == 0 and not bool(active.any()):
             break
         image = product(direction)
         curvature = _dot(direction, image)
-        active = active & (curvature > 0)
-        step = torch.where(active, rho / curvature.where(active, torch.ones_like(curvature)), torch.zeros_like(rho))
-        solution = solution + step[:, None, None] * direction
-        residual = residual - step[:, None, None] * image
-        active = active & (_dot(residual, residual).sqrt() > tolerance * scale)
+        active &= curvature > 0
+        step = torch.where(active, rho / curvature, 0.0)
+        solution.addcmul_(step, direction)
+        residual.addcmul_(step, image, value=-1.0)
+        active &= _dot(residual, residual).sqrt() > tolerance * scale
         preconditioned = precondition(residual)
         last, rho = rho, _dot(residual, preconditioned)
-        ratio = torch.where(active, rho / last.where(active, torch.ones_like(last)), torch.zeros_like(rho))
-        direction = torch.where(active[:, None, None], preconditioned + ratio[:, None, None] * direction, direction)
-    return solution, _relative(residual, scale)
+        # without a step what is done takes no harm from its direction
+        direction = torch.addcmul(preconditioned, torch.where(active, rho / last, 0.0), direction)
+    error = _dot(residual, residual).sqrt() / torch.where(scale > 0, scale, 1.0)
+    return solution, error.flatten()
 
 
 def _recording(tensor: Tensor) -> bool:
@@ -105,27 +104,29 @@ def _asks(plan: list[Tensor], right: Tensor) -> bool:
     return right.is_cuda and kernel_of(plan) != "block"
 
 
-def _relative(residual: Tensor, scale: Tensor) -> Tensor:
-    return _dot(residual, residual).sqrt() / torch.where(scale > 0, scale, torch.ones_like(scale))
-
-
 @dataclass(frozen=True)
 class _System:
     """H of a step's objective, on what moves: P (inertia + elastic Hessian) P, and the diagonal for it."""
 
-    inertia: Tensor  # [V, 1] or [B, V, 1] N/m, without the curvature of what is slid on
-    inverse: Tensor  # 1 / D [B, V, 1], 0 where a vertex does not move
+    inertia: Tensor  # [1, V] or [B, V] N/m, without the curvature of what is slid on
+    inverse: Tensor  # 1 / D of the same shape, 0 where a vertex does not move
     projector: Tensor | None  # of what contacts let through [B, V, 3, 3]
     stiffness: Tensor
     plan: list[Tensor]
 
     def allowed(self, field: Tensor) -> Tensor:
         """The part of a field [B, V, 3] that may move."""
-        field = torch.where(self.inverse != 0, field, 0.0)
+        return self.off_normals(torch.where(self.inverse.unsqueeze(-1) != 0, field, 0.0))
+
+    def off_normals(self, field: Tensor) -> Tensor:
+        """The part of a field [B, V, 3] that contacts let through."""
         return field if self.projector is None else (self.projector * field.unsqueeze(-2)).sum(-1)
 
     def solve(self, positions: Tensor, right: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
-        """As `conjugate_gradients`, with the elastic Hessian at some positions; `right` is `allowed`."""
+        """As `conjugate_gradients`, with the elastic Hessian at some positions; `right` is `allowed`.
+
+        The residual is float64, and no number where positions or right side are none.
+        """
         asks = _asks(self.plan, right)
         if asks and _recording(right):
             raise RuntimeError(
@@ -135,85 +136,50 @@ class _System:
                 "the graph"
             )
         if has_levels(self.plan) or (right.is_cuda and right.shape[1] > _MOST_OF_A_BLOCK):
-            return conjugate_gradients(lambda f: self._product(positions, f), self._precondition, right, tolerance)
+            return self.solve_by_operations(positions, right, tolerance)
         # what many operations on small tensors would spend their time with
-        solution, residual, direction = torch.zeros_like(right), right.clone(), torch.empty_like(right)
-        progress = right.new_full((len(right), 3), -1.0, dtype=torch.float64)
+        solution, residual, direction = torch.empty_like(right), right.clone(), torch.empty_like(right)
+        progress = right.new_full((len(right), 4), -1.0, dtype=torch.float64)
         steps = _ASKED_EVERY if asks else _MOST_ITERATIONS
         for _ in range(0, _MOST_ITERATIONS, steps):
             torch.ops.torchpd.conjugate_gradients_(
-                solution, residual, direction, progress, positions, self.inertia.squeeze(-1),
-                self.inverse.squeeze(-1), self.projector, self.stiffness, self.plan,
-                tolerance=tolerance, iterations=steps,
+                solution, residual, direction, progress, positions, self.inertia, self.inverse, self.projector,
+                self.stiffness, self.plan, tolerance=tolerance, iterations=steps,
             )  # fmt: skip
             if not asks or not bool(progress[:, 2].any()):
                 break
-        return solution, _relative(residual, progress[:, 1].to(right.dtype))
+        return solution, progress[:, 3]
 
-    def _product(self, positions: Tensor, field: Tensor) -> Tensor:
-        elastic = torch.ops.torchpd.hessian_product(positions, field.contiguous(), self.stiffness, self.plan)
-        return self.allowed(self.inertia * field + elastic)
+    def solve_by_operations(self, positions: Tensor, right: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+        """`solve`, of torch operations and Hessian products."""
+        solution, error = conjugate_gradients(self.product_at(positions), self.preconditioner(), right, tolerance)
+        # one of them is enough: 0 times what is no finite number is no number, and so is its sum
+        lost = ((right + positions) * 0.0).sum((1, 2)).isnan()
+        return solution, torch.where(lost, torch.nan, error.nan_to_num(nan=torch.inf)).double()
 
-    def _precondition(self, field: Tensor) -> Tensor:
-        plain = self.inverse * field
+    def product_at(self, positions: Tensor) -> Callable[[Tensor], Tensor]:
+        """H of fields at some positions."""
+        inertia = self.inertia.unsqueeze(-1)
+
+        def product(field: Tensor) -> Tensor:
+            elastic = torch.ops.torchpd.hessian_product(positions, field.contiguous(), self.stiffness, self.plan)
+            return self.allowed(torch.addcmul(elastic, inertia, field))
+
+        return product
+
+    def preconditioner(self) -> Callable[[Tensor], Tensor]:
+        """M of the levels, and the diagonal where they have no say: on vertices that were held when M was made."""
+        inverse = self.inverse.unsqueeze(-1)
         if not has_levels(self.plan):
-            return plain
-        # M has no say on vertices that were held when it was made
+            return lambda field: inverse * field
         _, inertia_of_levels = reference_of_levels(self.plan)
-        known = torch.isfinite(inertia_of_levels).unsqueeze(-1)
-        return self.allowed(torch.where(known, torch.ops.torchpd.precondition(field, self.plan), plain))
+        known = (inverse != 0) & torch.isfinite(inertia_of_levels).unsqueeze(-1)
 
+        def precondition(field: Tensor) -> Tensor:
+            of_levels = torch.ops.torchpd.precondition(field, self.plan)
+            return self.off_normals(torch.where(known, of_levels, inverse * field))
 
-@dataclass(frozen=True)
-class _Held:
-    """What contacts do to the vertices of a solved step."""
-
-    projector: Tensor  # off the normals that hold a vertex [B, V, 3, 3]
-    stuck: Tensor  # bool [B, V, 1]: friction holds it
-    curvature: Tensor  # of the surface it slides on, times the push [B, V, 1] N/m
-
-    def off_normals(self, field: Tensor) -> Tensor:
-        """The part of a field [B, V, 3] that contacts let through."""
-        return (self.projector * field.unsqueeze(-2)).sum(-1)
-
-
-def _surfaces(material: dict[str, Tensor], x: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]:
-    """(normal, gap, friction, motion, curvature) of every contact at positions x [B, V, 3]."""
-    found = []
-    for plane in material["planes"].unbind(-2):
-        normal, height, friction = plane[..., None, :3], plane[..., None, 3], plane[..., None, 4]
-        rest = torch.zeros_like(x)
-        found.append((normal.expand_as(x), (x * normal).sum(-1) - height, friction, rest, rest[..., 0]))
-    for ball in material["spheres"].unbind(-2):
-        offset = x - ball[..., None, :3]
-        length = offset.norm(dim=-1).clamp_min(torch.finfo(x.dtype).tiny)
-        motion = ball[..., None, 5:].expand_as(x)
-        normal = offset / length.unsqueeze(-1)
-        found.append((normal, length - ball[..., None, 3], ball[..., None, 4], motion, 1 / length))
-    return found
-
-
-def _held_by_contacts(call: AdjointCall, residual: Tensor, diagonal: Tensor) -> _Held:
-    """A contact holds a vertex when one unaccelerated iteration, x' - r / D, would end inside it."""
-    projector = torch.eye(3, dtype=residual.dtype, device=residual.device).expand(*residual.shape, 3)
-    stuck = torch.zeros_like(residual[..., 0], dtype=torch.bool)
-    total = torch.zeros_like(residual[..., 0])
-    moved = call.after - call.positions
-    for normal, gap, friction, motion, curvature in _surfaces(named_material(call.material), call.after):
-        push = (residual * normal).sum(-1)
-        holds = (push > 0) & (gap < push / diagonal.squeeze(-1))
-        slip = moved - motion
-        slip = (slip - (slip * normal).sum(-1, keepdim=True) * normal).norm(dim=-1)
-        # what friction can take back in one iteration is more than what has slipped
-        stuck = stuck | (holds & (friction > 0) & (slip * diagonal.squeeze(-1) < _STICKING * friction * push))
-        # what earlier contacts leave of the normal, so that all together are a projector: take_directions in C++
-        left = (projector * normal.unsqueeze(-2)).sum(-1)
-        size = (left * left).sum(-1)
-        takes = holds & (size > _SPANNED)
-        share = torch.where(takes, 1.0 / torch.where(takes, size, 1.0), 0.0)[..., None, None]
-        projector = projector - share * left.unsqueeze(-1) * left.unsqueeze(-2)
-        total = total + torch.where(holds, push * curvature, torch.zeros_like(push))
-    return _Held(projector, stuck.unsqueeze(-1), total.unsqueeze(-1))
+        return precondition
 
 
 def _reduce(gradient: Tensor, like: Tensor, dims: int) -> Tensor:
@@ -256,41 +222,34 @@ def _warn_of(failed: Tensor, error: Tensor) -> None:
     )
 
 
-def _solve(call: AdjointCall, right: Tensor) -> tuple[Tensor, _Held | None]:
-    """The multiplier l of H l = dL/dx' on what moves, and what contacts hold."""
-    inertia, diagonal = (t.unsqueeze(-1) for t in step_diagonal(call.plan, call.material, call.time_step))
-    free = torch.isfinite(inertia)
-    inertia = torch.where(free, inertia, torch.zeros_like(inertia))
-    diagonal = torch.where(free, diagonal, torch.ones_like(diagonal)).expand(len(right), -1, -1)
-    material = named_material(call.material)
-    contacts = material["planes"].shape[-2] + material["spheres"].shape[-2] > 0
-    held = _held_by_contacts(call, step_gradient(call), diagonal) if contacts else None
+def _system_of(call: AdjointCall, grad_after: Tensor, grad_velocities: Tensor) -> tuple[_System, Tensor, Tensor | None]:
+    """H on what moves, the right side of H l = dL/dx' + dL/dv' / h there, and which vertices friction holds [B, V]."""
+    right, inertia, inverse, projector, stuck = torch.ops.torchpd.adjoint_system(
+        grad_after, grad_velocities, call.after, call.positions, call.velocities, call.forces, call.material, call.plan,
+        time_step=call.time_step,
+    )  # fmt: skip
+    stiffness = named_material(call.material)["stiffness"]
+    if not len(projector):
+        return _System(inertia, inverse, None, stiffness, call.plan), right, None
+    return _System(inertia, inverse, projector, stiffness, call.plan), right, stuck
 
-    moves = free if held is None else free & ~held.stuck
-    system = _System(
-        inertia=inertia if held is None else inertia - held.curvature,
-        inverse=torch.where(moves, 1.0 / diagonal, 0.0),
-        projector=None if held is None else held.projector,
-        stiffness=material["stiffness"],
-        plan=call.plan,
-    )
+
+def _solve(call: AdjointCall, system: _System, right: Tensor) -> tuple[Tensor, Tensor]:
+    """The multiplier l, and its relative residual [B], no number where the loss or the state has none."""
     tolerance = _TOLERANCE[right.dtype]
-    right = system.allowed(right)
     multiplier, error = system.solve(call.after, right, tolerance)
-    # a loss or a state that is no number has a gradient that is none, as those who watch for it expect
-    # one of them is enough: 0 times what is no finite number is no number, and so is its sum
-    lost = ((right + call.after) * 0.0).sum((1, 2)).isnan()
-    multiplier = torch.where(lost[:, None, None], torch.nan, multiplier)
-    failed = ~(error <= 1e3 * tolerance) & ~lost
+    failed = error > 1e3 * tolerance
     unasked = _recording(right)
     if unasked or bool(failed.any()):
         if not unasked:
             _warn_of(failed, error)
         wanted = torch.where(failed[:, None, None], right, 0.0)
         # the curvature of what is slid on has no part in the majoriser either
+        inertia, _ = step_diagonal(call.plan, call.material, call.time_step)
+        inertia = torch.where(torch.isfinite(inertia), inertia, 0.0)
         instead, _ = replace(system, inertia=inertia).solve(_STRETCH * call.after, wanted, tolerance)
         multiplier = torch.where(failed[:, None, None], instead, multiplier)
-    return multiplier.contiguous(), held
+    return multiplier, error
 
 
 def _elastic_product(call: AdjointCall, field: Tensor, positions: Tensor) -> Tensor:
@@ -311,18 +270,20 @@ def step_adjoint(
         wanted: which material arrays, in their order; the others are left out, and cost nothing.
     """
     h, material = call.time_step, named_material(call.material)
-    masses, inertial = material["masses"].unsqueeze(-1), _inertial(material, h)
-    right = grad_after + grad_velocities / h
-    multiplier, held = _solve(call, right)
+    system, right, stuck = _system_of(call, grad_after, grad_velocities)
+    solution, error = _solve(call, system, right)
+    # a loss or a state that is no number has a gradient that is none, as those who watch for it expect
+    grad_positions, grad_before, multiplier = torch.ops.torchpd.adjoint_result(
+        solution, error, grad_velocities, material["masses"], material["damping"], time_step=h
+    )
 
     @cache
     def passed_on() -> Tensor:
         """What vertices that are held pass on: to the targets of pins, to the start of those that friction holds."""
-        return right - _elastic_product(call, multiplier, call.after)
+        return grad_after + grad_velocities / h - _elastic_product(call, multiplier, call.after)
 
-    grad_positions = inertial * multiplier - grad_velocities / h
-    if held is not None:
-        grad_positions = grad_positions + torch.where(held.stuck, held.off_normals(passed_on()), 0.0)
+    if stuck is not None:
+        grad_positions = grad_positions + torch.where(stuck.unsqueeze(-1), system.off_normals(passed_on()), 0.0)
     by_name = _for_material(call, multiplier)
     by_name["pin_targets"] = lambda: _for_targets(call, multiplier, passed_on())
     grads = [
@@ -330,7 +291,7 @@ def step_adjoint(
         for row, array, asked in zip(MATERIAL_TABLE, call.material, wanted, strict=True)
         if asked
     ]
-    return [grad_positions, masses / h * multiplier, multiplier, *grads]
+    return [grad_positions, grad_before, multiplier, *grads]
 
 
 def _for_material(call: AdjointCall, multiplier: Tensor) -> dict[str, Callable[[], Tensor]]:

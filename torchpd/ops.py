@@ -123,6 +123,40 @@ def _(field: Tensor, plan: Sequence[Tensor]) -> Tensor:
     return field.new_empty(field.shape)
 
 
+@_register_fake("adjoint_system")
+def _(
+    grad_positions: Tensor,
+    grad_velocities: Tensor,
+    after: Tensor,
+    positions: Tensor,
+    velocities: Tensor,
+    forces: Tensor | None,
+    material: Sequence[Tensor],
+    plan: Sequence[Tensor],
+    *,
+    time_step: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    batch, vertices, _ = positions.shape
+    rows = list(zip(MATERIAL_TABLE, material, strict=True))
+    touching = any(row.name in ("planes", "spheres") and array.shape[-2] > 0 for row, array in rows)
+    # those that inertia and diagonal come from
+    own = touching or any(
+        row.name in ("stiffness", "masses", "damping", "pin_stiffness") and array.dim() > row.dims and len(array) > 1
+        for row, array in rows
+    )
+    inertia, inverse = (positions.new_empty((batch if own else 1, vertices)) for _ in range(2))
+    held = batch if touching else 0
+    projector = positions.new_empty((held, vertices, 3, 3))
+    stuck = positions.new_empty((held, vertices), dtype=torch.bool)
+    return positions.new_empty(positions.shape), inertia, inverse, projector, stuck
+
+
+@_register_fake("adjoint_result")
+def _(multiplier: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
+    x, v, out = (multiplier.new_empty(multiplier.shape) for _ in range(3))
+    return x, v, out
+
+
 @_register_fake("conjugate_gradients_")
 def _(*_: Any, **__: Any) -> None:
     return None
@@ -266,8 +300,7 @@ def _asked(wanted: Sequence[bool] | None, material: Sequence[Tensor]) -> Sequenc
     return wanted
 
 
-# as every op that takes a plan, see csrc/ops.cpp
-@torch.library.custom_op("torchpd::step_vjp", mutates_args=(), tags=[torch.Tag.cudagraph_unsafe])
+@torch.library.impl("torchpd::step_vjp", ("cpu", "cuda"))
 def step_vjp(
     grad_positions: Tensor,
     grad_velocities: Tensor,
@@ -288,7 +321,7 @@ def step_vjp(
         return step_adjoint(call, grad_positions, grad_velocities, _asked(wanted, material))
 
 
-@step_vjp.register_fake
+@_register_fake("step_vjp")
 def _(
     grad_positions: Tensor,
     grad_velocities: Tensor,
@@ -310,97 +343,8 @@ def _(
 register_rule("step_vjp", step_vjp_rule)
 
 
-def _step_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
-    positions, velocities, forces, _, material, plan = inputs
-    ctx.save_for_backward(positions, velocities, forces, output[0], *material, *plan)
-    ctx.time_step = keyword_only_inputs["time_step"]
-
-
-def _step_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _: Tensor) -> tuple[Any, ...]:
-    wanted = ctx.needs_input_grad
-    if wanted[3]:
-        raise RuntimeError("torchpd: a step has no derivative for its first iterate; detach start")
-    positions, velocities, forces, after, *rest = ctx.saved_tensors
-    material, plan = rest[: len(MATERIAL_TABLE)], rest[len(MATERIAL_TABLE) :]
-    _check_differentiable(wanted[4], material)
-    x, v, f, *values = _ops.step_vjp(
-        grad_positions.contiguous(), grad_velocities.contiguous(), after, positions, velocities, forces, material, plan,
-        time_step=ctx.time_step, wanted=list(wanted[4]),
-    )  # fmt: skip
-    return x, v, f if wanted[2] else None, None, _in_places(wanted[4], values), [None] * len(plan)
-
-
-def _in_places(wanted: Sequence[bool], values: Sequence[Tensor]) -> list[Tensor | None]:
-    """For every array of the material its gradient, or None where nobody wants it."""
-    left = iter(values)
-    return [next(left) if asked else None for asked in wanted]
-
-
-def _step_vjp_backward(ctx: Any, *_: Any) -> None:
-    raise RuntimeError(
-        "torchpd: a step has first derivatives only; differentiate without create_graph, or take differences of the "
-        "gradients of two steps"
-    )
-
-
-def _check_differentiable(wanted: Sequence[bool], material: Sequence[Tensor]) -> None:
-    arrays = zip(MATERIAL_TABLE, wanted, material, strict=True)
-    # without contacts nothing depends on them
-    contacts = [row.name for row, needed, array in arrays if needed and row.name in _CONTACTS and array.numel()]
-    if contacts:
-        raise RuntimeError(
-            f"torchpd: a step has no derivative for {' and '.join(contacts)}; detach them, or "
-            f"sim.{contacts[0]}.requires_grad_(False)"
-        )
-
-
-def _rollout_setup(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
-    positions, velocities, forces, material, plan = inputs
-    ctx.save_for_backward(positions, velocities, forces, output[0], output[1], *material, *plan)
-    ctx.time_step = keyword_only_inputs["time_step"]
-    ctx.every = keyword_only_inputs["every"]
-
-
-def _at_step(material: Sequence[Tensor], step: int) -> list[Tensor]:
-    """The material of one step of a rollout: spheres move on."""
-    return [
-        _moved(array, step) if row.name == "spheres" else array
-        for row, array in zip(MATERIAL_TABLE, material, strict=True)
-    ]
-
-
-def _moved(spheres: Tensor, steps: int) -> Tensor:
-    return torch.cat([spheres[..., :3] + steps * spheres[..., 5:], spheres[..., 3:]], dim=-1)
-
-
-def _rollout_backward(ctx: Any, grad_positions: Tensor, grad_velocities: Tensor, _: Tensor) -> tuple[Any, ...]:
-    """Backwards through the recorded states, one adjoint a step."""
-    if ctx.every != 1:
-        raise RuntimeError("torchpd: the rollout op is differentiable with every=1 only, where it records every state")
-    x0, v0, given, positions, velocities, *rest = ctx.saved_tensors
-    material, plan = rest[: len(MATERIAL_TABLE)], rest[len(MATERIAL_TABLE) :]
-    _check_differentiable(ctx.needs_input_grad[3], material)
-    wanted = list(ctx.needs_input_grad[3])
-    x, v, forces = torch.zeros_like(x0), torch.zeros_like(x0), torch.zeros_like(x0)
-    values = [torch.zeros_like(array) for array, asked in zip(material, wanted, strict=True) if asked]
-    for step in reversed(range(len(positions))):
-        before = (positions[step - 1], velocities[step - 1]) if step else (x0, v0)
-        x, v = x + grad_positions[step], v + grad_velocities[step]
-        x, v, f, *parts = _ops.step_vjp(
-            x, v, positions[step], *before, given, _at_step(material, step), plan,
-            time_step=ctx.time_step, wanted=wanted,
-        )  # fmt: skip
-        forces = forces + f
-        values = [total + part for total, part in zip(values, parts, strict=True)]
-    return x, v, forces if ctx.needs_input_grad[2] else None, _in_places(wanted, values), [None] * len(plan)
-
-
-_CONTACTS = ("planes", "spheres")
-torch.library.register_autograd("torchpd::rollout", _rollout_backward, setup_context=_rollout_setup)
 torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_save_nothing)
 torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)
-torch.library.register_autograd("torchpd::step", _step_backward, setup_context=_step_setup)
-torch.library.register_autograd("torchpd::step_vjp", _step_vjp_backward, setup_context=_save_nothing)
 
 for _name, _backward, _inputs in (
     ("element_energy", _element_energy_backward, ("positions", "stiffness")),

@@ -78,7 +78,7 @@ def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
         every=call.every,
         **sim.numbers(inertial=call.start == "inertial", report=call.report),
     )
-    return Track(positions, velocities, Info.from_rows(rows.detach()))
+    return Track(positions, velocities, Info.from_rows(rows))
 
 
 def _in_pieces(sim: Simulator, call: Rollout, bar: Any) -> Track:

@@ -125,8 +125,7 @@ class Simulator(Model):
             list(self.plan.arrays),
             **self.numbers(inertial=inertial, report=report),
         )
-        # a report, not a function to differentiate: torch would pass zeros back through it
-        return State(positions, velocities), rows.detach()
+        return State(positions, velocities), rows
 
     @torch.no_grad()
     def step_(

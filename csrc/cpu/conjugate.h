@@ -63,7 +63,7 @@ class ConjugatePass {
     Conjugate numbers(call_.progress + environment * progress_count);
     if (!numbers.active) return;
     environment_ = environment;
-    load();
+    load(numbers.begins);
     if (numbers.begins) begin(numbers);
     for (int k = 0; k < call_.iterations && numbers.active; ++k) iterate(numbers);
     store();
@@ -79,10 +79,10 @@ class ConjugatePass {
     return to_quad(from[row(i)], from[row(i) + 1], from[row(i) + 2]);
   }
 
-  void load() {
+  void load(bool begins) {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
       w_.x[i] = read(call_.positions, i);
-      solution()[i] = read(call_.solution, i);
+      solution()[i] = begins ? to_quad<T>(0, 0, 0) : read(call_.solution, i);
       residual()[i] = read(call_.residual, i);
       direction()[i] = read(call_.direction, i);
       w_.inertia[i] = call_.inertia.of(environment_)[plan_.vertex_order[i]];
@@ -108,7 +108,9 @@ class ConjugatePass {
     each_part([&](std::int64_t i, Sum& sums) {
       const Quad<T> right = residual()[i];
       direction()[i] = w_.inverse[i] * right;
-      sums.first = multiply_add(right, right, sums.first);
+      // zero, unless something is infinite or no number
+      const Quad<T> lost = multiply_add(T(0), w_.x[i], T(0) * right);
+      sums.first = multiply_add(right, right, sums.first) + lost;
       sums.second = multiply_add(right, direction()[i], sums.second);
     });
     const auto sum = total(1);

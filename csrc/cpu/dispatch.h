@@ -20,6 +20,10 @@ struct Kernels {
   void (*precondition64)(const PreconditionCall<double>&, int threads);
   void (*conjugate32)(const ConjugateCall<float>&, int threads);
   void (*conjugate64)(const ConjugateCall<double>&, int threads);
+  void (*adjoint_system32)(const AdjointSystemCall<float>&, int threads);
+  void (*adjoint_system64)(const AdjointSystemCall<double>&, int threads);
+  void (*adjoint_result32)(const AdjointResultCall<float>&, int threads);
+  void (*adjoint_result64)(const AdjointResultCall<double>&, int threads);
   void (*flops)(float* seconds, std::int64_t* operations);  // multiply-add loop, for calibration
 };
 

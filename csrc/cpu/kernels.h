@@ -1,5 +1,6 @@
 // The compiled physics of one instruction set. Included once by each cpu/isa_*.cpp, after PD_TARGET is set.
 #pragma once
+#include "cpu/adjoint.h"
 #include "cpu/conjugate.h"
 #include "cpu/fields.h"
 #include "cpu/multilevel_stepper.h"
@@ -245,6 +246,10 @@ const Kernels PD_KERNELS = {PD_NAME,
                             &precondition_any<double>,
                             &conjugate_any<float>,
                             &conjugate_any<double>,
+                            &adjoint_system_any<float>,
+                            &adjoint_system_any<double>,
+                            &adjoint_result_any<float>,
+                            &adjoint_result_any<double>,
                             &multiply_add_loop};
 
 }  // namespace pd

@@ -35,14 +35,18 @@ __device__ void add_across_block(double (&sum)[Count], WarpSums& warp_sums) {
   __syncthreads();
 }
 
-// The first direction of a vertex, 1 / D times the right side; adds to |b|^2 and b . b / D.
+// The first direction of a vertex, 1 / D times the right side; adds to |b|^2 and b . b / D, to the first also zero, which is
+// no number where something is infinite or none.
 template <class T>
 __device__ void begin_vertex(const DeviceConjugate<T>& call, std::int64_t at, T inverse,
                              double (&sums)[2]) {
   const Vec3<T> right = read3(call.residual + at);
+  const T none(0);
   write3(call.direction + at, inverse * right);
+  write3(call.solution + at, {none, none, none});
+  const Vec3<T> lost = multiply_add(none, read3(call.positions + at), none * right);
   const double square = double(dot(right, right));
-  sums[0] += square;
+  sums[0] += square + double(lost.x + lost.y + lost.z);
   sums[1] += double(inverse) * square;
 }
 

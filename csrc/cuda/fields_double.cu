@@ -1,3 +1,4 @@
+#include "cuda/adjoint.cuh"
 #include "cuda/conjugate.cuh"
 
 namespace pd {
@@ -5,5 +6,7 @@ template std::int64_t field_bytes(const DeviceField<double>&);
 template void run_field(const DeviceField<double>&, void*, Stream);
 template std::int64_t conjugate_bytes(const DeviceConjugate<double>&);
 template void run_conjugate(const DeviceConjugate<double>&, void*, Stream);
+template void run_adjoint_system(const DeviceAdjointSystem<double>&, Stream);
+template void run_adjoint_result(const AdjointResultCall<double>&, Stream);
 template void run_rotation(const RotationCall<double>&, Stream);
 }  // namespace pd

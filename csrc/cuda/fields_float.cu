@@ -1,3 +1,4 @@
+#include "cuda/adjoint.cuh"
 #include "cuda/conjugate.cuh"
 
 namespace pd {
@@ -5,5 +6,7 @@ template std::int64_t field_bytes(const DeviceField<float>&);
 template void run_field(const DeviceField<float>&, void*, Stream);
 template std::int64_t conjugate_bytes(const DeviceConjugate<float>&);
 template void run_conjugate(const DeviceConjugate<float>&, void*, Stream);
+template void run_adjoint_system(const DeviceAdjointSystem<float>&, Stream);
+template void run_adjoint_result(const AdjointResultCall<float>&, Stream);
 template void run_rotation(const RotationCall<float>&, Stream);
 }  // namespace pd

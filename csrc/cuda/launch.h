@@ -61,6 +61,14 @@ template <class T>
 void run_conjugate(const DeviceConjugate<T>& call, void* memory, Stream stream);
 
 template <class T>
+using DeviceAdjointSystem = AdjointSystemCall<T, DevicePlan<T>>;
+
+template <class T>
+void run_adjoint_system(const DeviceAdjointSystem<T>& call, Stream stream);
+template <class T>
+void run_adjoint_result(const AdjointResultCall<T>& call, Stream stream);
+
+template <class T>
 std::int64_t precondition_bytes(const PreconditionCall<T>& call);
 template <class T>
 void run_precondition(const PreconditionCall<T>& call, void* memory, Stream stream);

@@ -40,6 +40,18 @@ struct Cuda {
   }
 
   template <class T>
+  static void adjoint_system(const DeviceAdjointSystem<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_adjoint_system(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+  template <class T>
+  static void adjoint_result(const AdjointResultCall<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_adjoint_result(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+  template <class T>
   static void rotation(const RotationCall<T>& call, const Tensor& like) {
     const c10::cuda::CUDAGuard guard(like.device());
     run_rotation(call, c10::cuda::getCurrentCUDAStream().stream());

@@ -63,6 +63,17 @@ PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, 
   return subtract_product(pushed, grip, tangential);
 }
 
+// Of a normal, squared: what earlier ones leave of one that they span but for a thousandth.
+constexpr double spanned = 1e-6;
+
+// A projector without the part `left` that it leaves of a normal, by the reciprocal of that part's square.
+template <class R>
+PD_HD Mat3<R> take_off(const Mat3<R>& free, const Vec3<R>& left, const R& reciprocal) {
+  return {{subtract_product(free.row[0], reciprocal * left.x, left),
+           subtract_product(free.row[1], reciprocal * left.y, left),
+           subtract_product(free.row[2], reciprocal * left.z, left)}};
+}
+
 // What a contact leaves of the directions `free`, a projector, to a vertex that it pushes out from `u`: not its normal, and
 // nothing where friction takes back all slip.
 template <class R>
@@ -74,13 +85,10 @@ PD_HD void take_directions(Mat3<R>& free, const Vec3<R>& u, const Vec3<R>& norma
   const auto sticks = friction * depth > square_root(dot(tangential, tangential));
   const Vec3<R> left = free * normal;
   const R size = dot(left, left);
-  // a normal that earlier ones span but for a thousandth takes nothing more
-  const auto takes = depth > none && size > R(1e-6);
+  const auto takes = depth > none && size > R(spanned);
   const R scale = select(takes, one / select(takes, size, one), none);
   const R kept = select(sticks, none, one);
-  free = {{kept * subtract_product(free.row[0], scale * left.x, left),
-           kept * subtract_product(free.row[1], scale * left.y, left),
-           kept * subtract_product(free.row[2], scale * left.z, left)}};
+  free = kept * take_off(free, left, scale);
 }
 
 // `x` is the vertex at the start of the step, `u` its displacement since then.

@@ -210,9 +210,57 @@ struct FieldCall {
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, vertices] of the diagonal
 };
 
-// Numbers of an environment in the progress of a solve: r . z, |right side|, and 1 while it goes on, 0 after, -1 before: then
-// the first iteration works out the others, by a residual that is the right side.
-enum ConjugateProgress : int { progress_product, progress_scale, progress_active, progress_count };
+// The system of a step's adjoint, by the user's numbers of vertices.
+template <class T, class P = Plan<T>>
+struct AdjointSystemCall {
+  P plan;
+  Material<T> material;
+  Values<T> elastic;       // [vertices] weighted diagonal of elasticity
+  std::int64_t batch = 0;  // of the right sides
+  std::int64_t rows =
+      1;  // of inertia and inverse: 1, where environments share all that they come from, or the batch
+  double time_step = 0;
+  const T* grad_positions = nullptr;  // [batch, vertices, 3] each
+  const T* grad_velocities = nullptr;
+  T* right = nullptr;
+  T* inertia = nullptr;  // [rows, vertices]
+  T* inverse = nullptr;
+  // what only contacts ask for, else null: the step [batch, vertices, 3], the gradient of its elastic energy, and what of every
+  // vertex is free
+  const T* after = nullptr;
+  const T* positions = nullptr;
+  const T* velocities = nullptr;
+  const T* forces = nullptr;  // may be null
+  const T* elastic_gradient = nullptr;
+  T* projector = nullptr;  // [batch, vertices, 3, 3]
+  bool* stuck = nullptr;   // [batch, vertices]
+};
+
+// What a solved adjoint says of the state before the step.
+template <class T>
+struct AdjointResultCall {
+  Values<T> masses, damping;
+  std::int64_t batch = 0, vertices = 0;
+  double time_step = 0;
+  const T* multiplier = nullptr;  // [batch, vertices, 3] each
+  const T* grad_velocities = nullptr;
+  const double* error = nullptr;  // of each environment
+  std::int64_t error_stride = 1;
+  T* out_positions = nullptr;
+  T* out_velocities = nullptr;
+  T* out_multiplier = nullptr;
+};
+
+// Numbers of an environment in the progress of a solve: r . z, |right side|, 1 while it goes on, 0 after, -1 before, and the
+// residual relative to the right side. Before, the first iteration works out the others, by a residual that is the right side.
+// No number for an error: neither right side nor positions are numbers.
+enum ConjugateProgress : int {
+  progress_product,
+  progress_scale,
+  progress_active,
+  progress_error,
+  progress_count
+};
 
 // Iterations of conjugate gradients on (inertia + elastic Hessian) solution = right side, preconditioned by a diagonal, for each
 // environment by itself.
@@ -225,7 +273,7 @@ struct ConjugateCall {
   const T* positions = nullptr;  // [batch, vertices, 3]
   const T* projector =
       nullptr;            // [batch, vertices, 3, 3] of what contacts let through; may be null
-  T* solution = nullptr;  // [batch, vertices, 3] each
+  T* solution = nullptr;  // [batch, vertices, 3] each, from zero
   T* residual = nullptr;
   T* direction = nullptr;
   double* progress = nullptr;  // [batch, progress_count]

@@ -10,12 +10,13 @@ namespace pd::inline PD_TARGET {
 
 // One environment's numbers between iterations, as in ConjugateProgress.
 struct Conjugate {
-  double product, scale;
+  double product, scale, error;
   bool active, begins;
 
   PD_HD explicit Conjugate(const double* from)
       : product(from[progress_product]),
         scale(from[progress_scale]),
+        error(from[progress_error]),
         active(from[progress_active] != 0),
         begins(from[progress_active] < 0) {}
 
@@ -23,13 +24,15 @@ struct Conjugate {
     to[progress_product] = product;
     to[progress_scale] = scale;
     to[progress_active] = active ? 1 : 0;
+    to[progress_error] = error;
   }
 
-  // by |b|^2 and b . b / D
+  // by |b|^2, plus zero times every position, and b . b / D
   PD_HD void begin(double square, double weighted) {
     scale = sqrt(square);
     product = weighted;
     active = scale > 0;
+    error = active ? 1 : scale;
   }
 
   // how far to go along the direction; along one without positive curvature H is not positive, and what there is stays
@@ -42,7 +45,10 @@ struct Conjugate {
   PD_HD double keep(double residual_square, double next, double tolerance) {
     const double ratio = next / product;
     product = next;
-    active = sqrt(residual_square) > tolerance * scale;
+    const double residual = sqrt(residual_square);
+    active = residual > tolerance * scale;
+    // what got lost on the way is an error, however large
+    error = residual < HUGE_VAL ? residual / scale : HUGE_VAL;
     return ratio;
   }
 };

@@ -1,0 +1,355 @@
+// What autograd does around a step and a rollout. The adjoint of a step is an op of its own, step_vjp.
+//
+// Not registered from Python, where the lists of a plan and of a material cost more than a small step itself.
+#include "checks.h"
+
+#include <ATen/core/dispatch/Dispatcher.h>
+#include <torch/csrc/autograd/custom_function.h>
+#include <torch/library.h>
+
+#include <functional>
+#include <iterator>
+#include <optional>
+#include <string_view>
+#include <tuple>
+#include <vector>
+
+namespace pd {
+namespace {
+
+using OptionalTensor = std::optional<Tensor>;
+using Outputs = std::tuple<Tensor, Tensor, Tensor>;
+using torch::autograd::AutogradContext;
+using torch::autograd::variable_list;
+
+#define X(name, width, rows, meaning) #name,
+constexpr const char* material_names[] = {
+#include "plan/material.def"
+};
+#undef X
+
+// Where an array stands in a material.
+constexpr std::size_t place_of(std::string_view name) {
+  for (std::size_t i = 0; i < std::size(material_names); ++i) {
+    if (name == material_names[i]) return i;
+  }
+  throw "no such array";
+}
+
+template <class Signature>
+c10::TypedOperatorHandle<Signature> find_op(const char* name) {
+  return c10::Dispatcher::singleton().findSchemaOrThrow(name, "").typed<Signature>();
+}
+
+Outputs plain_step(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
+                   const OptionalTensor& start, at::TensorList material, at::TensorList plan,
+                   const Numbers& n) {
+  static const auto op =
+      find_op<Outputs(const Tensor&, const Tensor&, const OptionalTensor&, const OptionalTensor&,
+                      at::TensorList, at::TensorList, std::int64_t, std::int64_t, double, double,
+                      double, std::int64_t, bool, double, bool, bool)>("torchpd::step");
+  const at::AutoDispatchBelowADInplaceOrView below;
+  return op.call(positions, velocities, forces, start, material, plan, n.schedule, n.iterations,
+                 n.time_step, n.relaxation, n.rho, n.delay, n.weighted, n.tolerance, n.inertial,
+                 n.report);
+}
+
+Outputs plain_rollout(const Tensor& positions, const Tensor& velocities,
+                      const OptionalTensor& forces, at::TensorList material, at::TensorList plan,
+                      std::int64_t steps, std::int64_t every, const Numbers& n) {
+  static const auto op =
+      find_op<Outputs(const Tensor&, const Tensor&, const OptionalTensor&, at::TensorList,
+                      at::TensorList, std::int64_t, std::int64_t, std::int64_t, std::int64_t,
+                      double, double, double, std::int64_t, bool, double, bool, bool)>(
+          "torchpd::rollout");
+  const at::AutoDispatchBelowADInplaceOrView below;
+  return op.call(positions, velocities, forces, material, plan, steps, every, n.schedule,
+                 n.iterations, n.time_step, n.relaxation, n.rho, n.delay, n.weighted, n.tolerance,
+                 n.inertial, n.report);
+}
+
+// Which arrays of a material autograd wants to know about.
+using Wanted = std::optional<c10::List<bool>>;
+
+// A step as it was taken, for its adjoint.
+struct Taken {
+  Tensor positions, velocities;
+  OptionalTensor forces;
+  Tensor after;
+};
+
+// Gradients for positions, velocities, forces, then for the wanted arrays of the material.
+variable_list call_step_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
+                            const Taken& step, at::TensorList material, at::TensorList plan,
+                            double time_step, const Wanted& wanted) {
+  static const auto op =
+      find_op<variable_list(const Tensor&, const Tensor&, const Tensor&, const Tensor&,
+                            const Tensor&, const OptionalTensor&, at::TensorList, at::TensorList,
+                            double, const Wanted&)>("torchpd::step_vjp");
+  return op.call(grad_positions.contiguous(), grad_velocities.contiguous(), step.after,
+                 step.positions, step.velocities, step.forces, material, plan, time_step, wanted);
+}
+
+// Whether an array has any numbers; torch.compile has symbols for its lengths.
+bool some(const Tensor& array) { return array.sym_numel() != 0; }
+
+// Without contacts nothing depends on what they would be.
+void refuse_contacts(const c10::List<bool>& wanted, at::TensorList material) {
+  const auto without = [&](const char* name) {
+    const std::size_t at = place_of(name);
+    return wanted[at] && some(material[at]);
+  };
+  const bool planes = without("planes"), spheres = without("spheres");
+  TORCH_CHECK(!planes && !spheres, "torchpd: a step has no derivative for ", planes ? "planes" : "",
+              planes && spheres ? " and " : "", spheres ? "spheres" : "", "; detach them, or sim.",
+              planes ? "planes" : "spheres", ".requires_grad_(False)");
+}
+
+// What autograd does not look at, and both functions have to know.
+struct Unvaried {
+  at::TensorList plan;
+  Numbers numbers;
+  std::int64_t steps = 1, every = 1;
+};
+
+// Keeps the inputs that have derivatives and the positions that came out, and the velocities `between` steps; what there is
+// none of is undefined.
+variable_list keep(AutogradContext* context, const Tensor& positions, const Tensor& velocities,
+                   const OptionalTensor& forces, const Outputs& outputs, const Tensor& between,
+                   at::TensorList material, const Unvaried& rest) {
+  const auto& [after, after_velocities, info] = outputs;
+  variable_list saved{positions, velocities, forces.value_or(Tensor()), after, between};
+  saved.insert(saved.end(), material.begin(), material.end());
+  context->save_for_backward(std::move(saved));
+  // nobody changes it, and whoever moves what is saved elsewhere need not move it
+  context->saved_data["plan"] = c10::List<Tensor>(rest.plan);
+  context->saved_data["time_step"] = rest.numbers.time_step;
+  context->saved_data["every"] = rest.every;
+  // a report, not a function to differentiate
+  context->mark_non_differentiable({info});
+  return {after, after_velocities, info};
+}
+
+struct Kept {
+  Tensor positions, velocities;
+  OptionalTensor forces;
+  Tensor after, after_velocities;
+  variable_list material;
+
+  explicit Kept(const variable_list& saved)
+      : positions(saved[0]),
+        velocities(saved[1]),
+        after(saved[3]),
+        after_velocities(saved[4]),
+        material(saved.begin() + 5, saved.end()) {
+    if (saved[2].defined()) forces = saved[2];
+  }
+};
+
+// Inputs that autograd may ask for, by the order in which a function was given them: state, what else there is, material.
+struct Edges {
+  const AutogradContext* context;
+  std::size_t first_of_material;
+
+  c10::List<bool> material(std::size_t count) const {
+    c10::List<bool> wanted;
+    for (std::size_t i = 0; i < count; ++i)
+      wanted.push_back(context->needs_input_grad(first_of_material + i));
+    return wanted;
+  }
+};
+
+// In the places of all arrays, those that were wanted.
+void append_in_places(variable_list& to, const c10::List<bool>& wanted, const Tensor* values) {
+  for (const bool one : wanted) to.push_back(one ? *values++ : Tensor());
+}
+
+class StepFunction : public torch::autograd::Function<StepFunction> {
+ public:
+  static variable_list forward(AutogradContext* context, const Tensor& positions,
+                               const Tensor& velocities, const OptionalTensor& forces,
+                               const OptionalTensor& start, at::TensorList material,
+                               const Unvaried& rest) {
+    const Outputs outputs =
+        plain_step(positions, velocities, forces, start, material, rest.plan, rest.numbers);
+    context->saved_data["starts"] = start.has_value();
+    return keep(context, positions, velocities, forces, outputs, Tensor(), material, rest);
+  }
+
+  static variable_list backward(AutogradContext* context, const variable_list& grads) {
+    const Kept kept(context->get_saved_variables());
+    const bool forces = kept.forces.has_value(), starts = context->saved_data["starts"].toBool();
+    const std::size_t start_edge = forces ? 3 : 2;
+    TORCH_CHECK(!starts || !context->needs_input_grad(start_edge),
+                "torchpd: a step has no derivative for its first iterate; detach start");
+    const c10::List<bool> wanted =
+        Edges{context, start_edge + (starts ? 1 : 0)}.material(kept.material.size());
+    refuse_contacts(wanted, kept.material);
+    const variable_list values = call_step_vjp(
+        grads[0], grads[1], {kept.positions, kept.velocities, kept.forces, kept.after},
+        kept.material, context->saved_data["plan"].toTensorVector(),
+        context->saved_data["time_step"].toDouble(), wanted);
+    variable_list result{values[0], values[1], forces ? values[2] : Tensor(), Tensor()};
+    append_in_places(result, wanted, values.data() + 3);
+    result.push_back(Tensor());
+    return result;
+  }
+};
+
+// The material at one step of a rollout: spheres move on.
+variable_list material_at(const variable_list& material, std::int64_t step) {
+  variable_list at_step = material;
+  Tensor& spheres = at_step[place_of("spheres")];
+  if (!some(spheres)) return at_step;
+  const Tensor center = spheres.narrow(-1, 0, 3), rest = spheres.narrow(-1, 3, 5);
+  spheres = at::cat({center + double(step) * spheres.narrow(-1, 5, 3), rest}, -1);
+  return at_step;
+}
+
+class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
+ public:
+  static variable_list forward(AutogradContext* context, const Tensor& positions,
+                               const Tensor& velocities, const OptionalTensor& forces,
+                               at::TensorList material, const Unvaried& rest) {
+    const Outputs outputs = plain_rollout(positions, velocities, forces, material, rest.plan,
+                                          rest.steps, rest.every, rest.numbers);
+    return keep(context, positions, velocities, forces, outputs, std::get<1>(outputs), material,
+                rest);
+  }
+
+  // backwards through the recorded states, one adjoint a step
+  static variable_list backward(AutogradContext* context, const variable_list& grads) {
+    TORCH_CHECK(context->saved_data["every"].toInt() == 1,
+                "torchpd: the rollout op is differentiable with every=1 only, where it records "
+                "every state");
+    const Kept kept(context->get_saved_variables());
+    const bool forces = kept.forces.has_value();
+    const c10::List<bool> wanted = Edges{context, forces ? 3u : 2u}.material(kept.material.size());
+    refuse_contacts(wanted, kept.material);
+    const variable_list plan = context->saved_data["plan"].toTensorVector();
+    const double time_step = context->saved_data["time_step"].toDouble();
+    // of positions, velocities, forces and the wanted arrays; the first two of one step after another
+    variable_list sums(3);
+    for (std::int64_t step = kept.after.sym_size(0).guard_int(__FILE__, __LINE__) - 1; step >= 0;
+         --step) {
+      const auto add = [](const Tensor& a, const Tensor& b) { return a.defined() ? a + b : b; };
+      const Tensor before = step ? kept.after[step - 1] : kept.positions;
+      const Tensor speed = step ? kept.after_velocities[step - 1] : kept.velocities;
+      variable_list values =
+          call_step_vjp(add(sums[0], grads[0][step]), add(sums[1], grads[1][step]),
+                        {before, speed, kept.forces, kept.after[step]},
+                        material_at(kept.material, step), plan, time_step, wanted);
+      sums.resize(values.size());
+      for (std::size_t i = 2; i < values.size(); ++i) values[i] = add(sums[i], values[i]);
+      sums = std::move(values);
+    }
+    if (!sums[0].defined()) {
+      // of no steps
+      for (Tensor& sum : sums) sum = at::zeros_like(kept.positions);
+      for (std::size_t i = 0; i < wanted.size(); ++i) {
+        if (wanted[i]) sums.push_back(at::zeros_like(kept.material[i]));
+      }
+    }
+    variable_list result{sums[0], sums[1], forces ? sums[2] : Tensor()};
+    append_in_places(result, wanted, sums.data() + 3);
+    result.push_back(Tensor());
+    return result;
+  }
+};
+
+bool varies(at::TensorList tensors) {
+  for (const Tensor& t : tensors) {
+    if (t.requires_grad()) return true;
+  }
+  return false;
+}
+
+// Within torch.func.grad and its like torch takes functions from Python alone.
+void refuse_transforms() {
+  const auto& transforms = at::functorch::functorchTLSAccessor();
+  if (!transforms) return;
+  try {
+    transforms->checkSupportsCppAutogradFunction();
+  } catch (const c10::Error&) {
+    TORCH_CHECK(false,
+                "torchpd: a step has no derivative within torch.func.grad, vjp or jacrev; use "
+                "torch.autograd.grad, whose is_grads_batched takes many gradients at once");
+  }
+}
+
+bool varies(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
+            const OptionalTensor& start, at::TensorList material) {
+  return at::GradMode::is_enabled() && (positions.requires_grad() || velocities.requires_grad() ||
+                                        (forces && forces->requires_grad()) ||
+                                        (start && start->requires_grad()) || varies(material));
+}
+
+Outputs as_outputs(const variable_list& list) { return {list[0], list[1], list[2]}; }
+
+Outputs step(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
+             const OptionalTensor& start, at::TensorList material, at::TensorList plan,
+             std::int64_t schedule, std::int64_t iterations, double time_step, double relaxation,
+             double rho, std::int64_t delay, bool weighted, double tolerance, bool inertial,
+             bool report) {
+  const Numbers n{schedule, iterations, time_step, relaxation, rho,
+                  delay,    weighted,   tolerance, inertial,   report};
+  if (!varies(positions, velocities, forces, start, material))
+    return plain_step(positions, velocities, forces, start, material, plan, n);
+  refuse_transforms();
+  return as_outputs(
+      StepFunction::apply(positions, velocities, forces, start, material, Unvaried{plan, n}));
+}
+
+Outputs rollout(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
+                at::TensorList material, at::TensorList plan, std::int64_t steps,
+                std::int64_t every, std::int64_t schedule, std::int64_t iterations,
+                double time_step, double relaxation, double rho, std::int64_t delay, bool weighted,
+                double tolerance, bool inertial, bool report) {
+  const Numbers n{schedule, iterations, time_step, relaxation, rho,
+                  delay,    weighted,   tolerance, inertial,   report};
+  if (!varies(positions, velocities, forces, {}, material))
+    return plain_rollout(positions, velocities, forces, material, plan, steps, every, n);
+  refuse_transforms();
+  return as_outputs(RolloutFunction::apply(positions, velocities, forces, material,
+                                           Unvaried{plan, n, steps, every}));
+}
+
+// Of an op that has first derivatives only.
+class LastDerivative : public torch::autograd::Function<LastDerivative> {
+ public:
+  static variable_list forward(AutogradContext*, at::TensorList,
+                               const std::function<variable_list()>& run) {
+    return run();
+  }
+  static variable_list backward(AutogradContext*, const variable_list&) {
+    TORCH_CHECK(false,
+                "torchpd: a step has first derivatives only; differentiate without create_graph, "
+                "or take differences of the gradients of two steps");
+  }
+};
+
+variable_list step_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
+                       const Tensor& after, const Tensor& positions, const Tensor& velocities,
+                       const OptionalTensor& forces, at::TensorList material, at::TensorList plan,
+                       double time_step, const Wanted& wanted) {
+  const auto run = [&] {
+    const at::AutoDispatchBelowADInplaceOrView below;
+    return call_step_vjp(grad_positions, grad_velocities, {positions, velocities, forces, after},
+                         material, plan, time_step, wanted);
+  };
+  variable_list inputs{grad_positions, grad_velocities, after, positions, velocities};
+  if (forces) inputs.push_back(*forces);
+  inputs.insert(inputs.end(), material.begin(), material.end());
+  if (!at::GradMode::is_enabled() || !varies(inputs)) return run();
+  return LastDerivative::apply(at::TensorList(inputs), std::function<variable_list()>(run));
+}
+
+}  // namespace
+
+TORCH_LIBRARY_IMPL(torchpd, Autograd, m) {
+  m.impl("step", &step);
+  m.impl("rollout", &rollout);
+  m.impl("step_vjp", &step_vjp);
+}
+
+}  // namespace pd

@@ -1,0 +1,44 @@
+// Runner of solver/adjoint.h.
+#pragma once
+#include "cpu/team.h"
+#include "solver/adjoint.h"
+
+#include <algorithm>
+
+namespace pd::inline PD_TARGET {
+
+// Threads for so many vertices.
+inline int useful_threads(std::int64_t vertices, int threads) {
+  constexpr std::int64_t least_share = 4096;
+  return int(std::min<std::int64_t>(threads, vertices / least_share + 1));
+}
+
+template <class T>
+void adjoint_system_any(const AdjointSystemCall<T>& call, int threads) {
+  const Plan<T>& plan = call.plan;
+  using Vertex = AdjointVertex<T, Plan<T>>;
+  const std::int64_t count = call.batch * plan.vertices;
+  run_team(useful_threads(count, threads), [&](const Team& team) {
+    for (std::int64_t n = team.begin(count); n < team.end(count); ++n)
+      Vertex{call, n / plan.vertices, int(n % plan.vertices), -1}.solve_for();
+    team.barrier();
+    for (std::int64_t n = team.begin(call.batch * plan.pins); n < team.end(call.batch * plan.pins);
+         ++n) {
+      const std::int64_t environment = n / plan.pins, pin = n % plan.pins;
+      Vertex{call, environment, plan.vertex_order[plan.pin_vertex[pin]], int(pin)}.solve_for();
+    }
+  });
+}
+
+template <class T>
+void adjoint_result_any(const AdjointResultCall<T>& call, int threads) {
+  const std::int64_t count = call.batch * call.vertices;
+  run_team(useful_threads(count, threads), [&](const Team& team) {
+    for (std::int64_t n = team.begin(count); n < team.end(count); ++n) {
+      for (int c = 0; c < 3; ++c)
+        write_adjoint_number(call, n / call.vertices, 3 * (n % call.vertices) + c);
+    }
+  });
+}
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,46 @@
+// Runner of solver/adjoint.h.
+#pragma once
+#include "cuda/fields.cuh"
+#include "solver/adjoint.h"
+
+namespace pd {
+
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    adjoint_system(const __grid_constant__ AdjointSystemCall<T, DevicePlan<T>> call) {
+  const DevicePlan<T>& plan = call.plan;
+  const std::int64_t number = std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (number >= call.batch * plan.vertices) return;
+  const std::int64_t environment = number / plan.vertices;
+  const int internal = int(number % plan.vertices);
+  const int pin = plan.pins ? plan.vertex_pin[internal] : -1;
+  AdjointVertex<T, DevicePlan<T>>{call, environment, plan.vertex_order[internal], pin}.solve_for();
+}
+
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    adjoint_result(const __grid_constant__ AdjointResultCall<T> call) {
+  const std::int64_t number = std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  const std::int64_t numbers = 3 * call.vertices;
+  if (number >= call.batch * numbers) return;
+  write_adjoint_number(call, number / numbers, number % numbers);
+}
+
+template <class Call>
+void run_for_each(void (*kernel)(Call), const Call& call, std::int64_t count, Stream to) {
+  const std::int64_t blocks = (count + field_threads - 1) / field_threads;
+  kernel<<<blocks_of(blocks), field_threads, 0, static_cast<cudaStream_t>(to)>>>(call);
+  check(cudaGetLastError());
+}
+
+template <class T>
+void run_adjoint_system(const DeviceAdjointSystem<T>& call, Stream to) {
+  run_for_each(adjoint_system<T>, call, call.batch * call.plan.vertices, to);
+}
+
+template <class T>
+void run_adjoint_result(const AdjointResultCall<T>& call, Stream to) {
+  run_for_each(adjoint_result<T>, call, 3 * call.batch * call.vertices, to);
+}
+
+}  // namespace pd

@@ -1,0 +1,159 @@
+// The system of a step's adjoint, H l = dL/dx' + dL/dv' / h on what moves, and what its solution says of the state before; see
+// torchpd/adjoint.py. A vertex at a time, no neighbours.
+#pragma once
+#include "effects/contact.h"
+#include "math/mat.h"
+#include "plan/views.h"
+#include "solver/vertex.h"
+
+namespace pd::inline PD_TARGET {
+
+// of what friction could take back: slip below it counts as none
+constexpr double sticking = 1e-3;
+
+// What contacts do to a vertex of a solved step. One holds it when an unaccelerated iteration, x' - r / D, would end inside.
+template <class T>
+struct HeldVertex {
+  Vec3<T> position;  // x'
+  Vec3<T> moved;     // x' - x
+  Vec3<T> residual;  // r, the gradient of the step's objective
+  T diagonal;
+
+  // off the normals that hold it
+  Mat3<T> projector = {{{T(1), T(0), T(0)}, {T(0), T(1), T(0)}, {T(0), T(0), T(1)}}};
+  bool stuck = false;  // friction holds it
+  T curvature = T(0);  // of the surface that it slides on, times the push
+
+  PD_HD void touch(const Vec3<T>& normal, T gap, T friction, const Vec3<T>& motion, T curved) {
+    const T push = dot(residual, normal);
+    if (!(push > T(0) && gap < push / diagonal)) return;
+    Vec3<T> slip = moved - motion;
+    slip = subtract_product(slip, dot(slip, normal), normal);
+    // what friction can take back in one iteration is more than what has slipped
+    const T slipped = square_root(dot(slip, slip));
+    stuck = stuck || (friction > T(0) && slipped * diagonal < T(sticking) * friction * push);
+    // what earlier contacts leave of the normal, so that all together are a projector
+    const Vec3<T> left = projector * normal;
+    const T size = dot(left, left);
+    if (size > T(spanned)) projector = take_off(projector, left, T(1) / size);
+    curvature = multiply_add(push, curved, curvature);
+  }
+};
+
+template <class T>
+PD_HD void touch_all(HeldVertex<T>& vertex, const Material<T>& material, std::int64_t environment) {
+  const Vec3<T>& x = vertex.position;
+  for (int c = 0; c < material.planes_count; ++c) {
+    const T* p = material.planes.of(environment) + 5 * c;
+    const Vec3<T> normal = {p[0], p[1], p[2]};
+    vertex.touch(normal, dot(normal, x) - p[3], p[4], {T(0), T(0), T(0)}, T(0));
+  }
+  for (int c = 0; c < material.spheres_count; ++c) {
+    const T* p = material.spheres.of(environment) + 8 * c;
+    const Vec3<T> offset = x - Vec3<T>{p[0], p[1], p[2]};
+    const T length = square_root(dot(offset, offset));
+    if (!(length > T(0))) continue;
+    vertex.touch((T(1) / length) * offset, length - p[3], p[4], {p[5], p[6], p[7]}, T(1) / length);
+  }
+}
+
+// One vertex of one environment, by the user's number; `pin` holds it, or -1. `elastic`: of the weighted diagonal.
+template <class T, class P>
+struct AdjointVertex {
+  const AdjointSystemCall<T, P>& call;
+  std::int64_t environment;
+  int vertex, pin;
+
+  PD_HD Vec3<T> read(const T* from) const {
+    const T* p = from + 3 * (environment * call.plan.vertices + vertex);
+    return {p[0], p[1], p[2]};
+  }
+
+  PD_HD void write(T* to, const Vec3<T>& a) const {
+    T* p = to + 3 * (environment * call.plan.vertices + vertex);
+    p[0] = a.x;
+    p[1] = a.y;
+    p[2] = a.z;
+  }
+
+  PD_HD T mass() const { return call.material.masses.of(environment)[vertex]; }
+
+  PD_HD T spring() const {
+    return pin < 0 ? T(0) : call.material.pin_stiffness.of(environment)[pin];
+  }
+
+  PD_HD T inertia(T spring) const {
+    return inertia_weight(mass(), *call.material.damping.of(environment), spring,
+                          T(call.time_step));
+  }
+
+  // r = m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - force + k (x' - pin) + elasticity; contacts do not enter
+  PD_HD Vec3<T> residual(const Vec3<T>& after, const Vec3<T>& moved) const {
+    const T h = T(call.time_step);
+    const T* g = call.material.gravity.of(environment);
+    Vec3<T> pull =
+        mass() * multiply_add(T(1) / h, read(call.velocities), Vec3<T>{g[0], g[1], g[2]});
+    if (call.forces) pull = pull + read(call.forces);
+    Vec3<T> sum = multiply_add(inertia(T(0)), moved, read(call.elastic_gradient)) - pull;
+    if (pin >= 0) {
+      const T* p = call.material.pin_targets.of(environment) + 3 * std::int64_t(pin);
+      sum = multiply_add(spring(), after - Vec3<T>{p[0], p[1], p[2]}, sum);
+    }
+    return sum;
+  }
+
+  // A vertex that a pin holds exactly, or friction, has no part in H: right side and 1 / D are zero.
+  PD_HD void solve_for() const {
+    const T h = T(call.time_step), weight = inertia(spring());
+    const bool moves = weight < T(HUGE_VAL) && weight > -T(HUGE_VAL);
+    const T diagonal = moves ? weight + call.elastic.of(environment)[vertex] : T(1);
+    Vec3<T> right = {T(0), T(0), T(0)};
+    if (moves)
+      right = multiply_add(T(1) / h, read(call.grad_velocities), read(call.grad_positions));
+    T kept = moves ? weight : T(0), inverse = moves ? T(1) / diagonal : T(0);
+    if (call.projector) {
+      const Vec3<T> after = read(call.after);
+      HeldVertex<T> held{after, after - read(call.positions), right, diagonal};
+      if (moves) {
+        held.residual = residual(after, held.moved);
+        touch_all(held, call.material, environment);
+      }
+      const std::int64_t at = environment * call.plan.vertices + vertex;
+      for (int row = 0; row < 3; ++row) {
+        T* to = call.projector + 9 * at + 3 * row;
+        to[0] = held.projector.row[row].x;
+        to[1] = held.projector.row[row].y;
+        to[2] = held.projector.row[row].z;
+      }
+      call.stuck[at] = held.stuck;
+      kept = kept - held.curvature;
+      if (held.stuck) inverse = T(0);
+      right = inverse != T(0) ? held.projector * right : Vec3<T>{T(0), T(0), T(0)};
+    }
+    write(call.right, right);
+    // what environments share is written once
+    if (environment == 0 || call.rows > 1) {
+      const std::int64_t at = environment * call.plan.vertices + vertex;
+      call.inertia[at] = kept;
+      call.inverse[at] = inverse;
+    }
+  }
+};
+
+// -l . dr / d(x, v) of one number of a state: dL/dx = m / h^2 (1 + damping h) l - dL/dv' / h, dL/dv = m / h l. An environment
+// whose solve could not begin has no number for an answer.
+template <class T>
+PD_HD void write_adjoint_number(const AdjointResultCall<T>& call, std::int64_t environment,
+                                std::int64_t number) {
+  const T h = T(call.time_step);
+  const T mass = call.masses.of(environment)[number / 3];
+  const double error = call.error[environment * call.error_stride];
+  const std::int64_t at = 3 * environment * call.vertices + number;
+  const T multiplier = error == error ? call.multiplier[at] : T(NAN);
+  const T inertia = inertia_weight(mass, *call.damping.of(environment), T(0), h);
+  call.out_multiplier[at] = multiplier;
+  call.out_velocities[at] = mass / h * multiplier;
+  call.out_positions[at] = inertia * multiplier - call.grad_velocities[at] / h;
+}
+
+}  // namespace pd::inline PD_TARGET
