@@ -2,9 +2,7 @@
 
 A held bar swings, float32, time step 1/60 s, 64 guarded iterations, from 1e6 Pa on 256; the loss is the sum of squares
 of the new positions, and the velocities before are asked for their gradients. Times are medians, as Python calls it,
-device awaited. `operations`: backward where the conjugate gradients are torch operations and Hessian products, as they
-are for large meshes on a GPU and with a multilevel preconditioner. On a GPU also both ways with kernel "block", and
-these in a CUDA graph, which it alone allows.
+device awaited. On a GPU also both ways with kernel "block", and these in a CUDA graph, which it alone allows.
 
     python benchmarks/gradients.py --threads 1
     python benchmarks/gradients.py --device cuda --threads 16
@@ -18,7 +16,6 @@ import statistics
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import torch
 from gpu_scenes import GpuScene
@@ -27,7 +24,6 @@ from machine import describe_run, measure
 from tqdm import tqdm
 
 import torchpd as pd
-from torchpd.adjoint import _System
 
 Row = dict[str, Any]
 
@@ -37,7 +33,6 @@ YOUNGS = (1e4, 1e5, 1e6)
 TIMES = {
     "forward": "forward ms",
     "backward": "backward ms",
-    "operations": "by torch operations",
     "block": "both, `block`",
     "recorded": "in a CUDA graph",
 }
@@ -68,12 +63,9 @@ def measure_scene(cells: tuple[int, int, int], batch: int, youngs: float, device
 
     sim, state = simulator("auto")
     once, all_of_it = median(forward, sim, state), median(both, sim, state)
-    with mock.patch.object(_System, "solve", _System.solve_by_operations):
-        operations = median(both, sim, state)
     row = {
         "vertices": sim.vertices, "batch": batch, "youngs": youngs, "iterations": sim.iterations,
-        "kernel": sim.plan.kernel, "forward": once, "backward": all_of_it - once, "operations": operations - once,
-        "block": None, "recorded": None,
+        "kernel": sim.plan.kernel, "forward": once, "backward": all_of_it - once, "block": None, "recorded": None,
     }  # fmt: skip
     if device.type == "cuda":
         own = simulator("block")

@@ -2,15 +2,13 @@
 //
 // Not registered from Python, where the lists of a plan and of a material cost more than a small step itself.
 #include "checks.h"
+#include "find_op.h"
 
-#include <ATen/core/dispatch/Dispatcher.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
 
 #include <functional>
-#include <iterator>
 #include <optional>
-#include <string_view>
 #include <tuple>
 #include <vector>
 
@@ -21,25 +19,6 @@ using OptionalTensor = std::optional<Tensor>;
 using Outputs = std::tuple<Tensor, Tensor, Tensor>;
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
-
-#define X(name, width, rows, meaning) #name,
-constexpr const char* material_names[] = {
-#include "plan/material.def"
-};
-#undef X
-
-// Where an array stands in a material.
-constexpr std::size_t place_of(std::string_view name) {
-  for (std::size_t i = 0; i < std::size(material_names); ++i) {
-    if (name == material_names[i]) return i;
-  }
-  throw "no such array";
-}
-
-template <class Signature>
-c10::TypedOperatorHandle<Signature> find_op(const char* name) {
-  return c10::Dispatcher::singleton().findSchemaOrThrow(name, "").typed<Signature>();
-}
 
 Outputs plain_step(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
                    const OptionalTensor& start, at::TensorList material, at::TensorList plan,
@@ -96,7 +75,7 @@ bool some(const Tensor& array) { return array.sym_numel() != 0; }
 // Without contacts nothing depends on what they would be.
 void refuse_contacts(const c10::List<bool>& wanted, at::TensorList material) {
   const auto without = [&](const char* name) {
-    const std::size_t at = place_of(name);
+    const std::size_t at = place_in_material(name);
     return wanted[at] && some(material[at]);
   };
   const bool planes = without("planes"), spheres = without("spheres");
@@ -105,43 +84,44 @@ void refuse_contacts(const c10::List<bool>& wanted, at::TensorList material) {
               planes ? "planes" : "spheres", ".requires_grad_(False)");
 }
 
-// What autograd does not look at, and both functions have to know.
+// What autograd does not look at, and both functions have to know; `info` is handed out past it, a report, not a function to
+// differentiate.
 struct Unvaried {
   at::TensorList plan;
   Numbers numbers;
   std::int64_t steps = 1, every = 1;
+  Tensor* info = nullptr;
 };
 
-// Keeps the inputs that have derivatives and the positions that came out, and the velocities `between` steps; what there is
-// none of is undefined.
+// Keeps the inputs that have derivatives, the positions that came out, the velocities `between` steps, and the plan; what there
+// is none of is undefined.
 variable_list keep(AutogradContext* context, const Tensor& positions, const Tensor& velocities,
                    const OptionalTensor& forces, const Outputs& outputs, const Tensor& between,
                    at::TensorList material, const Unvaried& rest) {
   const auto& [after, after_velocities, info] = outputs;
   variable_list saved{positions, velocities, forces.value_or(Tensor()), after, between};
   saved.insert(saved.end(), material.begin(), material.end());
+  saved.insert(saved.end(), rest.plan.begin(), rest.plan.end());
   context->save_for_backward(std::move(saved));
-  // nobody changes it, and whoever moves what is saved elsewhere need not move it
-  context->saved_data["plan"] = c10::List<Tensor>(rest.plan);
   context->saved_data["time_step"] = rest.numbers.time_step;
   context->saved_data["every"] = rest.every;
-  // a report, not a function to differentiate
-  context->mark_non_differentiable({info});
-  return {after, after_velocities, info};
+  *rest.info = info;
+  return {after, after_velocities};
 }
 
 struct Kept {
   Tensor positions, velocities;
   OptionalTensor forces;
   Tensor after, after_velocities;
-  variable_list material;
+  variable_list material, plan;
 
   explicit Kept(const variable_list& saved)
       : positions(saved[0]),
         velocities(saved[1]),
         after(saved[3]),
         after_velocities(saved[4]),
-        material(saved.begin() + 5, saved.end()) {
+        material(saved.begin() + 5, saved.begin() + 5 + material_arrays),
+        plan(saved.begin() + 5 + material_arrays, saved.end()) {
     if (saved[2].defined()) forces = saved[2];
   }
 };
@@ -187,8 +167,7 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
     refuse_contacts(wanted, kept.material);
     const variable_list values = call_step_vjp(
         grads[0], grads[1], {kept.positions, kept.velocities, kept.forces, kept.after},
-        kept.material, context->saved_data["plan"].toTensorVector(),
-        context->saved_data["time_step"].toDouble(), wanted);
+        kept.material, kept.plan, context->saved_data["time_step"].toDouble(), wanted);
     variable_list result{values[0], values[1], forces ? values[2] : Tensor(), Tensor()};
     append_in_places(result, wanted, values.data() + 3);
     result.push_back(Tensor());
@@ -199,7 +178,7 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
 // The material at one step of a rollout: spheres move on.
 variable_list material_at(const variable_list& material, std::int64_t step) {
   variable_list at_step = material;
-  Tensor& spheres = at_step[place_of("spheres")];
+  Tensor& spheres = at_step[place_in_material("spheres")];
   if (!some(spheres)) return at_step;
   const Tensor center = spheres.narrow(-1, 0, 3), rest = spheres.narrow(-1, 3, 5);
   spheres = at::cat({center + double(step) * spheres.narrow(-1, 5, 3), rest}, -1);
@@ -226,7 +205,6 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
     const bool forces = kept.forces.has_value();
     const c10::List<bool> wanted = Edges{context, forces ? 3u : 2u}.material(kept.material.size());
     refuse_contacts(wanted, kept.material);
-    const variable_list plan = context->saved_data["plan"].toTensorVector();
     const double time_step = context->saved_data["time_step"].toDouble();
     // of positions, velocities, forces and the wanted arrays; the first two of one step after another
     variable_list sums(3);
@@ -238,7 +216,7 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
       variable_list values =
           call_step_vjp(add(sums[0], grads[0][step]), add(sums[1], grads[1][step]),
                         {before, speed, kept.forces, kept.after[step]},
-                        material_at(kept.material, step), plan, time_step, wanted);
+                        material_at(kept.material, step), kept.plan, time_step, wanted);
       sums.resize(values.size());
       for (std::size_t i = 2; i < values.size(); ++i) values[i] = add(sums[i], values[i]);
       sums = std::move(values);
@@ -284,8 +262,6 @@ bool varies(const Tensor& positions, const Tensor& velocities, const OptionalTen
                                         (start && start->requires_grad()) || varies(material));
 }
 
-Outputs as_outputs(const variable_list& list) { return {list[0], list[1], list[2]}; }
-
 Outputs step(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
              const OptionalTensor& start, at::TensorList material, at::TensorList plan,
              std::int64_t schedule, std::int64_t iterations, double time_step, double relaxation,
@@ -296,8 +272,10 @@ Outputs step(const Tensor& positions, const Tensor& velocities, const OptionalTe
   if (!varies(positions, velocities, forces, start, material))
     return plain_step(positions, velocities, forces, start, material, plan, n);
   refuse_transforms();
-  return as_outputs(
-      StepFunction::apply(positions, velocities, forces, start, material, Unvaried{plan, n}));
+  Tensor info;
+  const variable_list state = StepFunction::apply(positions, velocities, forces, start, material,
+                                                  Unvaried{plan, n, 1, 1, &info});
+  return {state[0], state[1], info};
 }
 
 Outputs rollout(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
@@ -310,8 +288,10 @@ Outputs rollout(const Tensor& positions, const Tensor& velocities, const Optiona
   if (!varies(positions, velocities, forces, {}, material))
     return plain_rollout(positions, velocities, forces, material, plan, steps, every, n);
   refuse_transforms();
-  return as_outputs(RolloutFunction::apply(positions, velocities, forces, material,
-                                           Unvaried{plan, n, steps, every}));
+  Tensor info;
+  const variable_list track = RolloutFunction::apply(positions, velocities, forces, material,
+                                                     Unvaried{plan, n, steps, every, &info});
+  return {track[0], track[1], info};
 }
 
 // Of an op that has first derivatives only.

@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cmath>
 #include <string>
+#include <string_view>
 #include <vector>
 
 namespace pd {
@@ -291,6 +292,18 @@ constexpr int material_arrays = 0
     ;
 #undef X
 
+// Where an array stands in a material.
+constexpr std::size_t place_in_material(std::string_view name) {
+  constexpr std::string_view names[] = {
+#define X(name, width, rows, meaning) #name,
+#include "plan/material.def"
+#undef X
+  };
+  std::size_t place = 0;
+  while (names[place] != name) ++place;
+  return place;
+}
+
 inline std::int64_t rows_of(const Tensor& t, int width, const char* name) {
   const int own = width > 1 ? 2 : 1;
   TORCH_CHECK_VALUE(t.dim() == own || t.dim() == own + 1, "material.", name, " must have ", own,
@@ -379,6 +392,16 @@ inline void check_direction(const Tensor& direction, const Tensor& matrices) {
       direction.sizes() == matrices.sizes() && direction.scalar_type() == matrices.scalar_type() &&
           direction.device() == matrices.device(),
       "direction must be ", describe(matrices), " like matrices, got ", describe(direction));
+}
+
+// Of what contacts let through of every vertex.
+inline void check_projector(const Tensor& t, const Tensor& like) {
+  TORCH_CHECK_TYPE(t.scalar_type() == like.scalar_type(), "projector must be ",
+                   at::toString(like.scalar_type()), " like the vectors, got ", describe(t));
+  TORCH_CHECK_VALUE(t.sizes() == at::IntArrayRef({like.size(0), like.size(1), 3, 3}) &&
+                        t.device() == like.device(),
+                    "projector must be [batch, vertices, 3, 3] beside the vectors, got ",
+                    describe(t));
 }
 
 inline void check_time_step(double time_step) {

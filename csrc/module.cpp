@@ -5,6 +5,7 @@
 #include "plan/device_build.h"
 #include "plan/multilevel_build.h"
 #include "plan/shared_memory.h"
+#include "solver/adjoint.h"
 #include "solver/multilevel.h"
 
 #include <pybind11/functional.h>
@@ -317,6 +318,12 @@ PYBIND11_MODULE(_C, m) {
   m.attr("outer_static_bytes") = pd::outer_static_bytes;
   m.attr("corotation_bytes") = pd::corotation_bytes;
   m.attr("known_inertia") = pd::known_inertia;
+  m.attr("adjoint_tolerance") =
+      std::make_pair(pd::adjoint_tolerance<float>, pd::adjoint_tolerance<double>);
+  m.attr("adjoint_failed") = pd::adjoint_failed;
+  m.attr("adjoint_iterations") = pd::adjoint_iterations;
+  m.attr("adjoint_asked_every") = pd::adjoint_asked_every;
+  m.attr("adjoint_most_of_a_block") = pd::adjoint_most_of_a_block;
   m.attr("most_environments") = pd::most_environments;
   m.attr("most_sharing_pairs") = pd::most_sharing_pairs;
   m.attr("pass_static_bytes") = pd::pass_static_bytes;

@@ -1,5 +1,5 @@
 // The ops: schemas, and the CPU behind them.
-#include "ops.h"
+#include "adjoint_ops.h"
 
 #include "cpu/dispatch.h"
 
@@ -62,6 +62,12 @@ struct Cpu {
     kernels().rotation64(call, threads());
   }
 
+  template <class T>
+  static bool asks(const Plan<T>&) {
+    return false;
+  }
+  static bool recording(const Tensor&) { return false; }
+
   static int threads() { return at::get_num_threads(); }
 };
 
@@ -100,12 +106,17 @@ TORCH_LIBRARY(torchpd, m) {
       "-> Tensor");
   with_plan("elastic_diagonal(Tensor stiffness, Tensor[] plan, *, bool weighted) -> Tensor");
   with_plan("precondition(Tensor field, Tensor[] plan) -> Tensor");
-  // its kernel, which comes from Python, runs on every device: torchpd/ops.py
   with_plan(
       "step_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor positions, "
       "Tensor "
       "velocities, Tensor? forces, Tensor[] material, Tensor[] plan, *, float time_step, bool[]? "
       "wanted=None) -> Tensor[]");
+  // its kernel, for every device, comes from Python
+  with_plan(
+      "solve_adjoint(Tensor after, Tensor right, Tensor inertia, Tensor inverse, Tensor? "
+      "projector, "
+      "Tensor[] material, Tensor[] plan, Tensor? solution=None, Tensor? error=None, *, float "
+      "time_step) -> (Tensor, Tensor)");
   with_plan(
       "adjoint_system(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
       "positions, Tensor "
@@ -115,7 +126,11 @@ TORCH_LIBRARY(torchpd, m) {
   m.def(
       "adjoint_result(Tensor multiplier, Tensor error, Tensor grad_velocities, Tensor masses, "
       "Tensor "
-      "damping, *, float time_step) -> (Tensor, Tensor, Tensor)");
+      "damping, Tensor? grad_positions=None, Tensor? elastic=None, Tensor? projector=None, Tensor? "
+      "stuck=None, *, float time_step) -> (Tensor, Tensor, Tensor)");
+  with_plan(
+      "conjugate_gradients(Tensor positions, Tensor right, Tensor inertia, Tensor inverse, Tensor? "
+      "projector, Tensor stiffness, Tensor[] plan, *, float tolerance) -> (Tensor, Tensor)");
   with_plan(
       "conjugate_gradients_(Tensor(a!) solution, Tensor(b!) residual, Tensor(c!) direction, "
       "Tensor(d!) "
@@ -125,6 +140,9 @@ TORCH_LIBRARY(torchpd, m) {
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }
 
-TORCH_LIBRARY_IMPL(torchpd, CPU, m) { register_ops<Cpu>(m); }
+TORCH_LIBRARY_IMPL(torchpd, CPU, m) {
+  register_ops<Cpu>(m);
+  register_adjoint_ops<Cpu>(m);
+}
 
 }  // namespace pd

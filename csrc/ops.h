@@ -1,8 +1,7 @@
 // What every op does on either device: checks, views, one call of the backend.
 //
 // A Backend has `Plan<T>`, the plan that its kernels see; `plan_view<T>(arrays, place)`; and `step`, `field`,
-// `precondition`, `conjugate`, `adjoint_system`, `adjoint_result` and `rotation`, which run a call on the device of the tensor
-// they are given.
+// `precondition`, `conjugate` and `rotation`, which run a call on the device of the tensor they are given.
 #pragma once
 #include "checks.h"
 
@@ -284,11 +283,12 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
 }
 
 template <class Backend>
-void conjugate_gradients(const Tensor& solution, const Tensor& residual, const Tensor& direction,
-                         const Tensor& progress, const Tensor& positions, const Tensor& inertia,
-                         const Tensor& inverse, const OptionalTensor& projector,
-                         const Tensor& stiffness, at::TensorList plan, double tolerance,
-                         std::int64_t iterations) {
+void conjugate_gradients_inplace(const Tensor& solution, const Tensor& residual,
+                                 const Tensor& direction, const Tensor& progress,
+                                 const Tensor& positions, const Tensor& inertia,
+                                 const Tensor& inverse, const OptionalTensor& projector,
+                                 const Tensor& stiffness, at::TensorList plan, double tolerance,
+                                 std::int64_t iterations) {
   check_positions(positions, "positions");
   const Place place{positions.device()};
   const auto check_vectors = [&](const Tensor& t, const char* name, const char* meaning) {
@@ -301,16 +301,7 @@ void conjugate_gradients(const Tensor& solution, const Tensor& residual, const T
   check_array(progress, at::kDouble, positions.size(0), progress_count, place, "progress",
               "r . z, |right side|, 1 while it goes on or -1 at the start, relative residual",
               "make it for this batch");
-  if (projector) {
-    const at::IntArrayRef sizes = positions.sizes();
-    TORCH_CHECK_TYPE(projector->scalar_type() == positions.scalar_type(), "projector must be ",
-                     at::toString(positions.scalar_type()), " like positions, got ",
-                     describe(*projector));
-    TORCH_CHECK_VALUE(projector->sizes() == at::IntArrayRef({sizes[0], sizes[1], 3, 3}) &&
-                          projector->device() == positions.device(),
-                      "projector must be [batch, vertices, 3, 3] beside positions, got ",
-                      describe(*projector));
-  }
+  if (projector) check_projector(*projector, positions);
   TORCH_CHECK_VALUE(tolerance >= 0, "tolerance must be >= 0, got ", tolerance);
   TORCH_CHECK_VALUE(iterations >= 0 && iterations <= std::numeric_limits<int>::max(),
                     "iterations must be in [0, 2^31), got ", iterations);
@@ -324,126 +315,6 @@ void conjugate_gradients(const Tensor& solution, const Tensor& residual, const T
   for (const Tensor& t : {solution, residual, direction, progress}) {
     if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
   }
-}
-
-// A step that was taken, and what a loss wants of its outcome.
-struct AdjointTensors {
-  Tensor grad_positions, grad_velocities, after, positions, velocities;
-  OptionalTensor forces;
-  at::TensorList material, plan;
-};
-
-using AdjointOutputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
-
-template <class Backend, class T>
-AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
-  AdjointSystemCall<T, typename Backend::template Plan<T>> call;
-  const Place place{t.after.device()};
-  call.plan = Backend::template plan_view<T>(t.plan, place);
-  call.batch = t.after.size(0);
-  const std::int64_t vertices = call.plan.vertices;
-  check_vertices(t.after, vertices);
-  call.material = material_view<T>(t.material, vertices, call.plan.pins, call.batch, place);
-  const Tensor& stiffness = t.material[0];
-  const Tensor elastic = diagonal_typed<Backend, T>(stiffness, t.plan, true);
-  const Material<T>& m = call.material;
-  call.elastic = {elastic.const_data_ptr<T>(), m.stiffness.stride ? vertices : 0};
-  const bool touching = m.planes_count + m.spheres_count > 0;
-  const bool own = touching || m.stiffness.stride || m.masses.stride || m.damping.stride ||
-                   m.pin_stiffness.stride;
-  call.rows = own ? call.batch : 1;
-  call.time_step = time_step;
-  const at::TensorOptions options = t.after.options();
-  const Tensor grad_x = t.grad_positions.contiguous(), grad_v = t.grad_velocities.contiguous();
-  const Tensor right = at::empty_like(grad_x), inertia = at::empty({call.rows, vertices}, options);
-  const Tensor inverse = at::empty_like(inertia);
-  call.grad_positions = grad_x.const_data_ptr<T>();
-  call.grad_velocities = grad_v.const_data_ptr<T>();
-  call.right = right.mutable_data_ptr<T>();
-  call.inertia = inertia.mutable_data_ptr<T>();
-  call.inverse = inverse.mutable_data_ptr<T>();
-  const std::int64_t held = touching ? call.batch : 0;
-  const Tensor projector = at::empty({held, vertices, 3, 3}, options);
-  const Tensor stuck = at::empty({held, vertices}, options.dtype(at::kBool));
-  Tensor after, x, v, f, gradient;
-  if (touching) {
-    after = t.after.contiguous(), x = t.positions.contiguous(), v = t.velocities.contiguous();
-    f = t.forces ? t.forces->contiguous() : Tensor();
-    gradient = run_field<Backend>(Field::gradient, after, {}, stiffness, t.plan);
-    call.after = after.const_data_ptr<T>();
-    call.positions = x.const_data_ptr<T>();
-    call.velocities = v.const_data_ptr<T>();
-    call.forces = f.defined() ? f.const_data_ptr<T>() : nullptr;
-    call.elastic_gradient = gradient.const_data_ptr<T>();
-    call.projector = projector.mutable_data_ptr<T>();
-    call.stuck = stuck.mutable_data_ptr<bool>();
-  }
-  if (call.batch > 0) Backend::adjoint_system(call, grad_x);
-  return {right, inertia, inverse, projector, stuck};
-}
-
-// The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1, vertices], and of
-// a scene with contacts the projector off the normals that hold a vertex [batch, vertices, 3, 3] and whether friction holds it
-// [batch, vertices], else of no environments.
-template <class Backend>
-AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_velocities,
-                              const Tensor& after, const Tensor& positions,
-                              const Tensor& velocities, const OptionalTensor& forces,
-                              at::TensorList material, at::TensorList plan, double time_step) {
-  check_positions(positions, "positions");
-  check_state(velocities, positions, "velocities", "m/s");
-  check_state(after, positions, "after", "m");
-  if (forces) check_state(*forces, positions, "forces", "N");
-  check_state(grad_positions, positions, "grad_positions", "of a loss, 1/m");
-  check_state(grad_velocities, positions, "grad_velocities", "of a loss, 1/(m/s)");
-  check_time_step(time_step);
-  const AdjointTensors tensors{grad_positions, grad_velocities, after,    positions,
-                               velocities,     forces,          material, plan};
-  return positions.scalar_type() == at::kFloat
-             ? adjoint_system_typed<Backend, float>(tensors, time_step)
-             : adjoint_system_typed<Backend, double>(tensors, time_step);
-}
-
-template <class Backend, class T>
-Outputs adjoint_result_typed(const Tensor& multiplier, const Tensor& error,
-                             const Tensor& grad_velocities, const Tensor& masses,
-                             const Tensor& damping, double time_step) {
-  AdjointResultCall<T> call;
-  const Place place{multiplier.device()};
-  call.batch = multiplier.size(0);
-  call.vertices = multiplier.size(1);
-  call.masses = values_view<T>(masses, call.vertices, 1, false, call.batch, place, "masses", "kg");
-  call.damping = values_view<T>(damping, 1, 1, true, call.batch, place, "damping", "1/s");
-  call.time_step = time_step;
-  const Tensor l = multiplier.contiguous(), v = grad_velocities.contiguous();
-  const Tensor x = at::empty_like(l), before = at::empty_like(l), out = at::empty_like(l);
-  call.multiplier = l.const_data_ptr<T>();
-  call.grad_velocities = v.const_data_ptr<T>();
-  call.error = error.const_data_ptr<double>();
-  call.error_stride = error.stride(0);
-  call.out_positions = x.mutable_data_ptr<T>();
-  call.out_velocities = before.mutable_data_ptr<T>();
-  call.out_multiplier = out.mutable_data_ptr<T>();
-  if (l.numel() > 0) Backend::adjoint_result(call, l);
-  return {x, before, out};
-}
-
-// Gradients for positions and velocities before a step, and the multiplier, of which no number is left where the error is none.
-template <class Backend>
-Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tensor& grad_velocities,
-                       const Tensor& masses, const Tensor& damping, double time_step) {
-  check_positions(multiplier, "multiplier");
-  check_state(grad_velocities, multiplier, "grad_velocities", "of a loss, 1/(m/s)");
-  TORCH_CHECK_VALUE(
-      error.scalar_type() == at::kDouble && error.dim() == 1 &&
-          error.size(0) == multiplier.size(0) && error.device() == multiplier.device(),
-      "error must be float64 [", multiplier.size(0), "] beside multiplier, got ", describe(error));
-  check_time_step(time_step);
-  return multiplier.scalar_type() == at::kFloat
-             ? adjoint_result_typed<Backend, float>(multiplier, error, grad_velocities, masses,
-                                                    damping, time_step)
-             : adjoint_result_typed<Backend, double>(multiplier, error, grad_velocities, masses,
-                                                     damping, time_step);
 }
 
 template <class Backend, class T>
@@ -490,9 +361,7 @@ void register_ops(torch::Library& m) {
   m.impl("element_energy_product", &element_energy_product<Backend>);
   m.impl("elastic_diagonal", &elastic_diagonal<Backend>);
   m.impl("precondition", &precondition<Backend>);
-  m.impl("conjugate_gradients_", &conjugate_gradients<Backend>);
-  m.impl("adjoint_system", &adjoint_system<Backend>);
-  m.impl("adjoint_result", &adjoint_result<Backend>);
+  m.impl("conjugate_gradients_", &conjugate_gradients_inplace<Backend>);
   m.impl("nearest_rotation", &nearest_rotation<Backend>);
   m.impl("rotation_differential", &rotation_differential<Backend>);
 }

@@ -298,6 +298,5 @@ def test_what_a_gradient_costs() -> None:
     row = measure_scene((2, 1, 1), 2, 1e5, torch.device("cpu"), 0.0)
     assert (row["batch"], row["vertices"], row["iterations"]) == (2, 12, 64)
     assert row["forward"] > 0
-    assert line_of({**row, "forward": 2.0, "backward": 3.0, "operations": 9.0}) == (
-        "| 2 x 12 | 1e+05 Pa | 2 | 3 | 9 | 1.5 |"
-    )
+    assert row["backward"] > 0
+    assert line_of({**row, "forward": 2.0, "backward": 3.0}) == "| 2 x 12 | 1e+05 Pa | 2 | 3 | 1.5 |"

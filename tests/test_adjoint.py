@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-from unittest import mock
+import gc
+import weakref
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
+import torch._dynamo.compiled_autograd
+from torch.profiler import ProfilerActivity, profile
 
 import torchpd as pd
-from torchpd import ops
-from torchpd.adjoint import step_adjoint
 
 # A central difference with relative step 1e-5 errs by about 1e-10 (truncation) and 1e-16 / 1e-5 (rounding), relative to
 # the largest terms; sums that cancel lose some digits more.
@@ -205,27 +204,64 @@ def test_info_is_no_function_to_differentiate() -> None:
     assert not info.energy.requires_grad
 
 
-@pytest.mark.parametrize("steps", [0, 1])
-def test_of_a_plan_nothing_is_saved(steps: int) -> None:
-    """Whoever moves saved tensors elsewhere moves states and material alone, and one that a step is made of may go."""
-    sim, state = body(iterations=10)
-    saved: list[torch.Tensor] = []
-    x = state.positions.clone().requires_grad_()
+@pytest.mark.parametrize("steps", [0, 2])
+def test_compiled_autograd(steps: int) -> None:
+    """Which traces what backward does, and knows of C++ only what it can pack."""
+    sim, state = body(iterations=100)
+    x, stiffness = state.positions.clone().requires_grad_(), sim.stiffness.requires_grad_()
 
-    def pack(tensor: torch.Tensor) -> torch.Tensor:
-        saved.append(tensor)
-        return tensor
-
-    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+    def loss() -> torch.Tensor:
         start = pd.State(x, state.velocities)
-        after = sim.rollout(start, steps) if steps else sim(start)
-    (found,) = torch.autograd.grad(after.positions.sum(), x)
-    assert len(saved) <= 5 + len(sim.material())
-    plan = {array.data_ptr() for array in sim.plan.arrays if array.numel()}
-    assert not plan & {tensor.data_ptr() for tensor in saved}
-    start = pd.State(x, state.velocities)
-    after = sim.rollout(start, steps) if steps else sim(start)
-    assert torch.equal(found, torch.autograd.grad(after.positions.sum(), x)[0])
+        return (sim.rollout(start, steps) if steps else sim(start)).positions.square().sum()
+
+    wanted = torch.autograd.grad(loss(), [x, stiffness])
+    with torch._dynamo.compiled_autograd._enable(torch.compile(backend="eager")):
+        loss().backward()
+    assert x.grad is not None
+    assert stiffness.grad is not None
+    assert torch.equal(x.grad, wanted[0])
+    assert torch.equal(stiffness.grad, wanted[1])
+
+
+def test_what_was_saved_goes_with_backward() -> None:
+    """A loss that somebody keeps does not keep the plan."""
+    sim, state = body(iterations=10)
+    loss = sim(pd.State(state.positions.requires_grad_(), state.velocities)).positions.sum()
+    loss.backward()
+    alive = [weakref.ref(array) for array in sim.plan.arrays]
+    del sim
+    gc.collect()
+    assert not any(array() is not None for array in alive)
+
+
+@pytest.mark.parametrize("contacts", [False, True])
+@pytest.mark.parametrize("value", [-1e5, float("inf")])
+def test_elasticity_without_bounds_leaves_its_vertices_out(value: float, contacts: bool) -> None:
+    """Whose 1 / D is zero: of a tetrahedron of negative or infinite stiffness."""
+    sim, state = body(*([pd.Ground(-1.0)] if contacts else []), iterations=10)
+    stiffness = sim.stiffness.detach().clone()
+    stiffness[0] = value
+    material = [stiffness, *(array.detach() for array in sim.material()[1:])]
+    after = sim(state).positions
+    given = (torch.ones_like(after), 0.0 * after, after, *state, None, material, list(sim.plan.arrays))
+    right, inertia, inverse, *_ = torch.ops.torchpd.adjoint_system(*given, time_step=sim.time_step)
+    left_out = (inverse == 0.0).expand(right.shape[:2])
+    assert int((left_out & (inertia != 0.0)).sum()) > 0
+    assert not right[left_out].any()
+    assert bool(right[~left_out].any())
+
+
+def test_a_failed_solve_is_not_done_twice() -> None:
+    """One that fails, and one that stands in."""
+    sim, state = body(iterations=1)
+    x = (
+        0.02 * torch.randn(state[0].shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    ).requires_grad_()
+    loss = sim(pd.State(x, state.velocities)).positions.sum()
+    with pytest.warns(UserWarning, match="adjoint of a step has no solution"):
+        _, calls = gradients_and_calls(loss, [x])
+    assert calls.count("torchpd::solve_adjoint") == 1
+    assert calls.count("torchpd::conjugate_gradients") == 1
 
 
 def test_a_state_that_changed_since_is_noticed() -> None:
@@ -258,24 +294,11 @@ def test_rollout_is_differentiable() -> None:
     assert float(gradient.abs().max()) > 0.0
 
 
-class Calls(TorchDispatchMode):
-    """Ops that the adjoint of a step calls: from outside of its own op nobody sees them."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.names: list[str] = []
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.names.append(func.name())
-        return func(*args, **(kwargs or {}))
-
-    def gradients(self, loss: torch.Tensor, inputs: list[torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        def watched(*args: Any) -> list[torch.Tensor]:
-            with self:
-                return step_adjoint(*args)
-
-        with mock.patch.object(ops, "step_adjoint", watched):
-            return torch.autograd.grad(loss, inputs)
+def gradients_and_calls(loss: torch.Tensor, inputs: list[torch.Tensor]) -> tuple[tuple[torch.Tensor, ...], list[str]]:
+    """Gradients, and the ops and operations that they took, by the profiler."""
+    with profile(activities=[ProfilerActivity.CPU]) as seen:
+        found = torch.autograd.grad(loss, inputs)
+    return found, [event.name for event in seen.events() if event.name.startswith(("torchpd::", "aten::"))]
 
 
 @pytest.mark.parametrize("steps", [1, 3])
@@ -287,8 +310,7 @@ def test_what_nobody_wants_costs_nothing(steps: int) -> None:
     start = pd.State(*(t.clone().requires_grad_() for t in state))
 
     def gradients(*wanted: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], list[str]]:
-        calls = Calls()
-        return calls.gradients(sim.rollout(start, steps).positions.square().sum(), list(wanted)), calls.names
+        return gradients_and_calls(sim.rollout(start, steps).positions.square().sum(), list(wanted))
 
     everything, most = gradients(*start, *arrays)
     for array in arrays:
@@ -308,9 +330,10 @@ def test_what_nobody_wants_costs_nothing(steps: int) -> None:
 def test_what_held_vertices_pass_on_is_worked_out_once() -> None:
     """Both the start of those that friction holds and the targets of pins want it."""
     sim, state = body(pd.Ground(-1.0, friction=0.5))
-    start, targets, calls = state.positions.requires_grad_(), sim.pin_targets.requires_grad_(), Calls()
-    calls.gradients(sim(pd.State(start, state.velocities)).positions.square().sum(), [start, targets])
-    assert calls.names.count("torchpd::hessian_product") == 1
+    start, targets = state.positions.requires_grad_(), sim.pin_targets.requires_grad_()
+    loss = sim(pd.State(start, state.velocities)).positions.square().sum()
+    _, calls = gradients_and_calls(loss, [start, targets])
+    assert calls.count("torchpd::hessian_product") == 1
 
 
 @pytest.mark.parametrize("wanted", [None, [True] * 3])
@@ -325,6 +348,20 @@ def test_the_op_gives_all_gradients_or_wants_to_know_of_each(wanted: list[bool] 
         return
     with pytest.raises(ValueError, match=f"of each of the {len(arrays)} arrays of the material .* got 3 numbers"):
         torch.ops.torchpd.step_vjp(*arguments, time_step=sim.time_step, wanted=wanted)
+
+
+def test_the_op_takes_material_of_any_strides() -> None:
+    sim, state = body()
+    after = sim(state).positions
+    arrays = [array.detach() for array in sim.material()]
+    strided = [torch.stack((array, array), dim=-1)[..., 0] for array in arrays]
+    given = [
+        torch.ops.torchpd.step_vjp(
+            after, after, after, *state, None, material, list(sim.plan.arrays), time_step=sim.time_step
+        )
+        for material in (arrays, strided)
+    ]
+    assert all(torch.equal(one, other) for one, other in zip(*given, strict=True))
 
 
 def test_unsolved_step_warns() -> None:
@@ -356,14 +393,15 @@ def test_what_is_lost_does_not_hide_what_has_failed() -> None:
     assert torch.equal(mixed[1], both[1])
 
 
-def test_a_loss_that_is_no_number_has_no_gradient(recwarn: pytest.WarningsRecorder) -> None:
+@pytest.mark.parametrize("contacts", [False, True])
+def test_a_loss_that_is_no_number_has_no_gradient(contacts: bool, recwarn: pytest.WarningsRecorder) -> None:
     """Whoever watches for NaN sees it, in the environment that has it and in what all share."""
-    sim, state = body()
+    sim, state = body(*([pd.Ground(-1.0, friction=0.5)] if contacts else []))
     x = state.positions.clone().requires_grad_()
     after = sim(pd.State(x, state.velocities)).positions
-    weight = torch.ones(len(x), 1, 1, dtype=x.dtype)
-    weight[0] = torch.nan
-    stiffness = sim.stiffness.requires_grad_()
+    weight = torch.ones_like(x)
+    weight[0, x.shape[1] // 2, 1] = torch.nan  # not of a vertex that a pin holds
+    stiffness, targets = sim.stiffness.requires_grad_(), sim.pin_targets.requires_grad_()
     (weight * sim(pd.State(x, state.velocities)).positions).sum().backward()
     assert after.isfinite().all()
     assert x.grad is not None
@@ -371,6 +409,8 @@ def test_a_loss_that_is_no_number_has_no_gradient(recwarn: pytest.WarningsRecord
     assert x.grad[1:].isfinite().all()
     assert stiffness.grad is not None
     assert stiffness.grad.isnan().all()
+    assert targets.grad is not None
+    assert targets.grad.isnan().all()
     assert not recwarn.list  # more iterations would not help
 
 

@@ -8,6 +8,8 @@ import pytest
 import torch
 from runs import ULP, noise, plan_of, small
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils import _pytree as pytree
 
 import torchpd as pd
 from torchpd.diagonal import named_material, step_diagonal
@@ -57,6 +59,36 @@ def test_the_system_without_contacts(own: str, dtype: torch.dtype, device: torch
     assert torch.allclose(inertia, torch.where(moves, wanted, 0.0), rtol=limit, atol=0.0)
     assert torch.allclose(inverse, torch.where(moves, 1.0 / diagonal, 0.0), rtol=limit, atol=0.0)
     assert torch.allclose(right, torch.where(moves[..., None], g + w / h, 0.0), rtol=0.0, atol=100 * limit)
+
+
+@pytest.mark.parametrize("batch", [0, 1, 3])
+@pytest.mark.parametrize("pins", [False, True])
+@pytest.mark.parametrize("own", ["", "stiffness", "damping", "pin_stiffness"])
+def test_shapes_without_values(own: str, pins: bool, batch: int) -> None:
+    """The shapes that the fake kernel promises, for material of each environment, of one, and of all."""
+    body = pd.Solid(pd.shapes.box((1.0, 1.0, 1.0), (2, 1, 1)), 1e4)
+    sim = pd.Simulator(pd.Scene(body, *([pd.Pin(body, [0, 1], 10.0)] if pins else [])), 1 / 60, progress=False)
+    x, v = sim.rest_state(batch)
+    material = [array.detach() for array in sim.material()]
+    for rows in (1, batch):
+        arrays = [
+            array.expand(rows, *array.shape).clone() if name == own else array
+            for name, array in zip(NAMES, material, strict=True)
+        ]
+        found = ops.adjoint_system(x, v, x, x, v, None, arrays, plan_of(sim), time_step=sim.time_step)
+        with FakeTensorMode() as mode:
+            fakes = pytree.tree_map_only(torch.Tensor, mode.from_tensor, (x, v, x, x, v, None, arrays, plan_of(sim)))
+            promised = ops.adjoint_system(*fakes, time_step=sim.time_step)
+        assert [t.shape for t in found] == [t.shape for t in promised]
+
+
+def test_a_right_side_of_any_strides(dtype: torch.dtype, device: torch.device) -> None:
+    sim, (x, _) = small(dtype, device)
+    right = noise(x)
+    strided = right.transpose(0, 1).contiguous().transpose(0, 1)
+    given = (sim.masses, 1 / sim.masses, None, sim.stiffness.detach(), plan_of(sim))
+    one, other = (ops.conjugate_gradients(x, t, *given, tolerance=1e-3) for t in (right, strided))
+    assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 def held_by_contacts(
@@ -145,6 +177,26 @@ def test_the_result(own: bool, dtype: torch.dtype, device: torch.device) -> None
         assert torch.allclose(one[::2], other[::2], rtol=10 * ULP[dtype], atol=1000 * ULP[dtype])
 
 
+def test_the_result_with_contacts(dtype: torch.dtype, device: torch.device) -> None:
+    """A vertex that friction holds moves with its start, by what contacts let through of dL/dx' + dL/dv' / h - K l."""
+    sim, (x, _) = small(dtype, device)
+    h = sim.time_step
+    multiplier, w, g, elastic = (noise(x, seed) for seed in range(4))
+    projector = noise(torch.empty(*x.shape, 3, dtype=dtype, device=device), 4)
+    stuck = noise(x, 5)[..., 0] > 0.5
+    errors = torch.tensor([0.0, torch.nan, 1.0], dtype=torch.float64, device=device)
+    given = (multiplier, errors, w, sim.masses, sim.damping)
+    found = ops.adjoint_result(*given, g, elastic, projector, stuck, time_step=h)
+    without = ops.adjoint_result(*given, time_step=h)
+    assert all(torch.equal(one[::2], other[::2]) for one, other in zip(found[1:], without[1:], strict=True))
+    assert all(t[1].isnan().all() for t in found)
+    passed = (projector * (g + w / h - elastic).unsqueeze(-2)).sum(-1)
+    wanted = without[0] + torch.where(stuck[..., None], passed, 0.0)
+    assert torch.allclose(found[0][::2], wanted[::2], rtol=10 * ULP[dtype], atol=1e4 * ULP[dtype])
+    assert torch.equal(found[0][~stuck].nan_to_num(7.0), without[0][~stuck].nan_to_num(7.0))
+    assert 0 < int(stuck.sum()) < stuck.numel()
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -154,14 +206,22 @@ def test_the_result(own: bool, dtype: torch.dtype, device: torch.device) -> None
         ({"masses": torch.ones(2)}, "masses must be"),
         ({"damping": torch.ones(2, 2)}, "damping must"),
         ({"time_step": 0.0}, "time_step must be positive"),
+        ({"elastic": None}, "come together or not at all"),
+        ({"elastic": torch.zeros(BATCH, 2, 3)}, "elastic must be"),
+        ({"grad_positions": torch.zeros(BATCH, 2, 3)}, "grad_positions must be"),
+        ({"projector": torch.zeros(BATCH, 2, 3, 3)}, "projector must be"),
+        ({"stuck": torch.zeros(BATCH, 2, dtype=torch.bool)}, "stuck must be bool"),
+        ({"stuck": torch.zeros(BATCH, 2)}, "stuck must be bool"),
     ],
 )
 def test_the_result_refuses(change: dict[str, Any], said: str) -> None:
     sim, (x, _) = small(torch.float32)
     given = {
         "multiplier": x, "error": torch.zeros(BATCH, dtype=torch.float64), "grad_velocities": x, "masses": sim.masses,
-        "damping": sim.damping, "time_step": sim.time_step,
+        "damping": sim.damping, "grad_positions": x, "elastic": x, "projector": torch.zeros(*x.shape, 3),
+        "stuck": torch.zeros(x.shape[:2], dtype=torch.bool), "time_step": sim.time_step,
     }  # fmt: skip
+    ops.adjoint_result(**given)
     with pytest.raises((TypeError, ValueError), match=said):
         ops.adjoint_result(**{**given, **change})
 

@@ -80,6 +80,26 @@ def samples(
                 direction,
                 sim.masses,
                 sim.damping,
+                f,
+                direction,
+                torch.eye(3, dtype=dtype, device=device).repeat(*x.shape[:2], 1, 1),
+                x[..., 0] > 0.1,
+            ),
+            {"time_step": sim.time_step},
+        ),
+        "conjugate_gradients": (
+            (x, f, sim.masses, 1 / sim.masses, None, sim.stiffness.detach(), plan),
+            {"tolerance": 1e-3},
+        ),
+        "solve_adjoint": (
+            (
+                still,
+                f,
+                sim.masses / sim.time_step**2,
+                sim.time_step**2 / sim.masses,
+                None,
+                [m.detach() for m in material],
+                plan,
             ),
             {"time_step": sim.time_step},
         ),
@@ -93,7 +113,7 @@ def samples(
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
     "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "conjugate_gradients_",
-    "adjoint_system", "adjoint_result",
+    "adjoint_system", "adjoint_result", "solve_adjoint", "conjugate_gradients",
 )  # fmt: skip
 
 

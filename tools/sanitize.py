@@ -178,8 +178,9 @@ def adjoint(sim: pd.Simulator, batch: int) -> None:
     names = [row.name for row in MATERIAL_TABLE]
     freed = [t[..., :0, :] if name in ("planes", "spheres") else t for name, t in zip(names, material, strict=True)]
     for arrays, forces in ((material, d), (material, None), (freed, None)):
-        right = ops.adjoint_system(d, d, x + d, x, d, forces, arrays, plan, time_step=h)[0]
-    ops.adjoint_result(right, error, d, sim.masses, sim.damping, time_step=h)
+        right, _, _, *held = ops.adjoint_system(d, d, x + d, x, d, forces, arrays, plan, time_step=h)
+        contacts = (d, d, *held) if arrays is material else ()
+        ops.adjoint_result(right, error, d, sim.masses, sim.damping, *contacts, time_step=h)
 
 
 def rotations(dtype: torch.dtype) -> None:

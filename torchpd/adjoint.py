@@ -18,24 +18,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import torch
 from torch import Tensor
 
+from . import _C
 from .diagonal import named_material, pinned_vertices, step_diagonal
 from .multilevel import has_levels, reference_of_levels
 from .plan import kernel_of
-from .tables import MATERIAL_TABLE
 from .warn import warn_user
 
-__all__ = ["AdjointCall", "step_adjoint", "step_gradient"]
+__all__ = ["AdjointCall", "solve_adjoint", "step_gradient"]
 
-# Relative residual of the adjoint system at which the solve stops: near the rounding floor of each precision.
-_TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
-_MOST_ITERATIONS = 2000
-_ASKED_EVERY = 10  # iterations: asking whether any environment goes on waits for a GPU
-_MOST_OF_A_BLOCK = 16384  # vertices of an environment that one thread block is quick enough with
+# see csrc/solver/adjoint.h
+_TOLERANCE = dict(zip((torch.float32, torch.float64), _C.adjoint_tolerance, strict=True))
 # A body stretched this much turns so little that its Hessian is the constant, positive majoriser but for 1e-4.
 _STRETCH = 1e4
 
@@ -55,7 +51,12 @@ class AdjointCall:
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     """Of every environment [B, 1, 1]."""
-    return torch.linalg.vecdot(a.flatten(1), b.flatten(1))[:, None, None]
+    each: Tensor = torch.linalg.vecdot(a.flatten(1), b.flatten(1))
+    return each[:, None, None]
+
+
+def _times(matrices: Tensor, field: Tensor) -> Tensor:
+    return (matrices * field.unsqueeze(-2)).sum(-1)
 
 
 def conjugate_gradients(
@@ -73,8 +74,8 @@ def conjugate_gradients(
     direction = precondition(residual)
     rho, scale = _dot(residual, direction), _dot(right, right).sqrt()
     active = scale > 0
-    for iteration in range(_MOST_ITERATIONS):
-        if iteration % _ASKED_EVERY == 0 and not bool(active.any()):
+    for iteration in range(_C.adjoint_iterations):
+        if iteration % _C.adjoint_asked_every == 0 and not bool(active.any()):
             break
         image = product(direction)
         curvature = _dot(direction, image)
@@ -120,7 +121,7 @@ class _System:
 
     def off_normals(self, field: Tensor) -> Tensor:
         """The part of a field [B, V, 3] that contacts let through."""
-        return field if self.projector is None else (self.projector * field.unsqueeze(-2)).sum(-1)
+        return field if self.projector is None else _times(self.projector, field)
 
     def solve(self, positions: Tensor, right: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
         """As `conjugate_gradients`, with the elastic Hessian at some positions; `right` is `allowed`.
@@ -135,20 +136,13 @@ class _System:
                 'make the simulator with kernel="block" and the Chebyshev or Jacobi solver, else leave backward out of '
                 "the graph"
             )
-        if has_levels(self.plan) or (right.is_cuda and right.shape[1] > _MOST_OF_A_BLOCK):
+        if has_levels(self.plan) or (right.is_cuda and right.shape[1] > _C.adjoint_most_of_a_block):
             return self.solve_by_operations(positions, right, tolerance)
         # what many operations on small tensors would spend their time with
-        solution, residual, direction = torch.empty_like(right), right.clone(), torch.empty_like(right)
-        progress = right.new_full((len(right), 4), -1.0, dtype=torch.float64)
-        steps = _ASKED_EVERY if asks else _MOST_ITERATIONS
-        for _ in range(0, _MOST_ITERATIONS, steps):
-            torch.ops.torchpd.conjugate_gradients_(
-                solution, residual, direction, progress, positions, self.inertia, self.inverse, self.projector,
-                self.stiffness, self.plan, tolerance=tolerance, iterations=steps,
-            )  # fmt: skip
-            if not asks or not bool(progress[:, 2].any()):
-                break
-        return solution, progress[:, 3]
+        found: tuple[Tensor, Tensor] = torch.ops.torchpd.conjugate_gradients(
+            positions, right, self.inertia, self.inverse, self.projector, self.stiffness, self.plan, tolerance=tolerance
+        )
+        return found
 
     def solve_by_operations(self, positions: Tensor, right: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
         """`solve`, of torch operations and Hessian products."""
@@ -180,11 +174,6 @@ class _System:
             return self.off_normals(torch.where(known, of_levels, inverse * field))
 
         return precondition
-
-
-def _reduce(gradient: Tensor, like: Tensor, dims: int) -> Tensor:
-    """Sum over environments for an array that they share."""
-    return gradient.sum(0) if like.dim() == dims else gradient.sum_to_size(like.shape)
 
 
 def _inertial(material: dict[str, Tensor], time_step: float) -> Tensor:
@@ -222,112 +211,49 @@ def _warn_of(failed: Tensor, error: Tensor) -> None:
     )
 
 
-def _system_of(call: AdjointCall, grad_after: Tensor, grad_velocities: Tensor) -> tuple[_System, Tensor, Tensor | None]:
-    """H on what moves, the right side of H l = dL/dx' + dL/dv' / h there, and which vertices friction holds [B, V]."""
-    right, inertia, inverse, projector, stuck = torch.ops.torchpd.adjoint_system(
-        grad_after, grad_velocities, call.after, call.positions, call.velocities, call.forces, call.material, call.plan,
-        time_step=call.time_step,
-    )  # fmt: skip
-    stiffness = named_material(call.material)["stiffness"]
-    if not len(projector):
-        return _System(inertia, inverse, None, stiffness, call.plan), right, None
-    return _System(inertia, inverse, projector, stiffness, call.plan), right, stuck
+def solve_adjoint(
+    after: Tensor,
+    right: Tensor,
+    inertia: Tensor,
+    inverse: Tensor,
+    projector: Tensor | None,
+    material: Sequence[Tensor],
+    plan: Sequence[Tensor],
+    solution: Tensor | None = None,
+    error: Tensor | None = None,
+    *,
+    time_step: float,
+) -> tuple[Tensor, Tensor]:
+    """The multiplier l, and its relative residual [B], no number where the loss or the state has none.
 
+    Where H turns out not to be positive, that of constant rotations stands in, with a warning.
 
-def _solve(call: AdjointCall, system: _System, right: Tensor) -> tuple[Tensor, Tensor]:
-    """The multiplier l, and its relative residual [B], no number where the loss or the state has none."""
+    Args:
+        after: x' [B, V, 3].
+        right: right side on what moves [B, V, 3].
+        inertia: [V] or [B, V] N/m.
+        inverse: 1 / D, 0 where a vertex does not move, of the same shape.
+        projector: of what contacts let through [B, V, 3, 3].
+        material: of the step.
+        plan: of its scene.
+        solution: what a solve has come to already [B, V, 3], and
+        error: its relative residual [B].
+        time_step: h [s].
+    """
+    arrays = list(plan)
+    system = _System(inertia, inverse, projector, named_material(material)["stiffness"], arrays)
     tolerance = _TOLERANCE[right.dtype]
-    multiplier, error = system.solve(call.after, right, tolerance)
-    failed = error > 1e3 * tolerance
+    if solution is None or error is None:
+        solution, error = system.solve(after, right, tolerance)
+    failed = error > _C.adjoint_failed * tolerance
     unasked = _recording(right)
     if unasked or bool(failed.any()):
         if not unasked:
             _warn_of(failed, error)
         wanted = torch.where(failed[:, None, None], right, 0.0)
         # the curvature of what is slid on has no part in the majoriser either
-        inertia, _ = step_diagonal(call.plan, call.material, call.time_step)
-        inertia = torch.where(torch.isfinite(inertia), inertia, 0.0)
-        instead, _ = replace(system, inertia=inertia).solve(_STRETCH * call.after, wanted, tolerance)
-        multiplier = torch.where(failed[:, None, None], instead, multiplier)
-    return multiplier, error
-
-
-def _elastic_product(call: AdjointCall, field: Tensor, positions: Tensor) -> Tensor:
-    stiffness = named_material(call.material)["stiffness"]
-    result: Tensor = torch.ops.torchpd.hessian_product(positions, field.contiguous(), stiffness, call.plan)
-    return result
-
-
-def step_adjoint(
-    call: AdjointCall, grad_after: Tensor, grad_velocities: Tensor, wanted: Sequence[bool]
-) -> list[Tensor]:
-    """Gradients of a loss for positions, velocities, forces [B, V, 3], then material arrays; contacts get zeros.
-
-    Args:
-        call: the step.
-        grad_after: dL/dx' [B, V, 3].
-        grad_velocities: dL/dv' [B, V, 3].
-        wanted: which material arrays, in their order; the others are left out, and cost nothing.
-    """
-    h, material = call.time_step, named_material(call.material)
-    system, right, stuck = _system_of(call, grad_after, grad_velocities)
-    solution, error = _solve(call, system, right)
-    # a loss or a state that is no number has a gradient that is none, as those who watch for it expect
-    grad_positions, grad_before, multiplier = torch.ops.torchpd.adjoint_result(
-        solution, error, grad_velocities, material["masses"], material["damping"], time_step=h
-    )
-
-    @cache
-    def passed_on() -> Tensor:
-        """What vertices that are held pass on: to the targets of pins, to the start of those that friction holds."""
-        return grad_after + grad_velocities / h - _elastic_product(call, multiplier, call.after)
-
-    if stuck is not None:
-        grad_positions = grad_positions + torch.where(stuck.unsqueeze(-1), system.off_normals(passed_on()), 0.0)
-    by_name = _for_material(call, multiplier)
-    by_name["pin_targets"] = lambda: _for_targets(call, multiplier, passed_on())
-    grads = [
-        _reduce(by_name[row.name](), array, row.dims) if row.name in by_name else torch.zeros_like(array)
-        for row, array, asked in zip(MATERIAL_TABLE, call.material, wanted, strict=True)
-        if asked
-    ]
-    return [grad_positions, grad_before, multiplier, *grads]
-
-
-def _for_material(call: AdjointCall, multiplier: Tensor) -> dict[str, Callable[[], Tensor]]:
-    """-l . dr/dp of every environment for each array p of the material but the targets of pins."""
-    h, material = call.time_step, named_material(call.material)
-    masses = material["masses"].unsqueeze(-1)
-
-    def rate() -> Tensor:
-        return (call.after - call.positions) / h
-
-    def for_stiffness() -> Tensor:
-        unit = torch.ones_like(material["stiffness"])
-        product: Tensor = torch.ops.torchpd.element_energy_product(call.after, multiplier, unit, call.plan)
-        return -product
-
-    def for_masses() -> Tensor:
-        pull = _inertial(material, h) / masses * h * rate() - call.velocities / h - material["gravity"].unsqueeze(-2)
-        return -(multiplier * pull).sum(-1)
-
-    def for_pin_stiffness() -> Tensor:
-        pins = pinned_vertices(call.plan)
-        stretch = call.after[:, pins] - material["pin_targets"]
-        hard = torch.isinf(material["pin_stiffness"])
-        return torch.where(hard, 0.0, -(multiplier[:, pins] * stretch).sum(-1))
-
-    return {
-        "stiffness": for_stiffness,
-        "masses": for_masses,
-        "gravity": lambda: (masses * multiplier).sum(1),
-        "damping": lambda: -(masses * multiplier * rate()).sum((1, 2)),
-        "pin_stiffness": for_pin_stiffness,
-    }
-
-
-def _for_targets(call: AdjointCall, multiplier: Tensor, passed_on: Tensor) -> Tensor:
-    """The same for the targets of pins: hard ones take on what their vertices pass on."""
-    pins, springs = pinned_vertices(call.plan), named_material(call.material)["pin_stiffness"].unsqueeze(-1)
-    hard = torch.isinf(springs)
-    return torch.where(hard, passed_on[:, pins], torch.where(hard, 0.0, springs) * multiplier[:, pins])
+        plain, _ = step_diagonal(arrays, material, time_step)
+        plain = torch.where(torch.isfinite(plain), plain, 0.0)
+        instead, _ = replace(system, inertia=plain).solve(_STRETCH * after, wanted, tolerance)
+        solution = torch.where(failed[:, None, None], instead, solution)
+    return solution.clone(), error.clone()

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
 
-from .adjoint import AdjointCall, step_adjoint
+from .adjoint import solve_adjoint
 from .batching import step_vjp_rule
 from .tables import MATERIAL_TABLE
 from .vmap_rules import register_rule
@@ -141,7 +141,10 @@ def _(
     touching = any(row.name in ("planes", "spheres") and array.shape[-2] > 0 for row, array in rows)
     # those that inertia and diagonal come from
     own = touching or any(
-        row.name in ("stiffness", "masses", "damping", "pin_stiffness") and array.dim() > row.dims and len(array) > 1
+        row.name in ("stiffness", "masses", "damping", "pin_stiffness")
+        and array.dim() > row.dims
+        and len(array) != 1
+        and array.shape[1:].numel() > 0
         for row, array in rows
     )
     inertia, inverse = (positions.new_empty((batch if own else 1, vertices)) for _ in range(2))
@@ -149,6 +152,14 @@ def _(
     projector = positions.new_empty((held, vertices, 3, 3))
     stuck = positions.new_empty((held, vertices), dtype=torch.bool)
     return positions.new_empty(positions.shape), inertia, inverse, projector, stuck
+
+
+def _solved(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+    return positions.new_empty(positions.shape), positions.new_empty(positions.shape[:1], dtype=torch.float64)
+
+
+_register_fake("conjugate_gradients")(_solved)
+_register_fake("solve_adjoint")(_solved)
 
 
 @_register_fake("adjoint_result")
@@ -289,36 +300,9 @@ def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | No
     return grads
 
 
-def _asked(wanted: Sequence[bool] | None, material: Sequence[Tensor]) -> Sequence[bool]:
-    if wanted is None:
-        return [True] * len(material)
-    if len(wanted) != len(material):
-        raise ValueError(
-            f"step_vjp: wanted must say of each of the {len(material)} arrays of the material whether its gradient is "
-            f"wanted, got {len(wanted)} numbers"
-        )
-    return wanted
-
-
-@torch.library.impl("torchpd::step_vjp", ("cpu", "cuda"))
-def step_vjp(
-    grad_positions: Tensor,
-    grad_velocities: Tensor,
-    after: Tensor,
-    positions: Tensor,
-    velocities: Tensor,
-    forces: Tensor | None,
-    material: Sequence[Tensor],
-    plan: Sequence[Tensor],
-    *,
-    time_step: float,
-    wanted: Sequence[bool] | None = None,
-) -> list[Tensor]:
-    """The adjoint of a step: gradients for positions, velocities, forces and the wanted material arrays, else all."""
-    call = AdjointCall(positions, velocities, forces, after, list(material), list(plan), time_step)
-    # in the precision of the step, also where autocast asks for less
-    with torch.autocast(after.device.type, enabled=False):
-        return step_adjoint(call, grad_positions, grad_velocities, _asked(wanted, material))
+@torch.library.impl("torchpd::solve_adjoint", ("cpu", "cuda"))
+def _(*args: Any, time_step: float) -> tuple[Tensor, Tensor]:
+    return solve_adjoint(*args, time_step=time_step)
 
 
 @_register_fake("step_vjp")
@@ -336,7 +320,7 @@ def _(
     wanted: Sequence[bool] | None = None,
 ) -> list[Tensor]:
     state = [positions.new_empty(positions.shape) for _ in range(3)]
-    asked = zip(material, _asked(wanted, material), strict=True)
+    asked = zip(material, [True] * len(material) if wanted is None else wanted, strict=True)
     return [*state, *(array.new_empty(array.shape) for array, own in asked if own)]
 
 

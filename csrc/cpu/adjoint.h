@@ -34,10 +34,8 @@ template <class T>
 void adjoint_result_any(const AdjointResultCall<T>& call, int threads) {
   const std::int64_t count = call.batch * call.vertices;
   run_team(useful_threads(count, threads), [&](const Team& team) {
-    for (std::int64_t n = team.begin(count); n < team.end(count); ++n) {
-      for (int c = 0; c < 3; ++c)
-        write_adjoint_number(call, n / call.vertices, 3 * (n % call.vertices) + c);
-    }
+    for (std::int64_t n = team.begin(count); n < team.end(count); ++n)
+      AdjointAnswer<T>{call, n / call.vertices, n % call.vertices}.give();
   });
 }
 

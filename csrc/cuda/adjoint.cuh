@@ -21,9 +21,8 @@ template <class T>
 __global__ void __launch_bounds__(field_threads)
     adjoint_result(const __grid_constant__ AdjointResultCall<T> call) {
   const std::int64_t number = std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
-  const std::int64_t numbers = 3 * call.vertices;
-  if (number >= call.batch * numbers) return;
-  write_adjoint_number(call, number / numbers, number % numbers);
+  if (number >= call.batch * call.vertices) return;
+  AdjointAnswer<T>{call, number / call.vertices, number % call.vertices}.give();
 }
 
 template <class Call>
@@ -40,7 +39,7 @@ void run_adjoint_system(const DeviceAdjointSystem<T>& call, Stream to) {
 
 template <class T>
 void run_adjoint_result(const AdjointResultCall<T>& call, Stream to) {
-  run_for_each(adjoint_result<T>, call, 3 * call.batch * call.vertices, to);
+  run_for_each(adjoint_result<T>, call, call.batch * call.vertices, to);
 }
 
 }  // namespace pd

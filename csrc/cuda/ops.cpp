@@ -1,8 +1,9 @@
 // The ops on CUDA: memory, stream and device come from torch, everything else from the kernels.
-#include "ops.h"
+#include "adjoint_ops.h"
 
 #include "cuda/launch.h"
 
+#include <c10/cuda/CUDAGraphsC10Utils.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
 
@@ -52,6 +53,16 @@ struct Cuda {
   }
 
   template <class T>
+  static bool asks(const Plan<T>& plan) {
+    return plan.kernel != int(DeviceKernel::block);
+  }
+
+  static bool recording(const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    return c10::cuda::currentStreamCaptureStatusMayInitCtx() != c10::cuda::CaptureStatus::None;
+  }
+
+  template <class T>
   static void rotation(const RotationCall<T>& call, const Tensor& like) {
     const c10::cuda::CUDAGuard guard(like.device());
     run_rotation(call, c10::cuda::getCurrentCUDAStream().stream());
@@ -70,6 +81,9 @@ struct Cuda {
 
 }  // namespace
 
-TORCH_LIBRARY_IMPL(torchpd, CUDA, m) { register_ops<Cuda>(m); }
+TORCH_LIBRARY_IMPL(torchpd, CUDA, m) {
+  register_ops<Cuda>(m);
+  register_adjoint_ops<Cuda>(m);
+}
 
 }  // namespace pd

@@ -246,6 +246,12 @@ struct AdjointResultCall {
   const T* grad_velocities = nullptr;
   const double* error = nullptr;  // of each environment
   std::int64_t error_stride = 1;
+  // of a scene with contacts, else null: dL/dx', elastic Hessian times the multiplier, what contacts let through, and which
+  // vertices friction holds
+  const T* grad_positions = nullptr;
+  const T* elastic = nullptr;
+  const T* projector = nullptr;  // [batch, vertices, 3, 3]
+  const bool* stuck = nullptr;   // [batch, vertices]
   T* out_positions = nullptr;
   T* out_velocities = nullptr;
   T* out_multiplier = nullptr;
@@ -253,7 +259,7 @@ struct AdjointResultCall {
 
 // Numbers of an environment in the progress of a solve: r . z, |right side|, 1 while it goes on, 0 after, -1 before, and the
 // residual relative to the right side. Before, the first iteration works out the others, by a residual that is the right side.
-// No number for an error: neither right side nor positions are numbers.
+// No number for an error: something in right side or positions is infinite or no number.
 enum ConjugateProgress : int {
   progress_product,
   progress_scale,

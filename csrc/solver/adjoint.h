@@ -8,6 +8,17 @@
 
 namespace pd::inline PD_TARGET {
 
+// Relative residual at which a solve stops: near the rounding floor of each precision.
+template <class T>
+constexpr double adjoint_tolerance = sizeof(T) == 4 ? 1e-5 : 1e-10;
+// times that, a solve has failed
+constexpr double adjoint_failed = 1e3;
+constexpr int adjoint_iterations = 2000;  // at most
+// iterations after which the host is asked whether any environment goes on, which waits for a GPU
+constexpr int adjoint_asked_every = 10;
+// vertices of an environment that one thread block is quick enough with
+constexpr int adjoint_most_of_a_block = 16384;
+
 // of what friction could take back: slip below it counts as none
 constexpr double sticking = 1e-3;
 
@@ -57,7 +68,7 @@ PD_HD void touch_all(HeldVertex<T>& vertex, const Material<T>& material, std::in
   }
 }
 
-// One vertex of one environment, by the user's number; `pin` holds it, or -1. `elastic`: of the weighted diagonal.
+// One vertex of one environment, by the user's number; `pin` holds it, or -1.
 template <class T, class P>
 struct AdjointVertex {
   const AdjointSystemCall<T, P>& call;
@@ -128,8 +139,10 @@ struct AdjointVertex {
       call.stuck[at] = held.stuck;
       kept = kept - held.curvature;
       if (held.stuck) inverse = T(0);
-      right = inverse != T(0) ? held.projector * right : Vec3<T>{T(0), T(0), T(0)};
+      right = held.projector * right;
     }
+    // also where elasticity without bounds leaves no 1 / D
+    if (!(inverse != T(0))) right = {T(0), T(0), T(0)};
     write(call.right, right);
     // what environments share is written once
     if (environment == 0 || call.rows > 1) {
@@ -140,20 +153,44 @@ struct AdjointVertex {
   }
 };
 
-// -l . dr / d(x, v) of one number of a state: dL/dx = m / h^2 (1 + damping h) l - dL/dv' / h, dL/dv = m / h l. An environment
-// whose solve could not begin has no number for an answer.
+// -l . dr / d(x, v) of a vertex: dL/dx = m / h^2 (1 + damping h) l - dL/dv' / h, dL/dv = m / h l; one that friction holds moves
+// with its start. An environment whose solve could not begin has no number for an answer.
 template <class T>
-PD_HD void write_adjoint_number(const AdjointResultCall<T>& call, std::int64_t environment,
-                                std::int64_t number) {
-  const T h = T(call.time_step);
-  const T mass = call.masses.of(environment)[number / 3];
-  const double error = call.error[environment * call.error_stride];
-  const std::int64_t at = 3 * environment * call.vertices + number;
-  const T multiplier = error == error ? call.multiplier[at] : T(NAN);
-  const T inertia = inertia_weight(mass, *call.damping.of(environment), T(0), h);
-  call.out_multiplier[at] = multiplier;
-  call.out_velocities[at] = mass / h * multiplier;
-  call.out_positions[at] = inertia * multiplier - call.grad_velocities[at] / h;
-}
+struct AdjointAnswer {
+  const AdjointResultCall<T>& call;
+  std::int64_t environment, vertex;
+
+  PD_HD std::int64_t at() const { return environment * call.vertices + vertex; }
+
+  PD_HD Vec3<T> read(const T* from) const {
+    const T* p = from + 3 * at();
+    return {p[0], p[1], p[2]};
+  }
+
+  PD_HD void write(T* to, const Vec3<T>& a) const {
+    T* p = to + 3 * at();
+    p[0] = a.x;
+    p[1] = a.y;
+    p[2] = a.z;
+  }
+
+  PD_HD void give() const {
+    const T h = T(call.time_step), mass = call.masses.of(environment)[vertex];
+    const double error = call.error[environment * call.error_stride];
+    Vec3<T> multiplier = read(call.multiplier);
+    if (!(error == error)) multiplier = {T(NAN), T(NAN), T(NAN)};
+    const T inertia = inertia_weight(mass, *call.damping.of(environment), T(0), h);
+    const Vec3<T> before = (T(1) / h) * read(call.grad_velocities);
+    Vec3<T> sum = inertia * multiplier - before;
+    if (call.stuck && call.stuck[at()]) {
+      const T* p = call.projector + 9 * at();
+      const Mat3<T> free = {{{p[0], p[1], p[2]}, {p[3], p[4], p[5]}, {p[6], p[7], p[8]}}};
+      sum = sum + free * (read(call.grad_positions) + before - read(call.elastic));
+    }
+    write(call.out_positions, sum);
+    write(call.out_velocities, (mass / h) * multiplier);
+    write(call.out_multiplier, multiplier);
+  }
+};
 
 }  // namespace pd::inline PD_TARGET

@@ -1,0 +1,398 @@
+// The ops of a step's adjoint on either device. Of a Backend, beside what ops.h asks for: `adjoint_system` and
+// `adjoint_result`, which run a call; `asks(plan)`, whether a solve asks the host between its iterations; and `recording(like)`,
+// whether what is done is recorded for later, where nobody can ask what comes out.
+#pragma once
+#include "find_op.h"
+#include "ops.h"
+#include "solver/adjoint.h"
+
+#include <optional>
+#include <string_view>
+#include <tuple>
+#include <vector>
+
+namespace pd {
+
+// A step that was taken, and what a loss wants of its outcome.
+struct AdjointTensors {
+  Tensor grad_positions, grad_velocities, after, positions, velocities;
+  OptionalTensor forces;
+  at::TensorList material, plan;
+};
+
+using AdjointOutputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+template <class Backend, class T>
+AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
+  AdjointSystemCall<T, typename Backend::template Plan<T>> call;
+  const Place place{t.after.device()};
+  call.plan = Backend::template plan_view<T>(t.plan, place);
+  call.batch = t.after.size(0);
+  const std::int64_t vertices = call.plan.vertices;
+  check_vertices(t.after, vertices);
+  call.material = material_view<T>(t.material, vertices, call.plan.pins, call.batch, place);
+  const Tensor& stiffness = t.material[0];
+  const Tensor elastic = diagonal_typed<Backend, T>(stiffness, t.plan, true);
+  const Material<T>& m = call.material;
+  call.elastic = {elastic.const_data_ptr<T>(), m.stiffness.stride ? vertices : 0};
+  const bool touching = m.planes_count + m.spheres_count > 0;
+  const bool own = touching || m.stiffness.stride || m.masses.stride || m.damping.stride ||
+                   m.pin_stiffness.stride;
+  call.rows = own ? call.batch : 1;
+  call.time_step = time_step;
+  const at::TensorOptions options = t.after.options();
+  const Tensor grad_x = t.grad_positions.contiguous(), grad_v = t.grad_velocities.contiguous();
+  const Tensor right = at::empty_like(grad_x), inertia = at::empty({call.rows, vertices}, options);
+  const Tensor inverse = at::empty_like(inertia);
+  call.grad_positions = grad_x.const_data_ptr<T>();
+  call.grad_velocities = grad_v.const_data_ptr<T>();
+  call.right = right.mutable_data_ptr<T>();
+  call.inertia = inertia.mutable_data_ptr<T>();
+  call.inverse = inverse.mutable_data_ptr<T>();
+  const std::int64_t held = touching ? call.batch : 0;
+  const Tensor projector = at::empty({held, vertices, 3, 3}, options);
+  const Tensor stuck = at::empty({held, vertices}, options.dtype(at::kBool));
+  Tensor after, x, v, f, gradient;
+  if (touching) {
+    after = t.after.contiguous(), x = t.positions.contiguous(), v = t.velocities.contiguous();
+    f = t.forces ? t.forces->contiguous() : Tensor();
+    gradient = run_field<Backend>(Field::gradient, after, {}, stiffness, t.plan);
+    call.after = after.const_data_ptr<T>();
+    call.positions = x.const_data_ptr<T>();
+    call.velocities = v.const_data_ptr<T>();
+    call.forces = f.defined() ? f.const_data_ptr<T>() : nullptr;
+    call.elastic_gradient = gradient.const_data_ptr<T>();
+    call.projector = projector.mutable_data_ptr<T>();
+    call.stuck = stuck.mutable_data_ptr<bool>();
+  }
+  if (call.batch > 0) Backend::adjoint_system(call, grad_x);
+  return {right, inertia, inverse, projector, stuck};
+}
+
+// The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1, vertices], and of
+// a scene with contacts the projector off the normals that hold a vertex [batch, vertices, 3, 3] and whether friction holds it
+// [batch, vertices], else of no environments.
+template <class Backend>
+AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_velocities,
+                              const Tensor& after, const Tensor& positions,
+                              const Tensor& velocities, const OptionalTensor& forces,
+                              at::TensorList material, at::TensorList plan, double time_step) {
+  check_positions(positions, "positions");
+  check_state(velocities, positions, "velocities", "m/s");
+  check_state(after, positions, "after", "m");
+  if (forces) check_state(*forces, positions, "forces", "N");
+  check_state(grad_positions, positions, "grad_positions", "of a loss, 1/m");
+  check_state(grad_velocities, positions, "grad_velocities", "of a loss, 1/(m/s)");
+  check_time_step(time_step);
+  const AdjointTensors tensors{grad_positions, grad_velocities, after,    positions,
+                               velocities,     forces,          material, plan};
+  return positions.scalar_type() == at::kFloat
+             ? adjoint_system_typed<Backend, float>(tensors, time_step)
+             : adjoint_system_typed<Backend, double>(tensors, time_step);
+}
+
+// Of a scene with contacts also what they let through of what vertices that friction holds pass on, dL/dx' + dL/dv' / h - K l.
+struct PassedOn {
+  OptionalTensor grad_positions, elastic, projector, stuck;
+};
+
+struct ResultTensors {
+  Tensor multiplier, error, grad_velocities, masses, damping;
+  PassedOn passed_on;
+};
+
+template <class Backend, class T>
+Outputs adjoint_result_typed(const ResultTensors& t, double time_step) {
+  AdjointResultCall<T> call;
+  const Place place{t.multiplier.device()};
+  call.batch = t.multiplier.size(0);
+  call.vertices = t.multiplier.size(1);
+  call.masses =
+      values_view<T>(t.masses, call.vertices, 1, false, call.batch, place, "masses", "kg");
+  call.damping = values_view<T>(t.damping, 1, 1, true, call.batch, place, "damping", "1/s");
+  call.time_step = time_step;
+  const Tensor l = t.multiplier.contiguous(), v = t.grad_velocities.contiguous();
+  const Tensor x = at::empty_like(l), before = at::empty_like(l), out = at::empty_like(l);
+  call.multiplier = l.const_data_ptr<T>();
+  call.grad_velocities = v.const_data_ptr<T>();
+  call.error = t.error.const_data_ptr<double>();
+  call.error_stride = t.error.stride(0);
+  call.out_positions = x.mutable_data_ptr<T>();
+  call.out_velocities = before.mutable_data_ptr<T>();
+  call.out_multiplier = out.mutable_data_ptr<T>();
+  Tensor grad_x, elastic, projector, stuck;
+  if (t.passed_on.stuck) {
+    grad_x = t.passed_on.grad_positions->contiguous(), elastic = t.passed_on.elastic->contiguous();
+    projector = t.passed_on.projector->contiguous(), stuck = t.passed_on.stuck->contiguous();
+    call.grad_positions = grad_x.const_data_ptr<T>();
+    call.elastic = elastic.const_data_ptr<T>();
+    call.projector = projector.const_data_ptr<T>();
+    call.stuck = stuck.const_data_ptr<bool>();
+  }
+  if (l.numel() > 0) Backend::adjoint_result(call, l);
+  return {x, before, out};
+}
+
+// Gradients for positions and velocities before a step, and the multiplier, of which no number is left where the error is none.
+template <class Backend>
+Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tensor& grad_velocities,
+                       const Tensor& masses, const Tensor& damping,
+                       const OptionalTensor& grad_positions, const OptionalTensor& elastic,
+                       const OptionalTensor& projector, const OptionalTensor& stuck,
+                       double time_step) {
+  check_positions(multiplier, "multiplier");
+  check_state(grad_velocities, multiplier, "grad_velocities", "of a loss, 1/(m/s)");
+  TORCH_CHECK_VALUE(
+      error.scalar_type() == at::kDouble && error.dim() == 1 &&
+          error.size(0) == multiplier.size(0) && error.device() == multiplier.device(),
+      "error must be float64 [", multiplier.size(0), "] beside multiplier, got ", describe(error));
+  check_time_step(time_step);
+  const bool some = grad_positions || elastic || projector || stuck;
+  if (some) {
+    TORCH_CHECK_VALUE(grad_positions && elastic && projector && stuck,
+                      "grad_positions, elastic, projector and stuck come together or not at all");
+    check_state(*grad_positions, multiplier, "grad_positions", "of a loss, 1/m");
+    check_state(*elastic, multiplier, "elastic", "Hessian product, N");
+    check_projector(*projector, multiplier);
+    TORCH_CHECK_VALUE(
+        stuck->scalar_type() == at::kBool && stuck->sizes() == multiplier.sizes().slice(0, 2) &&
+            stuck->device() == multiplier.device(),
+        "stuck must be bool [batch, vertices] beside multiplier, got ", describe(*stuck));
+  }
+  const ResultTensors tensors{multiplier, error,   grad_velocities,
+                              masses,     damping, {grad_positions, elastic, projector, stuck}};
+  return multiplier.scalar_type() == at::kFloat
+             ? adjoint_result_typed<Backend, float>(tensors, time_step)
+             : adjoint_result_typed<Backend, double>(tensors, time_step);
+}
+
+struct PlanTraits {
+  bool levels, large;  // large: more vertices than one thread block of a GPU is quick enough with
+  bool asks;           // a solve asks the host between its iterations
+};
+
+template <class Backend, class T>
+PlanTraits traits_of(at::TensorList arrays, at::Device device) {
+  const auto plan = Backend::template plan_view<T>(arrays, Place{device});
+  return {plan.levels.there(), !device.is_cpu() && plan.vertices > adjoint_most_of_a_block,
+          Backend::template asks<T>(plan)};
+}
+
+template <class Backend>
+PlanTraits traits_of(const Tensor& like, at::TensorList plan) {
+  return like.scalar_type() == at::kFloat ? traits_of<Backend, float>(plan, like.device())
+                                          : traits_of<Backend, double>(plan, like.device());
+}
+
+struct AdjointSystem {
+  Tensor right, inertia, inverse;
+  OptionalTensor projector;  // with contacts
+};
+
+// The solution, and the relative residual of every environment.
+using Solved = std::tuple<Tensor, Tensor>;
+
+// By the iterations of conjugate_gradients_, as many as it takes.
+template <class Backend>
+Solved solve_plainly(const Tensor& positions, const AdjointSystem& s, const Tensor& stiffness,
+                     at::TensorList plan, double tolerance, bool asks) {
+  const Tensor right = s.right.contiguous(), x = positions.contiguous();
+  const Tensor solution = at::empty_like(right), direction = at::empty_like(right);
+  const Tensor residual = right.clone();
+  const Tensor progress =
+      at::full({x.size(0), progress_count}, -1.0, x.options().dtype(at::kDouble));
+  const int steps = asks ? adjoint_asked_every : adjoint_iterations;
+  for (int done = 0; done < adjoint_iterations; done += steps) {
+    conjugate_gradients_inplace<Backend>(solution, residual, direction, progress, x, s.inertia,
+                                         s.inverse, s.projector, stiffness, plan, tolerance, steps);
+    if (!asks || !progress.select(1, progress_active).any().item<bool>()) break;
+  }
+  return {solution, progress.select(1, progress_error)};
+}
+
+template <class Backend>
+Solved conjugate_gradients(const Tensor& positions, const Tensor& right, const Tensor& inertia,
+                           const Tensor& inverse, const OptionalTensor& projector,
+                           const Tensor& stiffness, at::TensorList plan, double tolerance) {
+  check_positions(positions, "positions");
+  check_state(right, positions, "right", "N");
+  const auto [solution, error] =
+      solve_plainly<Backend>(positions, {right, inertia, inverse, projector}, stiffness, plan,
+                             tolerance, traits_of<Backend>(positions, plan).asks);
+  return {solution, error.contiguous()};
+}
+
+// Any other way, and what to do where the plain one has found no solution: torchpd/adjoint.py.
+inline Solved solve_composed(const AdjointTensors& t, const AdjointSystem& s, double time_step,
+                             const OptionalTensor& solution = {},
+                             const OptionalTensor& error = {}) {
+  static const auto op =
+      find_op<Solved(const Tensor&, const Tensor&, const Tensor&, const Tensor&,
+                     const OptionalTensor&, at::TensorList, at::TensorList, const OptionalTensor&,
+                     const OptionalTensor&, double)>("torchpd::solve_adjoint");
+  return op.call(t.after, s.right, s.inertia, s.inverse, s.projector, t.material, t.plan, solution,
+                 error, time_step);
+}
+
+template <class Backend>
+Solved solve(const AdjointTensors& t, const AdjointSystem& s, double time_step) {
+  const PlanTraits plan = traits_of<Backend>(t.after, t.plan);
+  if (plan.levels || plan.large || Backend::recording(t.after))
+    return solve_composed(t, s, time_step);
+  const double tolerance =
+      t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
+  const auto [solution, error] = solve_plainly<Backend>(
+      t.after, s, t.material[place_in_material("stiffness")], t.plan, tolerance, plan.asks);
+  const Tensor failed = error.gt(adjoint_failed * tolerance).any();
+  if (failed.item<bool>()) return solve_composed(t, s, time_step, solution, error);
+  return {solution, error};
+}
+
+// K l, by the dispatcher, whose profiler then sees it.
+inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier) {
+  static const auto op =
+      find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, at::TensorList)>(
+          "torchpd::hessian_product");
+  return op.call(t.after, multiplier, t.material[place_in_material("stiffness")], t.plan);
+}
+
+// -l . dr/dp of every environment, for an array p of the material, from its formulas for all of them.
+class MaterialGradients {
+ public:
+  // `elastic`: K l, undefined where nobody has worked it out
+  MaterialGradients(const AdjointTensors& t, const Tensor& multiplier, const Tensor& elastic,
+                    double time_step)
+      : t_(t), multiplier_(multiplier), elastic_(elastic), h_(time_step) {}
+
+  // of the array in a place; what environments share has the sum over them
+  Tensor of(std::size_t place) const {
+    const Tensor& array = t_.material[place];
+#define X(name, width, rows, meaning)    \
+  if (place == place_in_material(#name)) \
+    return reduce(name(), array, (width > 1 ? 1 : 0) + (std::string_view(#rows) != "one"));
+#include "plan/material.def"
+#undef X
+    TORCH_INTERNAL_ASSERT(false);
+  }
+
+ private:
+  static Tensor reduce(const Tensor& each, const Tensor& like, std::int64_t own) {
+    return like.dim() == own ? each.sum(0) : each.sum_to_size(like.sizes());
+  }
+
+  const Tensor& material(const char* name) const { return t_.material[place_in_material(name)]; }
+  Tensor mass() const { return material("masses").unsqueeze(-1); }
+  Tensor rate() const { return (t_.after - t_.positions) / h_; }
+  Tensor hard() const { return material("pin_stiffness").isinf(); }
+
+  // user's numbers of the pinned vertices
+  Tensor pins() const {
+    constexpr int vertex_order = 1, pin_vertex = 2;  // of every plan
+    return t_.plan[vertex_order].index_select(0, t_.plan[pin_vertex]).to(at::kLong);
+  }
+  Tensor pinned(const Tensor& field) const { return field.index_select(1, pins()); }
+
+  // what vertices that are held pass on
+  Tensor passed_on() const {
+    // what was worked out before does not know yet that an environment is lost
+    const Tensor product =
+        elastic_.defined() ? elastic_ + 0.0 * multiplier_ : elastic_product(t_, multiplier_);
+    return t_.grad_positions + t_.grad_velocities / h_ - product;
+  }
+
+  Tensor stiffness() const {
+    static const auto op =
+        find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, at::TensorList)>(
+            "torchpd::element_energy_product");
+    return -op.call(t_.after, multiplier_, at::ones_like(material("stiffness")), t_.plan);
+  }
+
+  Tensor masses() const {
+    const Tensor lag = 1 + material("damping").unsqueeze(-1).unsqueeze(-1) * h_;
+    const Tensor pull = (lag * rate() - t_.velocities) / h_ - material("gravity").unsqueeze(-2);
+    return -(multiplier_ * pull).sum(-1);
+  }
+
+  Tensor gravity() const { return (mass() * multiplier_).sum(1); }
+
+  Tensor damping() const { return -(mass() * multiplier_ * rate()).sum({1, 2}); }
+
+  Tensor pin_stiffness() const {
+    const Tensor stretch = pinned(t_.after) - material("pin_targets");
+    return at::where(hard(), 0.0, -(pinned(multiplier_) * stretch).sum(-1));
+  }
+
+  // hard ones take on what their vertices pass on
+  Tensor pin_targets() const {
+    const Tensor held = hard().unsqueeze(-1);
+    const Tensor springs = at::where(held, 0.0, material("pin_stiffness").unsqueeze(-1));
+    return at::where(held, pinned(passed_on()), springs * pinned(multiplier_));
+  }
+
+  // autograd refuses to ask for those of contacts
+  Tensor planes() const { return none("planes"); }
+  Tensor spheres() const { return none("spheres"); }
+  Tensor none(const char* name) const {
+    const Tensor& array = material(name);
+    return at::zeros({t_.after.size(0), array.size(-2), array.size(-1)}, array.options());
+  }
+
+  const AdjointTensors& t_;
+  const Tensor& multiplier_;
+  const Tensor& elastic_;
+  double h_;
+};
+
+using Wanted =
+    std::optional<c10::List<bool>>;  // of every array of the material, whether its gradient is
+
+// The adjoint of a step: gradients for positions, velocities, forces [batch, vertices, 3], then for the wanted arrays of the
+// material, else all; what nobody wants costs nothing.
+template <class Backend>
+std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
+                             const Tensor& after, const Tensor& positions, const Tensor& velocities,
+                             const OptionalTensor& forces, at::TensorList given,
+                             at::TensorList plan, double time_step, const Wanted& wanted) {
+  std::vector<Tensor> material;
+  for (const Tensor& array : given) material.push_back(array.contiguous());
+  const AdjointTensors t{grad_positions, grad_velocities, after,    positions,
+                         velocities,     forces,          material, plan};
+  TORCH_CHECK_VALUE(!wanted || wanted->size() == material.size(),
+                    "step_vjp: wanted must say of each of the ", material.size(),
+                    " arrays of the material whether its gradient is wanted, got ",
+                    wanted ? wanted->size() : 0, " numbers");
+  // in the precision of the step, also where autocast asks for less
+  const c10::impl::ExcludeDispatchKeyGuard plainly(c10::autocast_dispatch_keyset);
+  const auto [right, inertia, inverse, projector, stuck] =
+      adjoint_system<Backend>(grad_positions, grad_velocities, after, positions, velocities, forces,
+                              material, plan, time_step);
+  const bool touching = projector.size(0) > 0;
+  const OptionalTensor free = touching ? OptionalTensor(projector) : OptionalTensor();
+  const auto [solution, error] = solve<Backend>(t, {right, inertia, inverse, free}, time_step);
+  Tensor elastic;
+  PassedOn passed_on;
+  if (touching) {
+    elastic = elastic_product(t, solution);
+    passed_on = {grad_positions, elastic, projector, stuck};
+  }
+  auto [x, v, multiplier] = adjoint_result<Backend>(
+      solution, error, grad_velocities, material[place_in_material("masses")],
+      material[place_in_material("damping")], passed_on.grad_positions, passed_on.elastic,
+      passed_on.projector, passed_on.stuck, time_step);
+  std::vector<Tensor> found{x, v, multiplier};
+  const MaterialGradients gradients(t, multiplier, elastic, time_step);
+  for (std::size_t i = 0; i < material.size(); ++i) {
+    if (!wanted || wanted->get(i)) found.push_back(gradients.of(i));
+  }
+  return found;
+}
+
+template <class Backend>
+void register_adjoint_ops(torch::Library& m) {
+  m.impl("adjoint_system", &adjoint_system<Backend>);
+  m.impl("adjoint_result", &adjoint_result<Backend>);
+  m.impl("conjugate_gradients", &conjugate_gradients<Backend>);
+  m.impl("step_vjp", &step_vjp<Backend>);
+}
+
+}  // namespace pd
