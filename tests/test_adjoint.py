@@ -264,6 +264,23 @@ def test_a_failed_solve_is_not_done_twice() -> None:
     assert calls.count("torchpd::conjugate_gradients") == 1
 
 
+@pytest.mark.parametrize("forces", [False, True])
+def test_a_first_iterate_stands_between_state_and_material(forces: bool) -> None:
+    """In the order of what autograd may ask for: gradients of the solution do not depend on it."""
+    sim, state = body()
+    push = torch.ones_like(state.positions).requires_grad_() if forces else None
+    names = ["stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets"]
+    inputs = [state.positions.requires_grad_(), *(getattr(sim, name).requires_grad_() for name in names)]
+    inputs += [push] if push is not None else []
+    start = (state.positions + 0.01).detach()
+    one, other = (
+        torch.autograd.grad(sim(state, push, **options).positions.square().sum(), inputs)
+        for options in ({}, {"start": start})
+    )
+    for plain, given in zip(one, other, strict=True):
+        assert torch.allclose(plain, given, rtol=1e-6, atol=1e-9 * float(plain.abs().max()))
+
+
 def test_a_state_that_changed_since_is_noticed() -> None:
     sim, state = body(iterations=10)
     velocities = state.velocities.clone()
