@@ -512,11 +512,12 @@ def test_contacts_on_both_sides_leave_their_common_direction() -> None:
     assert float(gradient[0, 0, 2]) == pytest.approx(3.0 * float(above - below) / (2 * size), rel=5e-3)
 
 
-def test_autocast_does_not_touch_the_adjoint() -> None:
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "by torch operations"])
+def test_autocast_does_not_touch_the_adjoint(solver: pd.solvers.Solver) -> None:
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (8, 2, 2))
     bar = pd.Solid(mesh, 5e4)
     scene = pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] == 0.0), pd.Gravity(), pd.Sphere((0.5, -0.3, 0.13), 0.3, 0.3))
-    sim = pd.Simulator(scene, 1 / 60, 200)
+    sim = pd.Simulator(scene, 1 / 60, 200, solver=solver)
     sim.stiffness.requires_grad_()
 
     def gradient(lower: bool) -> torch.Tensor:
