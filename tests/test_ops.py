@@ -54,60 +54,38 @@ def samples(
         "element_energy": ((wanted(x), w, plan), {}),
         "element_energy_product": ((wanted(x), wanted(direction), w, plan), {}),
         "hessian_product": ((x, wanted(direction), w.detach(), plan), {}),
-        "conjugate_gradients_": (
-            (
-                0 * x,
-                f.clone(),
-                f.clone(),
-                torch.full((BATCH, 4), -1.0, dtype=torch.float64, device=device),
-                x,
-                sim.masses,
-                1 / sim.masses,
-                None,
-                sim.stiffness.detach(),
-                plan,
-            ),
-            {"tolerance": 1e-3, "iterations": 2},
-        ),
-        "adjoint_system": (
-            (f, direction, x, still, zero, 0.01 * f, [m.detach() for m in material], plan),
-            {"time_step": sim.time_step},
-        ),
-        "adjoint_result": (
-            (
-                f,
-                torch.tensor([0.0, 2.0, 1.0], dtype=torch.float64, device=device),
-                direction,
-                sim.masses,
-                sim.damping,
-                f,
-                direction,
-                torch.eye(3, dtype=dtype, device=device).repeat(*x.shape[:2], 1, 1),
-                x[..., 0] > 0.1,
-            ),
-            {"time_step": sim.time_step},
-        ),
-        "conjugate_gradients": (
-            (x, f, sim.masses, 1 / sim.masses, None, sim.stiffness.detach(), plan),
-            {"tolerance": 1e-3},
-        ),
-        "solve_adjoint": (
-            (
-                still,
-                f,
-                sim.masses / sim.time_step**2,
-                sim.time_step**2 / sim.masses,
-                None,
-                [m.detach() for m in material],
-                plan,
-            ),
-            {"time_step": sim.time_step},
-        ),
         "elastic_diagonal": ((w.detach(), plan), {"weighted": True}),
         "nearest_rotation": ((wanted(matrices),), {}),
         "rotation_differential": ((wanted(matrices), wanted(matrices.flip(0))), {}),
     }
-    return found[name]
+    return found[name] if name in found else samples_of_the_adjoint(sim, x)[name]
+
+
+def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
+    """Arguments of the ops that it is made of, which have no derivatives."""
+    material, plan = [array.detach() for array in sim.material()], plan_of(sim)
+    f, direction = noise(x), noise(x, 1)
+    still, zero = sim.rest_state(BATCH)
+    stiffness, h, double = (
+        sim.stiffness.detach(),
+        {"time_step": sim.time_step},
+        {"dtype": torch.float64, "device": x.device},
+    )
+    progress, errors = torch.full((BATCH, 4), -1.0, **double), torch.tensor([0.0, 2.0, 1.0], **double)
+    inertia = sim.masses / sim.time_step**2
+    projector = torch.eye(3, dtype=x.dtype, device=x.device).repeat(*x.shape[:2], 1, 1)
+    return {
+        "conjugate_gradients_": (
+            (0 * x, f.clone(), f.clone(), progress, x, sim.masses, 1 / sim.masses, None, stiffness, plan),
+            {"tolerance": 1e-3, "iterations": 2},
+        ),
+        "conjugate_gradients": ((x, f, sim.masses, 1 / sim.masses, None, stiffness, plan), {"tolerance": 1e-3}),
+        "adjoint_system": ((f, direction, x, still, zero, 0.01 * f, material, plan), h),
+        "adjoint_result": (
+            (f, errors, direction, sim.masses, sim.damping, f, direction, projector, x[..., 0] > 0.1), h,
+        ),
+        "solve_adjoint": ((still, f, inertia, 1 / inertia, None, material, plan), h),
+    }  # fmt: skip
 
 
 OPS = (

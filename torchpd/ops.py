@@ -124,18 +124,8 @@ def _(field: Tensor, plan: Sequence[Tensor]) -> Tensor:
 
 
 @_register_fake("adjoint_system")
-def _(
-    grad_positions: Tensor,
-    grad_velocities: Tensor,
-    after: Tensor,
-    positions: Tensor,
-    velocities: Tensor,
-    forces: Tensor | None,
-    material: Sequence[Tensor],
-    plan: Sequence[Tensor],
-    *,
-    time_step: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    _, _, _, positions, _, _, material, _ = step
     batch, vertices, _ = positions.shape
     rows = list(zip(MATERIAL_TABLE, material, strict=True))
     touching = any(row.name in ("planes", "spheres") and array.shape[-2] > 0 for row, array in rows)
@@ -162,6 +152,14 @@ _register_fake("conjugate_gradients")(_solved)
 _register_fake("solve_adjoint")(_solved)
 
 
+@_register_fake("step_vjp")
+def _(*step: Any, time_step: float, wanted: Sequence[bool] | None = None) -> list[Tensor]:
+    _, _, _, positions, _, _, material, _ = step
+    state = [positions.new_empty(positions.shape) for _ in range(3)]
+    asked = zip(material, [True] * len(material) if wanted is None else wanted, strict=True)
+    return [*state, *(array.new_empty(array.shape) for array, own in asked if own)]
+
+
 @_register_fake("adjoint_result")
 def _(multiplier: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
     x, v, out = (multiplier.new_empty(multiplier.shape) for _ in range(3))
@@ -181,6 +179,14 @@ def _(matrices: Tensor) -> Tensor:
 @_register_fake("rotation_differential")
 def _(matrices: Tensor, direction: Tensor) -> Tensor:
     return matrices.new_empty(matrices.shape)
+
+
+# ---- a kernel
+
+
+@torch.library.impl("torchpd::solve_adjoint", ("cpu", "cuda"))
+def _(*args: Any, time_step: float) -> tuple[Tensor, Tensor]:
+    return solve_adjoint(*args, time_step=time_step)
 
 
 # ---- derivatives: each is another op
@@ -298,30 +304,6 @@ def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | No
         inputs = [saved.detach().requires_grad_() for saved in ctx.saved_tensors]
         grads: tuple[Tensor | None, ...] = torch.autograd.grad(_rotation_differential(*inputs), inputs, grad)
     return grads
-
-
-@torch.library.impl("torchpd::solve_adjoint", ("cpu", "cuda"))
-def _(*args: Any, time_step: float) -> tuple[Tensor, Tensor]:
-    return solve_adjoint(*args, time_step=time_step)
-
-
-@_register_fake("step_vjp")
-def _(
-    grad_positions: Tensor,
-    grad_velocities: Tensor,
-    after: Tensor,
-    positions: Tensor,
-    velocities: Tensor,
-    forces: Tensor | None,
-    material: Sequence[Tensor],
-    plan: Sequence[Tensor],
-    *,
-    time_step: float,
-    wanted: Sequence[bool] | None = None,
-) -> list[Tensor]:
-    state = [positions.new_empty(positions.shape) for _ in range(3)]
-    asked = zip(material, [True] * len(material) if wanted is None else wanted, strict=True)
-    return [*state, *(array.new_empty(array.shape) for array, own in asked if own)]
 
 
 register_rule("step_vjp", step_vjp_rule)
