@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
-
 import pytest
 import torch
-import torch._dynamo.compiled_autograd
+from adjoint_cases import body
 from torch.profiler import ProfilerActivity, profile
 
 import torchpd as pd
@@ -15,22 +12,6 @@ import torchpd as pd
 # A central difference with relative step 1e-5 errs by about 1e-10 (truncation) and 1e-16 / 1e-5 (rounding), relative to
 # the largest terms; sums that cancel lose some digits more.
 TOLERANCE = 1e-6
-
-
-def body(*extra: pd.scene.Part, iterations: int = 600) -> tuple[pd.Simulator, pd.State]:
-    mesh = pd.shapes.box((1.0, 0.2, 0.2), (4, 2, 2))
-    solid = pd.Solid(mesh, youngs=2e4, density=1000.0)
-    parts = [
-        pd.Pin(solid, mesh.vertices[:, 0] == 0.0),
-        pd.Pin(solid, mesh.vertices[:, 0] == 1.0, stiffness=50.0),
-        pd.Gravity(),
-        pd.Damping(0.5),
-    ]
-    sim = pd.Simulator(pd.Scene(solid, *parts, *extra), 1 / 30, iterations, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
-    noise = [torch.randn(sim.rest_state(2).positions.shape, generator=generator, dtype=torch.float64) for _ in range(2)]
-    state = sim.rest_state(2)
-    return sim, pd.State(state.positions + 0.01 * noise[0], 0.3 * noise[1])
 
 
 def check(loss, tensor: torch.Tensor, seed: int = 1) -> None:
@@ -171,69 +152,6 @@ def test_rollout_op_against_single_steps(moving: bool) -> None:
     assert torch.allclose(gradient, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
 
 
-def test_forward_mode_is_refused() -> None:
-    sim, state = body(iterations=10)
-    for function in (
-        lambda x: sim(pd.State(x, state.velocities)).positions,
-        lambda x: sim.rollout(pd.State(x, state.velocities), 2).positions,
-        lambda x: sim.energy(x),
-    ):
-        with pytest.raises(RuntimeError, match="forward-mode"):
-            torch.func.jvp(function, (state.positions,), (torch.ones_like(state.positions),))
-    F = torch.eye(3, dtype=torch.float64)
-    with pytest.raises(RuntimeError, match="forward-mode"):
-        torch.func.jvp(pd.nearest_rotation, (F,), (F,))
-
-
-@pytest.mark.parametrize("steps", [0, 2])
-def test_functional_gradients_are_refused(steps: int) -> None:
-    sim, state = body(iterations=10)
-
-    def loss(x: torch.Tensor) -> torch.Tensor:
-        start = pd.State(x, state.velocities)
-        return (sim.rollout(start, steps) if steps else sim(start)).positions.sum()
-
-    for function in (torch.func.grad(loss), torch.func.jacrev(loss)):
-        with pytest.raises(RuntimeError, match=r"within torch.func.grad, vjp or jacrev; use torch.autograd.grad"):
-            function(state.positions)
-
-
-def test_info_is_no_function_to_differentiate() -> None:
-    sim, state = body(iterations=10)
-    _, info = sim(pd.State(state.positions.clone().requires_grad_(), state.velocities), return_info=True)
-    assert not info.energy.requires_grad
-
-
-@pytest.mark.parametrize("steps", [0, 2])
-def test_compiled_autograd(steps: int) -> None:
-    """Which traces what backward does, and knows of C++ only what it can pack."""
-    sim, state = body(iterations=100)
-    x, stiffness = state.positions.clone().requires_grad_(), sim.stiffness.requires_grad_()
-
-    def loss() -> torch.Tensor:
-        start = pd.State(x, state.velocities)
-        return (sim.rollout(start, steps) if steps else sim(start)).positions.square().sum()
-
-    wanted = torch.autograd.grad(loss(), [x, stiffness])
-    with torch._dynamo.compiled_autograd._enable(torch.compile(backend="eager")):
-        loss().backward()
-    assert x.grad is not None
-    assert stiffness.grad is not None
-    assert torch.equal(x.grad, wanted[0])
-    assert torch.equal(stiffness.grad, wanted[1])
-
-
-def test_what_was_saved_goes_with_backward() -> None:
-    """A loss that somebody keeps does not keep the plan."""
-    sim, state = body(iterations=10)
-    loss = sim(pd.State(state.positions.requires_grad_(), state.velocities)).positions.sum()
-    loss.backward()
-    alive = [weakref.ref(array) for array in sim.plan.arrays]
-    del sim
-    gc.collect()
-    assert not any(array() is not None for array in alive)
-
-
 @pytest.mark.parametrize("contacts", [False, True])
 @pytest.mark.parametrize("value", [-1e5, float("inf")])
 def test_elasticity_without_bounds_leaves_its_vertices_out(value: float, contacts: bool) -> None:
@@ -279,15 +197,6 @@ def test_a_first_iterate_stands_between_state_and_material(forces: bool) -> None
     )
     for plain, given in zip(one, other, strict=True):
         assert torch.allclose(plain, given, rtol=1e-6, atol=1e-9 * float(plain.abs().max()))
-
-
-def test_a_state_that_changed_since_is_noticed() -> None:
-    sim, state = body(iterations=10)
-    velocities = state.velocities.clone()
-    after = sim(pd.State(state.positions.clone().requires_grad_(), velocities)).positions.sum()
-    velocities += 1.0
-    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
-        after.backward()
 
 
 def test_step_gradient_vanishes_at_the_solution() -> None:
@@ -439,58 +348,6 @@ def test_contacts_that_are_not_there_may_want_gradients() -> None:
     sim.rollout(state, 2).positions.sum().backward()
 
 
-def test_material_that_is_copied_loses_its_history_aloud() -> None:
-    sim, state = body(iterations=50)
-    factor = torch.ones((), dtype=torch.float64, requires_grad=True)
-    with pytest.warns(UserWarning, match=r'torch\.func\.functional_call\(sim, \{"stiffness": \.\.\.\}, \(state,\)\)'):
-        sim.set_material(stiffness=factor * sim.stiffness)
-    assert not sim.stiffness.requires_grad
-    after = torch.func.functional_call(sim, {"stiffness": factor * sim.stiffness}, (state,))
-    (slope,) = torch.autograd.grad(after[0].square().sum(), factor)
-    sim.stiffness.requires_grad_()
-    (gradient,) = torch.autograd.grad(sim(state).positions.square().sum(), sim.stiffness)
-    assert float(slope) == pytest.approx(float((gradient * sim.stiffness.detach()).sum()), rel=1e-12)
-    with torch.no_grad():
-        sim.set_material(stiffness=factor * sim.stiffness)  # there is no history to lose
-
-
-def test_what_has_no_derivative_says_so() -> None:
-    sim, state = body(pd.Ground(-10.0))
-    start = state.positions.clone().requires_grad_()
-    with pytest.raises(RuntimeError, match="first iterate"):
-        sim(state, start=start).positions.sum().backward()
-    sim.planes.requires_grad_()
-    with pytest.raises(RuntimeError, match="planes"):
-        sim(state).positions.sum().backward()
-
-
-def test_second_derivatives_are_refused() -> None:
-    """Of the op and of a rollout; first ones that could have been differentiated again are the same."""
-    sim, state = body(iterations=50)
-    v = state.velocities.clone().requires_grad_()
-    (once,) = torch.autograd.grad(sim(pd.State(state.positions, v)).positions.square().sum(), v)
-    for step in (sim, lambda state: sim.rollout(state, 1).state(0)):
-        loss = step(pd.State(state.positions, v)).positions.square().sum()
-        (again,) = torch.autograd.grad(loss, v, create_graph=True)
-        assert torch.equal(again, once)
-        with pytest.raises(RuntimeError, match="torchpd: a step has first derivatives only"):
-            again.square().sum().backward()
-    with pytest.raises(RuntimeError, match="torchpd: a step has first derivatives only"):
-        torch.autograd.gradgradcheck(lambda v: sim(pd.State(state.positions, v)).positions, v)
-
-
-def test_compiles_with_its_backward() -> None:
-    sim, state = body(iterations=100)
-    x = state.positions.clone().requires_grad_()
-
-    def step(x: torch.Tensor) -> torch.Tensor:
-        return sim(pd.State(x, state.velocities)).positions.square().sum()
-
-    (expected,) = torch.autograd.grad(step(x), x)
-    (compiled,) = torch.autograd.grad(torch.compile(step, fullgraph=True, backend="aot_eager")(x), x)
-    assert torch.equal(compiled, expected)
-
-
 def test_contacts_on_both_sides_leave_their_common_direction() -> None:
     """In a valley of two slopes a vertex moves along it alone, whatever their angle."""
     tip = pd.TetMesh([[0.0, 0.0, 0.0], [0.1, 0.2, -0.05], [-0.1, 0.2, -0.06], [0.01, 0.2, 0.1]], [[0, 1, 2, 3]])
@@ -510,22 +367,3 @@ def test_contacts_on_both_sides_leave_their_common_direction() -> None:
     pull[0, 0, 2] = size
     above, below = (sim(state, sign * pull).positions[0, 0, 2] for sign in (1.0, -1.0))
     assert float(gradient[0, 0, 2]) == pytest.approx(3.0 * float(above - below) / (2 * size), rel=5e-3)
-
-
-@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "by torch operations"])
-def test_autocast_does_not_touch_the_adjoint(solver: pd.solvers.Solver) -> None:
-    mesh = pd.shapes.box((1.0, 0.2, 0.2), (8, 2, 2))
-    bar = pd.Solid(mesh, 5e4)
-    scene = pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] == 0.0), pd.Gravity(), pd.Sphere((0.5, -0.3, 0.13), 0.3, 0.3))
-    sim = pd.Simulator(scene, 1 / 60, 200, solver=solver)
-    sim.stiffness.requires_grad_()
-
-    def gradient(lower: bool) -> torch.Tensor:
-        state = sim.rest_state(2)
-        with torch.autocast("cpu", torch.bfloat16, enabled=lower):
-            for _ in range(6):
-                state = sim(state)
-            (result,) = torch.autograd.grad(state.positions.square().sum(), sim.stiffness)
-        return result
-
-    torch.testing.assert_close(gradient(True), gradient(False), rtol=0, atol=0)

@@ -162,6 +162,30 @@ def test_calls_go_on_where_the_last_one_ended(dtype: torch.dtype, device: torch.
     assert all(torch.equal(one, other) for one, other in zip(once, twice, strict=True))
 
 
+@pytest.mark.parametrize("kernel", ["auto", "block"])
+@pytest.mark.parametrize("factor", [2.0**-80, 2.0**70], ids=["tiny", "huge"])
+def test_the_size_of_the_right_side_does_not_matter(
+    factor: float, kernel: str, dtype: torch.dtype, device: torch.device
+) -> None:
+    """Nor where the squares of its numbers are no longer of its type; environments of several sizes, one zero."""
+    s, positions, right = system(dtype, device, contacts=True, kernel=kernel)
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-11
+    sizes = torch.tensor([1.0, factor, 0.0], dtype=dtype, device=device)[:, None, None]
+    wanted, _ = s.solve(positions, right, tolerance)
+    for solve in (s.solve, s.solve_by_operations):
+        found, error = solve(positions, sizes * right, tolerance)
+        assert float(error.max()) <= tolerance
+        for e in (0, 1):
+            back = found[e].double() / float(sizes[e])
+            assert float((back - wanted[e]).norm() / wanted[e].norm()) < 20 * tolerance
+        assert not found[2].any()
+    once, twice = start(s, sizes * right), start(s, sizes * right)
+    iterate(s, once, positions, 9)
+    iterate(s, twice, positions, 4)
+    iterate(s, twice, positions, 5)
+    assert all(torch.equal(one, other) for one, other in zip(once, twice, strict=True))
+
+
 def test_an_environment_ends_by_itself(dtype: torch.dtype, device: torch.device) -> None:
     """One is done, one not positive, one not to go on at all: the first has its solution, the others what they had."""
     s, positions, right = system(dtype, device)

@@ -146,7 +146,13 @@ class _System:
 
     def solve_by_operations(self, positions: Tensor, right: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
         """`solve`, of torch operations and Hessian products."""
-        solution, error = conjugate_gradients(self.product_at(positions), self.preconditioner(), right, tolerance)
+        # in units that leave room for squares
+        largest = right.abs().amax((1, 2), keepdim=True)
+        unit = torch.where((largest > 0) & torch.isfinite(largest), largest, 1.0)
+        solution, error = conjugate_gradients(
+            self.product_at(positions), self.preconditioner(), right / unit, tolerance
+        )
+        solution = unit * solution
         # one of them is enough: 0 times what is no finite number is no number, and so is its sum
         lost = ((right + positions) * 0.0).sum((1, 2)).isnan()
         return solution, torch.where(lost, torch.nan, error.nan_to_num(nan=torch.inf)).double()

@@ -3,7 +3,9 @@
 #include "cpu/sweep.h"
 #include "solver/conjugate.h"
 
+#include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace pd::inline PD_TARGET {
 
@@ -63,10 +65,13 @@ class ConjugatePass {
     Conjugate numbers(call_.progress + environment * progress_count);
     if (!numbers.active) return;
     environment_ = environment;
+    find_unit();
     load(numbers.begins);
+    numbers.scale_by(1 / double(unit_));
     if (numbers.begins) begin(numbers);
     for (int k = 0; k < call_.iterations && numbers.active; ++k) iterate(numbers);
     store();
+    numbers.scale_by(double(unit_));
     if (team_.rank == 0) numbers.write(call_.progress + environment * progress_count);
     team_.barrier();
   }
@@ -79,12 +84,26 @@ class ConjugatePass {
     return to_quad(from[row(i)], from[row(i) + 1], from[row(i) + 2]);
   }
 
+  // Vectors are solved for in a power of two near the largest number of the residual, so that squares of theirs have room in T.
+  // Every thread finds it for itself.
+  void find_unit() {
+    const std::int64_t count = 3 * std::int64_t(plan_.vertices);
+    const T* residual = call_.residual + environment_ * count;
+    T largest = 0;
+    for (std::int64_t i = 0; i < count; ++i) largest = std::max(largest, std::abs(residual[i]));
+    // neither a unit nor one over it is infinite or no normal number
+    constexpr int most = std::numeric_limits<T>::max_exponent - 3;
+    const bool finite = largest > T(0) && std::isfinite(largest);
+    unit_ = finite ? std::ldexp(T(1), std::clamp(std::ilogb(largest), -most, most)) : T(1);
+  }
+
   void load(bool begins) {
+    const T per_unit = T(1) / unit_;
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
       w_.x[i] = read(call_.positions, i);
-      solution()[i] = begins ? to_quad<T>(0, 0, 0) : read(call_.solution, i);
-      residual()[i] = read(call_.residual, i);
-      direction()[i] = read(call_.direction, i);
+      solution()[i] = begins ? to_quad<T>(0, 0, 0) : per_unit * read(call_.solution, i);
+      residual()[i] = per_unit * read(call_.residual, i);
+      direction()[i] = per_unit * read(call_.direction, i);
       w_.inertia[i] = call_.inertia.of(environment_)[plan_.vertex_order[i]];
       w_.inverse[i] = call_.inverse.of(environment_)[plan_.vertex_order[i]];
     }
@@ -155,9 +174,9 @@ class ConjugatePass {
 
   void store() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      write(call_.solution, i, solution()[i]);
-      write(call_.residual, i, residual()[i]);
-      write(call_.direction, i, direction()[i]);
+      write(call_.solution, i, unit_ * solution()[i]);
+      write(call_.residual, i, unit_ * residual()[i]);
+      write(call_.direction, i, unit_ * direction()[i]);
     }
   }
   void write(T* to, std::int64_t i, const Quad<T>& a) const {
@@ -204,6 +223,7 @@ class ConjugatePass {
   const Team& team_;
   Sweep<Lanes> sweep_;
   std::int64_t environment_ = 0;
+  T unit_ = 1;
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -35,6 +35,12 @@ __device__ void add_across_block(double (&sum)[Count], WarpSums& warp_sums) {
   __syncthreads();
 }
 
+// In float64, where a product of any two numbers has room.
+template <class T>
+__device__ double wide_dot(const Vec3<T>& a, const Vec3<T>& b) {
+  return double(a.x) * double(b.x) + double(a.y) * double(b.y) + double(a.z) * double(b.z);
+}
+
 // The first direction of a vertex, 1 / D times the right side; adds to |b|^2 and b . b / D, to the first also zero, which is
 // no number where something is infinite or none.
 template <class T>
@@ -45,7 +51,7 @@ __device__ void begin_vertex(const DeviceConjugate<T>& call, std::int64_t at, T 
   write3(call.direction + at, inverse * right);
   write3(call.solution + at, {none, none, none});
   const Vec3<T> lost = multiply_add(none, read3(call.positions + at), none * right);
-  const double square = double(dot(right, right));
+  const double square = wide_dot(right, right);
   sums[0] += square + double(lost.x + lost.y + lost.z);
   sums[1] += double(inverse) * square;
 }
@@ -58,7 +64,7 @@ __device__ void look_along(const ConjugateWork<T>& work, std::int64_t at, const 
   const Vec3<T> image = conjugate_image(elastic, direction, inertia, inverse != T(0),
                                         projector ? projector + 3 * at : nullptr);
   write3(work.image + at, image);
-  sum[0] += double(dot(direction, image));
+  sum[0] += wide_dot(direction, image);
 }
 
 // Goes along a direction; adds to |r|^2 and r . r / D.
@@ -69,7 +75,7 @@ __device__ void move_vertex(const ConjugateWork<T>& work, std::int64_t at, T ste
   write3(call.solution + at, multiply_add(step, direction, read3(call.solution + at)));
   const Vec3<T> rest = subtract_product(read3(call.residual + at), step, read3(work.image + at));
   write3(call.residual + at, rest);
-  const double square = double(dot(rest, rest));
+  const double square = wide_dot(rest, rest);
   sums[0] += square;
   sums[1] += double(inverse) * square;
 }

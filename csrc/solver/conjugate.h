@@ -27,6 +27,12 @@ struct Conjugate {
     to[progress_error] = error;
   }
 
+  // what they are of a right side so many times as large
+  PD_HD void scale_by(double factor) {
+    product *= factor * factor;
+    scale *= factor;
+  }
+
   // by |b|^2, plus zero times every position, and b . b / D
   PD_HD void begin(double square, double weighted) {
     scale = sqrt(square);

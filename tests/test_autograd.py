@@ -1,0 +1,176 @@
+"""What torch does around a step: modes of differentiation, what is saved, compiled, cast."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+
+import pytest
+import torch
+import torch._dynamo.compiled_autograd
+from adjoint_cases import body
+
+import torchpd as pd
+
+
+def test_forward_mode_is_refused() -> None:
+    sim, state = body(iterations=10)
+    for function in (
+        lambda x: sim(pd.State(x, state.velocities)).positions,
+        lambda x: sim.rollout(pd.State(x, state.velocities), 2).positions,
+        lambda x: sim.energy(x),
+    ):
+        with pytest.raises(RuntimeError, match="forward-mode"):
+            torch.func.jvp(function, (state.positions,), (torch.ones_like(state.positions),))
+    F = torch.eye(3, dtype=torch.float64)
+    with pytest.raises(RuntimeError, match="forward-mode"):
+        torch.func.jvp(pd.nearest_rotation, (F,), (F,))
+
+
+@pytest.mark.parametrize("steps", [0, 2])
+def test_functional_gradients_are_refused(steps: int) -> None:
+    sim, state = body(iterations=10)
+
+    def loss(x: torch.Tensor) -> torch.Tensor:
+        start = pd.State(x, state.velocities)
+        return (sim.rollout(start, steps) if steps else sim(start)).positions.sum()
+
+    for function in (torch.func.grad(loss), torch.func.jacrev(loss)):
+        with pytest.raises(RuntimeError, match=r"within torch.func.grad, vjp or jacrev; use torch.autograd.grad"):
+            function(state.positions)
+
+
+def test_info_is_no_function_to_differentiate() -> None:
+    sim, state = body(iterations=10)
+    _, info = sim(pd.State(state.positions.clone().requires_grad_(), state.velocities), return_info=True)
+    assert not info.energy.requires_grad
+
+
+@pytest.mark.parametrize("steps", [0, 2])
+def test_compiled_autograd(steps: int) -> None:
+    """Which traces what backward does, and knows of C++ only what it can pack."""
+    sim, state = body(iterations=100)
+    x, stiffness = state.positions.clone().requires_grad_(), sim.stiffness.requires_grad_()
+
+    def loss() -> torch.Tensor:
+        start = pd.State(x, state.velocities)
+        return (sim.rollout(start, steps) if steps else sim(start)).positions.square().sum()
+
+    wanted = torch.autograd.grad(loss(), [x, stiffness])
+    with torch._dynamo.compiled_autograd._enable(torch.compile(backend="eager")):
+        loss().backward()
+    assert x.grad is not None
+    assert stiffness.grad is not None
+    assert torch.equal(x.grad, wanted[0])
+    assert torch.equal(stiffness.grad, wanted[1])
+
+
+def test_what_was_saved_goes_with_backward() -> None:
+    """A loss that somebody keeps does not keep the plan."""
+    sim, state = body(iterations=10)
+    loss = sim(pd.State(state.positions.requires_grad_(), state.velocities)).positions.sum()
+    loss.backward()
+    alive = [weakref.ref(array) for array in sim.plan.arrays]
+    del sim
+    gc.collect()
+    assert not any(array() is not None for array in alive)
+
+
+def test_a_state_that_changed_since_is_noticed() -> None:
+    sim, state = body(iterations=10)
+    velocities = state.velocities.clone()
+    after = sim(pd.State(state.positions.clone().requires_grad_(), velocities)).positions.sum()
+    velocities += 1.0
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        after.backward()
+
+
+def test_material_that_is_copied_loses_its_history_aloud() -> None:
+    sim, state = body(iterations=50)
+    factor = torch.ones((), dtype=torch.float64, requires_grad=True)
+    with pytest.warns(UserWarning, match=r'torch\.func\.functional_call\(sim, \{"stiffness": \.\.\.\}, \(state,\)\)'):
+        sim.set_material(stiffness=factor * sim.stiffness)
+    assert not sim.stiffness.requires_grad
+    after = torch.func.functional_call(sim, {"stiffness": factor * sim.stiffness}, (state,))
+    (slope,) = torch.autograd.grad(after[0].square().sum(), factor)
+    sim.stiffness.requires_grad_()
+    (gradient,) = torch.autograd.grad(sim(state).positions.square().sum(), sim.stiffness)
+    assert float(slope) == pytest.approx(float((gradient * sim.stiffness.detach()).sum()), rel=1e-12)
+    with torch.no_grad():
+        sim.set_material(stiffness=factor * sim.stiffness)  # there is no history to lose
+
+
+def test_what_has_no_derivative_says_so() -> None:
+    sim, state = body(pd.Ground(-10.0))
+    start = state.positions.clone().requires_grad_()
+    with pytest.raises(RuntimeError, match="first iterate"):
+        sim(state, start=start).positions.sum().backward()
+    sim.planes.requires_grad_()
+    with pytest.raises(RuntimeError, match="planes"):
+        sim(state).positions.sum().backward()
+
+
+def test_second_derivatives_are_refused() -> None:
+    """Of the op and of a rollout; first ones that could have been differentiated again are the same."""
+    sim, state = body(iterations=50)
+    v = state.velocities.clone().requires_grad_()
+    (once,) = torch.autograd.grad(sim(pd.State(state.positions, v)).positions.square().sum(), v)
+    for step in (sim, lambda state: sim.rollout(state, 1).state(0)):
+        loss = step(pd.State(state.positions, v)).positions.square().sum()
+        (again,) = torch.autograd.grad(loss, v, create_graph=True)
+        assert torch.equal(again, once)
+        with pytest.raises(RuntimeError, match="torchpd: a step has first derivatives only"):
+            again.square().sum().backward()
+    with pytest.raises(RuntimeError, match="torchpd: a step has first derivatives only"):
+        torch.autograd.gradgradcheck(lambda v: sim(pd.State(state.positions, v)).positions, v)
+
+
+def test_compiles_with_its_backward() -> None:
+    sim, state = body(iterations=100)
+    x = state.positions.clone().requires_grad_()
+
+    def step(x: torch.Tensor) -> torch.Tensor:
+        return sim(pd.State(x, state.velocities)).positions.square().sum()
+
+    (expected,) = torch.autograd.grad(step(x), x)
+    (compiled,) = torch.autograd.grad(torch.compile(step, fullgraph=True, backend="aot_eager")(x), x)
+    assert torch.equal(compiled, expected)
+
+
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "by torch operations"])
+def test_autocast_does_not_touch_the_adjoint(solver: pd.solvers.Solver) -> None:
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (8, 2, 2))
+    bar = pd.Solid(mesh, 5e4)
+    scene = pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] == 0.0), pd.Gravity(), pd.Sphere((0.5, -0.3, 0.13), 0.3, 0.3))
+    sim = pd.Simulator(scene, 1 / 60, 200, solver=solver)
+    sim.stiffness.requires_grad_()
+
+    def gradient(lower: bool) -> torch.Tensor:
+        state = sim.rest_state(2)
+        with torch.autocast("cpu", torch.bfloat16, enabled=lower):
+            for _ in range(6):
+                state = sim(state)
+            (result,) = torch.autograd.grad(state.positions.square().sum(), sim.stiffness)
+        return result
+
+    torch.testing.assert_close(gradient(True), gradient(False), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "by torch operations"])
+@pytest.mark.parametrize("factor", [1e-25, 1e20])
+def test_a_loss_may_be_of_any_size(factor: float, solver: pd.solvers.Solver, device: torch.device) -> None:
+    """In float32, where the squares of its gradients would be zero, or infinite; nobody warns."""
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (8, 2, 2))
+    bar = pd.Solid(mesh, 5e4)
+    scene = pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+    sim = pd.Simulator(scene, 1 / 60, 200, solver=solver).to(device)
+    sim.stiffness.requires_grad_()
+    state = sim.rest_state(2)
+    velocities = state.velocities.clone().requires_grad_()
+    inputs = [velocities, sim.stiffness]
+    usual, scaled = (
+        torch.autograd.grad(size * sim(pd.State(state.positions, velocities)).positions.sum(), inputs)
+        for size in (1.0, factor)
+    )
+    for one, other in zip(usual, scaled, strict=True):
+        torch.testing.assert_close(other.double() / factor, one.double(), rtol=1e-3, atol=1e-4 * float(one.abs().max()))
