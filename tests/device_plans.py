@@ -183,11 +183,19 @@ def rows_of(plan: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray
     return patch, (packed & 65535).astype(np.int64), (packed >> 16 & 32767).astype(np.int64)
 
 
+def slices_of(plan: Arrays) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Of each patch the first entry of every slice of eight slots, and its rows: as many as the busiest slot needs."""
+    _, first, forces = rows_of(plan)
+    slices = []
+    for a, b in zip(plan.patch_slot[:-1], plan.patch_slot[1:], strict=True):
+        starts = np.arange(a, b, SLICE)
+        slices.append((first[starts], np.maximum.reduceat(forces[:b], starts)))
+    return slices
+
+
 def entries_of(plan: Arrays) -> NDArray[np.int64]:
-    """Entries of each patch, padding included: slices of eight slots, as many rows as the busiest needs."""
-    _, _, forces = rows_of(plan)
-    slots = [forces[a:b] for a, b in zip(plan.patch_slot[:-1], plan.patch_slot[1:], strict=True)]
-    return np.array([sum(SLICE * s[i : i + SLICE].max() for i in range(0, len(s), SLICE)) for s in slots])
+    """Entries of each patch, padding included: up to the end of its last slice."""
+    return np.array([start[-1] + SLICE * rows[-1] for start, rows in slices_of(plan)])
 
 
 # for every test that imports them: one of CASES, its scene, its plan for GRID, the pairs of that

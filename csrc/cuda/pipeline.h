@@ -26,7 +26,9 @@ namespace pd::inline PD_TARGET {
 // and bringers to add up (one more for movers 9 us, one fewer 4 us). What they no longer do is gained: a warp tells 32 stops
 // at once (2.5 us), and entries are added up by fewer instructions (1.5 us), though movers and bringers spill some registers
 // for it: the same without spills, but entry by entry where less than four are left, takes 1 us more. Patches of more or
-// fewer tetrahedra took 4 to 17 us more.
+// fewer tetrahedra took 4 to 17 us more. Entries that meet in banks cost: a fifth fewer passes (plan/phases.h) gained 1.8 us. A
+// pass that starts before the one before has ended, since whoever reads a vertex sees by the sign of 1 / D of which pass it is,
+// gained as much, but not more: the kernel of shared vertices is then what others wait for.
 //
 // Without any arithmetic an iteration would take 12 % less; schedulers issue in 71 % of their cycles, and DRAM is busy for 46
 // % (by a profiler, at 1.6 GHz). Fewer instructions and bytes of elements alone do not help: determinants worked out from
@@ -36,7 +38,6 @@ namespace pd::inline PD_TARGET {
 // A register that is written under a condition is kept from before, all around a loop: so where a thread has no slot, it
 // reads what is the first one's.
 constexpr int mover_threads = 128, bringer_threads = 128, element_threads = 384;
-constexpr int pipeline_slots = 1024;  // of a patch, at most: see SharedSlots
 constexpr int pipeline_threads = mover_threads + bringer_threads + element_threads;
 
 // The patches of a block, of all environments: item after item, from its own number on as far apart as there are blocks.

@@ -20,7 +20,7 @@ namespace pd {
 
 namespace {
 
-constexpr int lanes = 32, slice = 8;
+constexpr int lanes = 32, slice = entry_slice;
 constexpr int small_pairs = 512;                          // of a patch
 constexpr std::int64_t none = 65535;                      // entries of a patch count up to one less
 constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
@@ -33,6 +33,7 @@ struct Mesh {
   Partition partition;
   Numbering numbering;
   std::vector<std::int32_t> owner;  // of a cluster: the patch of each vertex
+  int kernel;
 
   // The patch that counts a tetrahedron, where several work it out.
   std::int32_t counted_by(std::int32_t tet) const {
@@ -49,6 +50,7 @@ struct Patch {
   std::vector<Pair> pairs;           // user's tetrahedra, corners are slots
   std::int64_t outer = 0;            // pairs past which none touches a shared vertex
   std::int64_t entries = 0;
+  bool piped = false;  // whether warps read and write entries as cuda/pipeline.h does
 
   std::int64_t blocks() const { return (std::ssize(pairs) + lanes - 1) / lanes; }
 };
@@ -89,8 +91,10 @@ void scatter(std::vector<T>& items, const std::vector<std::int32_t>& place) {
 // Every slice of eight slots has room for as many forces as its busiest.
 void count_entries(Patch& patch) {
   patch.first.resize(patch.forces.size());
+  SliceBanks banks;
   for (std::size_t s = 0; s < patch.forces.size(); s += slice) {
     const std::size_t end = std::min(s + slice, patch.forces.size());
+    if (patch.piped) patch.entries = banks.next(patch.entries);
     for (std::size_t i = s; i < end; ++i) patch.first[i] = std::int32_t(patch.entries + i - s);
     patch.entries += slice * *std::max_element(patch.forces.begin() + std::ptrdiff_t(s),
                                                patch.forces.begin() + std::ptrdiff_t(end));
@@ -146,6 +150,7 @@ Patch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& number)
     for (std::int32_t& tet : pair.tet) tet = tet < 0 ? -1 : tets[tet];
   }
   order_pairs(patch, index, mesh.numbering);
+  patch.piped = mesh.kernel == stream_kernel && std::ssize(patch.vertex) <= pipeline_slots;
   count_entries(patch);
   return patch;
 }
@@ -231,7 +236,7 @@ void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, const
 void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number,
                  double unit) {
   const std::int64_t first_block = plan.patch_block[number];
-  std::vector<std::int32_t> entry = patch.first;
+  EntryChoice choice(patch.first, patch.forces, patch.piped);
   const std::int64_t count = std::ssize(patch.pairs);
   for (std::int64_t i = 0; i < patch.blocks() * lanes; ++i) {
     const std::int64_t block = first_block + i / lanes, lane = i % lanes;
@@ -250,8 +255,7 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int
     for (int c = 0; c < 5; ++c) {
       const std::int32_t slot = pair.corner[c];
       plan.pair_corner[(5 * block + c) * lanes + lane] =
-          packed(slot_step * slot, c < forces ? entry[slot] : none);
-      if (c < forces) entry[slot] += slice;
+          packed(slot_step * slot, c < forces ? choice.take(c, int(lane), slot) : none);
     }
   }
 }
@@ -422,7 +426,7 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
                                  const std::int64_t* tets, std::int64_t count, int patches,
                                  int kernel, bool fixed, const std::int32_t* piece,
                                  const std::function<void(double)>& progress) {
-  Mesh mesh{positions, tets, {}, {}, {}};
+  Mesh mesh{positions, tets, {}, {}, {}, kernel};
   if (kernel == cluster_kernel) {
     Ownership owned = own_vertices(positions, vertices, tets, count, patches);
     mesh.partition = std::move(owned.mesh);

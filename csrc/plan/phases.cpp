@@ -106,4 +106,47 @@ void spread_banks(std::vector<Pair>& pairs) {
   pairs = std::move(ordered);
 }
 
+std::int64_t SliceBanks::next(std::int64_t entry) {
+  if (count_ == 0) taken_ = {};
+  const auto quarter = [&] { return int(entry / entry_slice % 4); };
+  const auto fits = [&] {
+    return !taken_[quarter()] && (count_ % 2 == 0 || (quarter() - last_) % 2 != 0);
+  };
+  while (!fits()) entry += entry_slice;
+  last_ = quarter();
+  taken_[last_] = true;
+  count_ = (count_ + 1) % 4;
+  return entry;
+}
+
+EntryChoice::EntryChoice(const std::vector<std::int32_t>& first,
+                         const std::vector<std::int32_t>& forces, bool spread)
+    : first_(first), forces_(forces), spread_(spread), row_(first.size(), {0, 1, 2, 3}) {}
+
+std::int32_t EntryChoice::take(int corner, int lane, std::int32_t slot) {
+  std::array<std::int32_t, quarters>& row = row_[slot];
+  if (!spread_) return first_[slot] + entry_slice * row[0]++;
+  if (lane == 0 && corner == 0) written_ = {};
+  auto& half = written_[corner].half[lane / 16];
+  auto& warp = written_[corner].warp;
+  const auto entry_in = [&](int q) { return first_[slot] + entry_slice * row[q]; };
+  const int most_half = *std::max_element(half.begin(), half.end());
+  const int most_warp = *std::max_element(warp.begin(), warp.end());
+  // passes more, then lanes met, then the rows that are left
+  const auto cost = [&](int q) {
+    const int e = entry_in(q), met_half = half[e % 16], met_warp = warp[e % 32];
+    return std::array<int, 3>{(met_half == most_half) + (met_warp == most_warp),
+                              met_half + met_warp, row[q] - forces_[slot]};
+  };
+  int best = -1;
+  for (int q = 0; q < quarters; ++q) {
+    if (row[q] < forces_[slot] && (best < 0 || cost(q) < cost(best))) best = q;
+  }
+  const std::int32_t entry = entry_in(best);
+  row[best] += quarters;
+  ++half[entry % 16];
+  ++warp[entry % 32];
+  return entry;
+}
+
 }  // namespace pd

@@ -92,6 +92,7 @@ constexpr std::size_t pass_shared_bytes(std::size_t real, std::size_t slots, std
 
 // One of the two halves of a pipeline's shared memory (cuda/pipeline.h): position and rest position of every slot, then entries
 // of three numbers, since a fourth would take its room from the cache.
+constexpr int pipeline_slots = 1024;  // of a patch, at most
 constexpr std::size_t pipeline_half_bytes(std::size_t real, std::size_t slots,
                                           std::size_t entries) {
   return slots_bytes(real, slots, 2) + aligned(3 * real * entries);
