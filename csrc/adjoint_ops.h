@@ -167,15 +167,14 @@ Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tens
 }
 
 struct PlanTraits {
-  bool levels, large;  // large: more vertices than one thread block of a GPU is quick enough with
-  bool asks;           // a solve asks the host between its iterations
+  bool levels;
+  bool asks;  // a solve asks the host between its iterations
 };
 
 template <class Backend, class T>
 PlanTraits traits_of(at::TensorList arrays, at::Device device) {
   const auto plan = Backend::template plan_view<T>(arrays, Place{device});
-  return {plan.levels.there(), !device.is_cpu() && plan.vertices > adjoint_most_of_a_block,
-          Backend::template asks<T>(plan)};
+  return {plan.levels.there(), Backend::template asks<T>(plan)};
 }
 
 template <class Backend>
@@ -237,7 +236,7 @@ inline Solved solve_composed(const AdjointTensors& t, const AdjointSystem& s, do
 template <class Backend>
 Solved solve(const AdjointTensors& t, const AdjointSystem& s, double time_step) {
   const PlanTraits plan = traits_of<Backend>(t.after, t.plan);
-  if (plan.levels || plan.large || Backend::recording(t.after))
+  if (plan.levels || Backend::recording(t.after))
     return solve_composed(t, s, time_step);
   const double tolerance =
       t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;

@@ -323,7 +323,6 @@ PYBIND11_MODULE(_C, m) {
   m.attr("adjoint_failed") = pd::adjoint_failed;
   m.attr("adjoint_iterations") = pd::adjoint_iterations;
   m.attr("adjoint_asked_every") = pd::adjoint_asked_every;
-  m.attr("adjoint_most_of_a_block") = pd::adjoint_most_of_a_block;
   m.attr("most_environments") = pd::most_environments;
   m.attr("most_sharing_pairs") = pd::most_sharing_pairs;
   m.attr("pass_static_bytes") = pd::pass_static_bytes;

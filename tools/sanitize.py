@@ -300,6 +300,9 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
         # whose block has a multiprocessor to itself, and several slots a thread
         mesh = bar(9, 9, 9) if dtype == torch.float32 else bar(6, 6, 6)
         fields(pd.Simulator(pd.Scene(pd.Solid(mesh, 1e5)), 1 / 60, **options).to("cuda"), 2)
+    if kernel == "grid":
+        # whose vertices are more than one block's in the adjoint's solve
+        fields(pd.Simulator(pd.Scene(pd.Solid(bar(11, 9, 9), 1e5)), 1 / 60, **options).to("cuda"), 2)
     with compiled_for(kernel, WAYS[kernel][0]):
         free = scene(WAYS[kernel][0].mesh, contacts=True, pieces=True, pins=False)
         step_all_ways(pd.Simulator(free, 1 / 60, 5, **options).to("cuda"), 2)

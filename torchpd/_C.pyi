@@ -59,7 +59,6 @@ adjoint_tolerance: tuple[float, float]
 adjoint_failed: float
 adjoint_iterations: int
 adjoint_asked_every: int
-adjoint_most_of_a_block: int
 pass_static_bytes: int
 most_environments: int
 most_sharing_pairs: int

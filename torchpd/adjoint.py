@@ -136,7 +136,7 @@ class _System:
                 'make the simulator with kernel="block" and the Chebyshev or Jacobi solver, else leave backward out of '
                 "the graph"
             )
-        if has_levels(self.plan) or (right.is_cuda and right.shape[1] > _C.adjoint_most_of_a_block):
+        if has_levels(self.plan):
             return self.solve_by_operations(positions, right, tolerance)
         # what many operations on small tensors would spend their time with
         found: tuple[Tensor, Tensor] = torch.ops.torchpd.conjugate_gradients(

@@ -1,5 +1,6 @@
 // Iterations of solver/conjugate.h. Where a block has a mesh in its shared memory it does all of them; on any other plan the
-// kernels of fields.cuh make the products, and a block an environment does the rest.
+// kernels of fields.cuh make the products, and a block an environment does the rest, or where that has many vertices one for
+// each thousand of them.
 #pragma once
 #include "cuda/fields.cuh"
 #include "solver/conjugate.h"
@@ -9,12 +10,18 @@
 namespace pd {
 
 constexpr int conjugate_threads = 512;
+constexpr int chunk_vertices = 1024;  // of a block, of an environment that has several
 
 template <class T>
 struct ConjugateWork {
   DeviceConjugate<T> call;
   FieldWork<T> product;  // of the direction, into an image
   T* image;              // [batch, vertices, 3]
+  double* curvature;     // [batch, chunks] of d . H d
+  double* squares;       // [batch, chunks, 2] of |r|^2 and r . r / D
+  double* begun;         // [batch, progress_count] as an iteration began
+
+  PD_HD int chunks() const { return (call.plan.vertices + chunk_vertices - 1) / chunk_vertices; }
 };
 
 using WarpSums = double[conjugate_threads / warp_size][2];
@@ -137,6 +144,139 @@ __global__ void __launch_bounds__(conjugate_threads)
   if (threadIdx.x == 0) numbers.write(progress);
 }
 
+// A block's part of an environment that has several: its vertices, and sums of all parts in their order.
+template <class T>
+struct Chunk {
+  const ConjugateWork<T>& work;
+  std::int64_t environment;
+  int number;
+
+  __device__ explicit Chunk(const ConjugateWork<T>& w)
+      : work(w), environment(blockIdx.x / w.chunks()), number(int(blockIdx.x % w.chunks())) {}
+
+  __device__ double* progress() const { return work.call.progress + environment * progress_count; }
+  __device__ double* begun() const { return work.begun + environment * progress_count; }
+  __device__ bool leads() const { return number == 0 && threadIdx.x == 0; }
+
+  // visit(vertex, where its vectors are)
+  template <class Visit>
+  __device__ void each_vertex(const Visit& visit) const {
+    const int first = number * chunk_vertices, vertices = work.call.plan.vertices;
+    const int end = min(first + chunk_vertices, vertices);
+    for (int i = first + int(threadIdx.x); i < end; i += conjugate_threads)
+      visit(i, 3 * (environment * vertices + i));
+  }
+
+  // of this part, for others
+  template <int Count>
+  __device__ void leave(double (&sum)[Count], double* sums, WarpSums& warp_sums) const {
+    add_across_block(sum, warp_sums);
+    if (threadIdx.x != 0) return;
+    for (int n = 0; n < Count; ++n) sums[int(blockIdx.x) * std::int64_t(Count) + n] = sum[n];
+  }
+  template <int Count>
+  __device__ void add_up(double (&sum)[Count], const double* sums, WarpSums& warp_sums) const {
+    for (int n = 0; n < Count; ++n) sum[n] = 0;
+    for (int part = threadIdx.x; part < work.chunks(); part += conjugate_threads) {
+      for (int n = 0; n < Count; ++n)
+        sum[n] += sums[(environment * work.chunks() + part) * Count + n];
+    }
+    add_across_block(sum, warp_sums);
+  }
+};
+
+// As conjugate_begin, of a part; what comes of all of them conjugate_begun writes, one thread block an environment.
+template <class T>
+__global__ void __launch_bounds__(conjugate_threads)
+    chunk_begin(const __grid_constant__ ConjugateWork<T> work) {
+  __shared__ WarpSums warp_sums;
+  const Chunk<T> chunk(work);
+  if (!Conjugate(chunk.progress()).begins) return;
+  const T* inverse = work.call.inverse.of(chunk.environment);
+  double sums[2] = {0, 0};
+  chunk.each_vertex([&](int i, std::int64_t at) { begin_vertex(work.call, at, inverse[i], sums); });
+  chunk.leave(sums, work.squares, warp_sums);
+}
+
+template <class T>
+__global__ void __launch_bounds__(conjugate_threads)
+    chunk_begun(const __grid_constant__ ConjugateWork<T> work) {
+  __shared__ WarpSums warp_sums;
+  Chunk<T> all(work);
+  all.environment = blockIdx.x;
+  double* progress = all.progress();
+  Conjugate numbers(progress);
+  if (!numbers.begins) return;
+  double sums[2];
+  all.add_up(sums, work.squares, warp_sums);
+  numbers.begin(sums[0], sums[1]);
+  if (threadIdx.x == 0) numbers.write(progress);
+}
+
+// An iteration in three: the curvature along the direction, the way along it, and the next one.
+template <class T>
+__global__ void __launch_bounds__(conjugate_threads)
+    chunk_look(const __grid_constant__ ConjugateWork<T> work) {
+  __shared__ WarpSums warp_sums;
+  const Chunk<T> chunk(work);
+  const DeviceConjugate<T>& call = work.call;
+  const Conjugate numbers(chunk.progress());
+  if (chunk.leads()) numbers.write(chunk.begun());
+  if (!numbers.active) return;
+  const T* inertia = call.inertia.of(chunk.environment);
+  const T* inverse = call.inverse.of(chunk.environment);
+  double curvature[1] = {0};
+  chunk.each_vertex([&](int i, std::int64_t at) {
+    look_along(work, at, read3(work.image + at), read3(call.direction + at), inertia[i], inverse[i],
+               curvature);
+  });
+  chunk.leave(curvature, work.curvature, warp_sums);
+}
+
+template <class T>
+__global__ void __launch_bounds__(conjugate_threads)
+    chunk_move(const __grid_constant__ ConjugateWork<T> work) {
+  __shared__ WarpSums warp_sums;
+  const Chunk<T> chunk(work);
+  const DeviceConjugate<T>& call = work.call;
+  Conjugate numbers(chunk.begun());
+  if (!numbers.active) return;
+  double curvature[1];
+  chunk.add_up(curvature, work.curvature, warp_sums);
+  const T step = T(numbers.step(curvature[0]));
+  if (!numbers.active) return;
+  const T* inverse = call.inverse.of(chunk.environment);
+  double sums[2] = {0, 0};
+  chunk.each_vertex([&](int i, std::int64_t at) {
+    move_vertex(work, at, step, read3(call.direction + at), inverse[i], sums);
+  });
+  chunk.leave(sums, work.squares, warp_sums);
+}
+
+template <class T>
+__global__ void __launch_bounds__(conjugate_threads)
+    chunk_turn(const __grid_constant__ ConjugateWork<T> work) {
+  __shared__ WarpSums warp_sums;
+  const Chunk<T> chunk(work);
+  const DeviceConjugate<T>& call = work.call;
+  Conjugate numbers(chunk.begun());
+  if (!numbers.active) return;
+  double curvature[1];
+  chunk.add_up(curvature, work.curvature, warp_sums);
+  numbers.step(curvature[0]);
+  if (numbers.active) {
+    double sums[2];
+    chunk.add_up(sums, work.squares, warp_sums);
+    const T keep = T(numbers.keep(sums[0], sums[1], call.tolerance));
+    const T* inverse = call.inverse.of(chunk.environment);
+    chunk.each_vertex([&](int i, std::int64_t at) {
+      write3(call.direction + at, multiply_add(keep, read3(call.direction + at),
+                                               inverse[i] * read3(call.residual + at)));
+    });
+  }
+  if (chunk.leads()) numbers.write(chunk.progress());
+}
+
 // Threads of a block that has a multiprocessor to itself: as many as there are registers for.
 template <class T>
 constexpr int alone_threads = sizeof(T) == 4 ? 512 : 256;
@@ -216,7 +356,12 @@ ConjugateWork<T> arrange(Arena& arena, const DeviceConjugate<T>& call) {
   T* image = nullptr;
   arena.place(image, call.batch * call.plan.vertices * 3);
   field.out = image;
-  return {call, arrange(arena, field), image};
+  ConjugateWork<T> work{call, arrange(arena, field), image, nullptr, nullptr, nullptr};
+  const std::int64_t parts = call.batch * work.chunks();
+  arena.place(work.curvature, parts);
+  arena.place(work.squares, 2 * parts);
+  arena.place(work.begun, call.batch * progress_count);
+  return work;
 }
 
 template <class T>
@@ -257,12 +402,30 @@ void run_conjugate_together(const ConjugateWork<T>& work, cudaStream_t stream) {
 }
 
 template <class T>
+void run_conjugate_in_chunks(const ConjugateWork<T>& work, cudaStream_t stream) {
+  const auto run = [&](void (*kernel)(ConjugateWork<T>), std::int64_t blocks) {
+    kernel<<<blocks_of(work.call.batch * blocks), conjugate_threads, 0, stream>>>(work);
+    check(cudaGetLastError());
+  };
+  weigh_field<true>(work.product, stream);
+  run(chunk_begin<T>, work.chunks());
+  run(chunk_begun<T>, 1);
+  for (int k = 0; k < work.call.iterations; ++k) {
+    run_vertices<true, SolidHessian, 2, 3>(work.product, stream);
+    for (const auto kernel : {chunk_look<T>, chunk_move<T>, chunk_turn<T>})
+      run(kernel, work.chunks());
+  }
+}
+
+template <class T>
 void run_conjugate(const DeviceConjugate<T>& call, void* memory, Stream to) {
   const auto stream = static_cast<cudaStream_t>(to);
   Arena arena(memory);
   const ConjugateWork<T> work = arrange(arena, call);
   if (call.plan.kernel == int(DeviceKernel::block)) {
     run_conjugate_alone(work, stream);
+  } else if (work.chunks() > 1) {
+    run_conjugate_in_chunks(work, stream);
   } else {
     run_conjugate_together(work, stream);
   }

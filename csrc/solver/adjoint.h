@@ -16,8 +16,6 @@ constexpr double adjoint_failed = 1e3;
 constexpr int adjoint_iterations = 2000;  // at most
 // iterations after which the host is asked whether any environment goes on, which waits for a GPU
 constexpr int adjoint_asked_every = 10;
-// vertices of an environment that one thread block is quick enough with
-constexpr int adjoint_most_of_a_block = 16384;
 
 // of what friction could take back: slip below it counts as none
 constexpr double sticking = 1e-3;
