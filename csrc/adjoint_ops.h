@@ -236,8 +236,7 @@ inline Solved solve_composed(const AdjointTensors& t, const AdjointSystem& s, do
 template <class Backend>
 Solved solve(const AdjointTensors& t, const AdjointSystem& s, double time_step) {
   const PlanTraits plan = traits_of<Backend>(t.after, t.plan);
-  if (plan.levels || Backend::recording(t.after))
-    return solve_composed(t, s, time_step);
+  if (plan.levels || Backend::recording(t.after)) return solve_composed(t, s, time_step);
   const double tolerance =
       t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
   const auto [solution, error] = solve_plainly<Backend>(
