@@ -1,11 +1,12 @@
 """What a gradient costs beside the step that it goes through: milliseconds forward, and backward.
 
-A held bar swings, float32, time step 1/60 s, 64 guarded iterations, from 1e6 Pa on 256; the loss is the sum of squares
-of the new positions, and the velocities before are asked for their gradients. Times are medians, as Python calls it,
-device awaited. On a GPU also both ways with kernel "block", and these in a CUDA graph, which it alone allows.
+A held bar swings, float32, time step 1/60 s; the loss is the sum of squares of the new positions, and the velocities
+before are asked for their gradients. Chebyshev takes 64 guarded iterations, 256 from 1e6 Pa on, and 16 times as many on
+the two large meshes of --large; Multilevel takes 16. Times are medians, as Python calls it, device awaited; on a GPU
+both ways in a CUDA graph besides.
 
     python benchmarks/gradients.py --threads 1
-    python benchmarks/gradients.py --device cuda --threads 16
+    python benchmarks/gradients.py --device cuda --threads 16 --large
 """
 
 from __future__ import annotations
@@ -29,58 +30,57 @@ Row = dict[str, Any]
 
 # cells, batch
 SCENES = (((3, 3, 3), 1), ((3, 3, 3), 64), ((15, 3, 3), 1), ((15, 3, 3), 64), ((15, 3, 3), 1024), ((9, 9, 9), 64))
+LARGE = (((38, 15, 15), 1), ((94, 32, 32), 1))
 YOUNGS = (1e4, 1e5, 1e6)
-TIMES = {
-    "forward": "forward ms",
-    "backward": "backward ms",
-    "block": "both, `block`",
-    "recorded": "in a CUDA graph",
-}
+SOLVERS = {"Chebyshev": pd.Chebyshev, "Multilevel": pd.Multilevel}
+TIMES = {"forward": "forward ms", "backward": "backward ms", "recorded": "both in a CUDA graph"}
 
 
-def measure_scene(cells: tuple[int, int, int], batch: int, youngs: float, device: torch.device, seconds: float) -> Row:
+def iterations_of(solver: str, cells: tuple[int, int, int], youngs: float) -> int:
+    """Of a step that leaves little of the way to its solution."""
+    if solver == "Multilevel":
+        return 16
+    return (64 if youngs < 1e6 else 256) * (16 if (cells, 1) in LARGE else 1)
+
+
+def measure_scene(
+    cells: tuple[int, int, int], batch: int, youngs: float, solver: str, device: torch.device, seconds: float
+) -> Row:
     """One row of the result."""
     scene = GpuScene("bar", cells, batch)
+    sim = pd.Simulator(
+        scene.build(), 1 / 60, iterations_of(solver, cells, youngs), solver=SOLVERS[solver](), progress=False,
+        batch=batch,
+    ).to(device)  # fmt: skip
+    sim.set_material(stiffness=sim.stiffness * (youngs / float(sim.stiffness.max())))
+    sim.prepare_solver()
+    state = scene.start(sim)
+    state.velocities.requires_grad_()
 
-    def simulator(kernel: str) -> tuple[pd.Simulator, pd.State]:
-        sim = pd.Simulator(
-            scene.build(), 1 / 60, 64 if youngs < 1e6 else 256, solver=pd.Chebyshev(), progress=False, kernel=kernel,
-            batch=batch,
-        ).to(device)  # fmt: skip
-        sim.set_material(stiffness=sim.stiffness * (youngs / float(sim.stiffness.max())))
-        state = scene.start(sim)
-        state.velocities.requires_grad_()
-        return sim, state
-
-    def forward(sim: pd.Simulator, state: pd.State) -> torch.Tensor:
+    def forward() -> torch.Tensor:
         return sim(state).positions.square().sum()
 
-    def both(sim: pd.Simulator, state: pd.State) -> None:
-        torch.autograd.grad(forward(sim, state), state.velocities)
+    def both() -> None:
+        torch.autograd.grad(forward(), state.velocities)
 
-    def median(work: Callable[..., object], *given: Any) -> float:
-        return 1e3 * statistics.median(measure(lambda: work(*given), device, repetitions=3, seconds=seconds))
+    def median(work: Callable[[], object]) -> float:
+        return 1e3 * statistics.median(measure(work, device, repetitions=3, seconds=seconds))
 
-    sim, state = simulator("auto")
-    once, all_of_it = median(forward, sim, state), median(both, sim, state)
+    once, all_of_it = median(forward), median(both)
     row = {
-        "vertices": sim.vertices, "batch": batch, "youngs": youngs, "iterations": sim.iterations,
-        "kernel": sim.plan.kernel, "forward": once, "backward": all_of_it - once, "block": None, "recorded": None,
+        "vertices": sim.vertices, "batch": batch, "youngs": youngs, "solver": solver, "iterations": sim.iterations,
+        "kernel": sim.plan.kernel, "forward": once, "backward": all_of_it - once, "recorded": None,
     }  # fmt: skip
     if device.type == "cuda":
-        own = simulator("block")
-        row["block"] = median(both, *own)
-        times = graph_times(lambda: both(*own), repetitions=3, seconds=seconds)
-        row["recorded"] = 1e3 * statistics.median(times)
+        row["recorded"] = 1e3 * statistics.median(graph_times(both, repetitions=3, seconds=seconds))
     return row
 
 
 def line_of(row: Row) -> str:
     """For a reader."""
-    names = [name for name in TIMES if row[name] is not None]
-    times = " | ".join(f"{row[name]:.3g}" for name in names)
+    times = " | ".join(f"{row[name]:.3g}" for name in TIMES if row[name] is not None)
     share = row["backward"] / row["forward"]
-    return f"| {row['batch']} x {row['vertices']} | {row['youngs']:.0e} Pa | {times} | {share:.2g} |"
+    return f"| {row['batch']} x {row['vertices']} | {row['youngs']:.0e} Pa | {row['solver']} | {times} | {share:.2g} |"
 
 
 def main() -> None:
@@ -88,18 +88,19 @@ def main() -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
     parser.add_argument("--seconds", type=float, default=0.5, help="of timing a scene (%(default)g)")
+    parser.add_argument("--large", action="store_true", help="also 10 and 102 thousand vertices")
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     device = torch.device(options.device)
-    jobs = [(cells, batch, youngs) for cells, batch in SCENES for youngs in YOUNGS]
+    scenes = SCENES + LARGE if options.large else SCENES
+    jobs = [(*scene, youngs, solver) for scene in scenes for youngs in YOUNGS for solver in SOLVERS]
     rows = [
-        measure_scene(cells, batch, youngs, device, options.seconds)
-        for cells, batch, youngs in tqdm(jobs, desc="measuring", unit="scene", leave=False)
+        measure_scene(*job, device, options.seconds) for job in tqdm(jobs, desc="measuring", unit="row", leave=False)
     ]
     heads = [head for name, head in TIMES.items() if rows[0][name] is not None]
-    print("| " + " | ".join(["batch x vertices", "Young's modulus", *heads, "backward / forward"]) + " |")
-    print("|---|---|" + "---|" * (len(heads) + 1))
+    print("| " + " | ".join(["batch x vertices", "Young's modulus", "solver", *heads, "backward / forward"]) + " |")
+    print("|---|---|---|" + "---|" * (len(heads) + 1))
     for row in rows:
         print(line_of(row))
     if options.out:

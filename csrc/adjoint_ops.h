@@ -1,6 +1,6 @@
 // The ops of a step's adjoint on either device. Of a Backend, beside what ops.h asks for: `adjoint_system` and
-// `adjoint_result`, which run a call; `asks(plan)`, whether a solve asks the host between its iterations; and `recording(like)`,
-// whether what is done is recorded for later, where nobody can ask what comes out.
+// `adjoint_result`, which run a call; and `recording(like)`, whether what is done is recorded for later, where nobody can ask
+// what comes out.
 #pragma once
 #include "find_op.h"
 #include "ops.h"
@@ -166,23 +166,6 @@ Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tens
              : adjoint_result_typed<Backend, double>(tensors, time_step);
 }
 
-struct PlanTraits {
-  bool levels;
-  bool asks;  // a solve asks the host between its iterations
-};
-
-template <class Backend, class T>
-PlanTraits traits_of(at::TensorList arrays, at::Device device) {
-  const auto plan = Backend::template plan_view<T>(arrays, Place{device});
-  return {plan.levels.there(), Backend::template asks<T>(plan)};
-}
-
-template <class Backend>
-PlanTraits traits_of(const Tensor& like, at::TensorList plan) {
-  return like.scalar_type() == at::kFloat ? traits_of<Backend, float>(plan, like.device())
-                                          : traits_of<Backend, double>(plan, like.device());
-}
-
 struct AdjointSystem {
   Tensor right, inertia, inverse;
   OptionalTensor projector;  // with contacts
@@ -194,18 +177,15 @@ using Solved = std::tuple<Tensor, Tensor>;
 // By the iterations of conjugate_gradients_, as many as it takes.
 template <class Backend>
 Solved solve_plainly(const Tensor& positions, const AdjointSystem& s, const Tensor& stiffness,
-                     at::TensorList plan, double tolerance, bool asks) {
+                     at::TensorList plan, double tolerance) {
   const Tensor right = s.right.contiguous(), x = positions.contiguous();
   const Tensor solution = at::empty_like(right), direction = at::empty_like(right);
   const Tensor residual = right.clone();
   const Tensor progress =
       at::full({x.size(0), progress_count}, -1.0, x.options().dtype(at::kDouble));
-  const int steps = asks ? adjoint_asked_every : adjoint_iterations;
-  for (int done = 0; done < adjoint_iterations; done += steps) {
-    conjugate_gradients_inplace<Backend>(solution, residual, direction, progress, x, s.inertia,
-                                         s.inverse, s.projector, stiffness, plan, tolerance, steps);
-    if (!asks || !progress.select(1, progress_active).any().item<bool>()) break;
-  }
+  conjugate_gradients_inplace<Backend>(solution, residual, direction, progress, x, s.inertia,
+                                       s.inverse, s.projector, stiffness, plan, tolerance,
+                                       adjoint_iterations);
   return {solution, progress.select(1, progress_error)};
 }
 
@@ -215,35 +195,32 @@ Solved conjugate_gradients(const Tensor& positions, const Tensor& right, const T
                            const Tensor& stiffness, at::TensorList plan, double tolerance) {
   check_positions(positions, "positions");
   check_state(right, positions, "right", "N");
-  const auto [solution, error] =
-      solve_plainly<Backend>(positions, {right, inertia, inverse, projector}, stiffness, plan,
-                             tolerance, traits_of<Backend>(positions, plan).asks);
+  const auto [solution, error] = solve_plainly<Backend>(
+      positions, {right, inertia, inverse, projector}, stiffness, plan, tolerance);
   return {solution, error.contiguous()};
 }
 
-// Any other way, and what to do where the plain one has found no solution: torchpd/adjoint.py.
-inline Solved solve_composed(const AdjointTensors& t, const AdjointSystem& s, double time_step,
-                             const OptionalTensor& solution = {},
-                             const OptionalTensor& error = {}) {
+// The solution with what stands in where there is none: torchpd/adjoint.py.
+inline Tensor mend(const AdjointTensors& t, const AdjointSystem& s, double time_step,
+                   const Tensor& solution, const Tensor& error) {
   static const auto op =
-      find_op<Solved(const Tensor&, const Tensor&, const Tensor&, const Tensor&,
-                     const OptionalTensor&, at::TensorList, at::TensorList, const OptionalTensor&,
-                     const OptionalTensor&, double)>("torchpd::solve_adjoint");
-  return op.call(t.after, s.right, s.inertia, s.inverse, s.projector, t.material, t.plan, solution,
-                 error, time_step);
+      find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, const Tensor&, const Tensor&,
+                     const OptionalTensor&, at::TensorList, at::TensorList, double)>(
+          "torchpd::mend_adjoint");
+  return op.call(solution, error, t.after, s.right, s.inverse, s.projector, t.material, t.plan,
+                 time_step);
 }
 
 template <class Backend>
 Solved solve(const AdjointTensors& t, const AdjointSystem& s, double time_step) {
-  const PlanTraits plan = traits_of<Backend>(t.after, t.plan);
-  if (plan.levels || Backend::recording(t.after)) return solve_composed(t, s, time_step);
   const double tolerance =
       t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
   const auto [solution, error] = solve_plainly<Backend>(
-      t.after, s, t.material[place_in_material("stiffness")], t.plan, tolerance, plan.asks);
-  const Tensor failed = error.gt(adjoint_failed * tolerance).any();
-  if (failed.item<bool>()) return solve_composed(t, s, time_step, solution, error);
-  return {solution, error};
+      t.after, s, t.material[place_in_material("stiffness")], t.plan, tolerance);
+  // a recording cannot ask, and takes what stands in along
+  const bool mends = Backend::recording(t.after) ||
+                     error.gt(adjoint_failed * tolerance).any().template item<bool>();
+  return {mends ? mend(t, s, time_step, solution, error) : solution, error};
 }
 
 // K l, by the dispatcher, whose profiler then sees it.

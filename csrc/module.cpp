@@ -322,7 +322,6 @@ PYBIND11_MODULE(_C, m) {
       std::make_pair(pd::adjoint_tolerance<float>, pd::adjoint_tolerance<double>);
   m.attr("adjoint_failed") = pd::adjoint_failed;
   m.attr("adjoint_iterations") = pd::adjoint_iterations;
-  m.attr("adjoint_asked_every") = pd::adjoint_asked_every;
   m.attr("most_environments") = pd::most_environments;
   m.attr("most_sharing_pairs") = pd::most_sharing_pairs;
   m.attr("pass_static_bytes") = pd::pass_static_bytes;

@@ -62,10 +62,6 @@ struct Cpu {
     kernels().rotation64(call, threads());
   }
 
-  template <class T>
-  static bool asks(const Plan<T>&) {
-    return false;
-  }
   static bool recording(const Tensor&) { return false; }
 
   static int threads() { return at::get_num_threads(); }
@@ -113,10 +109,8 @@ TORCH_LIBRARY(torchpd, m) {
       "wanted=None) -> Tensor[]");
   // its kernel, for every device, comes from Python
   with_plan(
-      "solve_adjoint(Tensor after, Tensor right, Tensor inertia, Tensor inverse, Tensor? "
-      "projector, "
-      "Tensor[] material, Tensor[] plan, Tensor? solution=None, Tensor? error=None, *, float "
-      "time_step) -> (Tensor, Tensor)");
+      "mend_adjoint(Tensor solution, Tensor error, Tensor after, Tensor right, Tensor inverse, "
+      "Tensor? projector, Tensor[] material, Tensor[] plan, *, float time_step) -> Tensor");
   with_plan(
       "adjoint_system(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
       "positions, Tensor "

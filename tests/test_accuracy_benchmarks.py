@@ -295,8 +295,9 @@ def test_time_to_error_keeps_rows_of_every_batch(
 def test_what_a_gradient_costs() -> None:
     from gradients import line_of, measure_scene
 
-    row = measure_scene((2, 1, 1), 2, 1e5, torch.device("cpu"), 0.0)
-    assert (row["batch"], row["vertices"], row["iterations"]) == (2, 12, 64)
-    assert row["forward"] > 0
-    assert row["backward"] > 0
-    assert line_of({**row, "forward": 2.0, "backward": 3.0}) == "| 2 x 12 | 1e+05 Pa | 2 | 3 | 1.5 |"
+    for solver, iterations in (("Chebyshev", 64), ("Multilevel", 16)):
+        row = measure_scene((2, 1, 1), 2, 1e5, solver, torch.device("cpu"), 0.0)
+        assert (row["batch"], row["vertices"], row["iterations"]) == (2, 12, iterations)
+        assert row["forward"] > 0
+        assert row["backward"] > 0
+        assert line_of({**row, "forward": 2.0, "backward": 3.0}) == f"| 2 x 12 | 1e+05 Pa | {solver} | 2 | 3 | 1.5 |"

@@ -178,8 +178,20 @@ def test_a_failed_solve_is_not_done_twice() -> None:
     loss = sim(pd.State(x, state.velocities)).positions.sum()
     with pytest.warns(UserWarning, match="adjoint of a step has no solution"):
         _, calls = gradients_and_calls(loss, [x])
-    assert calls.count("torchpd::solve_adjoint") == 1
+    assert calls.count("torchpd::mend_adjoint") == 1
     assert calls.count("torchpd::conjugate_gradients") == 1
+
+
+@pytest.mark.parametrize("error", [0.0, float("nan")])
+def test_nothing_is_mended_where_nothing_failed(error: float) -> None:
+    """What is no number has lost its solution, and has not failed."""
+    sim, state = body()
+    plan, material = list(sim.plan.arrays), [array.detach() for array in sim.material()]
+    x, right = state.positions, torch.ones_like(state.positions)
+    errors, inverse = torch.full((2,), error, dtype=torch.float64), torch.ones(sim.vertices, dtype=torch.float64)
+    given = (inverse, None, material, plan)
+    found = torch.ops.torchpd.mend_adjoint(2.0 * right, errors, x, right, *given, time_step=sim.time_step)
+    assert torch.equal(found, 2.0 * right)
 
 
 @pytest.mark.parametrize("forces", [False, True])

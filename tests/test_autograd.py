@@ -137,7 +137,7 @@ def test_compiles_with_its_backward() -> None:
     assert torch.equal(compiled, expected)
 
 
-@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "by torch operations"])
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "levels"])
 def test_autocast_does_not_touch_the_adjoint(solver: pd.solvers.Solver) -> None:
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (8, 2, 2))
     bar = pd.Solid(mesh, 5e4)
@@ -156,7 +156,7 @@ def test_autocast_does_not_touch_the_adjoint(solver: pd.solvers.Solver) -> None:
     torch.testing.assert_close(gradient(True), gradient(False), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "by torch operations"])
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "levels"])
 @pytest.mark.parametrize("factor", [1e-25, 1e20])
 def test_a_loss_may_be_of_any_size(factor: float, solver: pd.solvers.Solver, device: torch.device) -> None:
     """In float32, where the squares of its gradients would be zero, or infinite; nobody warns."""

@@ -63,7 +63,7 @@ def test_rollouts(kernel: str) -> None:
 
 
 def test_fields(kernel: str) -> None:
-    """Products with the Hessian, of which the adjoint of a step is made, gradients, energies, and the diagonal."""
+    """Products with the Hessian, gradients, energies, and the diagonal."""
     sim, kinds = large(kernel)
     x, w, plan = kinds.positions, sim.stiffness.detach(), plan_of(sim)
     own = w * torch.linspace(0.5, 2.0, KINDS, device=GPU)[:, None]

@@ -1,4 +1,4 @@
-"""Forward and backward in a CUDA graph, which "block" allows, since its adjoint asks nobody; others are refused."""
+"""Forward and backward in a CUDA graph: a solve of the adjoint is one launch and asks nobody."""
 
 from __future__ import annotations
 
@@ -6,19 +6,29 @@ import warnings
 
 import pytest
 import torch
+from conjugate_reference import conjugate_gradients
 from devices import require_gpu
 from on_gpu import DTYPES, GPU, KERNELS, device_work, relative, small_on_gpu
 from runs import noise
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.adjoint import conjugate_gradients
 
 require_gpu()
 
 pytestmark = pytest.mark.parametrize("precision", DTYPES)
 
+WAYS = [*KERNELS, "levels"]
 SOLVED = 400  # iterations, after which the implicit function theorem holds
+
+
+def simulator(kernel: str, precision: str) -> tuple[pd.Simulator, pd.State]:
+    """Of a kernel, or "levels" of the multilevel solver."""
+    sim, state = small_on_gpu(DTYPES[precision], "stream" if kernel == "levels" else kernel)
+    if kernel == "levels":
+        sim.solver = pd.Multilevel()
+    sim.iterations = SOLVED
+    return sim, state
 
 
 class Training:
@@ -56,9 +66,9 @@ class Training:
         return graph, results
 
 
-def test_a_recorded_training_step_is_that_of_python(precision: str) -> None:
-    sim, state = small_on_gpu(DTYPES[precision], "block")
-    sim.iterations = SOLVED
+@pytest.mark.parametrize("kernel", WAYS)
+def test_a_recorded_training_step_is_that_of_python(kernel: str, precision: str) -> None:
+    sim, state = simulator(kernel, precision)
     training = Training(sim, state)
     graph, results = training.record()
     for seed in range(1, 4):
@@ -70,9 +80,9 @@ def test_a_recorded_training_step_is_that_of_python(precision: str) -> None:
         assert all(bool((t != 0).any()) for t in own)
 
 
-def test_backward_waits_once_a_step(precision: str) -> None:
-    sim, state = small_on_gpu(DTYPES[precision], "block")
-    sim.iterations = SOLVED
+@pytest.mark.parametrize("kernel", WAYS)
+def test_backward_waits_once_a_step(kernel: str, precision: str) -> None:
+    sim, state = simulator(kernel, precision)
     training = Training(sim, state)  # of two steps
     training.run()
     with warnings.catch_warnings(record=True) as caught:
@@ -85,9 +95,10 @@ def test_backward_waits_once_a_step(precision: str) -> None:
     assert sum("called a synchronizing CUDA operation" in str(one.message) for one in caught) == 2
 
 
-def test_a_recording_takes_rotations_as_constant_where_python_would(precision: str) -> None:
+@pytest.mark.parametrize("kernel", WAYS)
+def test_a_recording_takes_rotations_as_constant_where_python_would(kernel: str, precision: str) -> None:
     """One environment is crumpled: Python is warned, a graph cannot be, and both take the same gradient."""
-    sim, state = small_on_gpu(DTYPES[precision], "block")
+    sim, state = simulator(kernel, precision)
     sim.iterations = 1
     state.positions[1] = 0.02 * noise(state.positions[1], 5)
     training = Training(sim, state)
@@ -100,21 +111,10 @@ def test_a_recording_takes_rotations_as_constant_where_python_would(precision: s
     assert all(torch.equal(one, other) for one, other in zip(results, wanted, strict=True))
 
 
-@pytest.mark.parametrize("kernel", [*(name for name in KERNELS if name != "block"), "levels"])
-def test_other_kernels_are_refused_while_recording(kernel: str, precision: str) -> None:
-    sim, state = small_on_gpu(DTYPES[precision], "stream" if kernel == "levels" else kernel)
-    sim.iterations = SOLVED
-    if kernel == "levels":
-        sim.solver = pd.Multilevel()
-    with pytest.raises(RuntimeError, match='CUDA graph can record the gradient of a step with kernel "block" alone'):
-        Training(sim, state).record()
-    # the device is as it was
-    assert bool(sim(state).positions.isfinite().all())
-
-
-def test_a_solve_is_one_kernel_behind_its_weights(precision: str) -> None:
+@pytest.mark.parametrize("kernel", WAYS)
+def test_a_solve_is_one_kernel_behind_its_weights(kernel: str, precision: str) -> None:
     """However many iterations it takes."""
-    sim, state = small_on_gpu(DTYPES[precision], "block")
+    sim, state = simulator(kernel, precision)
     right = noise(state.positions)
     diagonal = torch.ops.torchpd.elastic_diagonal(sim.stiffness, list(sim.plan.arrays), weighted=True)
     inertia = 0.1 * diagonal
@@ -134,10 +134,10 @@ def test_a_solve_is_one_kernel_behind_its_weights(precision: str) -> None:
 
     names = [name for name in device_work(solve) if "pd::" in name]
     assert len(names) == 2
-    assert "conjugate_alone" in names[1]
+    assert ("conjugate_alone" if kernel == "block" else "conjugate_teams") in names[1]
     assert progress[:, 2].tolist() == [0.0] * len(right)
     product = torch.ops.torchpd.hessian_product
-    wanted, _ = conjugate_gradients(
+    wanted, *_ = conjugate_gradients(
         lambda f: inertia[..., None] * f + product(rest, f.contiguous(), sim.stiffness, plan),
         lambda f: inverse[..., None] * f, right, 1e-5,
     )  # fmt: skip

@@ -84,14 +84,14 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
         "adjoint_result": (
             (f, errors, direction, sim.masses, sim.damping, f, direction, projector, x[..., 0] > 0.1), h,
         ),
-        "solve_adjoint": ((still, f, inertia, 1 / inertia, None, material, plan), h),
+        "mend_adjoint": ((direction, errors, still, f, 1 / inertia, None, material, plan), h),
     }  # fmt: skip
 
 
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
     "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "conjugate_gradients_",
-    "adjoint_system", "adjoint_result", "solve_adjoint", "conjugate_gradients",
+    "adjoint_system", "adjoint_result", "mend_adjoint", "conjugate_gradients",
 )  # fmt: skip
 
 

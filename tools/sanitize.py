@@ -161,13 +161,23 @@ def fields(sim: pd.Simulator, batch: int) -> None:
         ops.hessian_product(x, d, w, plan)
         ops.element_energy_product(x, d, w, plan)
         for weighted in (False, True):
-            diagonal = ops.elastic_diagonal(w, plan, weighted=weighted)
-        inertia, inverse = 0.1 * diagonal, 1.0 / (1.1 * diagonal)
-        active = torch.full((batch, 4), -1.0, dtype=torch.float64, device=x.device)
-        projector = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape, 3)
-        for held in (None, projector):
-            vectors = [torch.empty_like(x), d.clone(), torch.empty_like(x), active.clone()]
-            ops.conjugate_gradients_(*vectors, x, inertia, inverse, held, w, plan, tolerance=0.0, iterations=2)
+            ops.elastic_diagonal(w, plan, weighted=weighted)
+        solve(sim, batch, w)
+
+
+def solve(sim: pd.Simulator, batch: int, stiffness: torch.Tensor) -> None:
+    """Conjugate gradients, without contacts and with them, from the first iteration and on from the second."""
+    x, plan = sim.rest_state(batch).positions * 1.1, list(sim.plan.arrays)
+    diagonal = ops.elastic_diagonal(stiffness, plan, weighted=True)
+    inertia, inverse = 0.1 * diagonal, 1.0 / (1.1 * diagonal)
+    active = torch.full((batch, 4), -1.0, dtype=torch.float64, device=x.device)
+    projector = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape, 3)
+    for held in (None, projector):
+        vectors = [torch.empty_like(x), 0.01 * x, torch.empty_like(x), active.clone()]
+        for iterations in (2, 1):
+            ops.conjugate_gradients_(
+                *vectors, x, inertia, inverse, held, stiffness, plan, tolerance=0.0, iterations=iterations
+            )
 
 
 def adjoint(sim: pd.Simulator, batch: int) -> None:
@@ -227,10 +237,12 @@ def levels(dtype: torch.dtype) -> int:
         sim = pd.Simulator(built, 1 / 60, iterations, progress=False, **options).to("cuda")
         step_all_ways(sim, batch)
         ops.precondition(sim.rest_state(batch).positions, list(sim.plan.arrays))
+        solve(sim, batch, sim.stiffness)
     multilevel.MOST_DIRECT = usual
     built = scene(BAR, contacts=False, pieces=False, pins=True)
     many = pd.Simulator(built, 1 / 60, 1, solver=pd.Multilevel(), dtype=dtype, progress=False)
     many.to("cuda")(many.rest_state(300))
+    solve(many, 300, many.stiffness)
     torch.cuda.synchronize()
     return len(ways) + 1
 
@@ -301,7 +313,7 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
         mesh = bar(9, 9, 9) if dtype == torch.float32 else bar(6, 6, 6)
         fields(pd.Simulator(pd.Scene(pd.Solid(mesh, 1e5)), 1 / 60, **options).to("cuda"), 2)
     if kernel == "grid":
-        # whose vertices are more than one block's in the adjoint's solve
+        # whose vertices are several parts in the adjoint's solve
         fields(pd.Simulator(pd.Scene(pd.Solid(bar(11, 9, 9), 1e5)), 1 / 60, **options).to("cuda"), 2)
     with compiled_for(kernel, WAYS[kernel][0]):
         free = scene(WAYS[kernel][0].mesh, contacts=True, pieces=True, pins=False)

@@ -58,7 +58,6 @@ known_inertia: float
 adjoint_tolerance: tuple[float, float]
 adjoint_failed: float
 adjoint_iterations: int
-adjoint_asked_every: int
 pass_static_bytes: int
 most_environments: int
 most_sharing_pairs: int

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
 
-from .adjoint import solve_adjoint
+from .adjoint import mend_adjoint
 from .batching import step_vjp_rule
 from .tables import MATERIAL_TABLE
 from .vmap_rules import register_rule
@@ -144,12 +144,14 @@ def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
     return positions.new_empty(positions.shape), inertia, inverse, projector, stuck
 
 
-def _solved(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+@_register_fake("conjugate_gradients")
+def _(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
     return positions.new_empty(positions.shape), positions.new_empty(positions.shape[:1], dtype=torch.float64)
 
 
-_register_fake("conjugate_gradients")(_solved)
-_register_fake("solve_adjoint")(_solved)
+@_register_fake("mend_adjoint")
+def _(solution: Tensor, *_: Any, **__: Any) -> Tensor:
+    return solution.new_empty(solution.shape)
 
 
 @_register_fake("step_vjp")
@@ -184,9 +186,9 @@ def _(matrices: Tensor, direction: Tensor) -> Tensor:
 # ---- a kernel
 
 
-@torch.library.impl("torchpd::solve_adjoint", ("cpu", "cuda"))
-def _(*args: Any, time_step: float) -> tuple[Tensor, Tensor]:
-    return solve_adjoint(*args, time_step=time_step)
+@torch.library.impl("torchpd::mend_adjoint", ("cpu", "cuda"))
+def _(*args: Any, time_step: float) -> Tensor:
+    return mend_adjoint(*args, time_step=time_step)
 
 
 # ---- derivatives: each is another op

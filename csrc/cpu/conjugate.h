@@ -1,11 +1,12 @@
 // Runner of solver/conjugate.h: one environment at a time, by one thread or by a team.
 #pragma once
+#include "cpu/cycle.h"
 #include "cpu/sweep.h"
 #include "solver/conjugate.h"
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
+#include <memory>
 
 namespace pd::inline PD_TARGET {
 
@@ -46,20 +47,33 @@ class Turnings {
   T* data_;
 };
 
+// What an environment is solved in, by all of a team.
+template <class T>
+struct ConjugateMemory {
+  Workspace<Single<T>> vectors;
+  Turnings<T> turnings;
+  std::unique_ptr<Cycle<Single<T>>> cycle;  // of a plan with levels
+
+  explicit ConjugateMemory(const ConjugateCall<T>& call) : vectors(call), turnings(call.plan) {
+    if (call.plan.levels.there()) cycle = std::make_unique<Cycle<Single<T>>>(call.plan.levels);
+  }
+};
+
 template <class T>
 class ConjugatePass {
   using Lanes = Single<T>;
   using Sum = Sums<Lanes>;
 
  public:
-  ConjugatePass(const ConjugateCall<T>& call, Workspace<Lanes>& work, Turnings<T>& turnings,
-                Scratch<Lanes>& scratch, const Team& team)
+  ConjugatePass(const ConjugateCall<T>& call, ConjugateMemory<T>& work, Scratch<Lanes>& scratch,
+                const Team& team)
       : call_(call),
         plan_(call.plan),
-        w_(work),
-        turnings_(turnings),
+        w_(work.vectors),
+        turnings_(work.turnings),
+        cycle_(work.cycle.get()),
         team_(team),
-        sweep_{plan_, work, scratch, team} {}
+        sweep_{plan_, w_, scratch, team} {}
 
   void run(std::int64_t environment) {
     Conjugate numbers(call_.progress + environment * progress_count);
@@ -84,17 +98,13 @@ class ConjugatePass {
     return to_quad(from[row(i)], from[row(i) + 1], from[row(i) + 2]);
   }
 
-  // Vectors are solved for in a power of two near the largest number of the residual, so that squares of theirs have room in T.
   // Every thread finds it for itself.
   void find_unit() {
     const std::int64_t count = 3 * std::int64_t(plan_.vertices);
     const T* residual = call_.residual + environment_ * count;
     T largest = 0;
     for (std::int64_t i = 0; i < count; ++i) largest = std::max(largest, std::abs(residual[i]));
-    // neither a unit nor one over it is infinite or no normal number
-    constexpr int most = std::numeric_limits<T>::max_exponent - 3;
-    const bool finite = largest > T(0) && std::isfinite(largest);
-    unit_ = finite ? std::ldexp(T(1), std::clamp(std::ilogb(largest), -most, most)) : T(1);
+    unit_ = unit_near(largest);
   }
 
   void load(bool begins) {
@@ -124,16 +134,17 @@ class ConjugatePass {
   }
 
   void begin(Conjugate& numbers) {
+    const double weighted = cycle_ ? apply_levels() : 0;
     each_part([&](std::int64_t i, Sum& sums) {
       const Quad<T> right = residual()[i];
-      direction()[i] = w_.inverse[i] * right;
+      direction()[i] = preconditioned_residual(i);
       // zero, unless something is infinite or no number
       const Quad<T> lost = multiply_add(T(0), w_.x[i], T(0) * right);
       sums.first = multiply_add(right, right, sums.first) + lost;
       sums.second = multiply_add(right, direction()[i], sums.second);
     });
     const auto sum = total(1);
-    numbers.begin(sum.first, sum.second);
+    numbers.begin(sum.first, cycle_ ? weighted : sum.second);
     team_.barrier();  // before the next sums stand there
   }
 
@@ -148,9 +159,8 @@ class ConjugatePass {
     });
     sweep_.template run<2>(0, product, [&](std::int64_t i, const Quad<T>& force, Sum& sums) {
       const Quad<T> d = direction()[i];
-      const T* projector = call_.projector ? call_.projector + 3 * row(i) : nullptr;
       const Vec3<T> moved = conjugate_image(to_vec3(force), to_vec3(d), w_.inertia[i],
-                                            w_.inverse[i] != T(0), projector);
+                                            w_.inverse[i] != T(0), projector(i));
       image()[i] = Lanes::value(moved);
       sums.first = multiply_add(d, image()[i], sums.first);
     });
@@ -164,12 +174,38 @@ class ConjugatePass {
       sums.second = multiply_add(rest, w_.inverse[i] * rest, sums.second);
     });
     const auto sum = total(1);
-    const T keep = T(numbers.keep(sum.first, sum.second, call_.tolerance));
+    numbers.judge(sum.first, call_.tolerance);
     if (!numbers.active) return;
+    const T keep = T(numbers.keep(cycle_ ? apply_levels() : sum.second));
     // not part by part: others may still read the sums
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
-      direction()[i] = multiply_add(keep, direction()[i], w_.inverse[i] * residual()[i]);
+      direction()[i] = multiply_add(keep, direction()[i], preconditioned_residual(i));
     team_.barrier();
+  }
+
+  // M of the residual, for `preconditioned_residual`; returns r . M r
+  double apply_levels() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      cycle_->input()[i] = residual()[i];
+    team_.barrier();
+    cycle_->run(team_);
+    each_part([&](std::int64_t i, Sum& sums) {
+      Quad<T>& z = cycle_->result()[i];
+      z = Lanes::value(preconditioned(to_vec3(z), to_vec3(residual()[i]), w_.inverse[i],
+                                      plan_.levels.reference_inertia[i], projector(i)));
+      sums.second = multiply_add(residual()[i], z, sums.second);
+    });
+    const double sum = total(1).second;
+    team_.barrier();  // before the next sums stand there
+    return sum;
+  }
+  Quad<T> preconditioned_residual(std::int64_t i) const {
+    return cycle_ ? cycle_->result()[i] : w_.inverse[i] * residual()[i];
+  }
+
+  // of what contacts let through; null where all is
+  const T* projector(std::int64_t i) const {
+    return call_.projector ? call_.projector + 3 * row(i) : nullptr;
   }
 
   void store() {
@@ -220,10 +256,11 @@ class ConjugatePass {
   const Plan<T>& plan_;
   Workspace<Lanes>& w_;
   Turnings<T>& turnings_;
+  const Cycle<Lanes>* cycle_;
   const Team& team_;
   Sweep<Lanes> sweep_;
   std::int64_t environment_ = 0;
-  T unit_ = 1;
+  T unit_ = 1;  // unit_near
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -124,21 +124,19 @@ void conjugate_any(const ConjugateCall<T>& call, int threads) {
     std::atomic<std::int64_t> next{0};
     run_team(int(std::min<std::int64_t>(threads, call.batch)), [&](const Team&) {
       const CleanRegisters clean;
-      Workspace<Lanes> work(call);
-      Turnings<T> turnings(call.plan);
+      ConjugateMemory<T> work(call);
       Scratch<Lanes> scratch(call.plan.most_slots);
       const Team alone;
-      ConjugatePass<T> pass(call, work, turnings, scratch, alone);
+      ConjugatePass<T> pass(call, work, scratch, alone);
       for (std::int64_t e = next++; e < call.batch; e = next++) pass.run(e);
     });
     return;
   }
-  Workspace<Lanes> work(call);
-  Turnings<T> turnings(call.plan);
+  ConjugateMemory<T> work(call);
   auto scratches = make_scratches<Lanes>(call.plan, threads);
   run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
     const CleanRegisters clean;
-    ConjugatePass<T> pass(call, work, turnings, scratches[team.rank], team);
+    ConjugatePass<T> pass(call, work, scratches[team.rank], team);
     for (std::int64_t e = 0; e < call.batch; ++e) pass.run(e);
   });
 }

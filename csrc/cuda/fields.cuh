@@ -16,7 +16,7 @@ template <class T>
 struct FieldWork {
   DeviceField<T> field;
   T* weights;             // [batch or 1, blocks, 2, 32] w V
-  Quad<T>* shared_force;  // [batch, slots]
+  Quad<T>* shared_force;  // [batch or teams, slots]
 
   __device__ const T* weights_of(std::int64_t environment) const {
     const std::int64_t own = field.stiffness.stride ? environment : 0;
@@ -84,10 +84,7 @@ struct PatchFields {
   // of the slot of a corner, as pair_corner has it, for elements
   __device__ void operator()(unsigned corner, Vec3<T> (&vectors)[Fields]) const {
     if constexpr (Fields == 2) {
-      const unsigned slot_times_8 = corner & 0xffff;
-      const Quad<T> seen = both.look(slot_times_8);
-      vectors[0] = vec3(seen);
-      vectors[1] = both.second(slot_times_8, seen);
+      both(corner, vectors);
     } else {
       vectors[0] = at_corner(position, corner);
     }
@@ -169,20 +166,21 @@ __global__ void __launch_bounds__(field_threads)
   }
 }
 
+// `teams`: environments that are worked on at a time.
 template <class T>
-FieldWork<T> arrange(Arena& arena, const DeviceField<T>& field) {
+FieldWork<T> arrange(Arena& arena, const DeviceField<T>& field, std::int64_t teams) {
   const DevicePlan<T>& plan = field.plan;
   FieldWork<T> work{field, nullptr, nullptr};
   arena.place(work.weights,
               (field.stiffness.stride ? field.batch : 1) * plan.blocks * 2 * pair_lanes);
-  arena.place(work.shared_force, plan.shared ? field.batch * plan.slots : 0);
+  arena.place(work.shared_force, plan.shared ? teams * plan.slots : 0);
   return work;
 }
 
 template <class T>
 std::int64_t field_bytes(const DeviceField<T>& field) {
   Arena arena(nullptr);
-  arrange(arena, field);
+  arrange(arena, field, field.batch);
   return arena.size();
 }
 
@@ -238,7 +236,7 @@ template <class T>
 void run_field(const DeviceField<T>& field, void* memory, Stream to) {
   const auto stream = static_cast<cudaStream_t>(to);
   Arena arena(memory);
-  const FieldWork<T> work = arrange(arena, field);
+  const FieldWork<T> work = arrange(arena, field, field.batch);
   if (field.plan.kernel == int(DeviceKernel::block)) {
     run_field_with<false>(work, stream);
   } else {

@@ -1,31 +1,13 @@
 // The kernels of the multilevel solver and their launches, for one precision.
 #pragma once
-#include "cuda/arena.h"
-#include "cuda/launch.h"
 #include "cuda/misfit.h"
 #include "cuda/outer.h"
-#include "cuda/runtime.h"
+#include "cuda/teams.cuh"
 #include "plan/shared_memory.h"
-
-#include <algorithm>
 
 namespace pd {
 
 static_assert(sizeof(OuterControl) + pass_static_bytes <= outer_static_bytes);
-
-template <class T>
-PD_HD void arrange(Arena& arena, const Levels<T>& levels, int teams, CycleMemory<T>& m) {
-  const std::int64_t middle = levels.has_middle() ? 4 * std::int64_t(levels.fine_nodes) : 0;
-  const std::int64_t coarse = levels.coarse_unknowns(), below = levels.direct ? 0 : 1;
-  const auto place = [&](LevelFields<T>& f, std::int64_t size) {
-    for (Quad<T>** array : {&f.in, &f.z}) arena.place(*array, teams * size);
-    for (Quad<T>** array : {&f.rest, &f.part}) arena.place(*array, teams * size * below);
-  };
-  place(m.fine, levels.vertices);
-  place(m.middle, middle);
-  arena.place(m.coarse_half, teams * coarse);
-  for (Quad<T>** array : {&m.coarse_in, &m.coarse_out}) arena.place(*array, teams * coarse * below);
-}
 
 template <class T, bool Touching, int Threads>
 __global__ void __launch_bounds__(Threads, Threads == outer_threads ? 1 : small_outer_blocks)
@@ -84,23 +66,6 @@ __global__ void __launch_bounds__(outer_threads)
       write3(call.op.out + row(i), cycle.result(i));
     team.barrier();
   }
-}
-
-// How many blocks an environment gets, and how many environments run at once. No bits depend on it.
-struct Teams {
-  int count, blocks;
-
-  Teams(std::int64_t batch, int resident, int useful)
-      : count(int(std::clamp<std::int64_t>(batch, 1, resident))),
-        blocks(std::clamp(resident / count, 1, useful)) {}
-};
-
-template <class T>
-int useful_blocks(const Levels<T>& levels) {
-  if (levels.direct) return (levels.vertices + outer_warps - 1) / outer_warps;
-  constexpr int alone =
-      4 * outer_threads;  // vertices with which one block is done before several have met
-  return levels.vertices <= alone ? 1 : (levels.vertices + outer_threads - 1) / outer_threads;
 }
 
 template <class T>
@@ -178,7 +143,8 @@ struct OuterLaunch {
   OuterCall<T> call(const StreamCall<T>& stream) const {
     const DevicePlan<T>& plan = stream.step.plan;
     const bool spread = plan.levels.direct && !is_small(stream.step);
-    const int useful = std::max(plan.patches, spread ? useful_blocks(plan.levels) : 1);
+    const int useful =
+        std::max(plan.patches, spread ? useful_blocks(plan.levels, outer_threads) : 1);
     const Teams teams(stream.step.batch, resident, useful);
     return {stream, {}, teams.count, teams.blocks, shared_cycle, shared_corotation};
   }
@@ -219,16 +185,6 @@ std::int64_t outer_bytes(const DeviceStep<T>& step) {
   return arena.size();
 }
 
-// All blocks at once, since they wait for each other.
-template <class Call>
-void launch_teams(const void* kernel, Call& call, unsigned* counter, int threads,
-                  std::size_t shared, cudaStream_t stream) {
-  void* arguments[] = {&call};
-  check(cudaMemsetAsync(counter, 0, call.teams * sizeof(unsigned), stream));
-  check(cudaLaunchCooperativeKernel(kernel, dim3(call.teams * call.blocks), dim3(threads),
-                                    arguments, shared, stream));
-}
-
 template <class T>
 OuterCall<T> outer_call(const StreamCall<T>& stream, const OuterLaunch<T>& launch, void* memory) {
   Arena arena(memory);
@@ -256,7 +212,8 @@ void run_outer(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
 template <class T>
 CycleCall<T> cycle_call(const PreconditionCall<T>& op, void* memory, std::int64_t* bytes) {
   const void* kernel = reinterpret_cast<const void*>(precondition_fields<T>);
-  const Teams teams(op.batch, resident_blocks(kernel, outer_threads, 0), useful_blocks(op.levels));
+  const Teams teams(op.batch, resident_blocks(kernel, outer_threads, 0),
+                    useful_blocks(op.levels, outer_threads));
   CycleCall<T> call{op, {}, nullptr, teams.count, teams.blocks};
   Arena arena(memory);
   arena.place(call.counter, call.teams);

@@ -52,11 +52,6 @@ struct Cuda {
     run_adjoint_result(call, c10::cuda::getCurrentCUDAStream().stream());
   }
 
-  template <class T>
-  static bool asks(const Plan<T>& plan) {
-    return plan.kernel != int(DeviceKernel::block);
-  }
-
   static bool recording(const Tensor& like) {
     const c10::cuda::CUDAGuard guard(like.device());
     return c10::cuda::currentStreamCaptureStatusMayInitCtx() != c10::cuda::CaptureStatus::None;

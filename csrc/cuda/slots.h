@@ -29,6 +29,14 @@ class Slots {
     return {seen.w, two.a, two.b};
   }
 
+  // both, of the slot of a corner as pair_corner has it, for elements
+  PD_DEVICE void operator()(unsigned corner, Vec3<T> (&vectors)[2]) const {
+    const unsigned slot_times_8 = corner & 0xffff;
+    const Quad<T> seen = look(slot_times_8);
+    vectors[0] = vec3(seen);
+    vectors[1] = second(slot_times_8, seen);
+  }
+
   PD_DEVICE void set(int slot, const Vec3<T>& first, const Vec3<T>& second) const {
     first_[slot] = quad(first, second.x);
     behind_[slot] = {second.y, second.z};

@@ -268,8 +268,8 @@ enum ConjugateProgress : int {
   progress_count
 };
 
-// Iterations of conjugate gradients on (inertia + elastic Hessian) solution = right side, preconditioned by a diagonal, for each
-// environment by itself.
+// Iterations of conjugate gradients on (inertia + elastic Hessian) solution = right side, for each environment by itself;
+// preconditioned by a diagonal, or by a plan's levels where it has them.
 template <class T, class P = Plan<T>>
 struct ConjugateCall {
   P plan;

@@ -14,8 +14,6 @@ constexpr double adjoint_tolerance = sizeof(T) == 4 ? 1e-5 : 1e-10;
 // times that, a solve has failed
 constexpr double adjoint_failed = 1e3;
 constexpr int adjoint_iterations = 2000;  // at most
-// iterations after which the host is asked whether any environment goes on, which waits for a GPU
-constexpr int adjoint_asked_every = 10;
 
 // of what friction could take back: slip below it counts as none
 constexpr double sticking = 1e-3;

@@ -1,10 +1,13 @@
-// Conjugate gradients (Hestenes and Stiefel 1952) on H l = b, H = P (a + K) P with the elastic Hessian K, preconditioned by 1 / D.
+// Conjugate gradients (Hestenes and Stiefel 1952) on H l = b, H = P (a + K) P with the elastic Hessian K, preconditioned by 1 / D,
+// or by P M P where the plan has levels, with 1 / D on vertices of which M knows nothing.
 //
 // P leaves out vertices that do not move, and of others what contacts do not let through. D is one number a vertex, so P and
 // 1 / D commute, and all vectors stay where P leaves them.
 #pragma once
 #include "math/mat.h"
 #include "plan/views.h"
+
+#include <limits>
 
 namespace pd::inline PD_TARGET {
 
@@ -33,7 +36,7 @@ struct Conjugate {
     scale *= factor;
   }
 
-  // by |b|^2, plus zero times every position, and b . b / D
+  // by |b|^2, plus zero times every position, and b . z, z = b / D or M b
   PD_HD void begin(double square, double weighted) {
     scale = sqrt(square);
     product = weighted;
@@ -47,27 +50,53 @@ struct Conjugate {
     return active ? product / curvature : 0;
   }
 
-  // what of the last direction the next one keeps
-  PD_HD double keep(double residual_square, double next, double tolerance) {
-    const double ratio = next / product;
-    product = next;
-    const double residual = sqrt(residual_square);
+  // whether the residual r is not the end yet, by |r|^2
+  PD_HD void judge(double square, double tolerance) {
+    const double residual = sqrt(square);
     active = residual > tolerance * scale;
     // what got lost on the way is an error, however large
     error = residual < HUGE_VAL ? residual / scale : HUGE_VAL;
+  }
+
+  // what of the last direction the next one keeps, by r . z
+  PD_HD double keep(double next) {
+    const double ratio = next / product;
+    product = next;
     return ratio;
   }
 };
 
-// P (a d + K d) of a vertex; `moves`: it has any part in P. `projector`: nine numbers, or null.
+// What vectors are solved for in: a power of two near the largest number of the residual, so that squares of theirs have room.
+// Neither it nor one over it is infinite or no normal number.
+template <class T>
+PD_HD T unit_near(T largest) {
+  if (!(largest > T(0) && largest < T(HUGE_VAL))) return T(1);
+  constexpr int most = std::numeric_limits<T>::max_exponent - 3;
+  const int exponent = ilogb(double(largest));
+  return T(ldexp(1.0, exponent > most ? most : exponent < -most ? -most : exponent));
+}
+
+// The part of a field that contacts let through. `projector`: nine numbers, or null.
+template <class T>
+PD_HD Vec3<T> project(const Vec3<T>& field, const T* p) {
+  if (!p) return field;
+  return Mat3<T>{{{p[0], p[1], p[2]}, {p[3], p[4], p[5]}, {p[6], p[7], p[8]}}} * field;
+}
+
+// P (a d + K d) of a vertex; `moves`: it has any part in P.
 template <class T>
 PD_HD Vec3<T> conjugate_image(const Vec3<T>& elastic, const Vec3<T>& direction, T inertia,
                               bool moves, const T* projector) {
   if (!moves) return {T(0), T(0), T(0)};
-  const Vec3<T> image = multiply_add(inertia, direction, elastic);
-  if (!projector) return image;
-  const T* p = projector;
-  return Mat3<T>{{{p[0], p[1], p[2]}, {p[3], p[4], p[5]}, {p[6], p[7], p[8]}}} * image;
+  return project(multiply_add(inertia, direction, elastic), projector);
+}
+
+// z of a vertex with residual r: P M r, but r / D where it was held when M was made. `of_levels`: (M r) there.
+template <class T>
+PD_HD Vec3<T> preconditioned(const Vec3<T>& of_levels, const Vec3<T>& residual, T inverse,
+                             T reference_inertia, const T* projector) {
+  const bool known = inverse != T(0) && reference_inertia < T(HUGE_VAL);
+  return known ? project(of_levels, projector) : inverse * residual;
 }
 
 }  // namespace pd::inline PD_TARGET

@@ -1,0 +1,93 @@
+// What the runners of solver/conjugate.h share: sums of a block and of a team, in float64, and the product that an iteration
+// begins with.
+#pragma once
+#include "cuda/block_team.h"
+#include "cuda/fields.cuh"
+#include "solver/conjugate.h"
+
+namespace pd {
+
+// Threads of a block that has a multiprocessor to itself: as many as there are registers for.
+template <class T>
+constexpr int conjugate_threads = sizeof(T) == 4 ? 512 : 256;
+
+using WarpSums = double[conjugate_threads<float> / warp_size][2];
+
+struct Largest {
+  static constexpr double none = 0;
+  // of no number and another one that
+  __device__ double operator()(double a, double b) const { return b > a ? b : a; }
+};
+
+// Of all threads of a block, the same in each of them. `warp_sums` is free again when it returns.
+template <class Op, int Count>
+__device__ void across_block(double (&value)[Count], WarpSums& warp_sums) {
+  const Op op;
+  const int warp = int(threadIdx.x) / warp_size, lane = int(threadIdx.x) % warp_size;
+  for (int n = 0; n < Count; ++n) {
+    value[n] = across_warp(value[n], op);
+    if (lane == 0) warp_sums[warp][n] = value[n];
+  }
+  __syncthreads();
+  for (int n = 0; n < Count; ++n) {
+    value[n] = Op::none;
+    for (int w = 0; w < int(blockDim.x) / warp_size; ++w) value[n] = op(value[n], warp_sums[w][n]);
+  }
+  __syncthreads();
+}
+
+// Of the parts of an environment: blocks of a team leave them and, once they have met, all put them together in one order.
+template <class Op, int Count>
+struct Parts {
+  double* values;  // [count, Count]
+  int count;
+
+  __device__ void leave(int part, double (&value)[Count], WarpSums& warp_sums) const {
+    across_block<Op>(value, warp_sums);
+    if (threadIdx.x != 0) return;
+    for (int n = 0; n < Count; ++n) values[part * std::int64_t(Count) + n] = value[n];
+  }
+  __device__ void join(double (&value)[Count], WarpSums& warp_sums) const {
+    const Op op;
+    for (int n = 0; n < Count; ++n) value[n] = Op::none;
+    for (int part = threadIdx.x; part < count; part += int(blockDim.x)) {
+      for (int n = 0; n < Count; ++n)
+        value[n] = op(value[n], values[part * std::int64_t(Count) + n]);
+    }
+    across_block<Op>(value, warp_sums);
+  }
+};
+
+template <class T>
+__device__ double wide_dot(const Vec3<T>& a, const Vec3<T>& b) {
+  return double(a.x) * double(b.x) + double(a.y) * double(b.y) + double(a.z) * double(b.z);
+}
+
+template <class T>
+__device__ double largest_of(const Vec3<T>& a) {
+  const Largest larger;
+  return larger(larger(double(absolute(a.x)), double(absolute(a.y))), double(absolute(a.z)));
+}
+
+// |b|^2, and zero besides, which is no number where a right side b or a position is infinite or none.
+template <class T>
+__device__ double square_of_right(const Vec3<T>& right, const Vec3<T>& position) {
+  const T none(0);
+  const Vec3<T> lost = multiply_add(none, position, none * right);
+  return wide_dot(right, right) + double(lost.x + lost.y + lost.z);
+}
+
+// the field whose product with the direction an iteration begins with
+template <class T>
+DeviceField<T> conjugate_field(const DeviceConjugate<T>& call) {
+  DeviceField<T> field;
+  field.plan = call.plan;
+  field.field = Field::hessian_product;
+  field.stiffness = call.stiffness;
+  field.batch = call.batch;
+  field.positions = call.positions;
+  field.direction = call.direction;
+  return field;
+}
+
+}  // namespace pd

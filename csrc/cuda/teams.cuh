@@ -1,0 +1,54 @@
+// Launches of teams of blocks, each of which has an environment at a time, and what such a team keeps of the preconditioner.
+#pragma once
+#include "cuda/arena.h"
+#include "cuda/cycle.h"
+#include "cuda/launch.h"
+#include "cuda/runtime.h"
+
+#include <algorithm>
+
+namespace pd {
+
+template <class T>
+PD_HD void arrange(Arena& arena, const Levels<T>& levels, int teams, CycleMemory<T>& m) {
+  const std::int64_t middle = levels.has_middle() ? 4 * std::int64_t(levels.fine_nodes) : 0;
+  const std::int64_t coarse = levels.coarse_unknowns(), below = levels.direct ? 0 : 1;
+  const auto place = [&](LevelFields<T>& f, std::int64_t size) {
+    for (Quad<T>** array : {&f.in, &f.z}) arena.place(*array, teams * size);
+    for (Quad<T>** array : {&f.rest, &f.part}) arena.place(*array, teams * size * below);
+  };
+  place(m.fine, levels.vertices);
+  place(m.middle, middle);
+  arena.place(m.coarse_half, teams * coarse);
+  for (Quad<T>** array : {&m.coarse_in, &m.coarse_out}) arena.place(*array, teams * coarse * below);
+}
+
+// How many blocks an environment gets, and how many environments run at once. No bits depend on it.
+struct Teams {
+  int count, blocks;
+
+  Teams(std::int64_t batch, int resident, int useful)
+      : count(int(std::clamp<std::int64_t>(batch, 1, resident))),
+        blocks(std::clamp(resident / count, 1, useful)) {}
+};
+
+// for the preconditioner, of blocks of so many threads
+template <class T>
+int useful_blocks(const Levels<T>& levels, int threads) {
+  const auto blocks = [&](int each) { return (levels.vertices + each - 1) / each; };
+  if (levels.direct) return blocks(threads / warp_size);
+  // with fewer vertices one block is done before several have met
+  return levels.vertices <= 4 * threads ? 1 : blocks(threads);
+}
+
+// All blocks at once, since they wait for each other.
+template <class Call>
+void launch_teams(const void* kernel, Call& call, unsigned* counter, int threads,
+                  std::size_t shared, cudaStream_t stream) {
+  void* arguments[] = {&call};
+  check(cudaMemsetAsync(counter, 0, call.teams * sizeof(unsigned), stream));
+  check(cudaLaunchCooperativeKernel(kernel, dim3(call.teams * call.blocks), dim3(threads),
+                                    arguments, shared, stream));
+}
+
+}  // namespace pd
