@@ -16,7 +16,7 @@ std::int64_t conjugate_bytes(const DeviceConjugate<T>& call) {
   if (is_alone(call)) {
     arrange_alone(arena, call);
   } else {
-    arrange_teams(arena, call, ConjugateLaunch<T>(call).teams);
+    arrange_teams(arena, call, ConjugateLaunch<T>(call));
   }
   return arena.size();
 }

@@ -26,16 +26,15 @@ struct ConjugateTeams {
   unsigned* counter;  // [teams], zero at the launch
   int teams, blocks;  // blocks of a team
 
-  static constexpr int threads = conjugate_threads<T>;
-  PD_HD static int parts_of(int vertices) { return (vertices + threads - 1) / threads; }
+  int threads;  // of a block, and vertices of a part
+
+  PD_HD int parts_of(int vertices) const { return (vertices + threads - 1) / threads; }
   PD_HD int vertex_parts() const { return parts_of(call.plan.vertices); }
   PD_HD int product_parts() const { return call.plan.patches + parts_of(call.plan.shared); }
 };
 
 template <class T, bool Leveled>
 class ConjugateTeam {
-  static constexpr int threads = conjugate_threads<T>;
-
  public:
   __device__ ConjugateTeam(const ConjugateTeams<T>& work, const ConjugateMemory<T>& memory,
                            std::int64_t environment, BlockTeam& team, std::byte* shared,
@@ -77,8 +76,8 @@ class ConjugateTeam {
   template <class Visit, class Leave>
   __device__ void each_part(int first, int count, const Visit& visit, const Leave& leave) {
 #pragma unroll 1
-    for (int part = team_.rank(); part * threads < count; part += team_.blocks()) {
-      const int i = part * threads + int(threadIdx.x);
+    for (int part = team_.rank(); part * int(blockDim.x) < count; part += team_.blocks()) {
+      const int i = part * int(blockDim.x) + int(threadIdx.x);
       if (i < count) visit(first + i);
       leave(part);
     }
@@ -231,14 +230,14 @@ class ConjugateTeam {
   template <class Look>
   __device__ void multiply(const Patch<T>& patch, const Look& look) {
     const Vec3<T> anchor = vec3(m_.x[patch.vertex(0)]);
-    for (int s = threadIdx.x; s < patch.slots; s += threads) {
+    for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
       const int i = patch.vertex(s);
       slots_.set(s, vec3(m_.x[i]) - anchor, direction(i));
     }
     __syncthreads();
     each_pair<2>(patch, slots_, rest_of<true>(patch), weights_, entries_, SolidHessian{});
     __syncthreads();
-    for (int s = threadIdx.x; s < patch.slots; s += threads) {
+    for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
       const int slot = patch.first_slot + s;
       if (s < patch.interior) {
         Vec3<T> vectors[2];
@@ -339,11 +338,13 @@ struct ConjugateLaunch {
   static constexpr std::int64_t most_work = std::int64_t(1) << 30;
 
   const void* kernel;
+  int threads;
   std::size_t shared;
   Teams teams;
 
   explicit ConjugateLaunch(const DeviceConjugate<T>& call)
       : kernel(call.plan.levels.there() ? function<true>() : function<false>()),
+        threads(threads_of(call.plan)),
         shared(pass_shared_bytes(sizeof(T), call.plan.most_slots, call.plan.most_entries, 2)),
         teams(std::min(call.batch, std::max<std::int64_t>(1, most_vertices / call.plan.vertices)),
               resident(), useful(call.plan)) {}
@@ -359,19 +360,27 @@ struct ConjugateLaunch {
     return reinterpret_cast<const void*>(conjugate_teams<T, Leveled>);
   }
   int resident() const {
-    const int blocks = resident_blocks(kernel, conjugate_threads<T>, shared);
+    const int blocks = resident_blocks(kernel, threads, shared);
     if (blocks == 0) refuse_shared_memory(shared);
     return blocks;
   }
-  static int useful(const DevicePlan<T>& plan) {
-    const int levels = plan.levels.there() ? useful_blocks(plan.levels, conjugate_threads<T>) : 1;
-    return std::max({plan.patches, ConjugateTeams<T>::parts_of(plan.vertices), levels});
+  // The plan alone decides, since they set the order of sums: no more than there are pairs for, so that patches of a small
+  // mesh are worked on side by side; but the preconditioner wants few blocks that meet, of many threads.
+  static int threads_of(const DevicePlan<T>& plan) {
+    constexpr int most = conjugate_threads<T>, least = 64;
+    return plan.levels.there() ? most : std::clamp(int(whole_warps(plan.most_pairs)), least, most);
+  }
+  int useful(const DevicePlan<T>& plan) const {
+    const int levels = plan.levels.there() ? useful_blocks(plan.levels, threads) : 1;
+    return std::max({plan.patches, (plan.vertices + threads - 1) / threads, levels});
   }
 };
 
 template <class T>
-ConjugateTeams<T> arrange_teams(Arena& arena, const DeviceConjugate<T>& call, const Teams& teams) {
-  ConjugateTeams<T> work{call, {}, {}, nullptr, teams.count, teams.blocks};
+ConjugateTeams<T> arrange_teams(Arena& arena, const DeviceConjugate<T>& call,
+                                const ConjugateLaunch<T>& launch) {
+  const Teams& teams = launch.teams;
+  ConjugateTeams<T> work{call, {}, {}, nullptr, teams.count, teams.blocks, launch.threads};
   ConjugateMemory<T>& m = work.memory;
   const std::int64_t count = teams.count, vertices = count * call.plan.vertices;
   arena.place(work.counter, count);
@@ -390,12 +399,12 @@ template <class T>
 void run_conjugate_teams(const DeviceConjugate<T>& call, void* memory, cudaStream_t stream) {
   const ConjugateLaunch<T> launch(call);
   Arena arena(memory);
-  ConjugateTeams<T> work = arrange_teams(arena, call, launch.teams);
+  ConjugateTeams<T> work = arrange_teams(arena, call, launch);
   weigh_field<true>(work.product, stream);
   const int most = launch.most_iterations(call);
   for (std::int64_t done = 0; done < call.iterations; done += most) {
     work.call.iterations = int(std::min<std::int64_t>(most, call.iterations - done));
-    launch_teams(launch.kernel, work, work.counter, conjugate_threads<T>, launch.shared, stream);
+    launch_teams(launch.kernel, work, work.counter, launch.threads, launch.shared, stream);
   }
 }
 
