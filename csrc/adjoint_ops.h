@@ -174,10 +174,10 @@ struct AdjointSystem {
 // The solution, and the relative residual of every environment.
 using Solved = std::tuple<Tensor, Tensor>;
 
-// By the iterations of conjugate_gradients_, as many as it takes.
+// By the iterations of conjugate_gradients_, as many as it takes; the solution, and the progress at their end.
 template <class Backend>
-Solved solve_plainly(const Tensor& positions, const AdjointSystem& s, const Tensor& stiffness,
-                     at::TensorList plan, double tolerance) {
+std::tuple<Tensor, Tensor> iterate(const Tensor& positions, const AdjointSystem& s,
+                                   const Tensor& stiffness, at::TensorList plan, double tolerance) {
   const Tensor right = s.right.contiguous(), x = positions.contiguous();
   const Tensor solution = at::empty_like(right), direction = at::empty_like(right);
   const Tensor residual = right.clone();
@@ -186,7 +186,7 @@ Solved solve_plainly(const Tensor& positions, const AdjointSystem& s, const Tens
   conjugate_gradients_inplace<Backend>(solution, residual, direction, progress, x, s.inertia,
                                        s.inverse, s.projector, stiffness, plan, tolerance,
                                        adjoint_iterations);
-  return {solution, progress.select(1, progress_error)};
+  return {solution, progress};
 }
 
 template <class Backend>
@@ -195,9 +195,9 @@ Solved conjugate_gradients(const Tensor& positions, const Tensor& right, const T
                            const Tensor& stiffness, at::TensorList plan, double tolerance) {
   check_positions(positions, "positions");
   check_state(right, positions, "right", "N");
-  const auto [solution, error] = solve_plainly<Backend>(
-      positions, {right, inertia, inverse, projector}, stiffness, plan, tolerance);
-  return {solution, error.contiguous()};
+  const auto [solution, progress] =
+      iterate<Backend>(positions, {right, inertia, inverse, projector}, stiffness, plan, tolerance);
+  return {solution, progress.select(1, progress_error).contiguous()};
 }
 
 // The solution with what stands in where there is none: torchpd/adjoint.py.
@@ -211,15 +211,24 @@ inline Tensor mend(const AdjointTensors& t, const AdjointSystem& s, double time_
                  time_step);
 }
 
+// Whether the solve of any environment has. The copy waits for a GPU, and takes less than kernels that make one number of it.
+inline bool any_failed(const Tensor& progress, double tolerance) {
+  const Tensor here = progress.to(at::kCPU);
+  const auto numbers = here.accessor<double, 2>();
+  for (std::int64_t e = 0; e < numbers.size(0); ++e)
+    if (numbers[e][progress_error] > adjoint_failed * tolerance) return true;
+  return false;
+}
+
 template <class Backend>
 Solved solve(const AdjointTensors& t, const AdjointSystem& s, double time_step) {
   const double tolerance =
       t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
-  const auto [solution, error] = solve_plainly<Backend>(
-      t.after, s, t.material[place_in_material("stiffness")], t.plan, tolerance);
+  const auto [solution, progress] =
+      iterate<Backend>(t.after, s, t.material[place_in_material("stiffness")], t.plan, tolerance);
+  const Tensor error = progress.select(1, progress_error);
   // a recording cannot ask, and takes what stands in along
-  const bool mends = Backend::recording(t.after) ||
-                     error.gt(adjoint_failed * tolerance).any().template item<bool>();
+  const bool mends = Backend::recording(t.after) || any_failed(progress, tolerance);
   return {mends ? mend(t, s, time_step, solution, error) : solution, error};
 }
 
