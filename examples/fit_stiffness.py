@@ -5,12 +5,30 @@ from __future__ import annotations
 import argparse
 
 import torch
-from torch.func import functional_call
+from torch import Tensor
+from torch.nn.utils import parametrize
 
 import torchpd as pd
 
 TRUTH = (3e5, 6e4)  # Pa: beside the wall, and far from it
 GUESS = 1.5e5  # Pa
+
+
+class Halves(torch.nn.Module):
+    """Stiffness of every tetrahedron [E] from the logarithms of two, one for each half of the bar.
+
+    The logarithm keeps a stiffness positive, and makes doubling as easy as halving.
+    """
+
+    def __init__(self, half: Tensor) -> None:
+        super().__init__()
+        self.half = half
+
+    def forward(self, logarithm: Tensor) -> Tensor:
+        return logarithm.exp()[self.half]
+
+    def right_inverse(self, stiffness: Tensor) -> Tensor:
+        return torch.stack([stiffness[self.half == number].log().mean() for number in (0, 1)])
 
 
 def main() -> None:
@@ -26,24 +44,23 @@ def main() -> None:
     sim = pd.Simulator(scene, time_step=1 / 30, iterations=1000, dtype=torch.float64, tolerance=1e-7)
     half = torch.from_numpy((mesh.vertices[mesh.tets].mean(axis=1)[:, 0] > 0.5).astype(int))
 
-    def motion(youngs: torch.Tensor) -> torch.Tensor:
-        """Positions after every step [steps, 1, V, 3], with other values in the place of the module's parameter."""
-        state, positions = sim.rest_state(), []
-        for _ in range(options.steps):
-            state = functional_call(sim, {"stiffness": youngs[half]}, (state,))
-            positions.append(state.positions)
-        return torch.stack(positions)
+    parametrize.register_parametrization(sim, "stiffness", Halves(half))
+    logarithm = sim.parametrizations.stiffness.original.requires_grad_()
+
+    def motion() -> Tensor:
+        """Positions after every step [steps, 1, V, 3]."""
+        return sim.rollout(sim.rest_state(), options.steps).positions
 
     with torch.no_grad():
-        seen = motion(torch.tensor(TRUTH, dtype=torch.float64))
+        logarithm.copy_(torch.tensor(TRUTH).log())
+        seen = motion()
+        logarithm.copy_(torch.full((2,), GUESS).log())
 
-    # the logarithm keeps a stiffness positive, and makes doubling as easy as halving
-    logarithm = torch.full((2,), GUESS, dtype=torch.float64).log().requires_grad_()
     optimiser = torch.optim.LBFGS([logarithm], max_iter=2, line_search_fn="strong_wolfe")
 
-    def loss() -> torch.Tensor:
+    def loss() -> Tensor:
         optimiser.zero_grad()
-        error = 1e4 * (motion(logarithm.exp()) - seen).square().sum(dim=-1).mean()  # cm^2
+        error = 1e4 * (motion() - seen).square().sum(dim=-1).mean()  # cm^2
         error.backward()
         return error.detach()
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from .automatic import Choice, choose_solver
 from .checks import check_has_values, check_like, check_whole
@@ -220,9 +221,10 @@ class Model(nn.Module):
     def set_material(self, **arrays: Tensor | float) -> None:
         """Replace differentiable arrays, for all environments or with a leading batch for each; all of them, or none.
 
-        An array of the same shape is overwritten, so that optimisers keep it; another batch makes a new parameter. What
-        the numbers were made of gets no gradient, which a warning says: for that `torch.func.functional_call` gives the
-        simulator other arrays for one call.
+        An array of the same shape is overwritten, so that optimisers keep it; another batch makes a new parameter, and
+        a warning where the one before was learned. What the numbers were made of gets no gradient, which a warning
+        says: for that `torch.func.functional_call` gives the simulator other arrays for one call, and a parametrization
+        (`torch.nn.utils.parametrize`) for all. One that is there is written to through its `right_inverse`.
 
         Args:
             arrays: by name, see `Simulator`. Shapes and values are checked here, once, and that batches agree with each
@@ -239,6 +241,9 @@ class Model(nn.Module):
                 )
         check_batches(checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
         with _ordinary():
+            parametrized = self._parametrized() & set(checked)
+            for name in parametrized:
+                self._check_parametrized(name, checked[name])
             parameters = {
                 name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)
                 for name, tensor in checked.items()
@@ -248,12 +253,43 @@ class Model(nn.Module):
             plan = self._plan_with(checked)
             if self.promise is not None and any(not torch.equal(new, getattr(self, n)) for n, new in checked.items()):
                 self.promise.doubt(True)
-            for name, tensor in checked.items():
-                if name in parameters:
+            # first what may refuse
+            for name, tensor in sorted(checked.items(), key=lambda item: item[0] not in parametrized):
+                if name in parametrized:
+                    self._parametrization(name).right_inverse(tensor)
+                elif name in parameters:
                     setattr(self, name, parameters[name])
                 else:
                     getattr(self, name).copy_(tensor)
         self.plan = plan
+        if learned := [name for name, parameter in parameters.items() if parameter.requires_grad]:
+            warn_user(
+                f"the simulator has a new parameter for {' and '.join(learned)}, of another batch, which an optimiser "
+                "of the one before does not know: make the optimiser anew, or set the batch first"
+            )
+
+    def _parametrized(self) -> set[str]:
+        """Material that torch.nn.utils.parametrize makes of something else."""
+        return {name for name in MATERIAL_ROWS if parametrize.is_parametrized(self, name)}
+
+    def _parametrization(self, name: str) -> parametrize.ParametrizationList:
+        found: parametrize.ParametrizationList = self.parametrizations[name]  # type: ignore[index, assignment]
+        return found
+
+    def _check_parametrized(self, name: str, tensor: Tensor) -> None:
+        """Refuse what a parametrization cannot be set to."""
+        shape = getattr(self, name).shape
+        without = [type(one).__name__ for one in self._parametrization(name) if not hasattr(one, "right_inverse")]
+        if without:
+            raise ValueError(
+                f"set_material: {name} is made by the parametrization {without[0]}, which has no right_inverse to say "
+                f"of what: set sim.parametrizations.{name} itself, or take the parametrization away"
+            )
+        if tensor.shape != shape:
+            raise ValueError(
+                f"set_material: {name} is made by a parametrization, of {list(shape)}, and keeps its shape, got "
+                f"{list(tensor.shape)}: take the parametrization away first, and put it back for the other batch"
+            )
 
     def _plan_with(self, arrays: dict[str, Tensor]) -> Plan:
         """The plan that serves the material with some arrays replaced."""
@@ -292,6 +328,8 @@ class Model(nn.Module):
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """As of `torch.nn.Module`, but all arrays or none: torch loads what it can before it refuses other names.
+
+        Material of another batch makes new parameters, as `set_material` does, with its warning.
 
         As a part of another module the simulator is not asked whether names are missing; then torch's order holds.
         """

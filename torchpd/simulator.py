@@ -102,7 +102,11 @@ class Simulator(Model):
 
         Returns:
             The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
-            error follows the residual). Forward mode and `torch.func.grad` are not provided.
+            error follows that of the step). On rough ground they are those of a vertex that sticks; one that slides, or
+            lands in this step, keeps its friction as it is, so that what changes the friction (masses, gravity, forces
+            along the normal) gets a gradient that lacks that, wrong by factors where sliding is what a loss sees. There
+            are none for planes and spheres themselves, nor for `start`. Forward mode and `torch.func.grad` are not
+            provided.
         """
         self.check_state(state, forces=forces)
         material = self.material_at(targets, state[0].shape[0])
@@ -182,7 +186,7 @@ class Simulator(Model):
             targets: constant (a sphere with a velocity goes on with it), or a function of the step number (a sphere's
                 velocity then follows from its centres).
             start: first iterate of every step, "velocity" or "inertial".
-            return_info: fill in residual and energy of the recorded steps; NaN otherwise.
+            return_info: fill in residual and energy of the recorded steps; NaN otherwise, see `Info`.
             progress: show a bar.
 
         Returns:
@@ -344,6 +348,10 @@ class Simulator(Model):
 def _first_iterate(start: str | Tensor, positions: Tensor) -> tuple[Tensor | None, bool]:
     if isinstance(start, Tensor):
         check_like("start", start, positions, "first iterate, m")
+        if start.requires_grad and torch.is_grad_enabled():
+            raise ValueError(
+                "start, the first iterate, requires a gradient, but a solved step does not depend on it: detach() it"
+            )
         return start, False
     if not _is_start(start):
         raise ValueError(f'start must be "velocity", "inertial" or positions [B, V, 3], got {_in_short(start)}')

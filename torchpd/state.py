@@ -46,16 +46,28 @@ class State(NamedTuple):
 class Info(NamedTuple):
     """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it.
 
-    Of `Multilevel`, `restarts` counts trials that were taken back, and `rho` is 1 - q / s, where q A_0 <= A <= s A_0
-    and M was made of A_0: 0 where M fits, near 1 where it does not (`Simulator.prepare_solver` makes it anew).
+    Attributes:
+        residual: |grad E| / |grad E at x + h v| of the step's objective E, less what contacts balance: 1 is no better
+            than where the body would fly to, and as residuals weigh short waves, an error may be larger or smaller; at
+            rest, where rounding is all that there is, it is 0.3 to 1. NaN unless it was asked for (`return_info`), and
+            where state or material are none of a step: not finite, or negative.
+        energy: the objective E at the last iterate [J], elastic energy and m / (2 h^2) |x - y|^2: what a solve lowers.
+            Not the mechanical energy, which `Simulator.energy` gives. NaN unless asked for.
+        iterations: that were used.
+        restarts: of the acceleration, because the energy rose. Of `Multilevel` trials that were taken back.
+        converged: whether the error was judged to be within `Simulator.tolerance` before the iterations ran out; False
+            without a tolerance. It is an error of positions, relative to the way that elasticity and contacts take
+            them, so it may be there while the residual is large.
+        rho: spectral radius that the schedule used. Of `Multilevel` 1 - q / s, where q A_0 <= A <= s A_0 and M was made
+            of A_0: 0 where M fits, near 1 where it does not (`Simulator.prepare_solver` makes it anew).
     """
 
-    residual: Tensor  # |grad E| / |grad E at x + h v|, less what contacts balance; NaN unless asked for
-    energy: Tensor  # objective of the step at the last iterate [J]; NaN unless asked for
-    iterations: Tensor  # used
-    restarts: Tensor  # of the acceleration, because the energy rose
-    converged: Tensor  # bool: the error was judged to be within the tolerance before the iterations ran out
-    rho: Tensor  # spectral radius that the schedule used
+    residual: Tensor
+    energy: Tensor
+    iterations: Tensor
+    restarts: Tensor
+    converged: Tensor
+    rho: Tensor
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:

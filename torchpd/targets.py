@@ -74,7 +74,8 @@ class Anchors:
         if not any(came[-len(shape) :] == shape and came[: -len(shape)] in front for shape in shapes):
             wanted = " or ".join(str(list(shape)) for shape in shapes)
             raise ValueError(
-                f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}"
+                f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}; for a "
+                "rollout whose steps differ a function of their number"
             )
         if value.dtype != like.dtype or value.device != like.device:
             raise TypeError(f"{name} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}")

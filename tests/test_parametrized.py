@@ -1,0 +1,107 @@
+"""Material that torch.nn.utils.parametrize makes of something else, and parameters that an optimiser loses."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.utils import parametrize
+
+import torchpd as pd
+
+
+class Exponential(torch.nn.Module):
+    def forward(self, logarithm: Tensor) -> Tensor:
+        return logarithm.exp()
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        return value.log()
+
+
+class OneWay(torch.nn.Module):
+    def forward(self, value: Tensor) -> Tensor:
+        return value.abs()
+
+
+def simulator() -> pd.Simulator:
+    mesh = pd.shapes.box((0.3, 0.1, 0.1), (3, 1, 1))
+    bar = pd.Solid(mesh, youngs=2e4, density=1000.0)
+    scene = pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+    return pd.Simulator(scene, 1 / 60, 200, dtype=torch.float64)
+
+
+def parametrized(how: torch.nn.Module) -> tuple[pd.Simulator, Tensor]:
+    sim = simulator()
+    parametrize.register_parametrization(sim, "stiffness", how)
+    original: Tensor = sim.parametrizations.stiffness.original  # type: ignore[union-attr, assignment]
+    return sim, original
+
+
+def test_gradients_reach_the_logarithm_through_a_rollout() -> None:
+    sim, logarithm = parametrized(Exponential())
+    plain = simulator()
+    plain.stiffness.requires_grad_()
+    tracks = [s.rollout(s.rest_state(2), 3).positions for s in (sim, plain)]
+    assert torch.allclose(*tracks, rtol=1e-12, atol=1e-14)
+    (wanted,) = torch.autograd.grad(tracks[1].square().sum(), plain.stiffness)
+    logarithm.requires_grad_()
+    loss = sim.rollout(sim.rest_state(2), 3).positions.square().sum()
+    (found,) = torch.autograd.grad(loss, logarithm)
+    torch.testing.assert_close(
+        found, wanted * plain.stiffness.detach(), rtol=1e-6, atol=1e-9 * float(found.abs().max())
+    )
+
+
+def test_set_material_goes_through_the_right_inverse(tmp_path: Path) -> None:
+    sim, logarithm = parametrized(Exponential())
+    sim.set_material(stiffness=5e4, masses=2.0 * sim.masses)
+    assert sim.parametrizations.stiffness.original is logarithm  # type: ignore[union-attr]
+    torch.testing.assert_close(sim.stiffness, torch.full_like(sim.stiffness, 5e4))
+    sim.save(tmp_path / "sim.safetensors")
+    torch.testing.assert_close(pd.Simulator.load(tmp_path / "sim.safetensors").stiffness, sim.stiffness.detach())
+
+
+@pytest.mark.parametrize(
+    ("how", "batch", "said"),
+    [(Exponential(), 2, "keeps its shape, got"), (OneWay(), 0, "parametrization OneWay, which has no right_inverse")],
+)
+def test_what_a_parametrization_cannot_be_is_refused(how: torch.nn.Module, batch: int, said: str) -> None:
+    """And the rest stays as it was, too."""
+    sim, _ = parametrized(how)
+    before = [array.clone() for array in sim.material()]
+    value = torch.full((batch, *sim.stiffness.shape) if batch else sim.stiffness.shape, 7e4, dtype=torch.float64)
+    with pytest.raises(ValueError, match=said):
+        sim.set_material(masses=2.0 * sim.masses, stiffness=value)
+    assert all(torch.equal(now, then) for now, then in zip(sim.material(), before, strict=True))
+
+
+def test_a_learned_parameter_is_not_replaced_in_silence() -> None:
+    sim, other = simulator(), simulator()
+    sim.stiffness.requires_grad_()
+    with pytest.warns(UserWarning, match="a new parameter for stiffness, of another batch, which an optimiser"):
+        sim.set_material(stiffness=sim.stiffness.detach().repeat(2, 1))
+    assert sim.stiffness.requires_grad
+    other.masses.requires_grad_()
+    state = sim.state_dict()
+    state["masses"] = state["masses"].repeat(2, 1)
+    with pytest.warns(UserWarning, match="a new parameter for masses"):
+        other.load_state_dict(state)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sim.set_material(stiffness=3.0 * sim.stiffness.detach())  # the same batch
+        sim.set_material(masses=sim.masses.repeat(2, 1))  # nobody learns it
+
+
+def test_a_first_iterate_that_asks_for_a_gradient_is_refused() -> None:
+    """Before the step, not on the way back through many."""
+    sim = simulator()
+    state = sim.rest_state()
+    start = state.positions.clone().requires_grad_()
+    with pytest.raises(ValueError, match=r"start, the first iterate, requires a gradient, .* detach\(\)"):
+        sim(state, start=start)
+    with torch.no_grad():
+        sim(state, start=start)
+    sim(state, start=start.detach())
