@@ -20,7 +20,7 @@ struct AdjointTensors {
   at::TensorList material, plan;
 };
 
-using AdjointOutputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+using AdjointOutputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 template <class Backend, class T>
 AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
@@ -52,6 +52,7 @@ AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
   const std::int64_t held = touching ? call.batch : 0;
   const Tensor projector = at::empty({held, vertices, 3, 3}, options);
   const Tensor stuck = at::empty({held, vertices}, options.dtype(at::kBool));
+  const Tensor sliding = at::empty({held, vertices, slide_count, 3}, options);
   Tensor after, x, v, f, gradient;
   if (touching) {
     after = t.after.contiguous(), x = t.positions.contiguous(), v = t.velocities.contiguous();
@@ -64,14 +65,15 @@ AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
     call.elastic_gradient = gradient.const_data_ptr<T>();
     call.projector = projector.mutable_data_ptr<T>();
     call.stuck = stuck.mutable_data_ptr<bool>();
+    call.sliding = sliding.mutable_data_ptr<T>();
   }
   if (call.batch > 0) Backend::adjoint_system(call, grad_x);
-  return {right, inertia, inverse, projector, stuck};
+  return {right, inertia, inverse, projector, stuck, sliding};
 }
 
 // The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1, vertices], and of
-// a scene with contacts the projector off the normals that hold a vertex [batch, vertices, 3, 3] and whether friction holds it
-// [batch, vertices], else of no environments.
+// a scene with contacts the projector off the normals that hold a vertex [batch, vertices, 3, 3], whether friction holds it
+// [batch, vertices], and what it slides along [batch, vertices, 4, 3], else of no environments.
 template <class Backend>
 AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_velocities,
                               const Tensor& after, const Tensor& positions,
@@ -93,7 +95,7 @@ AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_v
 
 // Of a scene with contacts also what they let through of what vertices that friction holds pass on, dL/dx' + dL/dv' / h - K l.
 struct PassedOn {
-  OptionalTensor grad_positions, elastic, projector, stuck;
+  OptionalTensor grad_positions, elastic, projector, stuck, sliding;
 };
 
 struct ResultTensors {
@@ -120,14 +122,16 @@ Outputs adjoint_result_typed(const ResultTensors& t, double time_step) {
   call.out_positions = x.mutable_data_ptr<T>();
   call.out_velocities = before.mutable_data_ptr<T>();
   call.out_multiplier = out.mutable_data_ptr<T>();
-  Tensor grad_x, elastic, projector, stuck;
+  Tensor grad_x, elastic, projector, stuck, sliding;
   if (t.passed_on.stuck) {
     grad_x = t.passed_on.grad_positions->contiguous(), elastic = t.passed_on.elastic->contiguous();
     projector = t.passed_on.projector->contiguous(), stuck = t.passed_on.stuck->contiguous();
+    sliding = t.passed_on.sliding->contiguous();
     call.grad_positions = grad_x.const_data_ptr<T>();
     call.elastic = elastic.const_data_ptr<T>();
     call.projector = projector.const_data_ptr<T>();
     call.stuck = stuck.const_data_ptr<bool>();
+    call.sliding = sliding.const_data_ptr<T>();
   }
   if (l.numel() > 0) Backend::adjoint_result(call, l);
   return {x, before, out};
@@ -139,7 +143,7 @@ Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tens
                        const Tensor& masses, const Tensor& damping,
                        const OptionalTensor& grad_positions, const OptionalTensor& elastic,
                        const OptionalTensor& projector, const OptionalTensor& stuck,
-                       double time_step) {
+                       const OptionalTensor& sliding, double time_step) {
   check_positions(multiplier, "multiplier");
   check_state(grad_velocities, multiplier, "grad_velocities", "of a loss, 1/(m/s)");
   TORCH_CHECK_VALUE(
@@ -147,10 +151,11 @@ Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tens
           error.size(0) == multiplier.size(0) && error.device() == multiplier.device(),
       "error must be float64 [", multiplier.size(0), "] beside multiplier, got ", describe(error));
   check_time_step(time_step);
-  const bool some = grad_positions || elastic || projector || stuck;
+  const bool some = grad_positions || elastic || projector || stuck || sliding;
   if (some) {
-    TORCH_CHECK_VALUE(grad_positions && elastic && projector && stuck,
-                      "grad_positions, elastic, projector and stuck come together or not at all");
+    TORCH_CHECK_VALUE(
+        grad_positions && elastic && projector && stuck && sliding,
+        "grad_positions, elastic, projector, stuck and sliding come together or not at all");
     check_state(*grad_positions, multiplier, "grad_positions", "of a loss, 1/m");
     check_state(*elastic, multiplier, "elastic", "Hessian product, N");
     check_projector(*projector, multiplier);
@@ -158,9 +163,16 @@ Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tens
         stuck->scalar_type() == at::kBool && stuck->sizes() == multiplier.sizes().slice(0, 2) &&
             stuck->device() == multiplier.device(),
         "stuck must be bool [batch, vertices] beside multiplier, got ", describe(*stuck));
+    const std::int64_t wanted[] = {multiplier.size(0), multiplier.size(1), slide_count, 3};
+    TORCH_CHECK_VALUE(
+        sliding->sizes() == at::IntArrayRef(wanted) && sliding->device() == multiplier.device(),
+        "sliding must be [batch, vertices, 4, 3] beside multiplier, got ", describe(*sliding));
+    TORCH_CHECK_TYPE(sliding->scalar_type() == multiplier.scalar_type(), "sliding must be ",
+                     at::toString(multiplier.scalar_type()), ", got ", describe(*sliding));
   }
-  const ResultTensors tensors{multiplier, error,   grad_velocities,
-                              masses,     damping, {grad_positions, elastic, projector, stuck}};
+  const ResultTensors tensors{
+      multiplier, error,   grad_velocities,
+      masses,     damping, {grad_positions, elastic, projector, stuck, sliding}};
   return multiplier.scalar_type() == at::kFloat
              ? adjoint_result_typed<Backend, float>(tensors, time_step)
              : adjoint_result_typed<Backend, double>(tensors, time_step);
@@ -230,6 +242,21 @@ Solved solve(const AdjointTensors& t, const AdjointSystem& s, double time_step) 
   // a recording cannot ask, and takes what stands in along
   const bool mends = Backend::recording(t.after) || any_failed(progress, tolerance);
   return {mends ? mend(t, s, time_step, solution, error) : solution, error};
+}
+
+// The multiplier where vertices slide against friction, from the solution without it: torchpd/sliding.py. `sliding`: what they
+// slide along, of a scene with contacts.
+template <class Backend>
+Tensor slide(const AdjointTensors& t, const AdjointSystem& s, const Tensor& sliding,
+             const Tensor& solution, const Tensor& error) {
+  static const auto op =
+      find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, const Tensor&, const Tensor&,
+                     const Tensor&, const Tensor&, const Tensor&, at::TensorList)>(
+          "torchpd::slide_adjoint");
+  // a recording cannot ask
+  if (!Backend::recording(t.after) && !sliding.ne(0.0).any().template item<bool>()) return solution;
+  return op.call(solution, error, t.after, s.inertia, s.inverse, *s.projector, sliding,
+                 t.material[place_in_material("stiffness")], t.plan);
 }
 
 // K l, by the dispatcher, whose profiler then sees it.
@@ -347,22 +374,24 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
                     wanted ? wanted->size() : 0, " numbers");
   // in the precision of the step, also where autocast asks for less
   const c10::impl::ExcludeDispatchKeyGuard plainly(c10::autocast_dispatch_keyset);
-  const auto [right, inertia, inverse, projector, stuck] =
+  const auto [right, inertia, inverse, projector, stuck, sliding] =
       adjoint_system<Backend>(grad_positions, grad_velocities, after, positions, velocities, forces,
                               material, plan, time_step);
   const bool touching = projector.size(0) > 0;
   const OptionalTensor free = touching ? OptionalTensor(projector) : OptionalTensor();
-  const auto [solution, error] = solve<Backend>(t, {right, inertia, inverse, free}, time_step);
+  const AdjointSystem system{right, inertia, inverse, free};
+  auto [solution, error] = solve<Backend>(t, system, time_step);
   Tensor elastic;
   PassedOn passed_on;
   if (touching) {
+    solution = slide<Backend>(t, system, sliding, solution, error);
     elastic = elastic_product(t, solution);
-    passed_on = {grad_positions, elastic, projector, stuck};
+    passed_on = {grad_positions, elastic, projector, stuck, sliding};
   }
   auto [x, v, multiplier] = adjoint_result<Backend>(
       solution, error, grad_velocities, material[place_in_material("masses")],
       material[place_in_material("damping")], passed_on.grad_positions, passed_on.elastic,
-      passed_on.projector, passed_on.stuck, time_step);
+      passed_on.projector, passed_on.stuck, passed_on.sliding, time_step);
   std::vector<Tensor> found{x, v, multiplier};
   const MaterialGradients gradients(t, multiplier, elastic, time_step);
   for (std::size_t i = 0; i < material.size(); ++i) {

@@ -107,7 +107,10 @@ TORCH_LIBRARY(torchpd, m) {
       "Tensor "
       "velocities, Tensor? forces, Tensor[] material, Tensor[] plan, *, float time_step, bool[]? "
       "wanted=None) -> Tensor[]");
-  // its kernel, for every device, comes from Python
+  // their kernels, for every device, come from Python
+  with_plan(
+      "slide_adjoint(Tensor solution, Tensor error, Tensor after, Tensor inertia, Tensor inverse, "
+      "Tensor projector, Tensor sliding, Tensor stiffness, Tensor[] plan) -> Tensor");
   with_plan(
       "mend_adjoint(Tensor solution, Tensor error, Tensor after, Tensor right, Tensor inverse, "
       "Tensor? projector, Tensor[] material, Tensor[] plan, *, float time_step) -> Tensor");
@@ -115,13 +118,12 @@ TORCH_LIBRARY(torchpd, m) {
       "adjoint_system(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
       "positions, Tensor "
       "velocities, Tensor? forces, Tensor[] material, Tensor[] plan, *, float time_step) -> "
-      "(Tensor, Tensor, "
-      "Tensor, Tensor, Tensor)");
+      "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
   m.def(
       "adjoint_result(Tensor multiplier, Tensor error, Tensor grad_velocities, Tensor masses, "
       "Tensor "
       "damping, Tensor? grad_positions=None, Tensor? elastic=None, Tensor? projector=None, Tensor? "
-      "stuck=None, *, float time_step) -> (Tensor, Tensor, Tensor)");
+      "stuck=None, Tensor? sliding=None, *, float time_step) -> (Tensor, Tensor, Tensor)");
   with_plan(
       "conjugate_gradients(Tensor positions, Tensor right, Tensor inertia, Tensor inverse, Tensor? "
       "projector, Tensor stiffness, Tensor[] plan, *, float tolerance) -> (Tensor, Tensor)");

@@ -45,13 +45,14 @@ def test_the_system_without_contacts(own: str, dtype: torch.dtype, device: torch
     material = material_of(sim, contacts=False)
     material = for_each(material, own) if own else material
     g, w, h = noise(x), noise(x, 1), sim.time_step
-    right, inertia, inverse, projector, stuck = ops.adjoint_system(
+    right, inertia, inverse, projector, stuck, sliding = ops.adjoint_system(
         g, w, x, x, v, None, material, plan_of(sim), time_step=h
     )
     rows = BATCH if own not in ("", "gravity") else 1
     assert inertia.shape == inverse.shape == (rows, sim.vertices)
     assert projector.shape == (0, sim.vertices, 3, 3)
     assert stuck.shape == (0, sim.vertices)
+    assert sliding.shape == (0, sim.vertices, 4, 3)
     wanted, diagonal = (t.expand(rows, -1) for t in step_diagonal(plan_of(sim), material, h))
     moves = wanted.isfinite()
     assert 0 < int((~moves).sum()) < rows * sim.vertices
@@ -93,8 +94,8 @@ def test_a_right_side_of_any_strides(dtype: torch.dtype, device: torch.device) -
 
 def held_by_contacts(
     material: dict[str, Tensor], after: Tensor, moved: Tensor, residual: Tensor, diagonal: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Projector, stuck and curvature of every vertex, one contact after another, from torch operations."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Projector, stuck, curvature and sliding of every vertex, one contact after another, from torch operations."""
     surfaces = []
     for plane in material["planes"].unbind(-2):
         normal = plane[..., None, :3].expand_as(after)
@@ -107,18 +108,30 @@ def held_by_contacts(
         surfaces.append((offset / length[..., None], gap, ball[..., None, 4], ball[..., None, 5:], 1 / length))
     projector = torch.eye(3, dtype=after.dtype, device=after.device).expand(*after.shape, 3)
     stuck, curvature = torch.zeros_like(diagonal, dtype=torch.bool), torch.zeros_like(diagonal)
+    sliding, contacts = after.new_zeros((*after.shape[:2], 4, 3)), torch.zeros_like(diagonal)
     for normal, gap, friction, motion, curved in surfaces:
         push = (residual * normal).sum(-1)
         holds = (push > 0) & (gap < push / diagonal)
         slip = moved - motion
-        slip = (slip - (slip * normal).sum(-1, keepdim=True) * normal).norm(dim=-1)
-        stuck = stuck | (holds & (friction > 0) & (slip * diagonal < 1e-3 * friction * push))
+        slip = slip - (slip * normal).sum(-1, keepdim=True) * normal
+        length = slip.norm(dim=-1)
+        sticks = (friction > 0) & (length * diagonal < 1e-3 * friction * push)
+        stuck = stuck | (holds & sticks)
+        contacts = contacts + holds
+        slides = (holds & (friction > 0) & ~sticks)[..., None]
+        way = torch.where(slides, slip / length[..., None], 0.0)
+        across = torch.linalg.cross(normal, way)
+        rate, bend = (friction * push / length)[..., None].sqrt(), (push * curved)[..., None].sqrt()
+        mine = torch.where(slides, friction[..., None] * way, 0.0), torch.where(slides, normal, 0.0)
+        turns = torch.where(slides, rate * across, 0.0), torch.where(slides, friction[..., None] * bend * way, 0.0)
+        sliding = torch.where(holds[..., None, None], torch.stack([*mine, *turns], -2), sliding)
         left = (projector * normal.unsqueeze(-2)).sum(-1)
         size = (left * left).sum(-1)
         share = torch.where(holds & (size > 1e-6), 1 / size, 0.0)[..., None, None]
         projector = projector - share * left.unsqueeze(-1) * left.unsqueeze(-2)
         curvature = curvature + torch.where(holds, push * curved, 0.0)
-    return projector, stuck, curvature
+    sliding = torch.where((stuck | (contacts > 1))[..., None, None], 0.0, sliding)
+    return projector, stuck, curvature, sliding
 
 
 @pytest.mark.parametrize("forces", [False, True])
@@ -137,14 +150,14 @@ def test_the_system_with_contacts(own: str, forces: bool, dtype: torch.dtype, de
     material = for_each(material, own) if own else material
     g, w, h = noise(x), noise(x, 1), sim.time_step
     given = (g, w, after, x, v, f, material)
-    right, inertia, inverse, projector, stuck = ops.adjoint_system(*given, plan_of(sim), time_step=h)
+    right, inertia, inverse, projector, stuck, sliding = ops.adjoint_system(*given, plan_of(sim), time_step=h)
 
     known = named_material(material)
     wanted, diagonal = (t.expand(BATCH, -1) for t in step_diagonal(plan_of(sim), material, h))
     moves = wanted.isfinite()
     diagonal = torch.where(moves, diagonal, 1.0)
     residual = pd.adjoint.step_gradient(pd.adjoint.AdjointCall(x, v, f, after, material, plan_of(sim), h))
-    held, sticks, curvature = held_by_contacts(known, after, after - x, residual, diagonal)
+    held, sticks, curvature, slides = held_by_contacts(known, after, after - x, residual, diagonal)
     assert torch.equal(stuck, sticks)
     assert 0 < int(stuck.sum()) < stuck.numel()
     assert int((curvature > 0).sum()) > 0
@@ -152,6 +165,9 @@ def test_the_system_with_contacts(own: str, forces: bool, dtype: torch.dtype, de
     assert 0 < int(touched.sum()) < int(moves.sum())
     limit = 1e3 * ULP[dtype]
     assert torch.allclose(projector, held, rtol=0.0, atol=limit)
+    assert 0 < int((sliding != 0.0).any(-1).any(-1).sum()) < int(touched.sum())
+    largest = slides.abs().amax((0, 1, 3))[:, None]
+    assert torch.allclose(sliding / largest, slides / largest, rtol=limit, atol=limit)
     kept = torch.where(moves, wanted, 0.0) - curvature
     assert torch.allclose(inertia, kept, rtol=limit, atol=limit * float(diagonal.max()))
     assert torch.allclose(inverse, torch.where(moves & ~sticks, 1.0 / diagonal, 0.0), rtol=limit, atol=0.0)
@@ -178,22 +194,31 @@ def test_the_result(own: bool, dtype: torch.dtype, device: torch.device) -> None
 
 
 def test_the_result_with_contacts(dtype: torch.dtype, device: torch.device) -> None:
-    """A vertex that friction holds moves with its start, by what contacts let through of dL/dx' + dL/dv' / h - K l."""
+    """A vertex that friction holds moves with its start, by what contacts let through of dL/dx' + dL/dv' / h - K l.
+
+    One that slides has the turning of its slip, across it.
+    """
     sim, (x, _) = small(dtype, device)
     h = sim.time_step
     multiplier, w, g, elastic = (noise(x, seed) for seed in range(4))
     projector = noise(torch.empty(*x.shape, 3, dtype=dtype, device=device), 4)
     stuck = noise(x, 5)[..., 0] > 0.5
+    sliding = noise(torch.empty(*x.shape[:2], 4, 3, dtype=dtype, device=device), 6)
+    sliding[stuck] = 0.0
+    sliding[:, 1::2] = 0.0
     errors = torch.tensor([0.0, torch.nan, 1.0], dtype=torch.float64, device=device)
     given = (multiplier, errors, w, sim.masses, sim.damping)
-    found = ops.adjoint_result(*given, g, elastic, projector, stuck, time_step=h)
+    found = ops.adjoint_result(*given, g, elastic, projector, stuck, sliding, time_step=h)
     without = ops.adjoint_result(*given, time_step=h)
     assert all(torch.equal(one[::2], other[::2]) for one, other in zip(found[1:], without[1:], strict=True))
     assert all(t[1].isnan().all() for t in found)
     passed = (projector * (g + w / h - elastic).unsqueeze(-2)).sum(-1)
     wanted = without[0] + torch.where(stuck[..., None], passed, 0.0)
+    across = sliding[..., 2, :]
+    wanted = wanted + across * (across * multiplier).sum(-1, keepdim=True)
     assert torch.allclose(found[0][::2], wanted[::2], rtol=10 * ULP[dtype], atol=1e4 * ULP[dtype])
-    assert torch.equal(found[0][~stuck].nan_to_num(7.0), without[0][~stuck].nan_to_num(7.0))
+    plain = ~stuck & (across == 0.0).all(-1)
+    assert torch.equal(found[0][plain].nan_to_num(7.0), without[0][plain].nan_to_num(7.0))
     assert 0 < int(stuck.sum()) < stuck.numel()
 
 
@@ -212,6 +237,9 @@ def test_the_result_with_contacts(dtype: torch.dtype, device: torch.device) -> N
         ({"projector": torch.zeros(BATCH, 2, 3, 3)}, "projector must be"),
         ({"stuck": torch.zeros(BATCH, 2, dtype=torch.bool)}, "stuck must be bool"),
         ({"stuck": torch.zeros(BATCH, 2)}, "stuck must be bool"),
+        ({"sliding": None}, "come together or not at all"),
+        ({"sliding": torch.zeros(BATCH, 2, 4, 3)}, "sliding must be"),
+        ({"sliding": torch.zeros(BATCH, 12, 4, 3, dtype=torch.float64)}, "sliding must be"),
     ],
 )
 def test_the_result_refuses(change: dict[str, Any], said: str) -> None:
@@ -219,7 +247,8 @@ def test_the_result_refuses(change: dict[str, Any], said: str) -> None:
     given = {
         "multiplier": x, "error": torch.zeros(BATCH, dtype=torch.float64), "grad_velocities": x, "masses": sim.masses,
         "damping": sim.damping, "grad_positions": x, "elastic": x, "projector": torch.zeros(*x.shape, 3),
-        "stuck": torch.zeros(x.shape[:2], dtype=torch.bool), "time_step": sim.time_step,
+        "stuck": torch.zeros(x.shape[:2], dtype=torch.bool), "sliding": torch.zeros(*x.shape[:2], 4, 3),
+        "time_step": sim.time_step,
     }  # fmt: skip
     ops.adjoint_result(**given)
     with pytest.raises((TypeError, ValueError), match=said):

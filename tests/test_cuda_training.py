@@ -142,3 +142,21 @@ def test_a_solve_is_one_kernel_behind_its_weights(kernel: str, precision: str) -
         lambda f: inverse[..., None] * f, right, 1e-5,
     )  # fmt: skip
     assert relative(vectors[0], wanted) < 1e-3
+
+
+def test_a_recording_knows_sliding_friction(precision: str) -> None:
+    """It asks nobody whether anything slides, nor for how many iterations."""
+    mesh = pd.shapes.box((0.4, 0.2, 0.2), (4, 2, 2))
+    block = pd.Solid(mesh, youngs=2e4, density=1000.0)
+    scene = pd.Scene(block, pd.Gravity(), pd.Ground(float(mesh.vertices[:, 1].min()), friction=0.3))
+    sim = pd.Simulator(scene, 1 / 60, 1000, dtype=DTYPES[precision]).to(GPU)
+    state = sim.rest_state(3)
+    state.velocities[..., 0] = torch.tensor([1.0, 0.5, 0.0], device=GPU)[:, None]
+    training = Training(sim, state)
+    graph, results = training.record()
+    graph.replay()
+    wanted = training.run()
+    limit = 1e-3 if precision == "float32" else 1e-6
+    assert all(relative(one, other) < limit for one, other in zip(results, wanted, strict=True))
+    plain = pd.Simulator(pd.Scene(block, pd.Gravity(), pd.Ground(scene.grounds[0].height)), 1 / 60, 1000)
+    assert relative(results[1], Training(plain.to(DTYPES[precision]).to(GPU), state).run()[1]) > 0.1

@@ -74,6 +74,7 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
     progress, errors = torch.full((BATCH, 4), -1.0, **double), torch.tensor([0.0, 2.0, 1.0], **double)
     inertia = sim.masses / sim.time_step**2
     projector = torch.eye(3, dtype=x.dtype, device=x.device).repeat(*x.shape[:2], 1, 1)
+    sliding = noise(projector.new_empty(*x.shape[:2], 4, 3), 3)
     return {
         "conjugate_gradients_": (
             (0 * x, f.clone(), f.clone(), progress, x, sim.masses, 1 / sim.masses, None, stiffness, plan),
@@ -82,7 +83,10 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
         "conjugate_gradients": ((x, f, sim.masses, 1 / sim.masses, None, stiffness, plan), {"tolerance": 1e-3}),
         "adjoint_system": ((f, direction, x, still, zero, 0.01 * f, material, plan), h),
         "adjoint_result": (
-            (f, errors, direction, sim.masses, sim.damping, f, direction, projector, x[..., 0] > 0.1), h,
+            (f, errors, direction, sim.masses, sim.damping, f, direction, projector, x[..., 0] > 0.1, sliding), h,
+        ),
+        "slide_adjoint": (
+            (direction, 0 * errors, still, inertia, 1 / inertia, projector, 0.1 * sliding, stiffness, plan), {},
         ),
         "mend_adjoint": ((direction, errors, still, f, 1 / inertia, None, material, plan), h),
     }  # fmt: skip
@@ -91,7 +95,7 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
     "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "conjugate_gradients_",
-    "adjoint_system", "adjoint_result", "mend_adjoint", "conjugate_gradients",
+    "adjoint_system", "adjoint_result", "mend_adjoint", "slide_adjoint", "conjugate_gradients",
 )  # fmt: skip
 
 

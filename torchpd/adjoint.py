@@ -11,7 +11,7 @@ the error of the step: iterate far enough, and look at the residual.
 A GPU solves every environment in one launch, whatever it takes, so a CUDA graph can record it.
 
 Contacts: the normal direction of a vertex that a contact holds is taken out of the system; a vertex that friction holds
-moves with its start. A sliding vertex counts as frictionless: its friction force is taken as constant.
+moves with its start. What a vertex that slides against friction adds stands in `torchpd.sliding`.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from . import _C
 from .diagonal import named_material, pinned_vertices, step_diagonal
 from .warn import warn_user
 
-__all__ = ["AdjointCall", "mend_adjoint", "step_gradient"]
+__all__ = ["ADJOINT_TOLERANCE", "AdjointCall", "is_recording", "mend_adjoint", "step_gradient"]
 
 # see csrc/solver/adjoint.h
-_TOLERANCE = dict(zip((torch.float32, torch.float64), _C.adjoint_tolerance, strict=True))
+ADJOINT_TOLERANCE = dict(zip((torch.float32, torch.float64), _C.adjoint_tolerance, strict=True))
 # A body stretched this much turns so little that its Hessian is the constant, positive majoriser but for 1e-4.
 _STRETCH = 1e4
 
@@ -47,7 +47,7 @@ class AdjointCall:
     time_step: float
 
 
-def _recording(tensor: Tensor) -> bool:
+def is_recording(tensor: Tensor) -> bool:
     """Whether what is done with a tensor is recorded for a CUDA graph, where nobody can ask what comes out."""
     if not tensor.is_cuda:
         return False
@@ -117,9 +117,9 @@ def mend_adjoint(
         plan: of its scene.
         time_step: h [s].
     """
-    arrays, tolerance = list(plan), _TOLERANCE[right.dtype]
+    arrays, tolerance = list(plan), ADJOINT_TOLERANCE[right.dtype]
     failed = error > _C.adjoint_failed * tolerance
-    if not _recording(right) and bool(failed.any()):
+    if not is_recording(right) and bool(failed.any()):
         _warn_of(failed, error)
     # the curvature of what is slid on has no part in the majoriser
     inertia, _ = step_diagonal(arrays, material, time_step)

@@ -161,7 +161,7 @@ class Ground(_Part):
     Args:
         height: of the plane along its normal [m].
         normal: towards the free side; normalised here.
-        friction: Coulomb's coefficient, >= 0. Gradients take that of a vertex that slides as it is, see `Simulator`.
+        friction: Coulomb's coefficient, >= 0.
     """
 
     height: float

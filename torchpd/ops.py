@@ -12,6 +12,7 @@ from torch.utils._pytree import tree_leaves
 
 from .adjoint import mend_adjoint
 from .batching import step_vjp_rule
+from .sliding import slide_adjoint
 from .tables import MATERIAL_TABLE
 from .vmap_rules import register_rule
 
@@ -124,7 +125,7 @@ def _(field: Tensor, plan: Sequence[Tensor]) -> Tensor:
 
 
 @_register_fake("adjoint_system")
-def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     _, _, _, positions, _, _, material, _ = step
     batch, vertices, _ = positions.shape
     rows = list(zip(MATERIAL_TABLE, material, strict=True))
@@ -141,12 +142,18 @@ def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
     held = batch if touching else 0
     projector = positions.new_empty((held, vertices, 3, 3))
     stuck = positions.new_empty((held, vertices), dtype=torch.bool)
-    return positions.new_empty(positions.shape), inertia, inverse, projector, stuck
+    sliding = positions.new_empty((held, vertices, 4, 3))
+    return positions.new_empty(positions.shape), inertia, inverse, projector, stuck, sliding
 
 
 @_register_fake("conjugate_gradients")
 def _(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
     return positions.new_empty(positions.shape), positions.new_empty(positions.shape[:1], dtype=torch.float64)
+
+
+@_register_fake("slide_adjoint")
+def _(solution: Tensor, *_: Any) -> Tensor:
+    return solution.new_empty(solution.shape)
 
 
 @_register_fake("mend_adjoint")
@@ -183,7 +190,12 @@ def _(matrices: Tensor, direction: Tensor) -> Tensor:
     return matrices.new_empty(matrices.shape)
 
 
-# ---- a kernel
+# ---- kernels
+
+
+@torch.library.impl("torchpd::slide_adjoint", ("cpu", "cuda"))
+def _(*args: Any) -> Tensor:
+    return slide_adjoint(*args)
 
 
 @torch.library.impl("torchpd::mend_adjoint", ("cpu", "cuda"))

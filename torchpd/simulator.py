@@ -102,11 +102,8 @@ class Simulator(Model):
 
         Returns:
             The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
-            error follows that of the step). On rough ground they are those of a vertex that sticks; one that slides, or
-            lands in this step, keeps its friction as it is, so that what changes the friction (masses, gravity, forces
-            along the normal) gets a gradient that lacks that, wrong by factors where sliding is what a loss sees. There
-            are none for planes and spheres themselves, nor for `start`. Forward mode and `torch.func.grad` are not
-            provided.
+            error follows that of the step), friction included, see `torchpd.sliding`; none for planes and spheres
+            themselves, nor for `start`. Forward mode and `torch.func.grad` are not provided.
         """
         self.check_state(state, forces=forces)
         material = self.material_at(targets, state[0].shape[0])

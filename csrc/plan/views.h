@@ -234,7 +234,13 @@ struct AdjointSystemCall {
   const T* elastic_gradient = nullptr;
   T* projector = nullptr;  // [batch, vertices, 3, 3]
   bool* stuck = nullptr;   // [batch, vertices]
+  T* sliding = nullptr;    // [batch, vertices, slide_count, 3]
 };
+
+// Vectors of a vertex that slides against the friction of one contact, else zero: friction times the direction of slip; the
+// normal; the direction across both, times the square root of what the turning of the slip adds to H there; and that of slip,
+// times the square root of what the curving of the surface takes off.
+enum Slide : int { slide_along, slide_normal, slide_across, slide_bend, slide_count };
 
 // What a solved adjoint says of the state before the step.
 template <class T>
@@ -252,6 +258,7 @@ struct AdjointResultCall {
   const T* elastic = nullptr;
   const T* projector = nullptr;  // [batch, vertices, 3, 3]
   const bool* stuck = nullptr;   // [batch, vertices]
+  const T* sliding = nullptr;    // [batch, vertices, slide_count, 3]
   T* out_positions = nullptr;
   T* out_velocities = nullptr;
   T* out_multiplier = nullptr;

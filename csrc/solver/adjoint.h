@@ -30,6 +30,8 @@ struct HeldVertex {
   Mat3<T> projector = {{{T(1), T(0), T(0)}, {T(0), T(1), T(0)}, {T(0), T(0), T(1)}}};
   bool stuck = false;  // friction holds it
   T curvature = T(0);  // of the surface that it slides on, times the push
+  int contacts = 0;    // that hold it
+  Vec3<T> slides[slide_count] = {};
 
   PD_HD void touch(const Vec3<T>& normal, T gap, T friction, const Vec3<T>& motion, T curved) {
     const T push = dot(residual, normal);
@@ -38,7 +40,16 @@ struct HeldVertex {
     slip = subtract_product(slip, dot(slip, normal), normal);
     // what friction can take back in one iteration is more than what has slipped
     const T slipped = square_root(dot(slip, slip));
-    stuck = stuck || (friction > T(0) && slipped * diagonal < T(sticking) * friction * push);
+    const bool sticks = friction > T(0) && slipped * diagonal < T(sticking) * friction * push;
+    stuck = stuck || sticks;
+    // of several that hold it friction is left out
+    const bool slides_here = ++contacts == 1 && friction > T(0) && !sticks;
+    const T rate = T(1) / (slides_here ? slipped : T(1));
+    const T along = slides_here ? friction * rate : T(0);
+    slides[slide_along] = along * slip;
+    slides[slide_normal] = (slides_here ? T(1) : T(0)) * normal;
+    slides[slide_across] = (square_root(along * push) * rate) * cross(normal, slip);
+    slides[slide_bend] = (along * square_root(push * curved)) * slip;
     // what earlier contacts leave of the normal, so that all together are a projector
     const Vec3<T> left = projector * normal;
     const T size = dot(left, left);
@@ -133,6 +144,13 @@ struct AdjointVertex {
         to[2] = held.projector.row[row].z;
       }
       call.stuck[at] = held.stuck;
+      for (int n = 0; n < slide_count; ++n) {
+        T* to = call.sliding + 3 * (slide_count * at + n);
+        const Vec3<T> slides = held.stuck ? Vec3<T>{T(0), T(0), T(0)} : held.slides[n];
+        to[0] = slides.x;
+        to[1] = slides.y;
+        to[2] = slides.z;
+      }
       kept = kept - held.curvature;
       if (held.stuck) inverse = T(0);
       right = held.projector * right;
@@ -150,7 +168,7 @@ struct AdjointVertex {
 };
 
 // -l . dr / d(x, v) of a vertex: dL/dx = m / h^2 (1 + damping h) l - dL/dv' / h, dL/dv = m / h l; one that friction holds moves
-// with its start. An environment whose solve could not begin has no number for an answer.
+// with its start, one that slides has l with what its friction adds (torchpd/sliding.py). An environment whose solve could not begin has no number for an answer.
 template <class T>
 struct AdjointAnswer {
   const AdjointResultCall<T>& call;
@@ -182,6 +200,12 @@ struct AdjointAnswer {
       const T* p = call.projector + 9 * at();
       const Mat3<T> free = {{{p[0], p[1], p[2]}, {p[3], p[4], p[5]}, {p[6], p[7], p[8]}}};
       sum = sum + free * (read(call.grad_positions) + before - read(call.elastic));
+    }
+    if (call.sliding) {
+      // the direction of slip turns with its start
+      const T* p = call.sliding + 3 * (slide_count * at() + slide_across);
+      const Vec3<T> across = {p[0], p[1], p[2]};
+      sum = multiply_add(dot(across, multiplier), across, sum);
     }
     write(call.out_positions, sum);
     write(call.out_velocities, (mass / h) * multiplier);

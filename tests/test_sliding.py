@@ -1,0 +1,178 @@
+"""Gradients of steps in which vertices slide against friction, beside finite differences."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchpd as pd
+from torchpd.sliding import conjugate_residuals
+
+pytestmark = pytest.mark.usefixtures("poisoned")
+
+MESH = pd.shapes.box((0.4, 0.2, 0.2), (4, 2, 2))
+GROUND = float(MESH.vertices[:, 1].min())
+MATERIAL = ("stiffness", "masses", "gravity", "damping")
+
+
+def noise(like: Tensor, seed: int) -> Tensor:
+    return torch.randn(like.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(like)
+
+
+def scene(surface: str) -> tuple[pd.Simulator, float]:
+    """A soft block on a surface, in float64 and solved to rounding; what is left out of a ball's friction, relative."""
+    block = pd.Solid(MESH, youngs=2e4, density=1000.0)
+    rough: dict[str, tuple[list[pd.scene.Part], float]] = {
+        "ground": ([pd.Ground(GROUND, friction=0.3)], 1e-5),
+        "slope": ([pd.Ground(-0.01, (0.3, 1.0, 0.1), friction=0.2)], 1e-5),
+        "ball": ([pd.Sphere((0.2, GROUND - 0.3, 0.1), 0.3, friction=0.3)], 1e-3),
+    }
+    parts, left_out = rough[surface]
+    sim = pd.Simulator(
+        pd.Scene(block, pd.Gravity(), pd.Damping(0.5), *parts), 1 / 60, 6000, dtype=torch.float64, tolerance=1e-14
+    )
+    return sim, left_out
+
+
+def motion(sim: pd.Simulator, across: float) -> tuple[pd.State, Tensor]:
+    """Two environments that slide by now, the second one faster, and forces that push them on."""
+    state = sim.rest_state(2)
+    push = torch.zeros_like(state.positions)
+    push[..., 0], push[..., 2] = 80.0 / sim.vertices, across * 80.0 / sim.vertices
+    push[1] *= 1.5
+    with torch.no_grad():
+        for _ in range(6):
+            state = sim(state, push)
+    return state, push
+
+
+def count_sliding(sim: pd.Simulator, state: pd.State, push: Tensor) -> int:
+    material = [array.detach() for array in sim.material()]
+    after = sim(state, push).positions.detach()
+    *_, sliding = torch.ops.torchpd.adjoint_system(
+        after, after, after, *state, push, material, list(sim.plan.arrays), time_step=sim.time_step
+    )
+    return int((sliding[..., 0, :] != 0.0).any(-1).sum())
+
+
+@pytest.mark.parametrize("across", [0.3, 0.0])
+@pytest.mark.parametrize("surface", ["ground", "slope", "ball"])
+def test_gradients_are_those_of_differences(surface: str, across: float) -> None:
+    """For all that is differentiable, at once in random directions."""
+    sim, left_out = scene(surface)
+    state, push = motion(sim, across)
+    assert count_sliding(sim, state, push) >= 4
+    weight = noise(state.positions, 3)
+    weight[..., 0] += 1.0
+    inputs: dict[str, Tensor] = {"positions": state.positions, "velocities": state.velocities, "forces": push}
+    inputs |= {name: getattr(sim, name) for name in MATERIAL}
+
+    def loss(values: dict[str, Tensor]) -> Tensor:
+        material = {name: values[name] for name in MATERIAL}
+        given = pd.State(values["positions"], values["velocities"]), values["forces"]
+        after = torch.func.functional_call(sim, material, given)
+        return (weight * after.positions).sum() + 0.01 * (weight * after.velocities).sum()
+
+    leaves = {name: value.detach().clone().requires_grad_() for name, value in inputs.items()}
+    gradients = dict(zip(leaves, torch.autograd.grad(loss(leaves), list(leaves.values())), strict=True))
+    for seed, (name, value) in enumerate(leaves.items()):
+        size = 1e-6 * float(value.detach().abs().max())
+        direction = size * noise(value, 10 + seed)
+        with torch.no_grad():
+            ends = [float(loss({**leaves, name: value + sign * direction})) for sign in (1.0, -1.0)]
+        expected = (ends[0] - ends[1]) / 2.0
+        assert float((gradients[name] * direction).sum()) == pytest.approx(expected, rel=max(left_out, 2e-5), abs=1e-13)
+
+
+def test_who_slides_feels_what_presses_him_down() -> None:
+    """A block pushed along the ground: weight slows it by mu h^2 for each m/s^2, and by none without friction."""
+    sim, _ = scene("ground")
+    sim.set_material(stiffness=1e6)
+    state, push = motion(sim, 0.0)
+    sim.gravity.requires_grad_()
+    loss = sim(state, push).positions[0, :, 0].mean()
+    (gradient,) = torch.autograd.grad(loss, sim.gravity)
+    h, slowed = sim.time_step, 0.3 / (1.0 + 0.5 * sim.time_step)
+    # of the block as a whole; it is not rigid, and takes more than a step to press all of its weight on the ground
+    assert float(gradient[1]) == pytest.approx(slowed * h**2, rel=0.05)
+
+
+def test_in_float32_and_in_a_batch_with_others(device: torch.device) -> None:
+    """One environment slides, one rests, one flies, one has no state: the others are what they are alone."""
+    sim, _ = scene("ground")
+    state, push = motion(sim, 0.3)
+    rest = sim.rest_state()
+    still = torch.zeros_like(rest.positions)
+    high = rest.positions + torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    positions = torch.cat([state.positions[:1], rest.positions, high, torch.full_like(high, torch.nan)])
+    velocities, forces = (
+        torch.cat([state.velocities[:1], still, still, still]),
+        torch.cat([push[:1], still, still, still]),
+    )
+    sim.tolerance = 0.0
+    sim.iterations = 2000
+    wanted = gradient_of(sim, positions, velocities, forces)
+    single = sim.to(torch.float32).to(device)
+    found = gradient_of(single, *(t.to(torch.float32).to(device) for t in (positions, velocities, forces)))
+    assert found[3].isnan().all()
+    assert float((found[:3].cpu() - wanted[:3]).norm() / wanted[:3].norm()) < 1e-3
+    alone = gradient_of(single, *(t[:1].to(torch.float32).to(device) for t in (positions, velocities, forces)))
+    torch.testing.assert_close(alone[0], found[0], rtol=1e-4, atol=1e-4 * float(alone.abs().max()))
+
+
+def gradient_of(sim: pd.Simulator, x: Tensor, v: Tensor, forces: Tensor) -> Tensor:
+    """Of the way along the ground, for forces."""
+    push = forces.clone().requires_grad_()
+    (found,) = torch.autograd.grad(sim(pd.State(x, v), push).positions[..., 0].sum(), push)
+    return found
+
+
+def test_multilevel_has_the_same_gradients() -> None:
+    sim, _ = scene("ground")
+    state, push = motion(sim, 0.3)
+    wanted = gradient_of(sim, *state, push)
+    sim.solver = pd.Multilevel()
+    found = gradient_of(sim, *state, push)
+    assert float((found - wanted).norm() / wanted.norm()) < 1e-6
+
+
+def test_residuals_fall_as_they_must() -> None:
+    """A matrix that is not symmetric, of every environment; one has the identity, one nothing to solve."""
+    generator = torch.Generator().manual_seed(0)
+    size = 12
+    matrices = torch.eye(size, dtype=torch.float64) + 0.3 * torch.randn(
+        (3, size, size), generator=generator, dtype=torch.float64
+    )
+    matrices[1] = torch.eye(size)
+    right = torch.randn((3, 4, 3), generator=generator, dtype=torch.float64)
+    right[2] = 0.0
+
+    def product(field: Tensor) -> Tensor:
+        return torch.linalg.vecdot(matrices, field.flatten(1)[:, None]).reshape(field.shape)
+
+    for asks in (True, False):
+        found, left = conjugate_residuals(product, right, 1e-10, asks=asks)
+        assert float(left.max()) < 1e-9
+        wanted = torch.linalg.solve(matrices, right.flatten(1)[..., None])[..., 0].reshape(right.shape)
+        torch.testing.assert_close(found, wanted, rtol=1e-7, atol=1e-9)
+
+
+def test_without_friction_nothing_is_asked() -> None:
+    """Nor where friction holds everything."""
+    for friction in (0.0, 5.0):
+        block = pd.Solid(MESH, youngs=2e4)
+        sim = pd.Simulator(pd.Scene(block, pd.Gravity(), pd.Ground(GROUND, friction=friction)), 1 / 60, 500)
+        x = sim.rest_state().positions.requires_grad_()
+        loss = sim(pd.State(x, torch.zeros_like(x))).positions.sum()
+        with (
+            torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile,
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")
+            torch.autograd.grad(loss, x)
+        names: list[Any] = [event.name for event in profile.events()]
+        assert "torchpd::slide_adjoint" not in names

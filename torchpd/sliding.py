@@ -1,0 +1,134 @@
+"""The adjoint of vertices that slide against friction.
+
+Of one contact with normal n, friction mu and slip s against the surface, a solved step has, with the gradient r of its
+objective at the vertex, P = 1 - n n^T and d = s / |s|,
+
+    P r + mu (n . r) d = 0        beside n . x' = const.
+
+The derivative by x' is G H P + kappa Q, G = P + mu d n^T, and Q = 1 - n n^T - d d^T, by which the slip turns, with
+kappa = mu (n . r) / |s|. So for a loss L the multiplier is l = G^T y, where P H G^T y + kappa Q y = P dL/dx', and
+dL/dp = -l . dr/dp for all that r depends on; the start of the slip has kappa Q y besides. On a ball the normal turns
+too: P H P less (n . r) / radius, as without friction, and less mu^2 (n . r) / radius along d; what the normal motion of
+a step, over the radius, changes of kappa is left out.
+
+That system is not symmetric. Its symmetric part without friction, P H P, is what `conjugate_gradients` solves, and
+preconditions it: what is left is near the identity, and generalised conjugate residuals (Eisenstat, Elman and Schultz
+1983) take a handful of iterations. Contacts that are several at one vertex count as frictionless.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from . import _C
+from .adjoint import ADJOINT_TOLERANCE, is_recording
+from .warn import warn_user
+
+__all__ = ["slide_adjoint"]
+
+_ITERATIONS = 40  # at most
+_RECORDED = 12  # while nobody can ask whether more are wanted
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Of every environment [B, 1, 1]."""
+    each: Tensor = torch.linalg.vecdot(a.flatten(1), b.flatten(1))
+    return each[:, None, None]
+
+
+def _along(direction: Tensor, field: Tensor) -> Tensor:
+    """Part of a field [B, V, 3], as numbers [B, V, 1]."""
+    return (direction * field).sum(-1, keepdim=True)
+
+
+def _ratio(a: Tensor, b: Tensor) -> Tensor:
+    """a / b, 0 where b is 0."""
+    return torch.where(b != 0.0, a / torch.where(b != 0.0, b, 1.0), 0.0)
+
+
+def conjugate_residuals(
+    product: Callable[[Tensor], Tensor], right: Tensor, tolerance: float, *, asks: bool
+) -> tuple[Tensor, Tensor]:
+    """Solve for each environment of [B, V, 3]; returns the solution and the relative residual [B].
+
+    Args:
+        product: with a matrix near the identity.
+        right: right side.
+        tolerance: of the residual, relative to the right side.
+        asks: whether to ask after every iteration if any environment goes on.
+    """
+    solution, residual = torch.zeros_like(right), right
+    scale = _dot(right, right).sqrt()
+    directions: list[tuple[Tensor, Tensor]] = []
+    for _ in range(_ITERATIONS if asks else _RECORDED):
+        if asks and bool((_dot(residual, residual).sqrt() <= tolerance * scale).all()):
+            break
+        direction, image = residual, product(residual)
+        for earlier, its_image in directions:
+            share = _ratio(_dot(image, its_image), _dot(its_image, its_image))
+            direction, image = direction - share * earlier, image - share * its_image
+        directions.append((direction, image))
+        step = _ratio(_dot(residual, image), _dot(image, image))
+        solution, residual = solution + step * direction, residual - step * image
+    return solution, _ratio(_dot(residual, residual).sqrt(), scale).flatten()
+
+
+def slide_adjoint(
+    solution: Tensor,
+    error: Tensor,
+    after: Tensor,
+    inertia: Tensor,
+    inverse: Tensor,
+    projector: Tensor,
+    sliding: Tensor,
+    stiffness: Tensor,
+    plan: Sequence[Tensor],
+) -> Tensor:
+    """The multiplier l [B, V, 3] of a step in which vertices slide, with a warning where it is not found.
+
+    Args:
+        solution: of the system without friction [B, V, 3].
+        error: its relative residual [B]; where the solve has failed friction is left out.
+        after: x' [B, V, 3].
+        inertia: [V] or [B, V] N/m.
+        inverse: 1 / D, 0 where a vertex does not move, of the same shape.
+        projector: of what contacts let through [B, V, 3, 3].
+        sliding: what vertices slide along [B, V, 4, 3], see csrc/plan/views.h.
+        stiffness: [E] or [B, E] Pa.
+        plan: of the scene.
+    """
+    ops, arrays, tolerance = torch.ops.torchpd, list(plan), ADJOINT_TOLERANCE[solution.dtype]
+    solved = (error <= _C.adjoint_failed * tolerance)[:, None, None]
+    along, normal, across, bend = torch.where(solved.unsqueeze(-1), sliding, 0.0).unbind(-2)
+    weight, moves = inertia.unsqueeze(-1), (inverse != 0.0).unsqueeze(-1)
+    x = torch.where(solved, after, 0.0)
+
+    def pressed(y: Tensor) -> Tensor:
+        """What G^T y has of a normal."""
+        return normal * _along(along, y)
+
+    def product(y: Tensor) -> Tensor:
+        lift = pressed(y)
+        force = weight * lift + ops.hessian_product(x, lift, stiffness, arrays)
+        force = force + across * _along(across, y) - bend * _along(bend, y)
+        force = torch.where(moves & solved, (projector * force.unsqueeze(-2)).sum(-1), 0.0)
+        back, _ = ops.conjugate_gradients(x, force, inertia, inverse, projector, stiffness, arrays, tolerance=tolerance)
+        return y + torch.where(solved, back, 0.0)
+
+    # in units that leave room for squares
+    start = torch.where(solved, solution, 0.0)
+    largest = start.abs().amax((1, 2), keepdim=True)
+    unit = torch.where(largest > 0.0, largest, 1.0)
+    asks = not is_recording(after)
+    y, left = conjugate_residuals(product, start / unit, 10.0 * tolerance, asks=asks)
+    if asks and bool((left > 1e-2).any()):
+        warn_user(
+            f"torchpd: the adjoint of a step in which vertices slide is not solved in {int((left > 1e-2).sum())} of "
+            f"{len(left)} environments (relative residual {float(left.max()):.1e}): friction jams there, or vertices "
+            "hardly slide. Their gradients are approximate."
+        )
+    y = unit * y
+    return torch.where(solved, y + pressed(y), solution)
