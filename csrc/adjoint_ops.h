@@ -73,7 +73,7 @@ AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
 
 // The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1, vertices], and of
 // a scene with contacts the projector off the normals that hold a vertex [batch, vertices, 3, 3], whether friction holds it
-// [batch, vertices], and what it slides along [batch, vertices, 4, 3], else of no environments.
+// [batch, vertices], and what it slides along [batch, vertices, 5, 3], else of no environments.
 template <class Backend>
 AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_velocities,
                               const Tensor& after, const Tensor& positions,
@@ -163,12 +163,7 @@ Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tens
         stuck->scalar_type() == at::kBool && stuck->sizes() == multiplier.sizes().slice(0, 2) &&
             stuck->device() == multiplier.device(),
         "stuck must be bool [batch, vertices] beside multiplier, got ", describe(*stuck));
-    const std::int64_t wanted[] = {multiplier.size(0), multiplier.size(1), slide_count, 3};
-    TORCH_CHECK_VALUE(
-        sliding->sizes() == at::IntArrayRef(wanted) && sliding->device() == multiplier.device(),
-        "sliding must be [batch, vertices, 4, 3] beside multiplier, got ", describe(*sliding));
-    TORCH_CHECK_TYPE(sliding->scalar_type() == multiplier.scalar_type(), "sliding must be ",
-                     at::toString(multiplier.scalar_type()), ", got ", describe(*sliding));
+    check_sliding(*sliding, multiplier);
   }
   const ResultTensors tensors{
       multiplier, error,   grad_velocities,
@@ -180,7 +175,7 @@ Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tens
 
 struct AdjointSystem {
   Tensor right, inertia, inverse;
-  OptionalTensor projector;  // with contacts
+  OptionalTensor projector, sliding;  // with contacts
 };
 
 // The solution, and the relative residual of every environment.
@@ -196,19 +191,20 @@ std::tuple<Tensor, Tensor> iterate(const Tensor& positions, const AdjointSystem&
   const Tensor progress =
       at::full({x.size(0), progress_count}, -1.0, x.options().dtype(at::kDouble));
   conjugate_gradients_inplace<Backend>(solution, residual, direction, progress, x, s.inertia,
-                                       s.inverse, s.projector, stiffness, plan, tolerance,
-                                       adjoint_iterations);
+                                       s.inverse, s.projector, stiffness, plan, s.sliding,
+                                       tolerance, adjoint_iterations);
   return {solution, progress};
 }
 
 template <class Backend>
 Solved conjugate_gradients(const Tensor& positions, const Tensor& right, const Tensor& inertia,
                            const Tensor& inverse, const OptionalTensor& projector,
-                           const Tensor& stiffness, at::TensorList plan, double tolerance) {
+                           const Tensor& stiffness, at::TensorList plan,
+                           const OptionalTensor& sliding, double tolerance) {
   check_positions(positions, "positions");
   check_state(right, positions, "right", "N");
-  const auto [solution, progress] =
-      iterate<Backend>(positions, {right, inertia, inverse, projector}, stiffness, plan, tolerance);
+  const auto [solution, progress] = iterate<Backend>(
+      positions, {right, inertia, inverse, projector, sliding}, stiffness, plan, tolerance);
   return {solution, progress.select(1, progress_error).contiguous()};
 }
 
@@ -223,40 +219,57 @@ inline Tensor mend(const AdjointTensors& t, const AdjointSystem& s, double time_
                  time_step);
 }
 
-// Whether the solve of any environment has. The copy waits for a GPU, and takes less than kernels that make one number of it.
-inline bool any_failed(const Tensor& progress, double tolerance) {
-  const Tensor here = progress.to(at::kCPU);
-  const auto numbers = here.accessor<double, 2>();
-  for (std::int64_t e = 0; e < numbers.size(0); ++e)
-    if (numbers[e][progress_error] > adjoint_failed * tolerance) return true;
-  return false;
-}
-
-template <class Backend>
-Solved solve(const AdjointTensors& t, const AdjointSystem& s, double time_step) {
-  const double tolerance =
-      t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
-  const auto [solution, progress] =
-      iterate<Backend>(t.after, s, t.material[place_in_material("stiffness")], t.plan, tolerance);
-  const Tensor error = progress.select(1, progress_error);
-  // a recording cannot ask, and takes what stands in along
-  const bool mends = Backend::recording(t.after) || any_failed(progress, tolerance);
-  return {mends ? mend(t, s, time_step, solution, error) : solution, error};
-}
-
-// The multiplier where vertices slide against friction, from the solution without it: torchpd/sliding.py. `sliding`: what they
-// slide along, of a scene with contacts.
-template <class Backend>
-Tensor slide(const AdjointTensors& t, const AdjointSystem& s, const Tensor& sliding,
-             const Tensor& solution, const Tensor& error) {
+// The multiplier where vertices slide against friction, from the solution of what is symmetric: torchpd/sliding.py.
+inline Tensor slide(const AdjointTensors& t, const AdjointSystem& s, const Tensor& solution,
+                    const Tensor& error) {
   static const auto op =
       find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, const Tensor&, const Tensor&,
                      const Tensor&, const Tensor&, const Tensor&, at::TensorList)>(
           "torchpd::slide_adjoint");
-  // a recording cannot ask
-  if (!Backend::recording(t.after) && !sliding.ne(0.0).any().template item<bool>()) return solution;
-  return op.call(solution, error, t.after, s.inertia, s.inverse, *s.projector, sliding,
+  return op.call(solution, error, t.after, s.inertia, s.inverse, *s.projector, *s.sliding,
                  t.material[place_in_material("stiffness")], t.plan);
+}
+
+// What a solve leaves to be done: whether that of any environment has failed, and whether anything slides.
+struct Left {
+  bool failed = true, slides = true;
+};
+
+// One copy, which waits for a GPU, and takes less than kernels that make one number of it.
+inline Left look(const Tensor& progress, const OptionalTensor& sliding, double tolerance) {
+  Tensor numbers = progress.flatten();
+  if (sliding) numbers = at::cat({numbers, sliding->ne(0.0).any().to(at::kDouble).view({1})});
+  const Tensor here = numbers.to(at::kCPU);
+  const double* const number = here.const_data_ptr<double>();
+  Left left{false, sliding && number[progress.numel()] != 0};
+  for (std::int64_t at = progress_error; at < progress.numel(); at += progress_count)
+    left.failed = left.failed || number[at] > adjoint_failed * tolerance;
+  return left;
+}
+
+// The multiplier, its relative residual of every environment, and what slides where friction has a part in it: where a solve
+// has failed it has none.
+template <class Backend>
+std::tuple<Tensor, Tensor, OptionalTensor> solve(const AdjointTensors& t, const AdjointSystem& s,
+                                                 double time_step) {
+  const double tolerance =
+      t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
+  auto [solution, progress] =
+      iterate<Backend>(t.after, s, t.material[place_in_material("stiffness")], t.plan, tolerance);
+  const Tensor error = progress.select(1, progress_error);
+  // a recording cannot ask, and does all of it
+  const Left left = Backend::recording(t.after) ? Left{} : look(progress, s.sliding, tolerance);
+  OptionalTensor sliding = s.sliding;
+  if (left.failed) {
+    solution = mend(t, s, time_step, solution, error);
+    const Tensor solved = error.le(adjoint_failed * tolerance).view({-1, 1, 1, 1});
+    if (sliding) sliding = at::where(solved, *sliding, 0.0);
+  }
+  if (left.slides && sliding) {
+    const AdjointSystem known{s.right, s.inertia, s.inverse, s.projector, sliding};
+    solution = slide(t, known, solution, error);
+  }
+  return {solution, error, sliding};
 }
 
 // K l, by the dispatcher, whose profiler then sees it.
@@ -379,14 +392,14 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
                               material, plan, time_step);
   const bool touching = projector.size(0) > 0;
   const OptionalTensor free = touching ? OptionalTensor(projector) : OptionalTensor();
-  const AdjointSystem system{right, inertia, inverse, free};
-  auto [solution, error] = solve<Backend>(t, system, time_step);
+  const OptionalTensor slips = touching ? OptionalTensor(sliding) : OptionalTensor();
+  const auto [solution, error, slid] =
+      solve<Backend>(t, {right, inertia, inverse, free, slips}, time_step);
   Tensor elastic;
   PassedOn passed_on;
   if (touching) {
-    solution = slide<Backend>(t, system, sliding, solution, error);
     elastic = elastic_product(t, solution);
-    passed_on = {grad_positions, elastic, projector, stuck, sliding};
+    passed_on = {grad_positions, elastic, projector, stuck, slid};
   }
   auto [x, v, multiplier] = adjoint_result<Backend>(
       solution, error, grad_velocities, material[place_in_material("masses")],

@@ -404,6 +404,15 @@ inline void check_projector(const Tensor& t, const Tensor& like) {
                     describe(t));
 }
 
+inline void check_sliding(const Tensor& t, const Tensor& like) {
+  TORCH_CHECK_TYPE(t.scalar_type() == like.scalar_type(), "sliding must be ",
+                   at::toString(like.scalar_type()), " like the vectors, got ", describe(t));
+  TORCH_CHECK_VALUE(t.sizes() == at::IntArrayRef({like.size(0), like.size(1), slide_count, 3}) &&
+                        t.device() == like.device(),
+                    "sliding must be [batch, vertices, ", int(slide_count),
+                    ", 3] beside the vectors, got ", describe(t));
+}
+
 inline void check_time_step(double time_step) {
   TORCH_CHECK_VALUE(time_step > 0 && std::isfinite(time_step),
                     "time_step must be positive and finite [s], got ", time_step);

@@ -126,12 +126,13 @@ TORCH_LIBRARY(torchpd, m) {
       "stuck=None, Tensor? sliding=None, *, float time_step) -> (Tensor, Tensor, Tensor)");
   with_plan(
       "conjugate_gradients(Tensor positions, Tensor right, Tensor inertia, Tensor inverse, Tensor? "
-      "projector, Tensor stiffness, Tensor[] plan, *, float tolerance) -> (Tensor, Tensor)");
+      "projector, Tensor stiffness, Tensor[] plan, Tensor? sliding=None, *, float tolerance) -> "
+      "(Tensor, Tensor)");
   with_plan(
       "conjugate_gradients_(Tensor(a!) solution, Tensor(b!) residual, Tensor(c!) direction, "
       "Tensor(d!) "
       "progress, Tensor positions, Tensor inertia, Tensor inverse, Tensor? projector, Tensor "
-      "stiffness, Tensor[] plan, *, float tolerance, int iterations) -> ()");
+      "stiffness, Tensor[] plan, Tensor? sliding=None, *, float tolerance, int iterations) -> ()");
   m.def("nearest_rotation(Tensor matrices) -> Tensor");
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }

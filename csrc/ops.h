@@ -243,6 +243,7 @@ struct ConjugateTensors {
   OptionalTensor projector;
   Tensor stiffness;
   at::TensorList plan;
+  OptionalTensor sliding;
 };
 
 template <class Backend, class T>
@@ -256,6 +257,7 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
   const Tensor x = t.positions.contiguous(), w = t.stiffness.contiguous();
   const Tensor a = t.inertia.contiguous(), inverse = t.inverse.contiguous();
   const Tensor p = t.projector ? t.projector->contiguous() : Tensor();
+  const Tensor slides = t.sliding ? t.sliding->contiguous() : Tensor();
   const auto of_vertices = [&](const Tensor& values, const char* name, const char* meaning) {
     TORCH_CHECK_TYPE(values.scalar_type() == t.positions.scalar_type(), name, " must be ",
                      at::toString(t.positions.scalar_type()), " like positions (", meaning,
@@ -273,6 +275,7 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
   call.inverse = of_vertices(inverse, "inverse", "of the diagonal [m/N], 0 for what is held");
   call.positions = x.const_data_ptr<T>();
   call.projector = p.defined() ? p.const_data_ptr<T>() : nullptr;
+  call.sliding = slides.defined() ? slides.const_data_ptr<T>() : nullptr;
   call.solution = t.solution.mutable_data_ptr<T>();
   call.residual = t.residual.mutable_data_ptr<T>();
   call.direction = t.direction.mutable_data_ptr<T>();
@@ -287,7 +290,8 @@ void conjugate_gradients_inplace(const Tensor& solution, const Tensor& residual,
                                  const Tensor& direction, const Tensor& progress,
                                  const Tensor& positions, const Tensor& inertia,
                                  const Tensor& inverse, const OptionalTensor& projector,
-                                 const Tensor& stiffness, at::TensorList plan, double tolerance,
+                                 const Tensor& stiffness, at::TensorList plan,
+                                 const OptionalTensor& sliding, double tolerance,
                                  std::int64_t iterations) {
   check_positions(positions, "positions");
   const Place place{positions.device()};
@@ -302,11 +306,12 @@ void conjugate_gradients_inplace(const Tensor& solution, const Tensor& residual,
               "r . z, |right side|, 1 while it goes on or -1 at the start, relative residual",
               "make it for this batch");
   if (projector) check_projector(*projector, positions);
+  if (sliding) check_sliding(*sliding, positions);
   TORCH_CHECK_VALUE(tolerance >= 0, "tolerance must be >= 0, got ", tolerance);
   TORCH_CHECK_VALUE(iterations >= 0 && iterations <= std::numeric_limits<int>::max(),
                     "iterations must be in [0, 2^31), got ", iterations);
-  const ConjugateTensors tensors{solution, residual, direction, progress,  positions,
-                                 inertia,  inverse,  projector, stiffness, plan};
+  const ConjugateTensors tensors{solution, residual,  direction, progress, positions, inertia,
+                                 inverse,  projector, stiffness, plan,     sliding};
   if (positions.scalar_type() == at::kFloat) {
     conjugate_typed<Backend, float>(tensors, tolerance, iterations);
   } else {

@@ -52,7 +52,7 @@ def test_the_system_without_contacts(own: str, dtype: torch.dtype, device: torch
     assert inertia.shape == inverse.shape == (rows, sim.vertices)
     assert projector.shape == (0, sim.vertices, 3, 3)
     assert stuck.shape == (0, sim.vertices)
-    assert sliding.shape == (0, sim.vertices, 4, 3)
+    assert sliding.shape == (0, sim.vertices, 5, 3)
     wanted, diagonal = (t.expand(rows, -1) for t in step_diagonal(plan_of(sim), material, h))
     moves = wanted.isfinite()
     assert 0 < int((~moves).sum()) < rows * sim.vertices
@@ -108,7 +108,7 @@ def held_by_contacts(
         surfaces.append((offset / length[..., None], gap, ball[..., None, 4], ball[..., None, 5:], 1 / length))
     projector = torch.eye(3, dtype=after.dtype, device=after.device).expand(*after.shape, 3)
     stuck, curvature = torch.zeros_like(diagonal, dtype=torch.bool), torch.zeros_like(diagonal)
-    sliding, contacts = after.new_zeros((*after.shape[:2], 4, 3)), torch.zeros_like(diagonal)
+    sliding, contacts = after.new_zeros((*after.shape[:2], 5, 3)), torch.zeros_like(diagonal)
     for normal, gap, friction, motion, curved in surfaces:
         push = (residual * normal).sum(-1)
         holds = (push > 0) & (gap < push / diagonal)
@@ -122,9 +122,10 @@ def held_by_contacts(
         way = torch.where(slides, slip / length[..., None], 0.0)
         across = torch.linalg.cross(normal, way)
         rate, bend = (friction * push / length)[..., None].sqrt(), (push * curved)[..., None].sqrt()
-        mine = torch.where(slides, friction[..., None] * way, 0.0), torch.where(slides, normal, 0.0)
-        turns = torch.where(slides, rate * across, 0.0), torch.where(slides, friction[..., None] * bend * way, 0.0)
-        sliding = torch.where(holds[..., None, None], torch.stack([*mine, *turns], -2), sliding)
+        lean = curved[..., None] * ((moved - motion) * normal).sum(-1, keepdim=True)
+        rows = friction[..., None] * way, normal, rate * across, friction[..., None] * bend * way, lean * rate * across
+        mine = torch.stack([torch.where(slides, row, 0.0) for row in rows], -2)
+        sliding = torch.where(holds[..., None, None], mine, sliding)
         left = (projector * normal.unsqueeze(-2)).sum(-1)
         size = (left * left).sum(-1)
         share = torch.where(holds & (size > 1e-6), 1 / size, 0.0)[..., None, None]
@@ -170,7 +171,8 @@ def test_the_system_with_contacts(own: str, forces: bool, dtype: torch.dtype, de
     assert torch.allclose(sliding / largest, slides / largest, rtol=limit, atol=limit)
     kept = torch.where(moves, wanted, 0.0) - curvature
     assert torch.allclose(inertia, kept, rtol=limit, atol=limit * float(diagonal.max()))
-    assert torch.allclose(inverse, torch.where(moves & ~sticks, 1.0 / diagonal, 0.0), rtol=limit, atol=0.0)
+    turning = slides[..., 2, :].square().sum(-1)
+    assert torch.allclose(inverse, torch.where(moves & ~sticks, 1.0 / (diagonal + turning), 0.0), rtol=limit, atol=0.0)
     free = torch.where((moves & ~sticks)[..., None], g + w / h, 0.0)
     assert torch.allclose(right, (held * free.unsqueeze(-2)).sum(-1), rtol=0.0, atol=1e2 * limit)
 
@@ -203,7 +205,7 @@ def test_the_result_with_contacts(dtype: torch.dtype, device: torch.device) -> N
     multiplier, w, g, elastic = (noise(x, seed) for seed in range(4))
     projector = noise(torch.empty(*x.shape, 3, dtype=dtype, device=device), 4)
     stuck = noise(x, 5)[..., 0] > 0.5
-    sliding = noise(torch.empty(*x.shape[:2], 4, 3, dtype=dtype, device=device), 6)
+    sliding = noise(torch.empty(*x.shape[:2], 5, 3, dtype=dtype, device=device), 6)
     sliding[stuck] = 0.0
     sliding[:, 1::2] = 0.0
     errors = torch.tensor([0.0, torch.nan, 1.0], dtype=torch.float64, device=device)
@@ -238,7 +240,7 @@ def test_the_result_with_contacts(dtype: torch.dtype, device: torch.device) -> N
         ({"stuck": torch.zeros(BATCH, 2, dtype=torch.bool)}, "stuck must be bool"),
         ({"stuck": torch.zeros(BATCH, 2)}, "stuck must be bool"),
         ({"sliding": None}, "come together or not at all"),
-        ({"sliding": torch.zeros(BATCH, 2, 4, 3)}, "sliding must be"),
+        ({"sliding": torch.zeros(BATCH, 2, 5, 3)}, "sliding must be"),
         ({"sliding": torch.zeros(BATCH, 12, 4, 3, dtype=torch.float64)}, "sliding must be"),
     ],
 )
@@ -247,7 +249,7 @@ def test_the_result_refuses(change: dict[str, Any], said: str) -> None:
     given = {
         "multiplier": x, "error": torch.zeros(BATCH, dtype=torch.float64), "grad_velocities": x, "masses": sim.masses,
         "damping": sim.damping, "grad_positions": x, "elastic": x, "projector": torch.zeros(*x.shape, 3),
-        "stuck": torch.zeros(x.shape[:2], dtype=torch.bool), "sliding": torch.zeros(*x.shape[:2], 4, 3),
+        "stuck": torch.zeros(x.shape[:2], dtype=torch.bool), "sliding": torch.zeros(*x.shape[:2], 5, 3),
         "time_step": sim.time_step,
     }  # fmt: skip
     ops.adjoint_result(**given)

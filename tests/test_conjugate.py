@@ -303,6 +303,28 @@ def test_what_overflows_on_the_way_is_an_error(device: torch.device) -> None:
     assert float(error[0]) <= 1e-5
 
 
+@shapes("any", "levels", *MANY)
+def test_what_slides_is_harder_to_turn(shape: str, dtype: torch.dtype, device: torch.device) -> None:
+    """A direction of some vertices, whose square H has more."""
+    s, positions, right = system(dtype, device, contacts=True, **SHAPES[shape])
+    sliding = torch.zeros((*right.shape[:2], 5, 3), dtype=dtype, device=device)
+    sliding[:, ::3, 2] = 20.0 * s.off_normals(noise(right.shape, dtype, 7).to(device))[:, ::3]
+    across = sliding[:, :, 2]
+    tolerance = 1e-6 if dtype == torch.float32 else 1e-12
+    given = (positions, right, s.inertia, s.inverse, s.projector, s.stiffness, s.plan)
+    found, _ = ops.conjugate_gradients(*given, sliding, tolerance=tolerance)
+    plain, _ = ops.conjugate_gradients(*given, tolerance=tolerance)
+    without = s.product_at(positions)
+    wanted, *_ = conjugate_gradients(
+        lambda d: without(d) + s.allowed(across * (across * d).sum(-1, keepdim=True)),
+        s.preconditioner(),
+        right,
+        tolerance,
+    )
+    assert float((found - wanted).norm() / wanted.norm()) < 300 * tolerance
+    assert float((plain - wanted).norm() / wanted.norm()) > 1e-2
+
+
 @pytest.mark.parametrize(
     ("name", "change", "said"),
     [

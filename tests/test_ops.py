@@ -74,7 +74,7 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
     progress, errors = torch.full((BATCH, 4), -1.0, **double), torch.tensor([0.0, 2.0, 1.0], **double)
     inertia = sim.masses / sim.time_step**2
     projector = torch.eye(3, dtype=x.dtype, device=x.device).repeat(*x.shape[:2], 1, 1)
-    sliding = noise(projector.new_empty(*x.shape[:2], 4, 3), 3)
+    sliding = noise(projector.new_empty(*x.shape[:2], 5, 3), 3)
     return {
         "conjugate_gradients_": (
             (0 * x, f.clone(), f.clone(), progress, x, sim.masses, 1 / sim.masses, None, stiffness, plan),

@@ -21,6 +21,24 @@ class Exponential(torch.nn.Module):
         return value.log()
 
 
+class Overflowing(torch.nn.Module):
+    """Softplus, whose inverse is not for large numbers."""
+
+    def forward(self, value: Tensor) -> Tensor:
+        return torch.nn.functional.softplus(value.float()).double()
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        return value.float().expm1().log().double()
+
+
+class Clamped(torch.nn.Module):
+    def forward(self, value: Tensor) -> Tensor:
+        return value.clamp(min=1.0)
+
+    def right_inverse(self, value: Tensor) -> Tensor:
+        return value
+
+
 class OneWay(torch.nn.Module):
     def forward(self, value: Tensor) -> Tensor:
         return value.abs()
@@ -66,7 +84,10 @@ def test_set_material_goes_through_the_right_inverse(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("how", "batch", "said"),
-    [(Exponential(), 2, "keeps its shape, got"), (OneWay(), 0, "parametrization OneWay, which has no right_inverse")],
+    [
+        (Exponential(), 2, "keeps its shape, got"),
+        (OneWay(), 0, "parametrization OneWay, which has no right_inverse"),
+    ],
 )
 def test_what_a_parametrization_cannot_be_is_refused(how: torch.nn.Module, batch: int, said: str) -> None:
     """And the rest stays as it was, too."""
@@ -105,3 +126,33 @@ def test_a_first_iterate_that_asks_for_a_gradient_is_refused() -> None:
     with torch.no_grad():
         sim(state, start=start)
     sim(state, start=start.detach())
+
+
+def test_all_of_them_or_none() -> None:
+    """Where the second right_inverse does not give back what it was asked for."""
+    sim, _ = parametrized(Exponential())
+    with torch.no_grad():
+        parametrize.register_parametrization(sim, "masses", Overflowing())
+    before = [array.detach().clone() for array in sim.material()]
+    with pytest.raises(ValueError, match="parametrization Overflowing of masses makes other numbers"):
+        sim.set_material(stiffness=7e4, masses=torch.full_like(sim.masses, 1e3))
+    assert all(torch.equal(now, then) for now, then in zip(sim.material(), before, strict=True))
+
+
+def test_what_was_given_stays_the_callers() -> None:
+    sim, original = parametrized(Clamped())
+    address, given = original.data_ptr(), torch.full_like(sim.stiffness, 5e4)
+    sim.set_material(stiffness=given)
+    with torch.no_grad():
+        original += 1.0
+    assert original.data_ptr() == address  # which a CUDA graph may know
+    assert float(given.max()) == 5e4
+
+
+def test_a_parametrized_simulator_is_tuned_and_audited() -> None:
+    sim, _ = parametrized(Exponential())
+    state = sim.rest_state()
+    promise = sim.tune(state, error=1e-2)
+    assert sim.iterations == promise.iterations
+    after = sim(state)
+    assert bool(promise.audit(sim, state, after).all())

@@ -23,19 +23,21 @@ def noise(like: Tensor, seed: int) -> Tensor:
     return torch.randn(like.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(like)
 
 
-def scene(surface: str) -> tuple[pd.Simulator, float]:
-    """A soft block on a surface, in float64 and solved to rounding; what is left out of a ball's friction, relative."""
-    block = pd.Solid(MESH, youngs=2e4, density=1000.0)
-    rough: dict[str, tuple[list[pd.scene.Part], float]] = {
-        "ground": ([pd.Ground(GROUND, friction=0.3)], 1e-5),
-        "slope": ([pd.Ground(-0.01, (0.3, 1.0, 0.1), friction=0.2)], 1e-5),
-        "ball": ([pd.Sphere((0.2, GROUND - 0.3, 0.1), 0.3, friction=0.3)], 1e-3),
+def simulator(*parts: pd.scene.Part, mesh: pd.TetMesh = MESH, youngs: float = 2e4) -> pd.Simulator:
+    """A soft block, in float64 and solved to rounding."""
+    block = pd.Solid(mesh, youngs, density=1000.0)
+    scene = pd.Scene(block, pd.Gravity(), pd.Damping(0.5), *parts)
+    return pd.Simulator(scene, 1 / 60, 6000, dtype=torch.float64, tolerance=1e-14)
+
+
+def scene(surface: str) -> pd.Simulator:
+    rough: dict[str, list[pd.scene.Part]] = {
+        "ground": [pd.Ground(GROUND, friction=0.3)],
+        "slope": [pd.Ground(-0.01, (0.3, 1.0, 0.1), friction=0.2)],
+        "ball": [pd.Sphere((0.2, GROUND - 0.3, 0.1), 0.3, friction=0.3)],
+        "small balls": [pd.Sphere((x, GROUND - 0.05, 0.1), 0.05, friction=0.5) for x in (0.0, 0.2, 0.4)],
     }
-    parts, left_out = rough[surface]
-    sim = pd.Simulator(
-        pd.Scene(block, pd.Gravity(), pd.Damping(0.5), *parts), 1 / 60, 6000, dtype=torch.float64, tolerance=1e-14
-    )
-    return sim, left_out
+    return simulator(*rough[surface])
 
 
 def motion(sim: pd.Simulator, across: float) -> tuple[pd.State, Tensor]:
@@ -60,12 +62,16 @@ def count_sliding(sim: pd.Simulator, state: pd.State, push: Tensor) -> int:
 
 
 @pytest.mark.parametrize("across", [0.3, 0.0])
-@pytest.mark.parametrize("surface", ["ground", "slope", "ball"])
+@pytest.mark.parametrize("surface", ["ground", "slope", "ball", "small balls"])
 def test_gradients_are_those_of_differences(surface: str, across: float) -> None:
     """For all that is differentiable, at once in random directions."""
-    sim, left_out = scene(surface)
+    sim = scene(surface)
     state, push = motion(sim, across)
-    assert count_sliding(sim, state, push) >= 4
+    assert count_sliding(sim, state, push) >= 1
+    compare_with_differences(sim, state, push)
+
+
+def compare_with_differences(sim: pd.Simulator, state: pd.State, push: Tensor, **targets: Any) -> None:
     weight = noise(state.positions, 3)
     weight[..., 0] += 1.0
     inputs: dict[str, Tensor] = {"positions": state.positions, "velocities": state.velocities, "forces": push}
@@ -74,7 +80,7 @@ def test_gradients_are_those_of_differences(surface: str, across: float) -> None
     def loss(values: dict[str, Tensor]) -> Tensor:
         material = {name: values[name] for name in MATERIAL}
         given = pd.State(values["positions"], values["velocities"]), values["forces"]
-        after = torch.func.functional_call(sim, material, given)
+        after = torch.func.functional_call(sim, material, given, targets)
         return (weight * after.positions).sum() + 0.01 * (weight * after.velocities).sum()
 
     leaves = {name: value.detach().clone().requires_grad_() for name, value in inputs.items()}
@@ -85,12 +91,81 @@ def test_gradients_are_those_of_differences(surface: str, across: float) -> None
         with torch.no_grad():
             ends = [float(loss({**leaves, name: value + sign * direction})) for sign in (1.0, -1.0)]
         expected = (ends[0] - ends[1]) / 2.0
-        assert float((gradients[name] * direction).sum()) == pytest.approx(expected, rel=max(left_out, 2e-5), abs=1e-13)
+        assert float((gradients[name] * direction).sum()) == pytest.approx(expected, rel=2e-5, abs=1e-13), name
+
+
+def test_landing_on_a_ball_that_moves() -> None:
+    """Fast along the normal, so that it turns under the slip."""
+    ball = pd.Sphere((0.2, GROUND - 0.11, 0.1), 0.1, friction=0.4)
+    sim = simulator(ball)
+    state = sim.rest_state(2)
+    velocities = torch.tensor([[1.5, -1.0, 0.4], [1.0, -1.5, -0.4]], dtype=torch.float64)[:, None].expand_as(
+        state.positions
+    )
+    target = torch.tensor([0.21, GROUND - 0.105, 0.1, 0.3, 0.2, 0.0], dtype=torch.float64)
+    state = pd.State(state.positions, velocities.contiguous())
+    compare_with_differences(sim, state, torch.zeros_like(state.positions), targets={ball: target})
+
+
+def test_some_slide_some_stick_and_some_are_held() -> None:
+    """By hard pins and soft ones, of one block."""
+    block = pd.Solid(MESH, youngs=2e4, density=1000.0)
+    far, near = MESH.vertices[:, 0] > 0.35, MESH.vertices[:, 0] < 0.05
+    parts = [pd.Pin(block, far & (MESH.vertices[:, 1] > 0.05)), pd.Pin(block, near, stiffness=30.0)]
+    surfaces = [pd.Ground(GROUND, friction=0.3)]
+    sim = pd.Simulator(
+        pd.Scene(block, pd.Gravity(), *parts, *surfaces), 1 / 60, 6000, dtype=torch.float64, tolerance=1e-14
+    )
+    state = sim.rest_state(2)
+    state.velocities[..., 0] = 0.5 * (0.4 - state.positions[..., 0])
+    push = torch.zeros_like(state.positions)
+    push[..., 2] = 0.3
+    assert count_sliding(sim, state, push) > 4
+    compare_with_differences(sim, state, push)
+
+
+@pytest.mark.parametrize("pushed", [1.05, 1.3, 2.0])
+def test_slow_slip_takes_no_more_iterations(pushed: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The slower, the more a slip turns for a force across it: by up to a thousand times what elasticity holds."""
+    sim = simulator(pd.Ground(0.0, friction=0.4), mesh=pd.shapes.box((0.6, 0.15, 0.4), (12, 3, 8)))
+    state = sim.rest_state()
+    push = torch.zeros_like(state.positions)
+    push[..., 0], push[..., 2] = pushed * 0.4 * 9.81 * sim.masses, 0.3 * sim.masses
+    with torch.no_grad():
+        for _ in range(8):
+            state = sim(state, push)
+    products = []
+
+    def counted(product: Any, *given: Any, **options: Any) -> Any:
+        return conjugate_residuals(lambda y: products.append(1) or product(y), *given, **options)
+
+    monkeypatch.setattr("torchpd.sliding.conjugate_residuals", counted)
+    assert count_sliding(sim, state, push) > 100
+    gradient_of(sim, *state, push)
+    assert 0 < len(products) <= 10
+
+
+def test_where_a_solve_fails_friction_is_left_out() -> None:
+    """All of it: the start of a slip too, which else would be worth more the slower it is."""
+    sim = scene("ground")
+    sim.iterations, sim.tolerance = 1, 0.0
+    rest = sim.rest_state()
+    crumpled = rest.positions + 0.05 * noise(rest.positions, 1)
+    crumpled[..., 1] = crumpled[..., 1].abs() + GROUND
+    sizes = []
+    for speed in (0.3, 3e-3):
+        x = crumpled.clone().requires_grad_()
+        velocities = torch.zeros_like(x)
+        velocities[..., 0], velocities[..., 1] = speed, -1.0
+        with pytest.warns(UserWarning, match="adjoint of a step has no solution"):
+            (gradient,) = torch.autograd.grad(sim(pd.State(x, velocities)).positions[..., 0].sum(), x)
+        sizes.append(float(gradient.norm()))
+    assert max(sizes) < 3.0 * min(sizes)
 
 
 def test_who_slides_feels_what_presses_him_down() -> None:
     """A block pushed along the ground: weight slows it by mu h^2 for each m/s^2, and by none without friction."""
-    sim, _ = scene("ground")
+    sim = scene("ground")
     sim.set_material(stiffness=1e6)
     state, push = motion(sim, 0.0)
     sim.gravity.requires_grad_()
@@ -103,7 +178,7 @@ def test_who_slides_feels_what_presses_him_down() -> None:
 
 def test_in_float32_and_in_a_batch_with_others(device: torch.device) -> None:
     """One environment slides, one rests, one flies, one has no state: the others are what they are alone."""
-    sim, _ = scene("ground")
+    sim = scene("ground")
     state, push = motion(sim, 0.3)
     rest = sim.rest_state()
     still = torch.zeros_like(rest.positions)
@@ -120,8 +195,9 @@ def test_in_float32_and_in_a_batch_with_others(device: torch.device) -> None:
     found = gradient_of(single, *(t.to(torch.float32).to(device) for t in (positions, velocities, forces)))
     assert found[3].isnan().all()
     assert float((found[:3].cpu() - wanted[:3]).norm() / wanted[:3].norm()) < 1e-3
-    alone = gradient_of(single, *(t[:1].to(torch.float32).to(device) for t in (positions, velocities, forces)))
-    torch.testing.assert_close(alone[0], found[0], rtol=1e-4, atol=1e-4 * float(alone.abs().max()))
+    for e in range(3):
+        one = (t[e : e + 1].to(torch.float32).to(device) for t in (positions, velocities, forces))
+        assert torch.equal(gradient_of(single, *one)[0], found[e])
 
 
 def gradient_of(sim: pd.Simulator, x: Tensor, v: Tensor, forces: Tensor) -> Tensor:
@@ -132,7 +208,7 @@ def gradient_of(sim: pd.Simulator, x: Tensor, v: Tensor, forces: Tensor) -> Tens
 
 
 def test_multilevel_has_the_same_gradients() -> None:
-    sim, _ = scene("ground")
+    sim = scene("ground")
     state, push = motion(sim, 0.3)
     wanted = gradient_of(sim, *state, push)
     sim.solver = pd.Multilevel()
@@ -144,7 +220,7 @@ def test_residuals_fall_as_they_must() -> None:
     """A matrix that is not symmetric, of every environment; one has the identity, one nothing to solve."""
     generator = torch.Generator().manual_seed(0)
     size = 12
-    matrices = torch.eye(size, dtype=torch.float64) + 0.3 * torch.randn(
+    matrices = torch.eye(size, dtype=torch.float64) + 0.02 * torch.randn(
         (3, size, size), generator=generator, dtype=torch.float64
     )
     matrices[1] = torch.eye(size)

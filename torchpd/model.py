@@ -218,6 +218,12 @@ class Model(nn.Module):
         """The differentiable arrays in the order of the ops."""
         return [getattr(self, name) for name in MATERIAL_ROWS]
 
+    def __copy__(self) -> Self:
+        """Torch lets no parametrized module be copied as a pickle would."""
+        copied = type(self).__new__(type(self))
+        copied.__dict__.update(self.__dict__)
+        return copied
+
     def set_material(self, **arrays: Tensor | float) -> None:
         """Replace differentiable arrays, for all environments or with a leading batch for each; all of them, or none.
 
@@ -241,9 +247,7 @@ class Model(nn.Module):
                 )
         check_batches(checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
         with _ordinary():
-            parametrized = self._parametrized() & set(checked)
-            for name in parametrized:
-                self._check_parametrized(name, checked[name])
+            originals = {name: self._inverted(name, checked) for name in self._parametrized() & set(checked)}
             parameters = {
                 name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)
                 for name, tensor in checked.items()
@@ -253,10 +257,9 @@ class Model(nn.Module):
             plan = self._plan_with(checked)
             if self.promise is not None and any(not torch.equal(new, getattr(self, n)) for n, new in checked.items()):
                 self.promise.doubt(True)
-            # first what may refuse
-            for name, tensor in sorted(checked.items(), key=lambda item: item[0] not in parametrized):
-                if name in parametrized:
-                    self._parametrization(name).right_inverse(tensor)
+            for name, tensor in checked.items():
+                if name in originals:
+                    self._parametrization(name).original.copy_(originals[name])
                 elif name in parameters:
                     setattr(self, name, parameters[name])
                 else:
@@ -276,20 +279,35 @@ class Model(nn.Module):
         found: parametrize.ParametrizationList = self.parametrizations[name]  # type: ignore[index, assignment]
         return found
 
-    def _check_parametrized(self, name: str, tensor: Tensor) -> None:
-        """Refuse what a parametrization cannot be set to."""
-        shape = getattr(self, name).shape
-        without = [type(one).__name__ for one in self._parametrization(name) if not hasattr(one, "right_inverse")]
-        if without:
+    def _inverted(self, name: str, checked: dict[str, Tensor]) -> Tensor:
+        """What a parametrization makes a checked array of; the array becomes what it then makes."""
+        wanted, makes, shape = checked[name], self._parametrization(name), getattr(self, name).shape
+        steps: list[Any] = list(makes)
+        kind = " and ".join(type(one).__name__ for one in steps)
+        if wanted.shape != shape:
             raise ValueError(
-                f"set_material: {name} is made by the parametrization {without[0]}, which has no right_inverse to say "
-                f"of what: set sim.parametrizations.{name} itself, or take the parametrization away"
+                f"set_material: {name} is made by the parametrization {kind}, of {list(shape)}, and keeps its shape, "
+                f"got {list(wanted.shape)}: take the parametrization away first, and put it back for the other batch"
             )
-        if tensor.shape != shape:
+        if not makes.is_tensor or not all(hasattr(one, "right_inverse") for one in steps):
             raise ValueError(
-                f"set_material: {name} is made by a parametrization, of {list(shape)}, and keeps its shape, got "
-                f"{list(tensor.shape)}: take the parametrization away first, and put it back for the other batch"
+                f"set_material: {name} is made by the parametrization {kind}, which has no right_inverse to say of "
+                f"what one tensor: set sim.parametrizations.{name} itself, or take the parametrization away"
             )
+        original = wanted.clone()
+        for one in reversed(steps):
+            original = one.right_inverse(original)
+        made: Tensor = original
+        for one in steps:
+            made = one(made)
+        fits = original.shape == makes.original.shape and made.shape == shape
+        if not (fits and torch.allclose(made, wanted, rtol=1e-3, atol=0.0, equal_nan=True)):
+            raise ValueError(
+                f"set_material: the parametrization {kind} of {name} makes other numbers of what its right_inverse "
+                f"gives than these: set sim.parametrizations.{name} itself, or give it what it can make"
+            )
+        checked[name] = made
+        return original
 
     def _plan_with(self, arrays: dict[str, Tensor]) -> Plan:
         """The plan that serves the material with some arrays replaced."""

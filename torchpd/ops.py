@@ -142,7 +142,7 @@ def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
     held = batch if touching else 0
     projector = positions.new_empty((held, vertices, 3, 3))
     stuck = positions.new_empty((held, vertices), dtype=torch.bool)
-    sliding = positions.new_empty((held, vertices, 4, 3))
+    sliding = positions.new_empty((held, vertices, 5, 3))
     return positions.new_empty(positions.shape), inertia, inverse, projector, stuck, sliding
 
 

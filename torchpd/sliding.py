@@ -7,13 +7,13 @@ objective at the vertex, P = 1 - n n^T and d = s / |s|,
 
 The derivative by x' is G H P + kappa Q, G = P + mu d n^T, and Q = 1 - n n^T - d d^T, by which the slip turns, with
 kappa = mu (n . r) / |s|. So for a loss L the multiplier is l = G^T y, where P H G^T y + kappa Q y = P dL/dx', and
-dL/dp = -l . dr/dp for all that r depends on; the start of the slip has kappa Q y besides. On a ball the normal turns
-too: P H P less (n . r) / radius, as without friction, and less mu^2 (n . r) / radius along d; what the normal motion of
-a step, over the radius, changes of kappa is left out.
+dL/dp = -l . dr/dp for all that r depends on; the start of the slip has kappa Q y besides. On a ball of radius R, from
+the centre to the vertex, the normal turns too: P H P less (n . r) / R, as without friction, less mu^2 (n . r) / R along
+d, and kappa Q times 1 - m / R, m the motion along the normal.
 
-That system is not symmetric. Its symmetric part without friction, P H P, is what `conjugate_gradients` solves, and
-preconditions it: what is left is near the identity, and generalised conjugate residuals (Eisenstat, Elman and Schultz
-1983) take a handful of iterations. Contacts that are several at one vertex count as frictionless.
+That system is not symmetric. Most of it is, P H P + kappa Q, which `conjugate_gradients` solves: times its inverse the
+rest is near the identity, and generalised conjugate residuals (Eisenstat, Elman and Schultz 1983) take a few
+iterations, fewer the smaller mu is. A vertex that several contacts hold counts as frictionless.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from .warn import warn_user
 
 __all__ = ["slide_adjoint"]
 
-_ITERATIONS = 40  # at most
-_RECORDED = 12  # while nobody can ask whether more are wanted
+_ITERATIONS = 24  # at most
+_UNASKED = 10  # on a GPU, which would have to be waited for
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
@@ -54,19 +54,23 @@ def conjugate_residuals(
 ) -> tuple[Tensor, Tensor]:
     """Solve for each environment of [B, V, 3]; returns the solution and the relative residual [B].
 
+    One that is done keeps its bits while others go on.
+
     Args:
-        product: with a matrix near the identity.
+        product: with a matrix near the identity, zero of zero.
         right: right side.
         tolerance: of the residual, relative to the right side.
-        asks: whether to ask after every iteration if any environment goes on.
+        asks: whether to ask before every iteration if any environment goes on.
     """
     solution, residual = torch.zeros_like(right), right
     scale = _dot(right, right).sqrt()
     directions: list[tuple[Tensor, Tensor]] = []
-    for _ in range(_ITERATIONS if asks else _RECORDED):
-        if asks and bool((_dot(residual, residual).sqrt() <= tolerance * scale).all()):
+    for _ in range(_ITERATIONS if asks else _UNASKED):
+        active = _dot(residual, residual).sqrt() > tolerance * scale
+        if asks and not bool(active.any()):
             break
-        direction, image = residual, product(residual)
+        direction = torch.where(active, residual, 0.0)
+        image = product(direction)
         for earlier, its_image in directions:
             share = _ratio(_dot(image, its_image), _dot(its_image, its_image))
             direction, image = direction - share * earlier, image - share * its_image
@@ -90,45 +94,51 @@ def slide_adjoint(
     """The multiplier l [B, V, 3] of a step in which vertices slide, with a warning where it is not found.
 
     Args:
-        solution: of the system without friction [B, V, 3].
+        solution: of P H P + kappa Q [B, V, 3].
         error: its relative residual [B]; where the solve has failed friction is left out.
         after: x' [B, V, 3].
         inertia: [V] or [B, V] N/m.
         inverse: 1 / D, 0 where a vertex does not move, of the same shape.
         projector: of what contacts let through [B, V, 3, 3].
-        sliding: what vertices slide along [B, V, 4, 3], see csrc/plan/views.h.
+        sliding: what vertices slide along [B, V, 5, 3], see csrc/plan/views.h.
         stiffness: [E] or [B, E] Pa.
         plan: of the scene.
     """
     ops, arrays, tolerance = torch.ops.torchpd, list(plan), ADJOINT_TOLERANCE[solution.dtype]
-    solved = (error <= _C.adjoint_failed * tolerance)[:, None, None]
-    along, normal, across, bend = torch.where(solved.unsqueeze(-1), sliding, 0.0).unbind(-2)
-    weight, moves = inertia.unsqueeze(-1), (inverse != 0.0).unsqueeze(-1)
+    limit = _C.adjoint_failed * tolerance
+    solved = (error <= limit)[:, None, None]
+    known = torch.where(solved.unsqueeze(-1), sliding, 0.0)
+    along, normal, across, bend, lean = known.unbind(-2)
+    slides = (known != 0.0).flatten(1).any(1)[:, None, None]
+    moves = (inverse != 0.0).unsqueeze(-1) & slides
     x = torch.where(solved, after, 0.0)
+    worst = torch.zeros_like(error)
 
     def pressed(y: Tensor) -> Tensor:
         """What G^T y has of a normal."""
         return normal * _along(along, y)
 
     def product(y: Tensor) -> Tensor:
-        lift = pressed(y)
-        force = weight * lift + ops.hessian_product(x, lift, stiffness, arrays)
-        force = force + across * _along(across, y) - bend * _along(bend, y)
-        force = torch.where(moves & solved, (projector * force.unsqueeze(-2)).sum(-1), 0.0)
-        back, _ = ops.conjugate_gradients(x, force, inertia, inverse, projector, stiffness, arrays, tolerance=tolerance)
-        return y + torch.where(solved, back, 0.0)
+        force = ops.hessian_product(x, pressed(y), stiffness, arrays)
+        force = force - bend * _along(bend, y) - lean * _along(across, y)
+        force = torch.where(moves, (projector * force.unsqueeze(-2)).sum(-1), 0.0)
+        back, inner = ops.conjugate_gradients(
+            x, force, inertia, inverse, projector, stiffness, arrays, known, tolerance=tolerance
+        )
+        torch.maximum(worst, inner, out=worst)
+        return y + torch.where(slides, back, 0.0)
 
-    # in units that leave room for squares
-    start = torch.where(solved, solution, 0.0)
-    largest = start.abs().amax((1, 2), keepdim=True)
-    unit = torch.where(largest > 0.0, largest, 1.0)
-    asks = not is_recording(after)
-    y, left = conjugate_residuals(product, start / unit, 10.0 * tolerance, asks=asks)
-    if asks and bool((left > 1e-2).any()):
+    # in units that leave room for squares, of two so that nothing is rounded
+    start = torch.where(slides, solution, 0.0)
+    _, exponent = torch.frexp(start.abs().amax((1, 2), keepdim=True))
+    unit = torch.ldexp(torch.ones_like(start[:, :1, :1]), exponent)
+    y, left = conjugate_residuals(product, start / unit, 10.0 * tolerance, asks=not after.is_cuda)
+    failed = ~((left <= limit) & (worst <= limit))
+    if not is_recording(after) and bool(failed.any()):
         warn_user(
-            f"torchpd: the adjoint of a step in which vertices slide is not solved in {int((left > 1e-2).sum())} of "
-            f"{len(left)} environments (relative residual {float(left.max()):.1e}): friction jams there, or vertices "
-            "hardly slide. Their gradients are approximate."
+            f"torchpd: the adjoint of a step in which vertices slide is not solved in {int(failed.sum())} of "
+            f"{len(failed)} environments (relative residual {float(left.max()):.1e}): friction jams there. Their "
+            "gradients are approximate."
         )
     y = unit * y
-    return torch.where(solved, y + pressed(y), solution)
+    return torch.where(slides, y + pressed(y), solution)

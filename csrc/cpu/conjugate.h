@@ -160,7 +160,7 @@ class ConjugatePass {
     sweep_.template run<2>(0, product, [&](std::int64_t i, const Quad<T>& force, Sum& sums) {
       const Quad<T> d = direction()[i];
       const Vec3<T> moved = conjugate_image(to_vec3(force), to_vec3(d), w_.inertia[i],
-                                            w_.inverse[i] != T(0), projector(i));
+                                            w_.inverse[i] != T(0), projector(i), across(i));
       image()[i] = Lanes::value(moved);
       sums.first = multiply_add(d, image()[i], sums.first);
     });
@@ -203,6 +203,9 @@ class ConjugatePass {
     return cycle_ ? cycle_->result()[i] : w_.inverse[i] * residual()[i];
   }
 
+  const T* across(std::int64_t i) const {
+    return call_.sliding ? call_.sliding + slide_count * row(i) + 3 * slide_across : nullptr;
+  }
   // of what contacts let through; null where all is
   const T* projector(std::int64_t i) const {
     return call_.projector ? call_.projector + 3 * row(i) : nullptr;

@@ -76,9 +76,9 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     double curvature[1] = {0};
     each_slot([&](int s, int i, std::int64_t at) {
       const Vec3<T> direction = direction_of(s);
-      const Vec3<T> image =
-          conjugate_image(sum_entries(fields.entries, plan.slot_row[s]), direction, inertia[i],
-                          inverse[i] != T(0), call.projector ? call.projector + 3 * at : nullptr);
+      const Vec3<T> image = conjugate_image(
+          sum_entries(fields.entries, plan.slot_row[s]), direction, inertia[i], inverse[i] != T(0),
+          call.projector ? call.projector + 3 * at : nullptr, across_of(call, at));
       write3(work.image + at, image);
       curvature[0] += wide_dot(direction, image);
     });

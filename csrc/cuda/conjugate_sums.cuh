@@ -77,6 +77,12 @@ __device__ double square_of_right(const Vec3<T>& right, const Vec3<T>& position)
   return wide_dot(right, right) + double(lost.x + lost.y + lost.z);
 }
 
+// slide_across of a vertex, whose vectors stand at `at`
+template <class T>
+__device__ const T* across_of(const DeviceConjugate<T>& call, std::int64_t at) {
+  return call.sliding ? call.sliding + slide_count * at + 3 * slide_across : nullptr;
+}
+
 // the field whose product with the direction an iteration begins with
 template <class T>
 DeviceField<T> conjugate_field(const DeviceConjugate<T>& call) {

@@ -190,8 +190,8 @@ class ConjugateTeam {
     double sum[1] = {0};
     const auto look = [&](int i, const Vec3<T>& elastic, const Vec3<T>& d) {
       const T inertia = last_[i].w;
-      const Vec3<T> image =
-          conjugate_image(elastic, d, inertia, m_.residual[i].w != T(0), projector(i));
+      const Vec3<T> image = conjugate_image(elastic, d, inertia, m_.residual[i].w != T(0),
+                                            projector(i), across_of(call_, 3 * row(i)));
       m_.image[i] = quad(image);
       next_[i] = quad(d, inertia);
       sum[0] += wide_dot(d, image);

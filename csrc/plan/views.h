@@ -238,9 +238,10 @@ struct AdjointSystemCall {
 };
 
 // Vectors of a vertex that slides against the friction of one contact, else zero: friction times the direction of slip; the
-// normal; the direction across both, times the square root of what the turning of the slip adds to H there; and that of slip,
-// times the square root of what the curving of the surface takes off.
-enum Slide : int { slide_along, slide_normal, slide_across, slide_bend, slide_count };
+// normal; the direction across both, times the square root of what the turning of the slip adds to H there. Of a surface that
+// curves also the direction of slip, times the square root of what that takes off; and the third of them, times the motion
+// along the normal over the radius, by which the slip turns less.
+enum Slide : int { slide_along, slide_normal, slide_across, slide_bend, slide_lean, slide_count };
 
 // What a solved adjoint says of the state before the step.
 template <class T>
@@ -285,7 +286,9 @@ struct ConjugateCall {
   std::int64_t batch = 0;
   const T* positions = nullptr;  // [batch, vertices, 3]
   const T* projector =
-      nullptr;            // [batch, vertices, 3, 3] of what contacts let through; may be null
+      nullptr;  // [batch, vertices, 3, 3] of what contacts let through; may be null
+  const T* sliding =
+      nullptr;  // [batch, vertices, slide_count, 3], whose slide_across H has; may be null
   T* solution = nullptr;  // [batch, vertices, 3] each, from zero
   T* residual = nullptr;
   T* direction = nullptr;

@@ -40,16 +40,19 @@ struct HeldVertex {
     slip = subtract_product(slip, dot(slip, normal), normal);
     // what friction can take back in one iteration is more than what has slipped
     const T slipped = square_root(dot(slip, slip));
-    const bool sticks = friction > T(0) && slipped * diagonal < T(sticking) * friction * push;
+    const bool sticks = friction > T(0) && slipped * diagonal <= T(sticking) * friction * push;
     stuck = stuck || sticks;
     // of several that hold it friction is left out
     const bool slides_here = ++contacts == 1 && friction > T(0) && !sticks;
     const T rate = T(1) / (slides_here ? slipped : T(1));
     const T along = slides_here ? friction * rate : T(0);
+    const Vec3<T> none = {T(0), T(0), T(0)};
     slides[slide_along] = along * slip;
-    slides[slide_normal] = (slides_here ? T(1) : T(0)) * normal;
-    slides[slide_across] = (square_root(along * push) * rate) * cross(normal, slip);
-    slides[slide_bend] = (along * square_root(push * curved)) * slip;
+    slides[slide_normal] = slides_here ? normal : none;
+    slides[slide_across] =
+        slides_here ? (square_root(along * push) * rate) * cross(normal, slip) : none;
+    slides[slide_bend] = slides_here ? (along * square_root(push * curved)) * slip : none;
+    slides[slide_lean] = (curved * dot(moved - motion, normal)) * slides[slide_across];
     // what earlier contacts leave of the normal, so that all together are a projector
     const Vec3<T> left = projector * normal;
     const T size = dot(left, left);
@@ -152,6 +155,9 @@ struct AdjointVertex {
         to[2] = slides.z;
       }
       kept = kept - held.curvature;
+      // with the turning of the slip, which H has
+      const Vec3<T>& across = held.slides[slide_across];
+      if (moves) inverse = T(1) / (diagonal + dot(across, across));
       if (held.stuck) inverse = T(0);
       right = held.projector * right;
     }

@@ -83,12 +83,17 @@ PD_HD Vec3<T> project(const Vec3<T>& field, const T* p) {
   return Mat3<T>{{{p[0], p[1], p[2]}, {p[3], p[4], p[5]}, {p[6], p[7], p[8]}}} * field;
 }
 
-// P (a d + K d) of a vertex; `moves`: it has any part in P.
+// P (a d + K d) of a vertex; `moves`: it has any part in P. `across`: slide_across, by which H has its square more; or null.
 template <class T>
 PD_HD Vec3<T> conjugate_image(const Vec3<T>& elastic, const Vec3<T>& direction, T inertia,
-                              bool moves, const T* projector) {
+                              bool moves, const T* projector, const T* across) {
   if (!moves) return {T(0), T(0), T(0)};
-  return project(multiply_add(inertia, direction, elastic), projector);
+  Vec3<T> image = multiply_add(inertia, direction, elastic);
+  if (across) {
+    const Vec3<T> turning = {across[0], across[1], across[2]};
+    image = multiply_add(dot(turning, direction), turning, image);
+  }
+  return project(image, projector);
 }
 
 // z of a vertex with residual r: P M r, but r / D where it was held when M was made. `of_levels`: (M r) there.
