@@ -52,9 +52,9 @@ def motion(sim: pd.Simulator, across: float) -> tuple[pd.State, Tensor]:
     return state, push
 
 
-def count_sliding(sim: pd.Simulator, state: pd.State, push: Tensor) -> int:
-    material = [array.detach() for array in sim.material()]
-    after = sim(state, push).positions.detach()
+def count_sliding(sim: pd.Simulator, state: pd.State, push: Tensor, targets: Any = None) -> int:
+    material = [array.detach() for array in sim.material_at(targets, len(push))]
+    after = sim(state, push, targets).positions.detach()
     *_, sliding = torch.ops.torchpd.adjoint_system(
         after, after, after, *state, push, material, list(sim.plan.arrays), time_step=sim.time_step
     )
@@ -104,7 +104,9 @@ def test_landing_on_a_ball_that_moves() -> None:
     )
     target = torch.tensor([0.21, GROUND - 0.105, 0.1, 0.3, 0.2, 0.0], dtype=torch.float64)
     state = pd.State(state.positions, velocities.contiguous())
-    compare_with_differences(sim, state, torch.zeros_like(state.positions), targets={ball: target})
+    still = torch.zeros_like(state.positions)
+    assert count_sliding(sim, state, still, {ball: target}) > 0
+    compare_with_differences(sim, state, still, targets={ball: target})
 
 
 def test_some_slide_some_stick_and_some_are_held() -> None:
@@ -205,6 +207,23 @@ def gradient_of(sim: pd.Simulator, x: Tensor, v: Tensor, forces: Tensor) -> Tens
     push = forces.clone().requires_grad_()
     (found,) = torch.autograd.grad(sim(pd.State(x, v), push).positions[..., 0].sum(), push)
     return found
+
+
+@pytest.mark.parametrize("factor", [2.0**-90, 2.0**118])
+def test_a_loss_may_be_of_any_size(factor: float) -> None:
+    """In float32, to the ends of its range."""
+    sim = scene("ground")
+    state, push = (t.float() if isinstance(t, Tensor) else pd.State(*(x.float() for x in t)) for t in motion(sim, 0.3))
+    sim.tolerance = 0.0
+    sim.iterations = 300
+    sim.to(torch.float32)
+    x = push.clone().requires_grad_()
+    loss = sim(state, x).positions[..., 0].sum()
+    (wanted,) = torch.autograd.grad(loss, x, retain_graph=True)
+    (found,) = torch.autograd.grad(factor * loss, x)
+    torch.testing.assert_close(
+        found.double() / factor, wanted.double(), rtol=1e-3, atol=1e-3 * float(wanted.abs().max())
+    )
 
 
 def test_multilevel_has_the_same_gradients() -> None:

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils import parametrize
+from torch.nn.utils.parametrize import is_parametrized
 
 from .automatic import Choice, choose_solver
 from .checks import check_has_values, check_like, check_whole
 from .forecast import warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_batches, check_material, material_of
 from .multilevel import has_levels, has_strangers
+from .parametrized import invert, parametrization
 from .placing import check_wanted_device, move_plan, plan_anew, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
@@ -247,7 +248,9 @@ class Model(nn.Module):
                 )
         check_batches(checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
         with _ordinary():
-            originals = {name: self._inverted(name, checked) for name in self._parametrized() & set(checked)}
+            originals = {}
+            for name in [name for name in checked if is_parametrized(self, name)]:
+                originals[name], checked[name] = invert(self, name, checked[name])
             parameters = {
                 name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)
                 for name, tensor in checked.items()
@@ -259,7 +262,7 @@ class Model(nn.Module):
                 self.promise.doubt(True)
             for name, tensor in checked.items():
                 if name in originals:
-                    self._parametrization(name).original.copy_(originals[name])
+                    parametrization(self, name).original.copy_(originals[name])
                 elif name in parameters:
                     setattr(self, name, parameters[name])
                 else:
@@ -270,44 +273,6 @@ class Model(nn.Module):
                 f"the simulator has a new parameter for {' and '.join(learned)}, of another batch, which an optimiser "
                 "of the one before does not know: make the optimiser anew, or set the batch first"
             )
-
-    def _parametrized(self) -> set[str]:
-        """Material that torch.nn.utils.parametrize makes of something else."""
-        return {name for name in MATERIAL_ROWS if parametrize.is_parametrized(self, name)}
-
-    def _parametrization(self, name: str) -> parametrize.ParametrizationList:
-        found: parametrize.ParametrizationList = self.parametrizations[name]  # type: ignore[index, assignment]
-        return found
-
-    def _inverted(self, name: str, checked: dict[str, Tensor]) -> Tensor:
-        """What a parametrization makes a checked array of; the array becomes what it then makes."""
-        wanted, makes, shape = checked[name], self._parametrization(name), getattr(self, name).shape
-        steps: list[Any] = list(makes)
-        kind = " and ".join(type(one).__name__ for one in steps)
-        if wanted.shape != shape:
-            raise ValueError(
-                f"set_material: {name} is made by the parametrization {kind}, of {list(shape)}, and keeps its shape, "
-                f"got {list(wanted.shape)}: take the parametrization away first, and put it back for the other batch"
-            )
-        if not makes.is_tensor or not all(hasattr(one, "right_inverse") for one in steps):
-            raise ValueError(
-                f"set_material: {name} is made by the parametrization {kind}, which has no right_inverse to say of "
-                f"what one tensor: set sim.parametrizations.{name} itself, or take the parametrization away"
-            )
-        original = wanted.clone()
-        for one in reversed(steps):
-            original = one.right_inverse(original)
-        made: Tensor = original
-        for one in steps:
-            made = one(made)
-        fits = original.shape == makes.original.shape and made.shape == shape
-        if not (fits and torch.allclose(made, wanted, rtol=1e-3, atol=0.0, equal_nan=True)):
-            raise ValueError(
-                f"set_material: the parametrization {kind} of {name} makes other numbers of what its right_inverse "
-                f"gives than these: set sim.parametrizations.{name} itself, or give it what it can make"
-            )
-        checked[name] = made
-        return original
 
     def _plan_with(self, arrays: dict[str, Tensor]) -> Plan:
         """The plan that serves the material with some arrays replaced."""

@@ -131,7 +131,7 @@ def slide_adjoint(
     # in units that leave room for squares, of two so that nothing is rounded
     start = torch.where(slides, solution, 0.0)
     _, exponent = torch.frexp(start.abs().amax((1, 2), keepdim=True))
-    unit = torch.ldexp(torch.ones_like(start[:, :1, :1]), exponent)
+    unit = torch.ldexp(torch.ones_like(start[:, :1, :1]), exponent - 1)
     y, left = conjugate_residuals(product, start / unit, 10.0 * tolerance, asks=not after.is_cuda)
     failed = ~((left <= limit) & (worst <= limit))
     if not is_recording(after) and bool(failed.any()):

@@ -174,7 +174,8 @@ struct AdjointVertex {
 };
 
 // -l . dr / d(x, v) of a vertex: dL/dx = m / h^2 (1 + damping h) l - dL/dv' / h, dL/dv = m / h l; one that friction holds moves
-// with its start, one that slides has l with what its friction adds (torchpd/sliding.py). An environment whose solve could not begin has no number for an answer.
+// with its start, and l of one that slides has what its friction adds (torchpd/sliding.py). An environment whose solve could not
+// begin has no number for an answer.
 template <class T>
 struct AdjointAnswer {
   const AdjointResultCall<T>& call;

@@ -1,5 +1,6 @@
-// Conjugate gradients (Hestenes and Stiefel 1952) on H l = b, H = P (a + K) P with the elastic Hessian K, preconditioned by 1 / D,
-// or by P M P where the plan has levels, with 1 / D on vertices of which M knows nothing.
+// Conjugate gradients (Hestenes and Stiefel 1952) on H l = b, H = P (a + K) P with the elastic Hessian K, preconditioned by
+// 1 / D, or by P M P where the plan has levels, with 1 / D on vertices of which M knows nothing. Where vertices slide against
+// friction H has what turns their slip besides (slide_across).
 //
 // P leaves out vertices that do not move, and of others what contacts do not let through. D is one number a vertex, so P and
 // 1 / D commute, and all vectors stay where P leaves them.
