@@ -13,7 +13,13 @@ d, and kappa Q times 1 - m / R, m the motion along the normal.
 
 That system is not symmetric. Most of it is, P H P + kappa Q, which `conjugate_gradients` solves: times its inverse the
 rest is near the identity, and generalised conjugate residuals (Eisenstat, Elman and Schultz 1983) take a few
-iterations, fewer the smaller mu is. A vertex that several contacts hold counts as frictionless.
+iterations, fewer the smaller mu is.
+
+Of a vertex between two planes P leaves the edge alone, d lies along it and does not turn, and in place of mu n stands
+the sum of mu_k m_k, the m_k dual to the normals: r is the sum of (m_k . r) n_k. The steps themselves take the friction
+of a plane against the slip before the other has pushed back, which differs by (push / (D |s|))^2 where that one is
+smooth, without the square where both are rough. A vertex that more contacts hold, or a ball and another, counts as
+frictionless.
 """
 
 from __future__ import annotations

@@ -31,33 +31,61 @@ struct HeldVertex {
   bool stuck = false;  // friction holds it
   T curvature = T(0);  // of the surface that it slides on, times the push
   int contacts = 0;    // that hold it
+  Vec3<T> first_normal = {};
+  T first_friction = T(0);
   Vec3<T> slides[slide_count] = {};
 
   PD_HD void touch(const Vec3<T>& normal, T gap, T friction, const Vec3<T>& motion, T curved) {
     const T push = dot(residual, normal);
     if (!(push > T(0) && gap < push / diagonal)) return;
-    Vec3<T> slip = moved - motion;
-    slip = subtract_product(slip, dot(slip, normal), normal);
-    // what friction can take back in one iteration is more than what has slipped
+    const Vec3<T> slip = tangential(moved - motion, normal);
     const T slipped = square_root(dot(slip, slip));
-    const bool sticks = friction > T(0) && slipped * diagonal <= T(sticking) * friction * push;
+    const bool sticks = friction > T(0) && holds(slipped, friction * push);
     stuck = stuck || sticks;
-    // of several that hold it friction is left out
-    const bool slides_here = ++contacts == 1 && friction > T(0) && !sticks;
-    const T rate = T(1) / (slides_here ? slipped : T(1));
-    const T along = slides_here ? friction * rate : T(0);
-    const Vec3<T> none = {T(0), T(0), T(0)};
-    slides[slide_along] = along * slip;
-    slides[slide_normal] = slides_here ? normal : none;
-    slides[slide_across] =
-        slides_here ? (square_root(along * push) * rate) * cross(normal, slip) : none;
-    slides[slide_bend] = slides_here ? (along * square_root(push * curved)) * slip : none;
-    slides[slide_lean] = (curved * dot(moved - motion, normal)) * slides[slide_across];
     // what earlier contacts leave of the normal, so that all together are a projector
     const Vec3<T> left = projector * normal;
     const T size = dot(left, left);
     if (size > T(spanned)) projector = take_off(projector, left, T(1) / size);
     curvature = multiply_add(push, curved, curvature);
+    for (Vec3<T>& of : slides) of = {T(0), T(0), T(0)};
+    ++contacts;
+    if (contacts == 1) {
+      first_normal = normal;
+      first_friction = friction;
+      if (friction > T(0) && !sticks)
+        slide_on(normal, push, friction, motion, curved, slip, slipped);
+    } else if (contacts == 2 && curvature == T(0)) {
+      slide_along_edge(normal, friction);
+    }
+  }
+
+  // what friction can take back in one iteration is more than what has slipped
+  PD_HD bool holds(T slipped, T most) const { return slipped * diagonal <= T(sticking) * most; }
+
+  PD_HD void slide_on(const Vec3<T>& normal, T push, T friction, const Vec3<T>& motion, T curved,
+                      const Vec3<T>& slip, T slipped) {
+    const T rate = T(1) / slipped, along = friction * rate;
+    slides[slide_along] = along * slip;
+    slides[slide_normal] = normal;
+    slides[slide_across] = (square_root(along * push) * rate) * cross(normal, slip);
+    slides[slide_bend] = (along * square_root(push * curved)) * slip;
+    slides[slide_lean] = (curved * dot(moved - motion, normal)) * slides[slide_across];
+  }
+
+  // Between two planes, whose edge leaves a slip no other direction: the friction of both, of whose pushes r is made.
+  PD_HD void slide_along_edge(const Vec3<T>& normal, T friction) {
+    const T both = dot(first_normal, normal), share = T(1) / (T(1) - both * both);
+    const Vec3<T> first = share * subtract_product(first_normal, both, normal);
+    const Vec3<T> second = share * subtract_product(normal, both, first_normal);
+    const Vec3<T> rub = multiply_add(friction, second, first_friction * first);
+    const Vec3<T> slip = projector * moved;
+    const T slipped = square_root(dot(slip, slip)), force = dot(rub, residual);
+    // the same plane twice, or smooth ones
+    if (!(share < T(1 / spanned) && force > T(0))) return;
+    stuck = stuck || holds(slipped, force);
+    if (stuck) return;
+    slides[slide_along] = (T(1) / slipped) * slip;
+    slides[slide_normal] = rub;
   }
 };
 
