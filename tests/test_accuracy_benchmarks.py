@@ -221,6 +221,26 @@ def test_time_to_error_on_a_small_beam(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("on_path")
+def test_contacts_finds_the_fewest_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    import contacts
+
+    monkeypatch.setattr(contacts, "COUNTS", [1, 2, 3, 4, 6, 8, 12, 16, 24])
+    row = contacts.compare("cube slides", 1, 1e6, 0.5, "cpu", 0.0)
+    assert row["residual"] <= 1e-9
+    assert row["vertices"] == 64
+    plain, levels = (found["iterations"] for found in row["solvers"].values())
+    assert plain[-1] is None
+    assert levels == sorted(levels)
+    assert levels[-1] <= 16
+    assert row["solvers"]["Chebyshev"]["ms"][-1] is None
+    assert all(ms > 0.0 for ms in row["solvers"]["Multilevel"]["ms"])
+    head, line = contacts.table([row]).splitlines()
+    assert "Chebyshev: it. and ms to 0.1, 0.01, 0.001" in head
+    assert line.startswith("cube slides")
+    assert "> 24" in line
+
+
+@pytest.mark.usefixtures("on_path")
 def test_forecasts_are_judged_by_what_was_needed() -> None:
     from forecast import summary
 

@@ -130,6 +130,41 @@ def test_multilevel_costs_more_than_chebyshev_everywhere(
             assert automatic._multilevel_time(sim, batch) > 2.0 * automatic._chebyshev_time(sim, batch) > 0.0
 
 
+@pytest.mark.parametrize("on", ["ground", "ball"])
+@pytest.mark.parametrize("youngs", [1e4, 1e6, 1e7])
+def test_smooth_contacts_leave_the_choice_and_reach_the_aim(youngs: float, on: str) -> None:
+    contact: Any = pd.Ground(-0.005) if on == "ground" else pd.Sphere((0.15, -0.305, 0.15), 0.3)
+    body = pd.Solid(pd.shapes.box((0.3, 0.3, 0.3), (6, 6, 6)), youngs)
+
+    def made(*contacts: Any) -> pd.Simulator:
+        return pd.Simulator(
+            pd.Scene(body, pd.Gravity(), *contacts), 1 / 60, solver="auto", dtype=torch.float64, progress=False
+        )
+
+    sim = made(contact)
+    assert isinstance(sim.solver, pd.Multilevel) == (youngs > 1e5)
+    # "lbfgs" would do in the air, but knows no contacts
+    assert sim.solver == (pd.Multilevel() if youngs > 1e5 else made().solver)
+    state = sim.rest_state()
+    state.velocities[:] = torch.tensor([0.3, -1.0, 0.1])
+    for _ in range(3):
+        (exact,) = exact_steps(sim, state)
+        after = sim(state)
+        assert exact.judge(after.velocities[0].numpy() / 60).position <= AIM
+        state = after
+
+
+def test_friction_gets_chebyshev_and_print_says_so() -> None:
+    body = pd.Solid(pd.shapes.box((0.3, 0.3, 0.3), (4, 4, 4)), 1e7)
+    scene = pd.Scene(body, pd.Gravity(), pd.Ground(friction=0.5))
+    sim = pd.Simulator(scene, 1 / 60, solver="auto", progress=False)
+    assert isinstance(sim.solver, pd.Chebyshev)
+    assert "friction on contacts may keep Multilevel from working" in repr(sim)
+    sim.set_material(planes=sim.planes * torch.tensor([1.0, 1.0, 1.0, 1.0, 0.0]))
+    sim.prepare_solver()
+    assert isinstance(sim.solver, pd.Multilevel)
+
+
 def test_time_of_a_batch() -> None:
     """2 + 4 * 0.5 us of one environment, 500 vertices; two others take turns, or 0.8 * 0.5 us each, or 1.2 / 4 more.
 

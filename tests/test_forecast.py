@@ -120,21 +120,29 @@ def test_multilevel_does_not_care_about_the_mesh() -> None:
         assert least < rates[0] / rates[1] < most
 
 
-def test_with_contacts_multilevel_is_expected_to_be_accelerated_jacobi() -> None:
+def test_smooth_contacts_cost_the_usual_multilevel_nothing() -> None:
+    """With friction, and where M knows nothing of contacts, it is expected to be accelerated Jacobi."""
     solid = pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2)), 1e6)
     spectrum = Spectrum(1e-3, 1e-3)
-    found = {
-        (bool(parts), type(solver).__name__): forecast(
-            pd.Simulator(pd.Scene(solid, *parts), iterations=1), solver, spectrum
-        )
-        for parts in ((), (pd.Ground(),), (pd.Sphere((0.0, -1.0, 0.0), 1.0),))
-        for solver in (pd.Chebyshev(), pd.Multilevel())
-    }
-    rates = {key: expected.rate for key, expected in found.items() if expected is not None}
-    assert rates[False, "Multilevel"] > 3 * rates[False, "Chebyshev"]
-    assert rates[True, "Chebyshev"] == rates[False, "Chebyshev"]
+
+    def rate(solver: pd.Chebyshev | pd.Multilevel, *contacts: Any) -> float:
+        sim = pd.Simulator(pd.Scene(solid, *contacts), iterations=1)
+        expected = forecast(sim, solver, spectrum)
+        assert expected is not None
+        return expected.rate
+
+    smooth, rough = (pd.Ground(friction=friction) for friction in (0.0, 0.5))
+    ball, plain = pd.Sphere((0.0, -1.0, 0.0), 1.0, friction=0.1), rate(pd.Chebyshev())
+    assert rate(pd.Multilevel()) > 3 * plain
+    assert rate(pd.Multilevel(), smooth) == rate(pd.Multilevel())
+    assert rate(pd.Chebyshev(), smooth) == rate(pd.Chebyshev(), rough) == plain
     # their relaxations differ
-    assert rates[True, "Multilevel"] == pytest.approx(rates[True, "Chebyshev"], rel=0.05)
+    for solver, contacts in (
+        (pd.Multilevel("lbfgs"), (smooth,)),
+        (pd.Multilevel(), (rough,)),
+        (pd.Multilevel(), (smooth, ball)),
+    ):
+        assert rate(solver, *contacts) == pytest.approx(plain, rel=0.05)
 
 
 def test_a_default_that_is_far_too_small_is_said_once_and_printed() -> None:

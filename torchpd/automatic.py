@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from .forecast import Forecast, Spectrum, forecast, has_contacts, spectrum_of
+from .forecast import Forecast, Spectrum, forecast, has_contacts, has_friction, knows_contacts, spectrum_of
 from .gpu import H100
 from .kernel_costs import iteration_microseconds
 from .multilevel import MOST_DIRECT
@@ -103,16 +103,14 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
     if spectrum is None:
         return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
-    # M knows no contacts. On a Delaunay plate of 700 vertices that lands (tests/test_multilevel_scenes.py) the inverse
-    # in the free directions needs 24 iterations to 1e-3; M between projections on those has 0.06 after 128, and solving
-    # exactly for one to four rigid or affine pieces beside it changes nothing. Newton's method on active sets, with
-    # conjugate gradients and that M, takes 59 passes (182 at 1e6 Pa), Chebyshev over 256.
-    if has_contacts(sim):
-        plain = _known(forecast(sim, chebyshev, spectrum))
-        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and contacts may keep Multilevel from working"
-        return chebyshev, chosen(_enough(plain), why)
+    # where much slides, or a face of slivers lands, Multilevel may take as many iterations as Chebyshev
+    if not knows_contacts(sim, _LEVELS[0], spectrum):
+        plain, reason = _known(forecast(sim, chebyshev, spectrum)), "friction" if has_friction(sim) else "slivers"
+        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and {reason} on contacts may keep Multilevel"
+        return chebyshev, chosen(_enough(plain), f"{why} from working")
     plain, lasting, short = (_known(forecast(sim, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
-    saves = short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
+    # contacts are known to the first alone
+    saves = has_contacts(sim) or short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
     multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
     if not runs(multilevel, sim):

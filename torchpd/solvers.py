@@ -139,9 +139,10 @@ class Multilevel:
     five times the cost of a Jacobi iteration on a CPU, and 5 to 36 times on a GPU, where M of a mesh of up to 1024
     vertices is A^-1 itself unless it comes in batches (`Simulator(batch=...)`). The scene takes longer to compile.
 
-    Every iterate is judged by its energy before the next one starts from it. After four failures in a row, which many
-    contacts cause, since M knows none, come two accelerated Jacobi iterations, then four, eight and so on, until M
-    serves again. With friction, which has no energy, a dozen follow the first failure, two dozen the second.
+    Every iterate is judged by its energy before the next one starts from it. After four failures in a row come two
+    accelerated Jacobi iterations, then four, eight and so on, until M serves again; with friction eight after two
+    failures, then sixteen. What makes trials fail is a stiff face that lands, since M learns of a contact only when a
+    trial has found it. "lbfgs" and "momentum" know nothing of contacts; with friction "lbfgs" gives way at once.
     M is made of the material when the simulator is, see `Simulator.prepare_solver`; an environment that differs gets
     M / s, s its largest ratio of inertia or stiffness to that material. `Info.rho` says how unlike the two are.
 
@@ -149,9 +150,10 @@ class Multilevel:
         outer: "lbfgs" corrects M by the last eight steps, "momentum" (no inner products) extrapolates. "corotated", the
             usual one, is "lbfgs" with another M for motions in which whole parts of a body turn, for which A is far too
             stiff: on the rigid motions of four overlapping groups of vertices it has the inverse of the energy's second
-            derivative, that of corotated elasticity. That is made once in most steps, after three iterations, for the
-            time of one or two more. Bodies that bend or spin need a third to two thirds of the iterations, others as
-            many as with "lbfgs".
+            derivative, that of corotated elasticity, with springs where contacts hold vertices. That is made once in
+            most steps, after three iterations, for the time of one or two more. Bodies that bend or spin need a third
+            to two thirds of the iterations of "lbfgs", bodies that rest or slide with friction a tenth to a third,
+            others as many.
         relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8.
     """
 

@@ -152,7 +152,7 @@ def tune(
 
 
 def _usual(sim: Simulator, solvers: Mapping[str, Solver]) -> dict[str, Solver]:
-    """Those that are studied unless others are named: the study knows no friction, which may lead Multilevel astray."""
+    """Those that are studied if no others are named: friction, which the study leaves out, may cost Multilevel much."""
     smooth = not has_friction(sim)
     return {name: solver for name, solver in solvers.items() if smooth or not isinstance(solver, Multilevel)}
 

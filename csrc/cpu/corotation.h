@@ -25,6 +25,13 @@ class Corotation {
     CorotationMaker<Lanes>(plan_, team_, w_, shared_).make(base, asks, scales);
   }
 
+  // With contacts: the lanes that have it, where these leave the directions `free`.
+  void hold(const Mat3<Real>* free, const bool (&has)[width], const double (&scales)[width]) const {
+    CorotationMaker<Lanes>(plan_, team_, w_, shared_).hold(free, has, scales);
+  }
+
+  bool is_held(int lane) const { return shared_.unheld[lane].held; }
+
   void forget(int lane) const {
     if (team_.rank == 0) shared_.inverse[lane] = {};
   }

@@ -14,6 +14,21 @@
 
 namespace pd::inline PD_TARGET {
 
+// Displacements of a vertex by all modes, of its sixteen numbers: w_k e_a and w_k e_a x r. visit(mode, displacement)
+template <class Number, class Visit>
+void each_mode_at(const Number& number, const Visit& visit) {
+  for (int k = 0; k < turning_groups; ++k) {
+    const double w = number(4 * k), x = number(4 * k + 1), y = number(4 * k + 2),
+                 z = number(4 * k + 3);
+    visit(6 * k, Vec3<double>{w, 0, 0});
+    visit(6 * k + 1, Vec3<double>{0, w, 0});
+    visit(6 * k + 2, Vec3<double>{0, 0, w});
+    visit(6 * k + 3, Vec3<double>{0, -z, y});
+    visit(6 * k + 4, Vec3<double>{z, 0, -x});
+    visit(6 * k + 5, Vec3<double>{-y, x, 0});
+  }
+}
+
 // One environment's elements, whichever way lanes run elsewhere: sums of products of strains of all modes, patch by patch.
 template <class T>
 class TurningElements {
@@ -140,6 +155,18 @@ class CorotationMaker {
       add_elements(lane, base);
       team_.barrier();
       if (team_.rank == 0) solve(lane, scales[lane]);
+      team_.barrier();
+    }
+  }
+
+  // Contacts hold a vertex by springs as stiff as its diagonal, in the directions that they do not leave `free`.
+  void hold(const Mat3<Real>* free, const bool (&has)[width], const double (&scales)[width]) {
+    for (int lane = 0; lane < width; ++lane) {
+      if (!has[lane]) continue;
+      for (std::int64_t c = team_.begin(shared_.chunks); c < team_.end(shared_.chunks); ++c)
+        add_springs_of(c, free, lane);
+      team_.barrier();
+      if (team_.rank == 0) solve_held(lane, scales[lane]);
       team_.barrier();
     }
   }
@@ -292,6 +319,64 @@ class CorotationMaker {
     const bool sound = invert(energy, scale, times * turning_noise, found.energy) &&
                        invert(matrix, scale, turning_noise, found.matrix);
     shared_.inverse[lane] = sound ? found : typename Shared::Inverses{};
+    if (shared_.unheld.size() == 0) return;
+    typename Shared::Unheld& unheld = shared_.unheld[lane];
+    unheld = {energy, {}, sound, false};
+    std::copy_n(scale, turning_modes, unheld.scale);
+  }
+
+  void add_springs_of(std::int64_t chunk, const Mat3<Real>* free, int lane) const {
+    std::array<double, turning_pairs>& sum = shared_.springs[chunk];
+    sum.fill(0);
+    shared_.each_of_chunk(plan_.vertices, chunk, [&](std::int64_t i) {
+      // hardly any vertex is held in any lane
+      if (leaves_all(free[i])) return;
+      const double inverse = Shared::number(w_.inverse[i], lane);
+      if (!(inverse > 0)) return;
+      Vec3<double> held[3];  // I - free
+      for (int a = 0; a < 3; ++a) {
+        const Vec3<Real>& row = free[i].row[a];
+        held[a] = {(a == 0) - Shared::number(row.x, lane), (a == 1) - Shared::number(row.y, lane),
+                   (a == 2) - Shared::number(row.z, lane)};
+      }
+      Vec3<double> mode[turning_modes];
+      each_mode_at([&](int n) { return Shared::number(shared_.numbers[i].of[n], lane); },
+                   [&](int m, const Vec3<double>& d) {
+                     mode[m] = {dot(held[0], d), dot(held[1], d), dot(held[2], d)};
+                   });
+      for (int m = 0; m < turning_modes; ++m) {
+        const Vec3<double> force = (1 / inverse) * mode[m];
+        for (int n = 0; n <= m; ++n) sum[turning_pair(m, n)] += dot(force, mode[n]);
+      }
+    });
+  }
+
+  // a projector has less than this trace where it takes anything
+  static bool leaves_all(const Mat3<Real>& free) {
+    const Real trace = (free.row[0].x + free.row[1].y) + free.row[2].z;
+    return !any(trace < Real(T(2.5)));
+  }
+
+  void solve_held(int lane, double times) const {
+    typename Shared::Unheld& unheld = shared_.unheld[lane];
+    if (!unheld.sound) return;
+    TurningMatrix energy = unheld.energy;
+    bool held = false;
+    for (int m = 0; m < turning_modes; ++m) {
+      for (int n = 0; n <= m; ++n) {
+        double sum = 0;
+        for (const auto& of_chunk : shared_.springs) sum += of_chunk[turning_pair(m, n)];
+        held = held || sum != 0;
+        energy.at[m][n] += sum;
+        if (n < m) energy.at[n][m] += sum;
+      }
+    }
+    // as it was
+    if (!held && !unheld.held) return;
+    const double noise = times * turning_noise;
+    TurningMatrix& inverse = shared_.inverse[lane].energy;
+    unheld.held = held && invert(energy, unheld.scale, noise, inverse);
+    if (!unheld.held) invert(unheld.energy, unheld.scale, noise, inverse);
   }
 
   // false where X is not positive

@@ -20,6 +20,7 @@ class Row {
   Item& operator[](std::size_t i) const { return items_[i]; }
   Item* begin() const { return items_; }
   Item* end() const { return items_ + count_; }
+  std::size_t size() const { return count_; }
 
  private:
   std::size_t count_;
@@ -43,6 +44,12 @@ struct CorotationWork {
   struct Inverses {
     TurningMatrix energy, matrix;  // Hc^-1, Ac^-1
   };
+  // Hc before contacts hold it.
+  struct Unheld {
+    TurningMatrix energy;
+    double scale[turning_modes];  // of the diagonal of Ac
+    bool sound, held;             // whether it could be made; whether Hc^-1 has contacts
+  };
 
   int chunks;
   Row<Numbers> numbers, images;                    // [vertices] (w, w r), and A times them
@@ -50,10 +57,12 @@ struct CorotationWork {
   Row<Products> products;                          // [chunks]
   Row<std::array<double, turning_pairs>> strains;  // [patches]
   Row<Inverses> inverse;                           // [environments]
+  Row<Unheld> unheld;                              // [environments]; none without contacts
+  Row<std::array<double, turning_pairs>> springs;  // [chunks]; none without contacts
   Row<Quad<T>> slots;                              // [threads, 3, most slots of a patch]
   Row<T> weights;  // [elements] of one environment, where they differ
 
-  CorotationWork(const Plan<T>& plan, bool wanted, int threads)
+  CorotationWork(const Plan<T>& plan, bool wanted, bool touching, int threads)
       : chunks(wanted ? (plan.vertices + chunk - 1) / chunk : 0),
         numbers(wanted ? plan.vertices : 0),
         images(wanted ? plan.vertices : 0),
@@ -61,6 +70,8 @@ struct CorotationWork {
         products(chunks),
         strains(wanted ? plan.patches : 0),
         inverse(wanted ? width : 0),
+        unheld(wanted && touching ? width : 0),
+        springs(touching ? chunks : 0),
         slots(wanted ? std::size_t(threads) * 3 * plan.most_slots : 0),
         weights(wanted && width > 1 ? std::size_t(plan.blocks) * block_lanes : 0) {}
 

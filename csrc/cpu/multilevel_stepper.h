@@ -51,7 +51,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
       const bool rough = Lanes::lane(friction, lane) > 0;
-      outer_[lane].begin(misfit_[lane], rough, energy_noise<T>(), this->stop_[lane].fall);
+      outer_[lane].begin(misfit_[lane], rough, corotates_, energy_noise<T>(),
+                         this->stop_[lane].fall);
       pairs_[lane] = {};
       made_[lane] = doubted_[lane] = 0;
       has_[lane] = false;
@@ -69,11 +70,12 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       sums.energy = v.add_energy(w_.u[i], sums.energy);
       o_.fresh[i] = v.unbalanced(contacts_, w_.u[i], force);
       if constexpr (Touching) {
-        o_.fresh_free[i] = v.free_directions(contacts_, w_.u[i], force);
+        const auto left = v.leeway(contacts_, w_.u[i], force);
+        o_.fresh_free[i] = left.free;
+        o_.fresh_friction[i] = v.friction(left.taken);
         o_.fresh_gradient[i] = v.gradient(w_.u[i], force);
         // work against the friction of the base
-        const Value friction = open(i, o_.pull[i] - o_.gradient[i]);
-        sums.first = multiply_add(friction, w_.u[i] - o_.base[i], sums.first);
+        sums.first = multiply_add(o_.friction[i], w_.u[i] - o_.base[i], sums.first);
       }
     });
   }
@@ -108,7 +110,9 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
         o_.pull[i] = o_.fresh[i];
       }
       const Value change = w_.u[i] - o_.base[i];
-      const Value s = let_through(i, change), y = let_through(i, o_.fresh[i] - o_.pull[i]);
+      // directions are those of another step at first
+      const Value s = k == 0 ? none_ : let_through(i, change);
+      const Value y = k == 0 ? none_ : let_through(i, o_.fresh[i] - o_.pull[i]);
       if constexpr (Touching) keep_directions(i);
       // what momentum goes on along
       w_.before[i] = choose(o_.base[i], w_.before[i]);
@@ -182,7 +186,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     each_vertex([&](std::int64_t i) { o_.direction[i] = o_.cycle.result()[i]; });
   }
 
-  // next trial: P(u + beta (u - before) - (1 + beta) t d), or a plain or accelerated Jacobi iteration
+  // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi iteration
   void advance() {
     Real beta, length, plain, diagonal;
     bool some_plain = false, some_diagonal = false;
@@ -205,13 +209,17 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     each_vertex([&](std::int64_t i) {
       const auto v = vertex(i);
       const Value u = o_.base[i], before = w_.before[i];
+      const Value& slope = Touching ? o_.gradient[i] : o_.pull[i];
       Value next = u - way(i, length * o_.direction[i] - beta * (u - before));
-      if (some_plain) next = pick(plain, subtract_product(u, v.inverse, o_.pull[i]), next);
-      if (some_diagonal) {
-        const Value& g = Touching ? o_.gradient[i] : o_.pull[i];
-        next = pick(diagonal, accelerate(u, before, g, theta * v.inverse, one + beta), next);
+      next = v.land(contacts_, next, u, slope);
+      if (some_plain || some_diagonal) {
+        Value other = subtract_product(u, v.inverse, o_.pull[i]);
+        if (some_diagonal)
+          other =
+              pick(diagonal, accelerate(u, before, slope, theta * v.inverse, one + beta), other);
+        next = pick(plain + diagonal, v.project(contacts_, other, u), next);
       }
-      w_.u[i] = v.hold(v.target, v.project(contacts_, next, u));
+      w_.u[i] = v.hold(v.target, next);
     });
   }
 
@@ -230,7 +238,10 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   void corotate(int k) {
     bool asks[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
-      const TurningPlan plan(k, made_[lane], outer_[lane].restarts - doubted_[lane]);
+      bool held = false;
+      if constexpr (Touching) held = made_[lane] > 0 && corotation_.is_held(lane);
+      const TurningPlan plan(k, made_[lane], outer_[lane].restarts - doubted_[lane], Touching,
+                             held);
       asks[lane] = false;
       // alone it would not have come here
       if (outer_[lane].diagonal) continue;
@@ -246,6 +257,12 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     for (int lane = 0; lane < width; ++lane) scales[lane] = outer_[lane].scale;
     if (some) corotation_.make(o_.base, asks, scales);
     corotated_ = std::any_of(has_, has_ + width, [](bool has) { return has; });
+    if constexpr (Touching) {
+      bool holds[width];
+      for (int lane = 0; lane < width; ++lane)
+        holds[lane] = has_[lane] && !done_[lane] && !outer_[lane].diagonal;
+      if (corotated_) corotation_.hold(o_.free, holds, scales);
+    }
   }
 
   // the cycle between what the small problem takes and what it gives
@@ -325,6 +342,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   void keep_directions(std::int64_t i) {
     o_.gradient[i] = choose(o_.fresh_gradient[i], o_.gradient[i]);
+    o_.friction[i] = choose(o_.fresh_friction[i], o_.friction[i]);
     for (int a = 0; a < 3; ++a) {
       o_.free[i].row[a] = Lanes::vec3(
           choose(Lanes::value(o_.fresh_free[i].row[a]), Lanes::value(o_.free[i].row[a])));

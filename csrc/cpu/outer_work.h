@@ -22,19 +22,19 @@ struct OuterWork {
       *direction;  // [vertices] iterate to go on from, residuals there and at the trial
   Value *s[history], *y[history];  // [vertices] L-BFGS pairs
   Mat3<Real>*free, *fresh_free;  // [vertices] directions that contacts leave; none without contacts
-  Value *gradient,
-      *fresh_gradient;  // [vertices] dE/du with what contacts balance; none without contacts
+  // [vertices] dE/du with what contacts balance, and their friction; none without contacts
+  Value *gradient, *fresh_gradient, *friction, *fresh_friction;
   Wide (*sums)[dots];   // [chunks]
   double (*ratios)[2];  // [threads] least and largest, of the material to that of M
   int chunks;
 
   OuterWork(const StepCall<typename Lanes::Scalar>& call, bool touching, int threads)
       : cycle(call.plan.levels),
-        corotation(call.plan, call.settings.schedule == ScheduleKind::corotated, threads),
+        corotation(call.plan, call.settings.schedule == ScheduleKind::corotated, touching, threads),
         chunks((call.plan.vertices + chunk - 1) / chunk) {
     const bool pairs = call.settings.learns();
     const std::int64_t n = call.plan.vertices, held = touching ? n : 0;
-    const std::int64_t vectors = 4 * n + 2 * held + (pairs ? 2 * history * n : 0);
+    const std::int64_t vectors = 4 * n + 4 * held + (pairs ? 2 * history * n : 0);
     storage_ = allocate_zeroed(vectors * sizeof(Value) + 2 * held * sizeof(Mat3<Real>) +
                                chunks * sizeof(*sums) + threads * sizeof(*ratios) + 4 * alignment);
     std::byte* at = storage_.get();
@@ -43,7 +43,8 @@ struct OuterWork {
       s[i] = place<Value>(at, pairs ? n : 0);
       y[i] = place<Value>(at, pairs ? n : 0);
     }
-    for (Value** field : {&gradient, &fresh_gradient}) *field = place<Value>(at, held);
+    for (Value** field : {&gradient, &fresh_gradient, &friction, &fresh_friction})
+      *field = place<Value>(at, held);
     for (Mat3<Real>** field : {&free, &fresh_free}) *field = place<Mat3<Real>>(at, held);
     sums = place<Wide[dots]>(at, chunks);
     ratios = place<double[2]>(at, threads);

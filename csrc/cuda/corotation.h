@@ -8,6 +8,7 @@
 namespace pd::inline PD_TARGET {
 
 constexpr int turning_products = turning_numbers * turning_numbers;
+constexpr int turning_entries = turning_modes * turning_modes;
 constexpr int turning_totals = 2 * turning_products + turning_pairs;
 
 // Products of vertices that are added up together: the plan alone decides.
@@ -24,6 +25,7 @@ struct CorotationMemory {
   double* products;          // [chunks, 2, turning_products] those of inertia, and of A
   double* strains;           // [patches, turning_pairs]
   double* totals;            // [turning_totals]
+  double* springs;           // [chunks, turning_entries] of contacts; none without them
 };
 
 // In shared memory, the same in every block.
@@ -32,7 +34,8 @@ struct CorotationControl {
   TurningMatrix inverse[2];  // Hc^-1, Ac^-1
   double own[turning_modes], scale[turning_modes];
   T mode[turning_modes];
-  DevicePlan<T> plan;  // while it is made
+  DevicePlan<T> plan;  // of those who make it
+  bool sound, held;    // whether it could be made; whether contacts hold Hc
 
   PD_DEVICE double* at(int which) { return &inverse[which].at[0][0]; }
 
@@ -62,6 +65,9 @@ class DeviceCorotation {
     __syncthreads();
     return c_;
   }
+
+  // as it was given to them
+  PD_DEVICE CorotationControl<T>& control() const { return c_; }
 
   // Products of all modes with a field, at a vertex; sums are those of them.
   PD_DEVICE void multiply_modes(int i, const Vec3<T>& q, T (&sum)[turning_modes]) const {

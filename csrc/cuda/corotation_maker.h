@@ -49,6 +49,26 @@ class CorotationMaker {
     solve();
   }
 
+  // Contacts hold a vertex by springs as stiff as its diagonal, in the directions that they do not leave `free`.
+  PD_DEVICE void hold(const Mat3<T>* free) const {
+    if (!c_.sound) return;
+#pragma unroll 1
+    for (int c = team_.warp(); c < turning_chunks(plan_.vertices); c += team_.warps())
+      add_springs(c, free);
+    team_.barrier();
+    const bool held = sum_energy(true);
+    // as it was
+    if (!held && !c_.held) return;
+    const bool sound = invert(energy(), 1) && held;
+    if (held && !sound) {
+      __syncthreads();
+      sum_energy(false);
+      invert(energy(), 1);
+    }
+    if (threadIdx.x == 0) c_.held = sound;
+    __syncthreads();
+  }
+
  private:
   // Any place amid the vertices will do. What is held has no part in it, be it NaN.
   PD_DEVICE Vec3<T> find_middle() const {
@@ -278,25 +298,104 @@ class CorotationMaker {
     }
   }
 
+  // A lane has a mode, and sums its products with all of them over the vertices of a chunk that contacts hold.
+  PD_DEVICE void add_springs(int chunk, const Mat3<T>* free) const {
+    const int lane = int(threadIdx.x) % warp_size, count = turning_chunk(plan_.vertices);
+    const int end = min((chunk + 1) * count, plan_.vertices);
+    Vec3<double>* force =
+        reinterpret_cast<Vec3<double>*>(scratch_) + int(threadIdx.x) / warp_size * turning_modes;
+    static_assert(outer_warps * turning_modes * sizeof(*force) <= turning_scratch_bytes);
+    double sum[turning_modes] = {};
+#pragma unroll 1
+    for (int first = chunk * count; first < end; first += warp_size) {
+      const int i = first + lane;
+      unsigned held =
+          __ballot_sync(whole_warp, i < end && in_.u[i].w > T(0) && !leaves_all(free[i]));
+#pragma unroll 1
+      for (; held; held &= held - 1) {
+        const int vertex = first + __ffs(int(held)) - 1;
+        const Vec3<double> mode = held_mode(free[vertex], vertex, min(lane, turning_modes - 1));
+        __syncwarp();
+        if (lane < turning_modes) force[lane] = (1 / double(in_.u[vertex].w)) * mode;
+        __syncwarp();
+#pragma unroll
+        for (int m = 0; m < turning_modes; ++m) sum[m] += dot(force[m], mode);
+      }
+    }
+    double* to = m_.springs + std::int64_t(chunk) * turning_entries + lane;
+    for (int m = 0; m < turning_modes; ++m) {
+      if (lane < turning_modes) to[m * turning_modes] = sum[m];
+    }
+  }
+
+  // a projector has less than this trace where it takes anything
+  PD_DEVICE static bool leaves_all(const Mat3<T>& free) {
+    return !((free.row[0].x + free.row[1].y) + free.row[2].z < T(2.5));
+  }
+
+  // Hc, where invert() reads it before it writes there
+  PD_DEVICE TurningMatrix* energy() const { return reinterpret_cast<TurningMatrix*>(scratch_) + 3; }
+
+  // With the springs of contacts or without; whether there are any.
+  PD_DEVICE bool sum_energy(bool springs) const {
+    const int chunks = springs ? turning_chunks(plan_.vertices) : 0;
+    bool some = false;
+    for (int e = threadIdx.x; e < turning_entries; e += blockDim.x) {
+      double sum = 0;
+#pragma unroll 4
+      for (int c = 0; c < chunks; ++c) sum += m_.springs[std::int64_t(c) * turning_entries + e];
+      const int i = e / turning_modes, j = e % turning_modes;
+      energy()->at[i][j] = entry(m_.totals, 0, i, j) + sum;
+      some = some || sum != 0;
+    }
+    return __syncthreads_or(some);
+  }
+
+  // what of a mode's displacement of a vertex is not free
+  PD_DEVICE Vec3<double> held_mode(const Mat3<T>& free, int vertex, int mode) const {
+    const Quad<T> n = m_.numbers[at(mode / 6, vertex)];
+    const int a = mode % 3;
+    const T w = n.x;
+    const Vec3<T> way = mode % 6 < 3
+                            ? Vec3<T>{a == 0 ? w : T(0), a == 1 ? w : T(0), a == 2 ? w : T(0)}
+                        : a == 0 ? Vec3<T>{T(0), -n.w, n.z}
+                        : a == 1 ? Vec3<T>{n.w, T(0), -n.y}
+                                 : Vec3<T>{-n.z, n.y, T(0)};
+    const auto wide = [](const Vec3<T>& v) {
+      return Vec3<double>{double(v.x), double(v.y), double(v.z)};
+    };
+    const Vec3<double> d = wide(way);
+    return {d.x - dot(wide(free.row[0]), d), d.y - dot(wide(free.row[1]), d),
+            d.z - dot(wide(free.row[2]), d)};
+  }
+
+  // of Hc or Ac, by the totals
+  PD_DEVICE static double entry(const double* totals, int of, int i, int j) {
+    using Products = double[turning_numbers][turning_numbers];
+    const auto* products = reinterpret_cast<const Products*>(totals);
+    const double* strains = totals + 2 * turning_products;
+    const double strain = of == 0 ? strains[i < j ? turning_pair(j, i) : turning_pair(i, j)] : 0;
+    return mode_product(products[of], i, j) + strain;
+  }
+
   // Every block for itself, from the same totals.
   PD_DEVICE void solve() const {
-    using Products = double[turning_numbers][turning_numbers];
     double* totals = reinterpret_cast<double*>(scratch_);
     static_assert(turning_totals * sizeof(double) <= turning_scratch_bytes);
     for (int t = threadIdx.x; t < turning_totals; t += blockDim.x) totals[t] = m_.totals[t];
     __syncthreads();
-    const auto* products = reinterpret_cast<const Products*>(totals);
-    const double* strains = totals + 2 * turning_products;
-    TurningMatrix* const matrix = c_.inverse;
-    each_entry([&](int of, int i, int j) {
-      const double strain = strains[i < j ? turning_pair(j, i) : turning_pair(i, j)];
-      matrix[of].at[i][j] = mode_product(products[of], i, j) + (of == 0 ? strain : 0);
-    });
+    each_entry(2, [&](int of, int i, int j) { c_.inverse[of].at[i][j] = entry(totals, of, i, j); });
     __syncthreads();
     if (threadIdx.x < turning_modes)
       c_.scale[threadIdx.x] = turning_scale(c_.inverse[1], int(threadIdx.x));
     __syncthreads();
-    if (!invert()) c_.clear();
+    const bool sound = invert(c_.inverse, 2);
+    if (!sound) c_.clear();
+    if (threadIdx.x == 0) {
+      c_.sound = sound;
+      c_.held = false;
+    }
+    __syncthreads();
   }
 
   PD_DEVICE std::int64_t at(int group, int i) const {
@@ -316,33 +415,31 @@ class CorotationMaker {
     return {half(a.x, b.x), half(a.y, b.y), half(a.z, b.z), half(a.w, b.w)};
   }
 
-  // visit(matrix, i, j): the entries of Hc and Ac that this thread has
+  // visit(matrix, i, j): the entries of one or two matrices that this thread has
   template <class Visit>
-  PD_DEVICE static void each_entry(const Visit& visit) {
-    constexpr int entries = turning_modes * turning_modes;
-    for (int e = threadIdx.x; e < 2 * entries; e += blockDim.x) {
-      const int of = e >= entries, i = e / turning_modes - of * turning_modes;
+  PD_DEVICE static void each_entry(int matrices, const Visit& visit) {
+    for (int e = threadIdx.x; e < matrices * turning_entries; e += blockDim.x) {
+      const int of = e >= turning_entries, i = e / turning_modes - of * turning_modes;
       visit(of, i, e % turning_modes);
     }
   }
 
-  // Both, in the scale of c_.scale; false where one is not positive. All threads.
-  PD_DEVICE bool invert() const {
-    TurningMatrix* const matrix = c_.inverse;
+  // Inverses of Hc alone, or of Ac too, in the scale of c_.scale; false where one is not positive. All threads.
+  PD_DEVICE bool invert(const TurningMatrix* matrix, int matrices) const {
     TurningMatrix *now = reinterpret_cast<TurningMatrix*>(scratch_), *next = now + 2;
     static_assert(4 * sizeof(TurningMatrix) <= turning_scratch_bytes);
     const double* scale = c_.scale;
-    each_entry([&](int of, int i, int j) {
+    each_entry(matrices, [&](int of, int i, int j) {
       now[of].at[i][j] = scaled_entry(matrix[of], scale[i], scale[j], i, j,
                                       of ? turning_noise : times_ * turning_noise);
     });
     __syncthreads();
 #pragma unroll 1
     for (int k = 0; k < turning_modes; ++k) {
-      const double pivot[2] = {now[0].at[k][k], now[1].at[k][k]};
+      const double pivot[2] = {now[0].at[k][k], matrices == 2 ? now[1].at[k][k] : 1};
       if (!(pivot[0] > 0 && pivot[1] > 0)) return false;
       const double share[2] = {1 / pivot[0], 1 / pivot[1]};
-      each_entry([&](int of, int i, int j) {
+      each_entry(matrices, [&](int of, int i, int j) {
         next[of].at[i][j] = swept(now[of], k, of ? share[1] : share[0], i, j);
       });
       __syncthreads();
@@ -350,8 +447,8 @@ class CorotationMaker {
       now = next;
       next = done;
     }
-    each_entry([&](int of, int i, int j) {
-      matrix[of].at[i][j] = -scale[i] * scale[j] * now[of].at[i][j];
+    each_entry(matrices, [&](int of, int i, int j) {
+      c_.inverse[of].at[i][j] = -scale[i] * scale[j] * now[of].at[i][j];
     });
     __syncthreads();
     return true;
@@ -375,6 +472,16 @@ __device__ __noinline__ BlockTeam make_corotation(CorotationInput<T> in, Corotat
                                                   std::size_t scratch_bytes, double times,
                                                   CorotationControl<T>& control) {
   CorotationMaker<T>(in, memory, team, scratch, scratch_bytes, times, control).make();
+  return team;
+}
+
+// The same of what contacts do to it.
+template <class T>
+__device__ __noinline__ BlockTeam hold_corotation(CorotationInput<T> in, const Mat3<T>* free,
+                                                  CorotationMemory<T> memory, BlockTeam team,
+                                                  std::byte* scratch, double times,
+                                                  CorotationControl<T>& control) {
+  CorotationMaker<T>(in, memory, team, scratch, turning_scratch_bytes, times, control).hold(free);
   return team;
 }
 

@@ -163,7 +163,8 @@ OuterMemory<T> arrange(Arena& arena, const OuterCall<T>& call) {
   for (Quad<T>** array : {&m.base, &m.pull, &m.fresh}) arena.place(*array, teams * n);
   for (Quad<T>** array : {&m.s, &m.y}) arena.place(*array, teams * pairs);
   for (Mat3<T>** array : {&m.free, &m.fresh_free}) arena.place(*array, teams * held);
-  for (Quad<T>** array : {&m.gradient, &m.fresh_gradient}) arena.place(*array, teams * held);
+  for (Quad<T>** array : {&m.gradient, &m.fresh_gradient, &m.friction, &m.fresh_friction})
+    arena.place(*array, teams * held);
   arrange(arena, step.plan.levels, int(teams), m.cycle);
   arena.place(m.corotation.arm, small * n);
   for (Quad<T>** array : {&m.corotation.numbers, &m.corotation.images})
@@ -171,6 +172,7 @@ OuterMemory<T> arrange(Arena& arena, const OuterCall<T>& call) {
   arena.place(m.corotation.products, small * turning_chunks(int(n)) * 2 * turning_products);
   arena.place(m.corotation.strains, small * step.plan.patches * turning_pairs);
   arena.place(m.corotation.totals, small * turning_totals);
+  arena.place(m.corotation.springs, held ? small * turning_chunks(int(n)) * turning_entries : 0);
   arena.place(m.chunk_dots, teams * 2 * call.chunks() * most_sums);
   arena.place(m.patch_sums, teams * step.plan.patches * sums_count);
   arena.place(m.ranges, teams * 2 * call.blocks * ranges_count);

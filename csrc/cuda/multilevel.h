@@ -29,7 +29,7 @@ class MultilevelRunner {
     trusted_ = T(misfit.trusted);
     if (threadIdx.x == 0) {
       const bool stops = w_.settings().tolerance > 0;
-      c_.outer.begin(misfit, w_.contacts.friction() > T(0), energy_noise<T>(),
+      c_.outer.begin(misfit, w_.contacts.friction() > T(0), corotates_, energy_noise<T>(),
                      stops ? w_.progress.stop.fall : 0);
       c_.pairs = {};
       c_.done = false;
@@ -191,7 +191,7 @@ class MultilevelRunner {
     if (lbfgs_) correct();
   }
 
-  // next trial: P(u + beta (u - before) - (1 + beta) t d), or a plain or accelerated Jacobi iteration
+  // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi iteration
   PD_DEVICE void advance() {
     const bool plain = c_.outer.plain, accelerates = c_.outer.diagonal && !plain;
     const bool extrapolates = accelerates || (!lbfgs_ && !plain);
@@ -208,13 +208,18 @@ class MultilevelRunner {
     each_vertex([&](int i) {
       const auto v = w_.v.at(i);
       const Vec3<T> u = vec3(m_.base[i]), before = vec3(w_.v.before[i]);
-      Vec3<T> next = u - way(i, length * direction(i) - beta * (u - before));
-      if (plain) next = subtract_product(u, v.inverse, vec3(m_.pull[i]));
-      if (accelerates) {
-        const Vec3<T> g = vec3(Touching ? m_.gradient[i] : m_.pull[i]);
-        next = accelerate(u, before, g, theta * v.inverse, T(1) + beta);
+      const Quad<T>* slope = Touching ? m_.gradient : m_.pull;
+      Vec3<T> next;
+      if (plain) {
+        next = v.project(w_.contacts, subtract_product(u, v.inverse, vec3(m_.pull[i])), u);
+      } else if (accelerates) {
+        next = accelerate(u, before, vec3(slope[i]), theta * v.inverse, T(1) + beta);
+        next = v.project(w_.contacts, next, u);
+      } else {
+        next = u - way(i, length * direction(i) - beta * (u - before));
+        if constexpr (Touching) next = v.land(w_.contacts, next, u, vec3(slope[i]));
       }
-      w_.v.set(i, v.hold(v.target, v.project(w_.contacts, next, u)));
+      w_.v.set(i, v.hold(v.target, next));
     });
   }
 
@@ -238,15 +243,22 @@ class MultilevelRunner {
   PD_DEVICE static Vec3<T> none() { return {T(0), T(0), T(0)}; }
 
   PD_DEVICE void corotate() {
-    const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_);
+    const bool held = made_ > 0 && corotation_.control().held;
+    const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_, Touching, held);
+    const CorotationInput<T> in = {w_.v.x, w_.v.u, w_.v.target, m_.base, w_.weights};
     if (plan.forget) corotated_ = false;
-    if (!plan.make) return;
-    ++made_;
-    doubted_ = c_.outer.restarts;
-    corotated_ = true;
-    team_ = make_corotation(CorotationInput<T>{w_.v.x, w_.v.u, w_.v.target, m_.base, w_.weights},
-                            m_.corotation, team_, shared_, call_.shared_corotation, c_.outer.scale,
-                            corotation_.with_plan(call_.plan()));
+    if (plan.make) {
+      ++made_;
+      doubted_ = c_.outer.restarts;
+      corotated_ = true;
+      team_ = make_corotation(in, m_.corotation, team_, shared_, call_.shared_corotation,
+                              c_.outer.scale, corotation_.with_plan(call_.plan()));
+    }
+    if constexpr (Touching) {
+      if (corotated_)
+        team_ = hold_corotation(in, m_.free, m_.corotation, team_, shared_, c_.outer.scale,
+                                corotation_.control());
+    }
   }
 
   PD_DEVICE void look_at(int i, const typename Vertices<T, Touching>::Seen& seen,
@@ -255,12 +267,13 @@ class MultilevelRunner {
     sums.value[0] += seen.energy();
     m_.fresh[i] = quad(v.unbalanced(w_.contacts, seen.u, force));
     if constexpr (Touching) {
-      m_.fresh_free[i] = v.free_directions(w_.contacts, seen.u, force);
+      const Leeway<T> left = v.leeway(w_.contacts, seen.u, force);
+      m_.fresh_free[i] = left.free;
+      m_.fresh_friction[i] = quad(v.friction(left.taken));
       m_.fresh_gradient[i] = quad(v.gradient(seen.u, force));
       // work against the friction of the base
       if (!c_.outer.known) return;
-      const Vec3<T> friction = open(i, vec3(m_.pull[i]) - vec3(m_.gradient[i]));
-      sums.value[1] += double(dot(friction, seen.u - vec3(m_.base[i])));
+      sums.value[1] += double(dot(vec3(m_.friction[i]), seen.u - vec3(m_.base[i])));
     }
   }
 
@@ -419,6 +432,7 @@ class MultilevelRunner {
   PD_DEVICE void keep_directions(int i, int k) const {
     if (!c_.accepted && k > 0) return;
     m_.gradient[i] = m_.fresh_gradient[i];
+    m_.friction[i] = m_.fresh_friction[i];
     m_.free[i] = m_.fresh_free[i];
   }
 

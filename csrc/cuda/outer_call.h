@@ -21,17 +21,17 @@ constexpr int outer_warps = outer_threads / warp_size;
 // Device memory of the teams.
 template <class T>
 struct OuterMemory {
-  Quad<T>*base, *pull, *fresh;        // [teams, vertices]
-  Quad<T>*s, *y;                      // [teams, history, vertices], with pairs
-  Mat3<T>*free, *fresh_free;          // [teams, vertices], with contacts
-  Quad<T>*gradient, *fresh_gradient;  // [teams, vertices], with contacts
-  CycleMemory<T> cycle;               // [teams, ...]
-  CorotationMemory<T> corotation;     // [teams, ...], with its small problem
-  double* chunk_dots;                 // [teams, 2, most_sums, chunks], passes alternate
-  double* patch_sums;                 // [teams, patches, sums_count]
-  Range* ranges;                      // [teams, 2, blocks, ranges_count], rounds alternate
-  Misfit* misfit;                     // [batch]
-  unsigned* counter;                  // [teams], zero at the launch
+  Quad<T>*base, *pull, *fresh;  // [teams, vertices]
+  Quad<T>*s, *y;                // [teams, history, vertices], with pairs
+  Mat3<T>*free, *fresh_free;    // [teams, vertices], with contacts, as are the next four
+  Quad<T>*gradient, *fresh_gradient, *friction, *fresh_friction;
+  CycleMemory<T> cycle;            // [teams, ...]
+  CorotationMemory<T> corotation;  // [teams, ...], with its small problem
+  double* chunk_dots;              // [teams, 2, most_sums, chunks], passes alternate
+  double* patch_sums;              // [teams, patches, sums_count]
+  Range* ranges;                   // [teams, 2, blocks, ranges_count], rounds alternate
+  Misfit* misfit;                  // [batch]
+  unsigned* counter;               // [teams], zero at the launch
 };
 
 template <class T>
@@ -73,7 +73,9 @@ template <class T>
 PD_DEVICE OuterMemory<T> of_team(const OuterCall<T>& call, int team) {
   OuterMemory<T> m = call.memory;
   const std::int64_t n = call.plan().vertices, at = team * n;
-  for (Quad<T>** array : {&m.base, &m.pull, &m.fresh, &m.gradient, &m.fresh_gradient}) *array += at;
+  for (Quad<T>** array :
+       {&m.base, &m.pull, &m.fresh, &m.gradient, &m.fresh_gradient, &m.friction, &m.fresh_friction})
+    *array += at;
   m.s += history * at;
   m.y += history * at;
   m.free += at;
@@ -86,6 +88,7 @@ PD_DEVICE OuterMemory<T> of_team(const OuterCall<T>& call, int team) {
   c.products += std::int64_t(team) * turning_chunks(int(n)) * 2 * turning_products;
   c.strains += std::int64_t(team) * call.plan().patches * turning_pairs;
   c.totals += std::int64_t(team) * turning_totals;
+  c.springs += std::int64_t(team) * turning_chunks(int(n)) * turning_entries;
   m.chunk_dots += std::int64_t(team) * 2 * call.chunks() * most_sums;
   m.patch_sums += std::int64_t(team) * call.plan().patches * sums_count;
   m.ranges += std::int64_t(team) * 2 * call.blocks * ranges_count;

@@ -51,45 +51,85 @@ PD_HD Vec3<R> outward(const Ball<R>& ball, const Vec3<R>& x) {
   return {scale * d.x, select(defined, scale * d.y, R(1)), scale * d.z};
 }
 
+template <class R>
+PD_HD Vec3<R> tangential(const Vec3<R>& slip, const Vec3<R>& normal) {
+  return subtract_product(slip, dot(normal, slip), normal);
+}
+
 // Pushes the displacement `u` out by `depth` along `normal`, then takes back slip against the surface.
 template <class R>
 PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, const R& friction,
                        const Vec3<R>& motion) {
   const Vec3<R> pushed = multiply_add(depth, normal, u);
-  const Vec3<R> slip = pushed - motion;
-  const Vec3<R> tangential = subtract_product(slip, dot(normal, slip), normal);
-  const R length = square_root(dot(tangential, tangential));
+  const Vec3<R> slip = tangential(pushed - motion, normal);
+  const R length = square_root(dot(slip, slip));
   const R grip = lesser(R(1), friction * depth / select(length > R(0), length, R(1)));
-  return subtract_product(pushed, grip, tangential);
+  return subtract_product(pushed, grip, slip);
 }
 
 // Of a normal, squared: what earlier ones leave of one that they span but for a thousandth.
 constexpr double spanned = 1e-6;
+// Of a slip: where friction takes back more than that, it resists turning the slip more than the body does.
+constexpr double stiff_grip = 0.1;
 
-// A projector without the part `left` that it leaves of a normal, by the reciprocal of that part's square.
+// A projector without the part `off` that it leaves of a normal, by the reciprocal of that part's square.
 template <class R>
-PD_HD Mat3<R> take_off(const Mat3<R>& free, const Vec3<R>& left, const R& reciprocal) {
-  return {{subtract_product(free.row[0], reciprocal * left.x, left),
-           subtract_product(free.row[1], reciprocal * left.y, left),
-           subtract_product(free.row[2], reciprocal * left.z, left)}};
+PD_HD Mat3<R> take_off(const Mat3<R>& free, const Vec3<R>& off, const R& reciprocal) {
+  return {{subtract_product(free.row[0], reciprocal * off.x, off),
+           subtract_product(free.row[1], reciprocal * off.y, off),
+           subtract_product(free.row[2], reciprocal * off.z, off)}};
 }
 
-// What a contact leaves of the directions `free`, a projector, to a vertex that it pushes out from `u`: not its normal, and
-// nothing where friction takes back all slip.
+// What contacts leave to a vertex.
 template <class R>
-PD_HD void take_directions(Mat3<R>& free, const Vec3<R>& u, const Vec3<R>& normal, const R& depth,
-                           const R& friction, const Vec3<R>& motion) {
-  const R none(0), one(1);
-  const Vec3<R> slip = multiply_add(depth, normal, u) - motion;
-  const Vec3<R> tangential = subtract_product(slip, dot(normal, slip), normal);
-  const auto sticks = friction * depth > square_root(dot(tangential, tangential));
-  const Vec3<R> left = free * normal;
-  const R size = dot(left, left);
-  const auto takes = depth > none && size > R(spanned);
-  const R scale = select(takes, one / select(takes, size, one), none);
-  const R kept = select(sticks, none, one);
-  free = kept * take_off(free, left, scale);
-}
+struct Leeway {
+  Mat3<R> free;   // projector on the directions in which it may go
+  Vec3<R> taken;  // slip that friction takes back
+};
+
+// A contact that pushes a vertex out by `depth`, if that is more than 0.
+template <class R>
+struct Push {
+  Vec3<R> normal;
+  R depth, friction;
+  Vec3<R> motion;
+
+  PD_HD Vec3<R> out(const Vec3<R>& u) const { return push_out(u, normal, depth, friction, motion); }
+  PD_HD Vec3<R> slip(const Vec3<R>& u) const { return tangential(u - motion, normal); }
+
+  // Takes from `left` what the contact does that pushes a vertex out from `u`: its normal, and all directions where friction takes
+  // back all slip. Friction resists the turning of a slip as a spring of its force over the slip: where that is stiff only the
+  // direction of the slip is left.
+  PD_HD void take(Leeway<R>& left, const Vec3<R>& u) const {
+    const R none(0), one(1);
+    const Vec3<R> way = slip(multiply_add(depth, normal, u));
+    const R length = square_root(dot(way, way)), rub = friction * depth;
+    const R share = one / select(length > none, length, one);
+    left.taken = multiply_add(lesser(one, rub * share), way, left.taken);
+    const Vec3<R> off = left.free * normal;
+    const R size = dot(off, off);
+    const auto takes = depth > none && size > R(spanned);
+    left.free = take_off(left.free, off, select(takes, one / select(takes, size, one), none));
+    const Vec3<R> along = left.free * (share * way);
+    const R rest = dot(along, along);
+    const auto slides = rest > R(spanned) && !(rub > length);
+    const R kept = select(slides, one / select(slides, rest, one), none);
+    const auto resists = rub > R(stiff_grip) * length && rub > none;
+    const R along_row[3] = {kept * along.x, kept * along.y, kept * along.z};
+    for (int a = 0; a < 3; ++a) {
+      const Vec3<R> row = left.free.row[a], line = along_row[a] * along;
+      left.free.row[a] = {select(resists, line.x, row.x), select(resists, line.y, row.y),
+                          select(resists, line.z, row.z)};
+    }
+  }
+
+  // `next` where friction stops it, if it went back on the slip of a vertex that the contact pushes out from `u`.
+  PD_HD Vec3<R> stop(const Vec3<R>& next, const Vec3<R>& u) const {
+    const R none(0);
+    const auto stops = friction * depth > none && !(dot(slip(next), slip(u)) > none);
+    return subtract_product(next, select(stops, R(1), none), slip(next));
+  }
+};
 
 // `x` is the vertex at the start of the step, `u` its displacement since then.
 template <class R>
@@ -119,24 +159,29 @@ struct Contacts {
     return u;
   }
 
-  // Projector on the directions in which a vertex may go from a free iterate `u`, off the contacts that push it out.
-  PD_HD Mat3<R> free_directions(const Vec3<R>& x, Vec3<R> u, const Vec3<R>& around) const {
+  // What the contacts leave to a vertex that they push out from a free iterate `u`.
+  PD_HD Leeway<R> leeway(const Vec3<R>& x, const Vec3<R>& u, const Vec3<R>& around) const {
     const R one(1), none(0);
-    const Vec3<R> still = {none, none, none};
-    Mat3<R> free = {{{one, none, none}, {none, one, none}, {none, none, one}}};
-    for (int i = 0; i < plane_count; ++i) {
-      const Plane<R>& p = planes[i];
-      take_directions(free, u, p.normal, penetration(gap(p, x + u)), p.friction, still);
-      u = pd::project(p, x, u, around);
-    }
-    for (int i = 0; i < ball_count; ++i) {
-      const Ball<R>& b = balls[i];
-      const Vec3<R> normal = outward(b, x + around);
-      const R depth = penetration(dot(normal, (x + u) - b.center) - b.radius);
-      take_directions(free, u, normal, depth, b.friction, b.motion);
-      u = pd::project(b, x, u, around);
-    }
-    return free;
+    Leeway<R> left = {{{{one, none, none}, {none, one, none}, {none, none, one}}},
+                      {none, none, none}};
+    each(x, u, around, [&](const Push<R>& push, const Vec3<R>& from) {
+      push.take(left, from);
+      return push.out(from);
+    });
+    return left;
+  }
+
+  // `next` no further than friction lets slide what the contacts push out from a free iterate `u`, and out of them.
+  PD_HD Vec3<R> land(const Vec3<R>& x, const Vec3<R>& u, const Vec3<R>& around,
+                     const Vec3<R>& next) const {
+    Vec3<R> stopped = next;
+    each(x, u, around, [&](const Push<R>& push, const Vec3<R>& from) {
+      stopped = push.stop(stopped, from);
+      return push.out(from);
+    });
+    return each(x, stopped, around, [](const Push<R>& push, const Vec3<R>& at) {
+      return multiply_add(push.depth, push.normal, at);
+    });
   }
 
   // the largest coefficient of any contact
@@ -152,6 +197,24 @@ struct Contacts {
     for (int i = 0; i < plane_count; ++i) least = lesser(least, gap(planes[i], x));
     for (int i = 0; i < ball_count; ++i) least = lesser(least, gap(balls[i], x));
     return least;
+  }
+
+ private:
+  // What visit(contact, u) makes of u, contact after contact.
+  template <class Visit>
+  PD_HD Vec3<R> each(const Vec3<R>& x, Vec3<R> u, const Vec3<R>& around, const Visit& visit) const {
+    for (int i = 0; i < plane_count; ++i) {
+      const Plane<R>& p = planes[i];
+      const R none(0);
+      u = visit(Push<R>{p.normal, penetration(gap(p, x + u)), p.friction, {none, none, none}}, u);
+    }
+    for (int i = 0; i < ball_count; ++i) {
+      const Ball<R>& b = balls[i];
+      const Vec3<R> normal = outward(b, x + around);
+      const R depth = penetration(dot(normal, (x + u) - b.center) - b.radius);
+      u = visit(Push<R>{normal, depth, b.friction, b.motion}, u);
+    }
+    return u;
   }
 };
 

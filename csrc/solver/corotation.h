@@ -6,6 +6,10 @@
 // which is positive whatever M is (deflation, Nicolaides 1987). V has the rigid motions of four overlapping groups of vertices
 // with weights w_k: w_k e_a and w_k e_a x r. Hc is that of corotated linear elasticity, a |dx|^2 + w V |sym(dF R^T)|^2, which is
 // positive as well. All of it follows from products of sixteen numbers a vertex, (w_k, w_k r), with others.
+//
+// Contacts: with the projector P on what they leave free, P (..) P is what an iteration uses. M P alone would let a body that
+// lies on the ground go down as if there were none: (P M P) instead of (P A P)^-1. The second term has no such motions, and Hc
+// gets the springs sum D_i |(I - P_i) dx_i|^2, about what it costs a vertex to stay behind.
 #pragma once
 #include "math/mat.h"
 
@@ -19,7 +23,8 @@ constexpr int turning_modes = 6 * turning_groups;    // three translations, thre
 constexpr int turning_pairs = turning_modes * (turning_modes + 1) / 2;
 
 constexpr double turning_noise = 1e-6;  // of Ac: modes that depend on others
-constexpr int turning_begins = 3;       // iterations before: the first iterates are too far away
+constexpr int turning_begins = 3;       // iterations before: the first iterates are too far away,
+constexpr int touching_begins = 1;      // but where contacts may hold M leads far astray without
 constexpr int turning_doubts = 3;       // failed trials that make it out of date
 constexpr int turning_most = 3;         // times that a step makes it, the first one too
 
@@ -39,14 +44,15 @@ PD_HD constexpr bool strain_has(int mode, int c) {
 }
 
 // Whether the small problem is to be made at iteration k, which it was `made` times before, `failed` trials ago. If not, whether
-// it is to be forgotten: a step that goes on failing does without.
+// it is to be forgotten: a step that goes on failing does without, but where contacts, which make it fail, hold it now.
 struct TurningPlan {
   bool make, forget;
 
-  PD_HD TurningPlan(int k, int made, int failed) {
+  PD_HD TurningPlan(int k, int made, int failed, bool touching, bool held) {
     const bool doubted = made > 0 && failed >= turning_doubts;
-    make = made > 0 ? doubted && made < turning_most : k >= turning_begins;
-    forget = doubted && !make;
+    make = made > 0 ? doubted && made < turning_most
+                    : k >= (touching ? touching_begins : turning_begins);
+    forget = doubted && !make && !held;
   }
 };
 

@@ -6,13 +6,20 @@
 // What accelerates that step may overshoot, so every trial is judged by its energy before the next one starts from it.
 // Trials that fail go back, and after a few of them Jacobi iterations take over, which descend by the proof there, accelerated:
 // for a while with L-BFGS, which has learnt from the failures, and for the rest of the step with momentum, which has not. A while
-// is two iterations, then four, eight, and shorter again where M serves: contacts on many vertices are more than eight pairs can
-// tell M of. With friction, whose forces no energy has, a dozen follow the first failure, two dozen the second, and so on: while
-// friction has not settled, M leads stiff bodies astray (by 200 times the error of the first iterate).
+// is two iterations, then four, eight, and shorter again where M serves: a stiff face that lands finds its contacts by them. With
+// friction eight follow two failures, sixteen the next: normal forces that have not settled drag stiff bodies far astray.
 //
-// Contacts hold vertices in directions that M does not know of. M is applied to what is out of balance in the others, and
-// its result taken in the others, while the held ones go by the diagonal (two-metric projection, Bertsekas 1982), as does a
-// vertex that a spring holds much harder than M knows. Friction enters the judgement as the force that it has at the base.
+// Contacts hold vertices in directions that A does not know of. M is applied to what is out of balance in the others, and its
+// result taken in the others, while the held ones go by the diagonal (two-metric projection, Bertsekas 1982), as does a vertex
+// that a spring holds much harder than M knows. In them M is far too soft for motions of whole parts, by the ratio of stiffness
+// to inertia; the small problem of solver/corotation.h takes those away and puts in what contacts make of them. Where there is
+// none to come, a single failure is enough with friction.
+//
+// Friction is that of Coulomb with the normal force of the base, so that within an iteration it has an energy, its bound times
+// the slip. Its force along the slip is part of what is out of balance; its work is part of the judgement; a trial goes no
+// further than to where a slip ends, since friction does not turn it round (as in OWL-QN, Andrew and Gao 2007); and where it
+// holds the direction of a slip harder than the body does, M is left the direction alone (effects/contact.h). Contacts that a
+// trial finds have no friction before the next one.
 #pragma once
 #include "math/chebyshev.h"
 #include "math/scalar.h"
@@ -219,12 +226,12 @@ struct Misfit {
 
 constexpr int history = 8;  // pairs that L-BFGS remembers
 // accelerated Jacobi iterations in place of L-BFGS the first time, and with friction
-constexpr int detour_length = 2, friction_detour_length = 12;
-constexpr int most_doublings = 7;          // of these lengths
-constexpr int patience = 4;                // trials that may fail before Jacobi iterations
-constexpr double sufficient = 1e-4;        // of the decrease that the slope promises (Armijo)
-constexpr double least_curvature = 1e-12;  // s.y of a pair, in |s| |y|
-constexpr double momentum_rho = 0.9995;    // that of M A is not known, and this limit serves all
+constexpr int detour_length = 2, rough_detour_length = 8;
+constexpr int most_doublings = 7;                // of these lengths
+constexpr int patience = 4, rough_patience = 2;  // failed trials before them, and with friction
+constexpr double sufficient = 1e-4;              // of the decrease that the slope promises (Armijo)
+constexpr double least_curvature = 1e-12;        // s.y of a pair, in |s| |y|
+constexpr double momentum_rho = 0.9995;  // that of M A is not known, and this limit serves all
 
 // About the share of an error that a full step with M changes where turning parts have no small problem, of which M knows
 // least, or where M holds other vertices than the step: no bound. What an earlier trial showed counts on for some trials, as
@@ -250,7 +257,9 @@ struct Outer {
   Share share;
   SoftStop stop;
   int detour = 0, doublings = 0;  // iterations left of a detour; how long the next one is
-  bool plain = false, friction = false, accepted = true, known = false;
+  bool plain = false, accepted = true, known = false;
+  // wary: nothing will tell M of the contacts that rub
+  bool friction = false, wary = false;
   // momentum with 1 / D in place of M: to the end of the step, of L-BFGS while a detour lasts
   bool diagonal = false;
 
@@ -278,9 +287,9 @@ struct Outer {
       // with the momentum gone M alone descends, if it fits
       diagonal = diagonal || failures > 1;
     } else if (!diagonal) {
-      if (failures >= patience || (friction && !fell)) {
+      if (failures >= (wary ? 1 : friction ? rough_patience : patience)) {
         start_detour();
-      } else if (fell && !friction && doublings > 0) {
+      } else if (fell && !wary && doublings > 0) {
         --doublings;
       }
     } else if (friction && !fell) {
@@ -293,11 +302,13 @@ struct Outer {
     return accepted;
   }
 
-  PD_HD void begin(const Misfit& misfit, bool has_friction, double noise, double fall) {
+  PD_HD void begin(const Misfit& misfit, bool has_friction, bool corotates, double noise,
+                   double fall) {
     *this = {};
     scale = misfit.scale;
     fits = misfit.spread < 1 ? 1 - misfit.spread : share_of_turns;
     friction = has_friction;
+    wary = has_friction && !corotates;
     slack = noise;
     stop.fall = fall;
   }
@@ -315,7 +326,7 @@ struct Outer {
   }
 
   PD_HD void start_detour() {
-    detour = (friction ? friction_detour_length : detour_length) << doublings;
+    detour = (friction ? rough_detour_length : detour_length) << doublings;
     doublings += doublings < most_doublings;
     diagonal = true;
     failures = 0;

@@ -112,11 +112,26 @@ struct Vertex {
     return hold(zero, diagonal * (u - project(contacts, subtract_product(u, inverse, free), u)));
   }
 
-  // where contacts let the vertex go from u: see effects/contact.h
-  PD_HD Mat3<Real> free_directions(const Contacts<Real>& contacts, const Value& u,
-                                   const Value& force) const {
-    const Value next = subtract_product(u, inverse, gradient(u, force));
-    return contacts.free_directions(Lanes::vec3(x), Lanes::vec3(next), Lanes::vec3(u));
+  // what contacts leave to the vertex at u: see effects/contact.h
+  PD_HD Leeway<Real> leeway(const Contacts<Real>& contacts, const Value& u,
+                            const Value& force) const {
+    return contacts.leeway(Lanes::vec3(x),
+                           Lanes::vec3(subtract_product(u, inverse, gradient(u, force))),
+                           Lanes::vec3(u));
+  }
+
+  // what friction makes of slip that it takes back
+  PD_HD Value friction(const Vec3<Real>& taken) const {
+    const Real none(T(0)), one(T(1)), diagonal = one / select(inverse > none, inverse, one);
+    return hold(Lanes::value({none, none, none}), Lanes::value(diagonal * taken));
+  }
+
+  // `next` out of the contacts, from u with dE/du: see effects/contact.h
+  PD_HD Value land(const Contacts<Real>& contacts, const Value& next, const Value& u,
+                   const Value& slope) const {
+    if constexpr (!Touching) return next;
+    const Vec3<Real> free = Lanes::vec3(subtract_product(u, inverse, slope));
+    return Lanes::value(contacts.land(Lanes::vec3(x), free, Lanes::vec3(u), Lanes::vec3(next)));
   }
 };
 
