@@ -166,7 +166,7 @@ def test_material_that_it_was_not_made_for(outer: str) -> None:
 
 @pytest.mark.usefixtures("most_direct")
 @pytest.mark.parametrize("outer", SOLVERS)
-@pytest.mark.parametrize("name", ["slivers", "beam", "ground"])
+@pytest.mark.parametrize("name", ["slivers", "beam", "ground", "sphere", "sliding"])
 def test_an_environment_does_not_know_of_the_others(name: str, outer: str, dtype: torch.dtype) -> None:
     """Alone by many blocks, in a batch by fewer, and among more than run at once."""
     case = CASES[name]()
@@ -189,6 +189,18 @@ def test_large_meshes_have_the_same_bits_alone_and_in_a_batch(cells: int) -> Non
     sim = simulator(case, torch.float32, GPU, solver=pd.Multilevel(), iterations=4)
     assert int(sim.plan.level_sizes[5]) > 0
     assert (sim.vertices > 640 * 32) == (cells == 17)
+    state = state_of(case, sim, 3)
+    together = sim(state)
+    assert same_bits(together, sim(state))
+    alone = sim(pd.State(state.positions[1:2], state.velocities[1:2]))
+    assert same_bits(alone, pd.State(together.positions[1:2], together.velocities[1:2]))
+
+
+def test_contacts_of_a_large_mesh_have_the_same_bits_alone_and_in_a_batch() -> None:
+    """Chunks of more than 64 vertices, several of them held."""
+    case = contact_block(pd.Ground(friction=0.5), velocity=(1.0, -1.0, 0.0), youngs=1e6, cells=20)
+    sim = simulator(case, torch.float32, GPU, solver=pd.Multilevel(), iterations=8)
+    assert sim.vertices > 64 * 128
     state = state_of(case, sim, 3)
     together = sim(state)
     assert same_bits(together, sim(state))

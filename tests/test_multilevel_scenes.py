@@ -207,6 +207,22 @@ def test_nothing_sinks_in_and_energy_does_not_rise(solver: pd.Multilevel, dtype:
     assert all(one * (1 + slack) >= other for one, other in pairwise(energies))
 
 
+@pytest.mark.parametrize("solver", SOLVERS, ids=IDS)
+def test_a_ball_pushes_what_friction_stops(solver: pd.Multilevel) -> None:
+    """A stiff block slides towards a ball that comes: rough ground must not hold its vertices inside the ball."""
+    ball = pd.Sphere((-0.25, 0.15, 0.15), 0.2, friction=0.5)
+    sim = block((4, 4, 4), (0.3, 0.3, 0.3), 1e6, pd.Ground(friction=0.9))
+    sim = pd.Simulator(pd.Scene(*sim.scene.solids, pd.Gravity(), pd.Ground(friction=0.9), ball), 1 / 60, 1, solver,
+                       dtype=torch.float64, progress=False)  # fmt: skip
+    state = sim.rest_state()
+    state.velocities[..., 0] = -2.0
+    end = torch.tensor([-0.25 + 3.0 / 60, 0.15, 0.15, 3.0, 0.0, 0.0], dtype=torch.float64)
+    for sim.iterations in range(20):
+        after = sim(state, targets={ball: end})
+        assert float((after.positions - end[:3]).norm(dim=-1).min()) >= 0.2 - 1e-12
+        assert float(after.positions[..., 1].min()) >= -1e-12
+
+
 # ---- what it was not prepared for
 
 
@@ -374,6 +390,35 @@ def test_batch_and_threads_do_not_matter(
         assert_same_bits([t[items] for t in together], outputs(sim, state, forces, items))
     if tolerance:
         assert len(sim(state, forces, return_info=True)[1].iterations.unique()) > 1
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_contacts_of_several_chunks_are_held_in_the_same_order(dtype: torch.dtype) -> None:
+    """Of a face of 81 vertices of 729, alone by two threads, in a batch by one each."""
+    case = contact_block(pd.Ground(friction=0.5), velocity=(1.0, -1.0, 0.2), youngs=1e6, cells=8)
+    sim = simulator(case, dtype, solver=pd.Multilevel(), iterations=10)
+    state = state_of(case, sim, 3)
+    state = pd.State(state.positions, state.velocities * torch.tensor([1.0, 0.5, 2.0], dtype=dtype)[:, None, None])
+    together = sim(state)
+    for count in (2, 1):
+        torch.set_num_threads(count)
+        alone = [sim(pd.State(state.positions[i : i + 1], state.velocities[i : i + 1])) for i in range(3)]
+        assert same_bits(together, pd.State(*(torch.cat(parts) for parts in zip(*alone, strict=True))))
+
+
+def test_one_that_is_no_number_leaves_the_others_alone() -> None:
+    """A ball has no normal there; the next environment of a thread begins with its own directions."""
+    case = on_sphere(0.3)
+    sim = simulator(case, torch.float64, solver=pd.Multilevel(), iterations=12)
+    torch.set_num_threads(1)
+    state = state_of(case, sim, 24)
+    state.positions[:20] = torch.nan
+    together = sim(state)
+    alone = sim(pd.State(state.positions[20:21], state.velocities[20:21]))
+    assert together.positions[:20].isnan().all()
+    for number in range(20, 24):
+        own = pd.State(together.positions[number : number + 1], together.velocities[number : number + 1])
+        assert same_bits(own, alone)
 
 
 def test_material_of_an_environment_is_that_of_its_own_simulator(dtype: torch.dtype) -> None:

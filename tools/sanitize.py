@@ -166,17 +166,18 @@ def fields(sim: pd.Simulator, batch: int) -> None:
 
 
 def solve(sim: pd.Simulator, batch: int, stiffness: torch.Tensor) -> None:
-    """Conjugate gradients, without contacts and with them, from the first iteration and on from the second."""
+    """Conjugate gradients without contacts, with them and with what slides, from the first iteration and the second."""
     x, plan = sim.rest_state(batch).positions * 1.1, list(sim.plan.arrays)
     diagonal = ops.elastic_diagonal(stiffness, plan, weighted=True)
     inertia, inverse = 0.1 * diagonal, 1.0 / (1.1 * diagonal)
     active = torch.full((batch, 4), -1.0, dtype=torch.float64, device=x.device)
     projector = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape, 3)
-    for held in (None, projector):
+    sliding = 0.1 * x.unsqueeze(-2).expand(*x.shape[:2], 5, 3).contiguous()
+    for held, slides in ((None, None), (projector, None), (projector, sliding)):
         vectors = [torch.empty_like(x), 0.01 * x, torch.empty_like(x), active.clone()]
         for iterations in (2, 1):
             ops.conjugate_gradients_(
-                *vectors, x, inertia, inverse, held, stiffness, plan, tolerance=0.0, iterations=iterations
+                *vectors, x, inertia, inverse, held, stiffness, plan, slides, tolerance=0.0, iterations=iterations
             )
 
 
