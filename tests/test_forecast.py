@@ -136,6 +136,12 @@ def test_smooth_contacts_cost_the_usual_multilevel_nothing() -> None:
     assert rate(pd.Multilevel()) > 3 * plain
     assert rate(pd.Multilevel(), smooth) == rate(pd.Multilevel())
     assert rate(pd.Chebyshev(), smooth) == rate(pd.Chebyshev(), rough) == plain
+    fine = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (15, 15, 15)), 1e6), smooth), iterations=1)
+    coarse = pd.Simulator(pd.Scene(solid, smooth), iterations=1)
+    slow, quick = (forecast(sim, pd.Multilevel(), Spectrum(1.0, 1.0)) for sim in (fine, coarse))
+    assert slow is not None
+    assert quick is not None
+    assert quick.rate / slow.rate == pytest.approx(2.0**1.3)
     # their relaxations differ
     for solver, contacts in (
         (pd.Multilevel("lbfgs"), (smooth,)),

@@ -4,8 +4,9 @@ The smallest ratio mu of inertia to diagonal bounds the spectrum of D^-1 A from 
 Jacobi and Chebyshev iterations. What `Multilevel` needs does not depend on the mesh, but on mu n^(2/3), n vertices of a
 body: about rho L^2 / (E h^2), how far a wave travels in a step against the size L of the body. It grows with the
 logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. Smooth contacts make
-no difference to the usual one, but on meshes with slivers. On 197 random scenes nine of ten needed 0.3 to 1.5 times the
-forecast, meshes with slivers the least (`benchmarks/forecast.py`).
+no difference to the usual one on small meshes without slivers; cubes of 343, 2197 and 15,625 vertices that slide need
+16, 32 and 91 iterations to 1e-3, which the last two constants fit. On 197 random scenes nine of ten needed 0.3 to 1.5
+times the forecast, meshes with slivers the least (`benchmarks/forecast.py`).
 `Simulator.tune` measures instead.
 
 Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
@@ -40,6 +41,8 @@ __all__ = [
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
 # iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
 _LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
+# with contacts times (n^(1/3) / cells)^growth: a flat face that is held has more modes than the small problem knows of
+_HELD_CELLS, _HELD_GROWTH = 8.0, 1.3
 _MOST = 10_000
 _SLIVERS = 0.2  # `Spectrum.even` of a mesh that has them
 FAR_TOO_FEW = 0.1  # error that is left
@@ -129,6 +132,8 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
         body = max(len(solid.mesh.vertices) for solid in sim.scene.solids)
         reach = min(spectrum.slow * body ** (2.0 / 3.0), 1.0)
         decade = _LEVELS_LEAST + _LEVELS_SLOPE[solver.outer] * math.log10(1.0 / reach)
+        if has_contacts(sim):
+            decade *= max(1.0, (body ** (1.0 / 3.0) / _HELD_CELLS) ** _HELD_GROWTH)
         return Forecast(math.log(10.0) / decade)
     theta, rho = numbers["relaxation"], numbers["rho"]
     slowest = 1.0 - theta * spectrum.slow
