@@ -5,7 +5,7 @@ Jacobi and Chebyshev iterations. What `Multilevel` needs does not depend on the 
 body: about rho L^2 / (E h^2), how far a wave travels in a step against the size L of the body. It grows with the
 logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. Smooth contacts make
 no difference to the usual one on small meshes without slivers; cubes of 343, 2197 and 15,625 vertices that slide need
-16, 32 and 91 iterations to 1e-3, which the last two constants fit. On 197 random scenes nine of ten needed 0.3 to 1.5
+13, 32 and 91 iterations to 1e-3, which the last two constants fit. On 197 random scenes nine of ten needed 0.3 to 1.5
 times the forecast, meshes with slivers the least (`benchmarks/forecast.py`).
 `Simulator.tune` measures instead.
 
