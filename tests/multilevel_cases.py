@@ -15,6 +15,9 @@ import torchpd as pd
 from torchpd.multilevel import precondition_plan, reference_of_levels
 from torchpd.plan import Plan
 
+SOLVERS = [pd.Multilevel("lbfgs"), pd.Multilevel("momentum"), pd.Multilevel()]
+IDS = ["lbfgs", "momentum", "corotated"]
+
 
 def swing(cells: int, youngs: float) -> Case:
     """The box of 5r x r x r cells that swings about its held end."""

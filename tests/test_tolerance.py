@@ -9,7 +9,7 @@ import pytest
 import torch
 from cases import beam, contact_block
 from runs import displacement, simulator, state_of
-from test_multilevel_scenes import plate
+from test_multilevel_contacts import plate
 
 import torchpd as pd
 from torchpd.reference import StepProblem, step_problem
