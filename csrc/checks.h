@@ -80,8 +80,9 @@ constexpr int level_arrays = 0
 
 // Lengths of the arrays, by the names in multilevel.def.
 struct LevelRows {
-  std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_lift, fine_node_end, middle_end,
-      middle_entry, middle, middle_lift, middle_node_end, coarse_entry, device_coarse_entry;
+  std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_lift, host_fine_lift,
+      device_fine_lift, fine_node_end, middle_end, middle_entry, middle, middle_lift,
+      host_middle_lift, device_middle_lift, middle_node_end, coarse_entry, device_coarse_entry;
 };
 
 // The preconditioner's arrays, which begin at `first`.
@@ -108,7 +109,10 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   count.middle_lift = size[level_middle_lifts];
   count.middle_node_end = middle ? levels.middle_nodes + 1 : 0;
   count.coarse_entry = coarse * (coarse + 1) / 2;
-  count.device_coarse_entry = place.device.is_cuda() ? count.coarse_entry : 0;
+  const bool on_device = place.device.is_cuda();
+  (on_device ? count.device_fine_lift : count.host_fine_lift) = count.fine_lift;
+  (on_device ? count.device_middle_lift : count.host_middle_lift) = count.middle_lift;
+  count.device_coarse_entry = on_device ? count.coarse_entry : 0;
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = first;
   using real = T;

@@ -131,7 +131,7 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets, int pa
 
 py::dict build_multilevel(const Doubles& positions, const Indices& tets, const Numbers& order,
                           const Doubles& stiffness, const Doubles& inertia,
-                          std::int64_t most_direct, int threads,
+                          std::int64_t most_direct, bool folded, int threads,
                           const std::function<void(double)>& progress) {
   check_mesh(positions, tets);
   const py::ssize_t vertices = positions.shape(0);
@@ -142,9 +142,10 @@ py::dict build_multilevel(const Doubles& positions, const Indices& tets, const N
   if (inertia.ndim() != 1 || inertia.shape(0) != vertices)
     throw py::value_error("inertia must be float64 [vertices]");
   if (threads < 1) throw py::value_error("threads must be at least 1");
-  auto tables = pd::build_multilevel({positions.data(), vertices, tets.data(), tets.shape(0),
-                                      order.data(), stiffness.data(), inertia.data(), most_direct},
-                                     threads, progress);
+  auto tables =
+      pd::build_multilevel({positions.data(), vertices, tets.data(), tets.shape(0), order.data(),
+                            stiffness.data(), inertia.data(), most_direct, folded},
+                           threads, progress);
   py::dict arrays;
 #define X(name, type, width, rows, meaning) arrays[#name] = as_array(tables.name, width);
 #include "plan/multilevel.def"
@@ -265,7 +266,7 @@ PYBIND11_MODULE(_C, m) {
         py::arg("progress"));
   m.def("build_multilevel", &build_multilevel, py::arg("positions"), py::arg("tets"),
         py::arg("vertex_order"), py::arg("stiffness"), py::arg("inertia"), py::arg("most_direct"),
-        py::arg("threads"), py::arg("progress"));
+        py::arg("folded"), py::arg("threads"), py::arg("progress"));
   m.def(
       "plan_table", [] { return table(plan_rows); },
       "Rows (name, type, width, rows, meaning) of the constant arrays, in op order.");

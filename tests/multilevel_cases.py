@@ -12,6 +12,7 @@ from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
 import torchpd as pd
+from torchpd import _C
 from torchpd.multilevel import precondition_plan, reference_of_levels
 from torchpd.plan import Plan
 
@@ -74,6 +75,16 @@ def converged(case: Case, **options: Any) -> Array:
     return u
 
 
+def build_levels(sim: pd.Simulator, *, folded: bool) -> dict[str, Any]:
+    """The arrays of its preconditioner, which has levels, in float64, with lifts as a GPU has them or as a CPU does."""
+    stiffness, inertia = (array.cpu().double().numpy() for array in reference_of_levels(sim.plan.arrays))
+    values, order = sim.scene.values(), sim.plan.vertex_order.cpu().numpy()
+    return _C.build_multilevel(
+        values.rest_positions, values.tets, order, stiffness, inertia,
+        0, folded, torch.get_num_threads(), lambda _: None,
+    )  # fmt: skip
+
+
 class Tables:
     """M as the tables say it, in float64: a V-cycle with Chebyshev smoothing of degree 2 on [1/4, 1]."""
 
@@ -110,7 +121,7 @@ class Tables:
         return csr_array(bsr_array((weight, t[f"{name}_node"], t[f"{name}_start"]), shape=shape))
 
     @staticmethod
-    def _smooth(matrix: csr_array, inverse: Array, right: Array) -> Array:
+    def smooth(matrix: csr_array, inverse: Array, right: Array) -> Array:
         # Chebyshev iteration, Saad 2003, algorithm 12.1, two steps
         middle, half = 0.625, 0.375
         step = inverse * right / middle
@@ -124,9 +135,9 @@ class Tables:
         if level == len(self.levels):
             return np.asarray(self.factor.T @ (self.factor @ right))
         matrix, inverse, lift = self.levels[level]
-        z = self._smooth(matrix, inverse, right)
+        z = self.smooth(matrix, inverse, right)
         z = z + lift @ self._cycle(level + 1, lift.T @ (right - matrix @ z))
-        return np.asarray(z + self._smooth(matrix, inverse, right - matrix @ z))
+        return np.asarray(z + self.smooth(matrix, inverse, right - matrix @ z))
 
     def __call__(self, field: Array) -> Array:
         """M of a field [V, 3] in the user's order."""

@@ -11,7 +11,7 @@ import pytest
 import torch
 from cases import Case, beam, contact_block, on_sphere, slivers
 from devices import require_gpu
-from multilevel_cases import irregular, many_bodies, precondition, swing
+from multilevel_cases import build_levels, irregular, many_bodies, precondition, swing
 from on_gpu import GPU, device_work, host_waits, moved, relative
 from runs import arguments_of, noise, same_bits, simulator, small, state_of
 from scipy.sparse import csr_array
@@ -67,7 +67,6 @@ def reordered(levels: dict[str, np.ndarray], place: np.ndarray) -> dict[str, np.
     out["fine_lift_weight"] = levels["fine_lift_weight"][lift.data]
     by_node = csr_array((np.arange(lift.nnz), lift.indices, lift.indptr), shape=lift.shape).tocsc()
     out["fine_node_row"], out["fine_node_lift"] = by_node.indices, by_node.data
-    out["coarse_columns"] = levels["coarse_columns"][:0]
     return out
 
 
@@ -81,15 +80,15 @@ def pair(case: Case, dtype: torch.dtype, solver: pd.Multilevel, **options: objec
 
 def share(gpu: pd.Simulator, cpu: pd.Simulator) -> None:
     """Gives a simulator on the CPU the preconditioner of one on a GPU; rows of a direct one are its own."""
-    levels = {row.name: getattr(gpu.plan, row.name).cpu().numpy() for row in MULTILEVEL_TABLE}
     place = np.argsort(cpu.plan.vertex_order.numpy())[gpu.plan.vertex_order.cpu().numpy()]
-    if levels["level_sizes"][6]:
+    if gpu.plan.level_sizes[6]:
         reference = (array.cpu() for array in reference_of_levels(gpu.plan.arrays))
         cpu.plan = precondition_plan(cpu.plan, cpu.scene.values(), *reference, most_direct=multilevel.MOST_DIRECT)
-        arrays = {"turning_weight": np.empty_like(levels["turning_weight"])}
-        arrays["turning_weight"][place] = levels["turning_weight"]
+        weight = gpu.plan.turning_weight.cpu().numpy()
+        arrays = {"turning_weight": np.empty_like(weight)}
+        arrays["turning_weight"][place] = weight
     else:
-        arrays = reordered(levels, place)
+        arrays = reordered(build_levels(gpu, folded=False), place)
     kept = cpu.plan.arrays[: -len(MULTILEVEL_TABLE)]
     own = cpu.plan.arrays[-len(MULTILEVEL_TABLE) :]
     new = (torch.as_tensor(arrays.get(row.name, t)).to(t.dtype) for row, t in zip(MULTILEVEL_TABLE, own, strict=True))

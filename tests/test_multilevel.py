@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from cases import Case, beam, box, slivers
-from multilevel_cases import Tables, many_bodies, precondition, solved_directly, spectrum_of, swing
+from multilevel_cases import Tables, build_levels, many_bodies, precondition, solved_directly, spectrum_of, swing
 from runs import ULP, noise, simulator
-from scipy.sparse import csr_array
+from scipy.sparse import bsr_array, csr_array
 
 import torchpd as pd
 from torchpd.multilevel import has_levels, reference_of_levels
@@ -48,6 +48,35 @@ def test_op_is_the_cycle_of_its_tables(name: str, dtype: torch.dtype) -> None:
     assert error <= (1e-9 if dtype == torch.float64 else 1e-2) * np.linalg.norm(expected)
     held = ~case.problem().free
     assert not found[held].any()
+
+
+@pytest.mark.parametrize("name", ["beam", "slivers", "bodies", "box"])
+def test_lifts_of_a_gpu_have_smoothing_in_them(name: str) -> None:
+    """(I - S A) P, by rows and by nodes; everything else is as on a CPU."""
+    case = {"beam": lambda: beam(1e6), "slivers": slivers, "bodies": many_bodies, "box": lambda: swing(13, 1e6)}[name]()
+    sim = prepared(case)
+    found, plain = (build_levels(sim, folded=folded) for folded in (True, False))
+    for row, array in zip(MULTILEVEL_TABLE, sim.plan.arrays[len(PLAN_TABLE) :], strict=True):
+        assert np.array_equal(plain[row.name], array.numpy()), row.name
+        if "lift" not in row.name and "node" not in row.name and row.name != "level_sizes":
+            assert np.array_equal(found[row.name], plain[row.name]), row.name
+    levels = Tables(sim.plan).levels
+    assert len(levels) == (2 if name in ("bodies", "box") else 1)
+    for kind, height, (matrix, inverse, lift) in zip(("fine", "middle"), (1, 4), levels, strict=False):
+        rng = np.random.default_rng(0)
+        below, above = (rng.standard_normal((count, 3)) for count in lift.shape[::-1])
+        t = {key: found[f"{kind}_{key}"] for key in ("lift_start", "lift_node", "lift_weight")}
+        t |= {key: found[f"{kind}_{key}"] for key in ("node_start", "node_row", "node_weight", "node_lift")}
+        rows = bsr_array((t["lift_weight"].reshape(-1, height, 4), t["lift_node"], t["lift_start"]), shape=lift.shape)
+        weight = t["node_weight"].reshape(-1, height, 4).transpose(0, 2, 1)
+        nodes = bsr_array((weight, t["node_row"], t["node_start"]), shape=lift.shape[::-1])
+        image = lift @ below
+        expected = image - Tables.smooth(matrix, inverse, matrix @ image)
+        assert np.linalg.norm(rows @ below - expected) <= 1e-13 * np.linalg.norm(image)
+        smoothed = lift.T @ (above - matrix @ Tables.smooth(matrix, inverse, above))
+        assert np.linalg.norm(nodes @ above - smoothed) <= 1e-13 * np.linalg.norm(lift.T @ above)
+        assert len(t["node_lift"]) == 0
+        assert len(t["lift_node"]) == found["level_sizes"][{"fine": 1, "middle": 4}[kind]]
 
 
 def test_a_direct_one_is_the_inverse(dtype: torch.dtype) -> None:

@@ -366,7 +366,7 @@ def test_ops_want_the_arrays_of_the_preconditioner() -> None:
         ops.precondition(torch.zeros(1, 3, 3), plan)
     with pytest.raises(TypeError, match=r"field must be float32 or float64"):
         ops.precondition(state.positions.long(), plan)
-    with pytest.raises(ValueError, match=r"plan must be the 16 arrays of Plan\.arrays, or 42 with those of"):
+    with pytest.raises(ValueError, match=r"plan must be the 16 arrays of Plan\.arrays, or 44 with those of"):
         ops.precondition(state.positions, plan[:-1])
     with pytest.raises(ValueError, match=r"plan\.reference_stiffness must be \[\d+\] .*compile the scene again"):
         ops.precondition(state.positions, [*plan[:17], plan[17][:-1].contiguous(), *plan[18:]])

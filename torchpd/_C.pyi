@@ -25,6 +25,7 @@ def build_multilevel(
     stiffness: NDArray[float64],
     inertia: NDArray[float64],
     most_direct: int,
+    folded: bool,
     threads: int,
     progress: Callable[[float], None],
 ) -> dict[str, NDArray[Any]]: ...

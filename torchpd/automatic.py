@@ -65,7 +65,7 @@ class Cost(NamedTuple):
 CPU_CHEBYSHEV, CPU_MULTILEVEL = Cost(0.5, 45.0), Cost(2.0, 170.0)
 # Batches were measured with 1024 environments of 256 and 936 vertices, and with 16 of 3,321 and 10,309; the squares fit
 # these sizes. Up to MOST_DIRECT vertices M is an inverse, without levels.
-_SMALL_MULTILEVEL, _LARGE_MULTILEVEL = Cost(31.0, 3.0, 0.6, 0.79), Cost(50.0, 2.4, 0.85, 0.073)
+_SMALL_MULTILEVEL, _LARGE_MULTILEVEL = Cost(29.0, 3.0, 0.54, 0.57), Cost(36.0, 2.3, 0.35, 0.093)
 
 
 def multilevel_cost(vertices: int, *, on_gpu: bool) -> Cost:

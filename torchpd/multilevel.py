@@ -108,7 +108,7 @@ def precondition_plan(
     with compiling(len(values.tets), progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_multilevel(
             values.rest_positions, values.tets, order, rounded(stiffness), rounded(inertia),
-            most_direct, torch.get_num_threads(), advance,
+            most_direct, plan.kernel is not None, torch.get_num_threads(), advance,
         )  # fmt: skip
     if plan.kernel is not None:
         arrays["coarse_columns"] = _by_columns(arrays["coarse_factor"])

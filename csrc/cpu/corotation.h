@@ -51,8 +51,8 @@ class Corotation {
     return q;
   }
 
-  // The same with M = A^-1: its result lacks V (Hc^-1 - Ac^-1) V^T q, since M A V = V, whatever the order.
-  void measure_direct(const Value* q, const Real& scale) {
+  // The same where nothing goes around M: its result lacks V (Hc^-1 - Ac^-1) V^T q, whatever the order.
+  void measure_lacking(const Value* q, const Real& scale) {
     sum_up(shared_.numbers, q, own_);
     set_lacking(own_, scale);
   }

@@ -265,11 +265,11 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
   }
 
-  // the cycle between what the small problem takes and what it gives
+  // the cycle, and what the small problem gives, with contacts around it
   void run_corotated(const Real& scale) {
     Value *in = o_.cycle.input(), *z = o_.cycle.result();
-    if (plan_.levels.direct) {
-      corotation_.measure_direct(in, scale);
+    if (!Touching || plan_.levels.direct) {
+      corotation_.measure_lacking(in, scale);
       o_.cycle.run(team_);
     } else {
       corotation_.measure(in);

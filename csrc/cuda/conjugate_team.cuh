@@ -38,14 +38,14 @@ class ConjugateTeam {
  public:
   __device__ ConjugateTeam(const ConjugateTeams<T>& work, const ConjugateMemory<T>& memory,
                            std::int64_t environment, BlockTeam& team, std::byte* shared,
-                           WarpSums& warp_sums)
+                           WarpSums& warp_sums, Quad<T>* cycle_sums)
       : call_(work.call),
         plan_(work.call.plan),
         m_(memory),
         environment_(environment),
         weights_(work.product.weights_of(environment)),
         team_(team),
-        cycle_(plan_.levels, memory.cycle, team),
+        cycle_(plan_.levels, memory.cycle, team, cycle_sums),
         slots_(shared, plan_.most_slots),
         entries_(reinterpret_cast<Quad<T>*>(shared + slots_bytes(sizeof(T), plan_.most_slots, 2))),
         warp_sums_(warp_sums),
@@ -322,11 +322,12 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     conjugate_teams(const __grid_constant__ ConjugateTeams<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
   __shared__ WarpSums warp_sums;
+  __shared__ Quad<T> cycle_sums[Leveled ? 4 * conjugate_threads<T> / warp_size : 1];
   const int number = int(blockIdx.x) / work.blocks;
   BlockTeam team(int(blockIdx.x) % work.blocks, work.blocks, work.counter + number);
   const ConjugateMemory<T> memory = memory_of_team(work, number);
   for (std::int64_t e = number; e < work.call.batch; e += work.teams)
-    ConjugateTeam<T, Leveled>(work, memory, e, team, shared, warp_sums).run();
+    ConjugateTeam<T, Leveled>(work, memory, e, team, shared, warp_sums, cycle_sums).run();
 }
 
 template <class T>

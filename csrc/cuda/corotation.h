@@ -77,14 +77,14 @@ class DeviceCorotation {
     products(m_.images, i, z, sum);
   }
 
-  // Before M, of sums V^T q; q came multiplied by `scale`. With M = A^-1 (`direct`) nothing else is needed: what its result
-  // lacks is V (Hc^-1 - Ac^-1) V^T q, since M A V = V.
-  PD_DEVICE void measure(const double* sum, bool direct, double scale) const {
+  // Before M, of sums V^T q; q came multiplied by `scale`. But for deflation, which goes `around` M, nothing else is needed: what
+  // its result lacks is V (Hc^-1 - Ac^-1) V^T q.
+  PD_DEVICE void measure(const double* sum, bool around, double scale) const {
     if (threadIdx.x < turning_modes) {
       const int i = threadIdx.x;
       const double part = row(c_.inverse[1], i, sum);
       c_.own[i] = sum[i];
-      c_.mode[i] = T(direct ? row(c_.inverse[0], i, sum) / scale - part : part);
+      c_.mode[i] = T(around ? part : row(c_.inverse[0], i, sum) / scale - part);
     }
     __syncthreads();
   }

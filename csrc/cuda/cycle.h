@@ -45,8 +45,10 @@ PD_DEVICE Vec3<T> across_lanes(Vec3<T> sum, int most, int least) {
 template <class T>
 class DeviceCycle {
  public:
-  PD_DEVICE DeviceCycle(const Levels<T>& levels, const CycleMemory<T>& memory, BlockTeam& team)
-      : levels_(levels), m_(memory), team_(team) {}
+  // `part`: shared memory for four vectors of every warp of the block
+  PD_DEVICE DeviceCycle(const Levels<T>& levels, const CycleMemory<T>& memory, BlockTeam& team,
+                        Quad<T>* part)
+      : levels_(levels), m_(memory), team_(team), part_(part) {}
 
   // The right side at a vertex. All are set, and met by a barrier, before a run.
   PD_DEVICE void set(int i, const Vec3<T>& right) const {
@@ -65,22 +67,76 @@ class DeviceCycle {
 
   // result = M times what was set, there for all of the team when it returns
   PD_DEVICE void run() {
-    const bool middle = levels_.has_middle(), direct = levels_.direct;
+    run_but_last();
+    if (levels_.direct) {
+      solve_columns();
+    } else {
+      lift(fine_level(levels_), m_.fine, below_fine());
+    }
+    team_.barrier();
+  }
+
+  // The same but for its last part, which run_last does. Between two barriers everything is done side by side.
+  PD_DEVICE void run_but_last() {
+    const Level<1, T> fine = fine_level(levels_);
+    const Level<4, T> middle = middle_level(levels_);
+    const bool direct = levels_.direct, three = levels_.has_middle();
     if (!direct) {
-      descend(fine_level(levels_), m_.fine);
-      restrict_to(fine_level(levels_), m_.fine.rest, middle ? m_.middle.in : m_.coarse_in,
-                  levels_.middle_inverse, middle ? m_.middle.part : nullptr);
+      restrict_to(fine, m_.fine, three ? m_.middle.in : m_.coarse_in,
+                  three ? m_.middle.part : nullptr);
+      smooth(fine, m_.fine);
+      team_.barrier();
+      find_rest(fine, m_.fine);
     }
-    if (middle) {
-      descend(middle_level(levels_), m_.middle);
-      restrict_to(middle_level(levels_), m_.middle.rest, m_.coarse_in, nullptr, nullptr);
+    if (three) {
+      restrict_to(middle, m_.middle, m_.coarse_in, nullptr);
+      smooth(middle, m_.middle);
+      team_.barrier();
+      find_rest(middle, m_.middle);
     }
-    solve_coarse(direct ? m_.fine.in : m_.coarse_in, direct ? m_.fine.z : m_.coarse_out);
-    if (middle) ascend(middle_level(levels_), m_.middle, m_.coarse_out);
-    if (!direct) ascend(fine_level(levels_), m_.fine, middle ? m_.middle.z : m_.coarse_out);
+    solve_rows();
+    team_.barrier();
+    if (direct) return;
+    solve_columns();
+    smooth_rest(fine, m_.fine);
+    if (three) {
+      smooth_rest(middle, m_.middle);
+      team_.barrier();
+      lift(middle, m_.middle, m_.coarse_out);
+    }
+    team_.barrier();
+  }
+
+  // At the vertices row(0 ... count - 1) that are there, for all threads of the block when they have met. `count` is a multiple
+  // of 32, and so are the places from which on rows follow each other.
+  template <class Row>
+  PD_DEVICE void run_last(int count, const Row& row) {
+    if (levels_.direct) {
+      constexpr int together = 4;
+      const int warps = int(blockDim.x) / warp_size;
+#pragma unroll 1
+      for (int t = int(threadIdx.x) / warp_size * together; t < count; t += warps * together) {
+        if (row(t) < levels_.vertices) dots_of<together>(columns(), row(t));
+      }
+      return;
+    }
+    constexpr int lanes = lanes_of_lift<1>;
+    const int last = levels_.vertices - 1, lane = int(threadIdx.x) % lanes;
+    const Level<1, T> fine = fine_level(levels_);
+#pragma unroll 1
+    for (int t = int(threadIdx.x) / lanes; t < count; t += int(blockDim.x) / lanes) {
+      const int at = min(row(t), last);
+      const Vec3<T> sum = across_lanes(lifted(fine, below_fine(), at, 0, lane), lanes / 2, 1);
+      if (lane == 0 && row(t) <= last) m_.fine.z[at] = quad(vec3(m_.fine.z[at]) + sum);
+    }
   }
 
  private:
+  template <int B>
+  static constexpr int lanes_of_lift = B == 1 ? 4 : 8;
+  static constexpr int at_once = sizeof(T) == 4 ? 8 : 4;   // entries of a node that a lane asks for
+  static constexpr int most_of_lane = 16, most_parts = 8;  // of them before more warps share a node
+
   // One entry of a row: where its vectors stand, and their factors.
   template <int Count>
   struct Entry {
@@ -88,42 +144,48 @@ class DeviceCycle {
     T factor[Count];
   };
 
-  // Sums over the entries of rows, `Lanes` threads a sum, for which `read` gives an entry. A thread asks for `Together` entries,
-  // then for all of their vectors. visit(unknown, sum) in one of these threads.
-  template <int Lanes, int Together, int Count, int B, class Read, class Visit>
-  PD_DEVICE void each_sum(const Level<B, T>& level, const int32* start, const Read& read,
-                          const Visit& visit) {
+  // A lane's part of the sum over the entries of a row for unknown i of it, for which `read` gives an entry. A lane asks for
+  // `Together` entries, then for all of their vectors.
+  template <int Lanes, int Together, int Count, class Read>
+  PD_DEVICE static Vec3<T> sum_of(const int32* start, int row, int i, int lane, const Read& read) {
+    const int end = start[row + 1];
+    Vec3<T> sum = {T(0), T(0), T(0)};
+#pragma unroll 1
+    for (int p = start[row] + lane; p < end; p += Together * Lanes) {
+      Entry<Count> entry[Together];
+      Vec3<T> x[Together][Count];
+#pragma unroll
+      for (int u = 0; u < Together; ++u) read(min(p + u * Lanes, end - 1), i, entry[u]);
+#pragma unroll
+      for (int u = 0; u < Together; ++u) {
+#pragma unroll
+        for (int c = 0; c < Count; ++c) x[u][c] = vec3(entry[u].from[c]);
+      }
+#pragma unroll
+      for (int u = 0; u < Together; ++u) {
+        const Vec3<T> part = product(entry[u].factor, x[u]);
+        const bool in = p + u * Lanes < end;
+        sum = {select(in, sum.x + part.x, sum.x), select(in, sum.y + part.y, sum.y),
+               select(in, sum.z + part.z, sum.z)};
+      }
+    }
+    return sum;
+  }
+
+  // visit(unknown, sum) for the unknowns of a level in one of the `Lanes` threads that have a part(row, number in it, lane) of
+  // the sum each. The last warps come first, since what is done beside keeps the first ones busy.
+  template <int Lanes, int B, class Part, class Visit>
+  PD_DEVICE void each_sum(const Level<B, T>& level, const Part& part, const Visit& visit) {
     constexpr int per_warp = warp_size / Lanes;
     const int count = level.rows * B, lane = int(threadIdx.x) % Lanes;
     const int own = int(threadIdx.x) % warp_size / Lanes;
 #pragma unroll 1
-    for (int first = team_.warp() * per_warp; first < count; first += team_.warps() * per_warp) {
-      const int at = min(first + own, count - 1), row = at / B, i = at % B;
-      const int end = start[row + 1];
-      Vec3<T> sum = {T(0), T(0), T(0)};
-#pragma unroll 1
-      for (int p = start[row] + lane; p < end; p += Together * Lanes) {
-        Entry<Count> entry[Together];
-        Vec3<T> x[Together][Count];
-#pragma unroll
-        for (int u = 0; u < Together; ++u) read(min(p + u * Lanes, end - 1), i, entry[u]);
-#pragma unroll
-        for (int u = 0; u < Together; ++u) {
-#pragma unroll
-          for (int c = 0; c < Count; ++c) x[u][c] = vec3(entry[u].from[c]);
-        }
-#pragma unroll
-        for (int u = 0; u < Together; ++u) {
-          const Vec3<T> part = product(entry[u].factor, x[u]);
-          const bool in = p + u * Lanes < end;
-          sum = {select(in, sum.x + part.x, sum.x), select(in, sum.y + part.y, sum.y),
-                 select(in, sum.z + part.z, sum.z)};
-        }
-      }
-      sum = across_lanes(sum, Lanes / 2, 1);
+    for (int first = (team_.warps() - 1 - team_.warp()) * per_warp; first < count;
+         first += team_.warps() * per_warp) {
+      const int at = min(first + own, count - 1);
+      const Vec3<T> sum = across_lanes(part(at / B, at % B, lane), Lanes / 2, 1);
       if (lane == 0 && first + own < count) visit(at, sum);
     }
-    team_.barrier();
   }
 
   PD_DEVICE static Vec3<T> product(const T (&a)[1], const Vec3<T> (&x)[1]) { return a[0] * x[0]; }
@@ -143,110 +205,152 @@ class DeviceCycle {
   // visit(unknown, (A x) there)
   template <int B, class Visit>
   PD_DEVICE void each_product(const Level<B, T>& level, const Quad<T>* x, const Visit& visit) {
-    each_sum<(B == 1 ? 4 : 8), (B == 1 ? 4 : 2), B>(
-        level, level.start,
-        [&](int p, int i, Entry<B>& entry) {
-          entry.from = x + std::int64_t(level.column[p]) * B;
-          if constexpr (B == 1) {
-            entry.factor[0] = level.value[p];
-          } else {
-            read_four(level.value, std::int64_t(p) * B + i, entry.factor);
-          }
-        },
-        visit);
+    constexpr int lanes = B == 1 ? 4 : 8, together = B == 1 || sizeof(T) == 4 ? 4 : 2;
+    const auto read = [&](int p, int i, Entry<B>& entry) {
+      entry.from = x + std::int64_t(level.column[p]) * B;
+      if constexpr (B == 1) {
+        entry.factor[0] = level.value[p];
+      } else {
+        read_four(level.value, std::int64_t(p) * B + i, entry.factor);
+      }
+    };
+    const auto part = [&](int row, int i, int lane) {
+      return sum_of<lanes, together, B>(level.start, row, i, lane, read);
+    };
+    each_sum<lanes>(level, part, visit);
   }
 
-  // visit(unknown, (P x) there)
-  template <int B, class Visit>
-  PD_DEVICE void each_lift(const Level<B, T>& level, const Quad<T>* x, const Visit& visit) {
-    each_sum<4, (B == 1 ? 1 : 2), 4>(
-        level, level.lift_start,
-        [&](int p, int i, Entry<4>& entry) {
-          entry.from = x + std::int64_t(level.lift_node[p]) * 4;
-          read_four(level.lift_weight, std::int64_t(p) * B + i, entry.factor);
-        },
-        visit);
-  }
-
-  // smooth from zero, and what that leaves
+  // z = S r, from zero
   template <int B>
-  PD_DEVICE void descend(const Level<B, T>& level, const LevelFields<T>& f) {
+  PD_DEVICE void smooth(const Level<B, T>& level, const LevelFields<T>& f) {
     each_product(level, f.part, [&](int at, const Vec3<T>& product) {
-      f.z[at] = quad(smooth(level, f, vec3(f.in[at]), at, product));
-    });
-    each_product(level, f.z, [&](int at, const Vec3<T>& product) {
-      f.rest[at] = quad(vec3(f.in[at]) - product);
+      f.z[at] = quad(smoothed(level, f, vec3(f.in[at]), at, product));
     });
   }
 
-  // correct by what the level below has found, and smooth
+  // what that leaves of r
   template <int B>
-  PD_DEVICE void ascend(const Level<B, T>& level, const LevelFields<T>& f, const Quad<T>* below) {
-    each_lift(level, below,
-              [&](int at, const Vec3<T>& lift) { f.z[at] = quad(vec3(f.z[at]) + lift); });
+  PD_DEVICE void find_rest(const Level<B, T>& level, const LevelFields<T>& f) {
     each_product(level, f.z, [&](int at, const Vec3<T>& product) {
       const Vec3<T> rest = vec3(f.in[at]) - product;
       f.rest[at] = quad(rest);
       f.part[at] = quad(T(Smoother::first) * level.inverse[at] * rest);
     });
+  }
+
+  // z += S rest
+  template <int B>
+  PD_DEVICE void smooth_rest(const Level<B, T>& level, const LevelFields<T>& f) {
     each_product(level, f.part, [&](int at, const Vec3<T>& product) {
-      f.z[at] = quad(vec3(f.z[at]) + smooth(level, f, vec3(f.rest[at]), at, product));
+      f.z[at] = quad(vec3(f.z[at]) + smoothed(level, f, vec3(f.rest[at]), at, product));
     });
+  }
+
+  // a lane's part of (F y) at unknown i of a row, y what the level below has found
+  template <int B>
+  PD_DEVICE static Vec3<T> lifted(const Level<B, T>& level, const Quad<T>* below, int row, int i,
+                                  int lane) {
+    const auto read = [&](int p, int number, Entry<4>& entry) {
+      entry.from = below + std::int64_t(level.lift_node[p]) * 4;
+      read_four(level.lift_weight, std::int64_t(p) * B + number, entry.factor);
+    };
+    return sum_of<lanes_of_lift<B>, 2, 4>(level.lift_start, row, i, lane, read);
+  }
+
+  // z += F y
+  template <int B>
+  PD_DEVICE void lift(const Level<B, T>& level, const LevelFields<T>& f, const Quad<T>* below) {
+    const auto part = [&](int row, int i, int lane) { return lifted(level, below, row, i, lane); };
+    each_sum<lanes_of_lift<B>>(
+        level, part, [&](int at, const Vec3<T>& sum) { f.z[at] = quad(vec3(f.z[at]) + sum); });
+  }
+  PD_DEVICE const Quad<T>* below_fine() const {
+    return levels_.has_middle() ? m_.middle.z : m_.coarse_out;
   }
 
   // keep w + second / D (r - A w), w being f.part and `product` A w
   template <int B>
-  PD_DEVICE static Vec3<T> smooth(const Level<B, T>& level, const LevelFields<T>& f,
-                                  const Vec3<T>& right, int at, const Vec3<T>& product) {
+  PD_DEVICE static Vec3<T> smoothed(const Level<B, T>& level, const LevelFields<T>& f,
+                                    const Vec3<T>& right, int at, const Vec3<T>& product) {
     const T scale = T(Smoother::second) * level.inverse[at];
     return multiply_add(T(Smoother::keep), vec3(f.part[at]), scale * (right - product));
   }
 
-  // A warp a node. `inverse`, `part`: what smoothing on the level below begins with; null for the dense one.
+  // F^T r, a node by one warp, or by several of a block where it has many entries: the plan alone decides. `part`: what
+  // smoothing on the level below begins with, null for the dense one. All threads.
   template <int B>
-  PD_DEVICE void restrict_to(const Level<B, T>& level, const Quad<T>* rest, Quad<T>* in,
-                             const T* inverse, Quad<T>* part) {
-    const int lane = int(threadIdx.x) % warp_size;
+  PD_DEVICE void restrict_to(const Level<B, T>& level, const LevelFields<T>& f, Quad<T>* in,
+                             Quad<T>* part) {
+    const std::int64_t entries = std::int64_t(level.lift_start[level.rows]) * B;
+    int parts = 1;
+    while (parts < most_parts &&
+           entries > std::int64_t(parts) * level.nodes * warp_size * most_of_lane)
+      parts *= 2;
+    const int warp = int(threadIdx.x) / warp_size, lane = int(threadIdx.x) % warp_size;
+    const int together = int(blockDim.x) / warp_size / parts;
+    const auto keep = [&](int at, const Vec3<T>& sum) {
+      in[at] = quad(sum);
+      if (part) part[at] = quad(T(Smoother::first) * levels_.middle_inverse[at] * sum);
+    };
 #pragma unroll 1
-    for (int node = team_.warp(); node < level.nodes; node += team_.warps()) {
+    for (int first = 0; first < level.nodes; first += together * team_.blocks()) {
+      const auto node_of = [&](int number) {
+        return first + number * team_.blocks() + team_.rank();
+      };
+      const int node = node_of(warp / parts);
       Vec3<T> sum[4] = {};
-#pragma unroll(B == 1 ? 4 : 1)
-      for (int p = level.node_start[node] + lane; p < level.node_start[node + 1]; p += warp_size) {
-        const std::int64_t row = level.node_row[p];
-        const auto* weights = reinterpret_cast<const Quad<T>*>(level.lift_weight) +
-                              std::int64_t(level.node_lift[p]) * B;
-        for (int i = 0; i < B; ++i) {
-          const Vec3<T> from = vec3(rest[row * B + i]);
-          const Quad<T> weight = weights[i];
-          sum[0] = multiply_add(weight.x, from, sum[0]);
-          sum[1] = multiply_add(weight.y, from, sum[1]);
-          sum[2] = multiply_add(weight.z, from, sum[2]);
-          sum[3] = multiply_add(weight.w, from, sum[3]);
-        }
-      }
+      if (node < level.nodes)
+        add_node(level, f.in, node, warp % parts * warp_size + lane, parts * warp_size, sum);
 #pragma unroll
       for (int j = 0; j < 4; ++j) {
         const Vec3<T> total = across_lanes(sum[j], warp_size / 2, 1);
         if (lane != j) continue;
-        const int at = 4 * node + j;
-        in[at] = quad(total);
-        if (part) part[at] = quad(T(Smoother::first) * inverse[at] * total);
+        if (parts > 1) {
+          part_[warp * 4 + j] = quad(total);
+        } else if (node < level.nodes) {
+          keep(4 * node + j, total);
+        }
       }
+      if (parts == 1) continue;
+      __syncthreads();
+      const int number = int(threadIdx.x) / 4, j = int(threadIdx.x) % 4;
+      if (number < together && node_of(number) < level.nodes) {
+        Vec3<T> total = {T(0), T(0), T(0)};
+        for (int p = 0; p < parts; ++p) total = total + vec3(part_[(number * parts + p) * 4 + j]);
+        keep(4 * node_of(number) + j, total);
+      }
+      __syncthreads();
     }
-    team_.barrier();
   }
 
-  // L^-T (L^-1 r): symmetric and positive in any precision. A warp a row, then a warp a column.
-  PD_DEVICE void solve_coarse(const Quad<T>* in, Quad<T>* out) {
-    const int n = levels_.coarse_unknowns();
-    each_dot(n, in, m_.coarse_half, [&](int i) {
-      return Stretch{levels_.coarse_factor + std::int64_t(i) * (i + 1) / 2, 0, i + 1};
-    });
-    each_dot(n, m_.coarse_half, out, [&](int j) {
-      // so that the numbers of row i are at i
-      const std::int64_t diagonal = std::int64_t(j) * n - std::int64_t(j) * (j - 1) / 2;
-      return Stretch{levels_.coarse_columns + diagonal - j, j, n};
-    });
+  // Sums over the entries first, first + stride ... of a node.
+  template <int B>
+  PD_DEVICE static void add_node(const Level<B, T>& level, const Quad<T>* from, int node, int first,
+                                 int stride, Vec3<T> (&sum)[4]) {
+    const auto* weights = reinterpret_cast<const Quad<T>*>(level.node_weight);
+    const std::int64_t begin = std::int64_t(level.node_start[node]) * B;
+    const int count = (level.node_start[node + 1] - level.node_start[node]) * B;
+#pragma unroll 1
+    for (int p = first; p < count; p += at_once * stride) {
+      Vec3<T> x[at_once];
+      Quad<T> weight[at_once];
+      int row[at_once];
+#pragma unroll
+      for (int u = 0; u < at_once; ++u) {
+        const std::int64_t at = begin + min(p + u * stride, count - 1);
+        row[u] = level.node_row[at / B] * B + int(at % B);
+        weight[u] = weights[at];
+      }
+#pragma unroll
+      for (int u = 0; u < at_once; ++u) x[u] = vec3(from[row[u]]);
+#pragma unroll
+      for (int u = 0; u < at_once; ++u) {
+        if (p + u * stride >= count) continue;
+        const T w[4] = {weight[u].x, weight[u].y, weight[u].z, weight[u].w};
+#pragma unroll
+        for (int j = 0; j < 4; ++j) sum[j] = multiply_add(w[j], x[u], sum[j]);
+      }
+    }
   }
 
   // Numbers first ... end - 1 of a row or column.
@@ -255,48 +359,73 @@ class DeviceCycle {
     int first, end;
   };
 
-  template <class Of>
-  PD_DEVICE void each_dot(int n, const Quad<T>* x, Quad<T>* out, const Of& of) {
-    if (n <= team_.warps()) {
-      dots<1>(n, x, out, of);
-    } else {
-      dots<4>(n, x, out, of);
+  // L^-1 row by row, or column by column: a product with a vector [n].
+  struct Triangle {
+    const T* numbers;
+    const Quad<T>* x;
+    Quad<T>* out;
+    int n;
+    bool by_columns;
+
+    PD_DEVICE Stretch stretch(int i) const {
+      if (!by_columns) return {numbers + std::int64_t(i) * (i + 1) / 2, 0, i + 1};
+      // so that the numbers of row i are at i
+      const std::int64_t diagonal = std::int64_t(i) * n - std::int64_t(i) * (i - 1) / 2;
+      return {numbers + diagonal - i, i, n};
     }
-    team_.barrier();
+  };
+
+  // L^-T (L^-1 r): symmetric and positive in any precision. A warp a row, then a warp a column.
+  PD_DEVICE void solve_rows() {
+    const Quad<T>* in = levels_.direct ? m_.fine.in : m_.coarse_in;
+    each_dot({levels_.coarse_factor, in, m_.coarse_half, levels_.coarse_unknowns(), false});
+  }
+  PD_DEVICE void solve_columns() { each_dot(columns()); }
+  PD_DEVICE Triangle columns() const {
+    Quad<T>* out = levels_.direct ? m_.fine.z : m_.coarse_out;
+    return {levels_.coarse_columns, m_.coarse_half, out, levels_.coarse_unknowns(), true};
   }
 
-  // `Rows` neighbouring stretches by a warp, chunk by chunk of a number for each lane.
-  template <int Rows, class Of>
-  PD_DEVICE void dots(int n, const Quad<T>* x, Quad<T>* out, const Of& of) {
-    const int lane = int(threadIdx.x) % warp_size;
+  PD_DEVICE void each_dot(const Triangle& a) {
+    if (a.n <= team_.warps()) {
+      if (team_.warp() < a.n) dots_of<1>(a, team_.warp());
+    } else {
 #pragma unroll 1
-    for (int i = team_.warp() * Rows; i < n; i += team_.warps() * Rows) {
-      Stretch stretch[Rows];
-      Vec3<T> sum[Rows];
+      for (int i = team_.warp() * 4; i < a.n; i += team_.warps() * 4) dots_of<4>(a, i);
+    }
+  }
+
+  // `Rows` neighbouring stretches by a warp, from i on, chunk by chunk of a number for each lane. Out of line, since so many
+  // call it.
+  template <int Rows>
+  static __device__ __noinline__ void dots_of(Triangle a, int i) {
+    const int n = a.n, lane = int(threadIdx.x) % warp_size;
+    const Quad<T>* x = a.x;
+    Stretch stretch[Rows];
+    Vec3<T> sum[Rows];
 #pragma unroll
-      for (int r = 0; r < Rows; ++r) {
-        stretch[r] = of(min(i + r, n - 1));
-        sum[r] = {T(0), T(0), T(0)};
-      }
-      // rows end where they are, columns begin there; chunks that all of them fill lie between
-      const Stretch &one = stretch[0], &other = stretch[Rows - 1];
-      const int full = (other.first + warp_size - 1) / warp_size, part = one.end / warp_size;
-      int chunk = one.first / warp_size;
+    for (int r = 0; r < Rows; ++r) {
+      stretch[r] = a.stretch(min(i + r, n - 1));
+      sum[r] = {T(0), T(0), T(0)};
+    }
+    // rows end where they are, columns begin there; chunks that all of them fill lie between
+    const Stretch &one = stretch[0], &other = stretch[Rows - 1];
+    const int full = (other.first + warp_size - 1) / warp_size, part = one.end / warp_size;
+    int chunk = one.first / warp_size;
 #pragma unroll 1
-      for (; chunk < min(full, part); ++chunk) add_part(n, x, stretch, chunk, sum);
-      constexpr int together = Rows == 1 ? 8 : 4;
+    for (; chunk < min(full, part); ++chunk) add_part(n, x, stretch, chunk, sum);
+    constexpr int together = Rows == 1 ? 8 : 4;
 #pragma unroll 1
-      for (; chunk + together <= part; chunk += together)
-        add_chunks<together>(x, stretch, chunk * warp_size + lane, sum);
+    for (; chunk + together <= part; chunk += together)
+      add_chunks<together>(x, stretch, chunk * warp_size + lane, sum);
 #pragma unroll 1
-      for (; chunk < part; ++chunk) add_chunks<1>(x, stretch, chunk * warp_size + lane, sum);
+    for (; chunk < part; ++chunk) add_chunks<1>(x, stretch, chunk * warp_size + lane, sum);
 #pragma unroll 1
-      for (; chunk * warp_size < other.end; ++chunk) add_part(n, x, stretch, chunk, sum);
+    for (; chunk * warp_size < other.end; ++chunk) add_part(n, x, stretch, chunk, sum);
 #pragma unroll
-      for (int r = 0; r < Rows; ++r) {
-        const Vec3<T> total = across_lanes(sum[r], warp_size / 2, 1);
-        if (lane == 0 && i + r < n) out[i + r] = quad(total);
-      }
+    for (int r = 0; r < Rows; ++r) {
+      const Vec3<T> total = across_lanes(sum[r], warp_size / 2, 1);
+      if (lane == 0 && i + r < n) a.out[i + r] = quad(total);
     }
   }
 
@@ -341,6 +470,7 @@ class DeviceCycle {
   const Levels<T>& levels_;
   const CycleMemory<T>& m_;
   BlockTeam& team_;
+  Quad<T>* part_;
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -32,10 +32,9 @@ class Ranges {
     }
     team_.barrier();
     for (int n = 0; n < ranges_count; ++n) {
-      range[n] = {};
-      for (int b = 0; b < team_.blocks(); ++b) {
-        range[n].add(rows[b * ranges_count + n]);
-      }
+      Range all;
+      for (int b = lane; b < team_.blocks(); b += warp_size) all.add(rows[b * ranges_count + n]);
+      range[n] = {across_warp(all.least, Least{}), -across_warp(-all.largest, Least{})};
     }
   }
 

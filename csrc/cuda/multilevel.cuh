@@ -55,7 +55,8 @@ __global__ void __launch_bounds__(outer_threads)
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.counter + number);
   const Levels<T>& levels = call.op.levels;
   const CycleMemory<T> memory = cycle_of_team(levels, call.memory, number);
-  DeviceCycle<T> cycle(levels, memory, team);
+  __shared__ Quad<T> part[4 * outer_warps];
+  DeviceCycle<T> cycle(levels, memory, team, part);
   for (std::int64_t e = number; e < call.op.batch; e += call.teams) {
     const auto row = [&](int i) { return (e * levels.vertices + call.op.vertex_order[i]) * 3; };
     for (int i = team.thread(); i < levels.vertices; i += team.threads())

@@ -4,11 +4,14 @@
 #include "cuda/corotation_maker.h"
 #include "cuda/shared_vertices.h"
 
+#include <type_traits>
+
 namespace pd::inline PD_TARGET {
 
 template <class T, bool Touching, int Threads>
 class MultilevelRunner {
   static constexpr int warps = Threads / warp_size;
+  struct Nothing {};
 
  public:
   PD_DEVICE MultilevelRunner(const OuterCall<T>& call, const OuterMemory<T>& memory,
@@ -19,7 +22,8 @@ class MultilevelRunner {
         m_(memory),
         team_(team),
         c_(control),
-        cycle_(call.plan().levels, memory.cycle, team),
+        cycle_(call.plan().levels, memory.cycle, team,
+               reinterpret_cast<Quad<T>*>(control.warp_dot)),
         shared_(shared),
         lbfgs_(call.stream.step.settings.learns()),
         corotates_(call.shared_corotation > 0),
@@ -40,8 +44,8 @@ class MultilevelRunner {
 
   PD_DEVICE bool finished() const { return c_.done; }
 
-  // E and what is out of balance at the trial u
-  PD_DEVICE void evaluate(int) {
+  // E and what is out of balance at the trial u, and what the pair from the base to it has in common with the others
+  PD_DEVICE void evaluate(int k) {
 #pragma unroll 1
     for (int patch = team_.rank(); patch < w_.plan.patches; patch += team_.blocks()) {
       ThreadSums sums = {{0, 0, 0}};
@@ -51,97 +55,30 @@ class MultilevelRunner {
       write_sums<Visit::measure>(sums, m_.patch_sums + patch * sums_count);
     }
     team_.barrier();
-    // those of this thread, on the way to the shared vertices
-    patch_sum_[0] = patch_sum_[1] = 0;
-#pragma unroll 1
-    for (int patch = threadIdx.x; patch < w_.plan.patches; patch += blockDim.x) {
-      for (int n = 0; n < 2; ++n) patch_sum_[n] += m_.patch_sums[patch * sums_count + n];
-    }
-    if (w_.plan.shared == 0) {
-      if (threadIdx.x == 0) c_.total[0] = c_.total[1] = 0;
-      return;
-    }
-    const int first = w_.plan.patch_vertex[w_.plan.patches];
-    add_up<2>(w_.plan.shared, [&](int i, double (&sum)[2]) {
-      ThreadSums sums = {{0, 0, 0}};
-      const auto seen = w_.v.see(first + i);
-      look_at(first + i, seen, shared_force(w_, SharedPlaces(w_.plan, i)), sums);
-      sum[0] = sums.value[0];
-      sum[1] = sums.value[1];
-    });
+    look_back(k);
   }
 
   // every block decides from the same sums, so all decide alike
   PD_DEVICE void judge(int) {
-    // the shared vertices' part is there
-    double sum[2] = {patch_sum_[0], patch_sum_[1]};
-    add_across_warp(sum);
-    const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
-    if (lane == 0) {
-      for (int n = 0; n < 2; ++n) c_.warp_dot[warp][n] = sum[n];
-    }
-    __syncthreads();
-    if (warp == 0) {
-      for (int n = 0; n < 2; ++n) sum[n] = lane < warps ? c_.warp_dot[lane][n] : 0;
-      add_across_warp(sum);
-    }
     if (threadIdx.x == 0) {
-      const double work = c_.outer.known ? c_.total[1] + sum[1] : 0;
-      const double energy = (c_.total[0] + sum[0]) + work;
+      const double work = c_.outer.known ? c_.total[dots_energy + 1] : 0;
+      const double energy = c_.total[dots_energy] + work;
       c_.accepted = c_.outer.accept(energy, lbfgs_);
       // the friction of another base does other work
       if (c_.accepted) c_.outer.energy -= work;
-      c_.finite = energy < HUGE_VAL;
     }
     __syncthreads();
+    const bool moves = c_.accepted;
+    base_ = moves ? w_.v.u : m_.base;
+    pull_ = moves ? m_.fresh : m_.pull;
+    free_ = moves ? m_.fresh_free : m_.free;
   }
 
-  // The pair from the base to the trial, kept or not: it holds for the curvature on the way. Then the base moves on.
+  // the pair from the base to the trial, kept or not: it holds for the curvature on the way
   PD_DEVICE void learn(int k) {
-    newest_ = (newest_ + 1) % history;
-    iteration_ = k;
-    pass<outer_dots, T>([&](int i, T(&sum)[outer_dots]) {
-      const Vec3<T> u = vec3(w_.v.u[i]), fresh = vec3(m_.fresh[i]);
-      const Vec3<T> base = k == 0 ? u : vec3(m_.base[i]), pull = k == 0 ? fresh : vec3(m_.pull[i]);
-      const Vec3<T> change = u - base;
-      Vec3<T> s = let_through(i, change, k), y = let_through(i, fresh - pull, k);
-      if constexpr (Touching) keep_directions(i, k);
-      const bool accepted = c_.accepted;
-      const Vec3<T> left = accepted ? fresh : pull;
-      sum[2 * history] += dot(change, change);
-      if (w_.settings().tolerance > 0) {
-        const Vec3<T> way = u - vec3(w_.v.target[i]);
-        sum[2 * history + 1] += dot(way, way);
-      }
-      const auto keep = [&] {
-        // what momentum goes on along
-        if (accepted || k == 0) w_.v.set_before(i, base);
-        m_.base[i] = quad(accepted ? u : base);
-        m_.pull[i] = quad(left);
-      };
-      if (!lbfgs_) return keep();
-      // a trial out of range must not poison sums in which it has no part
-      if (!c_.finite) s = y = none();
-      const Vec3<T> g = let_through(i, left);
-      Vec3<T> ways[history];
-      see_pairs(m_.s, i, ways);
-#pragma unroll
-      for (int j = 0; j < history; ++j) {
-        if (j != newest_ && !c_.pairs.valid[j]) continue;
-        const Vec3<T> way = j == newest_ ? s : ways[j];
-        sum[j] += dot(way, y);
-        sum[history + j] += dot(way, g);
-      }
-      sum[2 * history + 2] += dot(y, y);
-      keep();
-      m_.s[newest_ * vertices() + i] = quad(s);
-      m_.y[newest_ * vertices() + i] = quad(y);
-    });
     if (threadIdx.x < warp_size) {
-      if (threadIdx.x == 0) {
-        stop(k, c_.total[2 * history], c_.total[2 * history + 1]);
-        if (lbfgs_) remember(k);
-      }
+      if (lbfgs_) remember(k);
+      if (threadIdx.x == 0) stop(k, c_.total[dots_change], c_.total[dots_way]);
       __syncwarp();
       if (lbfgs_) PairLanes(c_.pairs, newest_).first_loop();
     }
@@ -155,7 +92,7 @@ class MultilevelRunner {
     if (corotates_) corotate();
     const double scale = w_.settings().relaxation / c_.outer.scale;
     const auto right_side = [&](int i) {
-      Vec3<T> q = let_through(i, vec3(m_.pull[i]));
+      Vec3<T> q = let_through(i, vec3(pull_[i]));
       if (lbfgs_) {
         Vec3<T> y[history];
         see_pairs(m_.y, i, y);
@@ -167,28 +104,31 @@ class MultilevelRunner {
       }
       return T(scale) * q;
     };
-    // the small problem takes its part before the cycle, and gives what that lacks after it
-    const bool direct = w_.plan.levels.direct, around = corotated_ && !direct;
+    // with contacts the small problem takes its part before the cycle, and gives what that lacks after it
+    const bool around = Touching && corotated_ && !w_.plan.levels.direct;
     if (corotated_) {
       pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
         const Vec3<T> q = right_side(i);
         cycle_.set(i, q);
         corotation_.multiply_modes(i, q, sum);
       });
-      corotation_.measure(c_.total, direct, scale);
+      corotation_.measure(c_.total, around, scale);
     } else {
       each_vertex([&](int i) { cycle_.set(i, right_side(i)); });
     }
-    if (around)
-      each_vertex([&](int i) { cycle_.set(i, corotation_.without(i, cycle_.right_side(i))); });
-    cycle_.run();
     if (around) {
+      each_vertex([&](int i) { cycle_.set(i, corotation_.without(i, cycle_.right_side(i))); });
+      cycle_.run();
       pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
         corotation_.multiply_images(i, cycle_.result(i), sum);
       });
       corotation_.answer(c_.total, scale);
+    } else if (lbfgs_) {
+      cycle_.run_but_last();
+    } else {
+      cycle_.run();
     }
-    if (lbfgs_) correct();
+    if (lbfgs_) correct(!around);
   }
 
   // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi iteration
@@ -205,22 +145,34 @@ class MultilevelRunner {
     __syncthreads();
     const T beta = T(c_.total[0]), length = T((1 + c_.total[0]) * c_.outer.length());
     const T theta = T(w_.settings().relaxation);
+    const bool moved = c_.accepted;
     each_vertex([&](int i) {
       const auto v = w_.v.at(i);
-      const Vec3<T> u = vec3(m_.base[i]), before = vec3(w_.v.before[i]);
-      const Quad<T>* slope = Touching ? m_.gradient : m_.pull;
+      const Vec3<T> u = vec3(base_[i]), pull = vec3(pull_[i]);
+      // what momentum goes on along
+      const Vec3<T> before = vec3(iteration_ == 0 ? w_.v.u[i]
+                                  : moved         ? m_.base[i]
+                                                  : w_.v.before[i]);
+      if constexpr (Touching) keep_directions(i);
+      const Vec3<T> slope = Touching ? vec3(m_.gradient[i]) : pull;
       Vec3<T> next;
       if (plain) {
-        next = v.project(w_.contacts, subtract_product(u, v.inverse, vec3(m_.pull[i])), u);
+        next = v.project(w_.contacts, subtract_product(u, v.inverse, pull), u);
       } else if (accelerates) {
-        next = accelerate(u, before, vec3(slope[i]), theta * v.inverse, T(1) + beta);
+        next = accelerate(u, before, slope, theta * v.inverse, T(1) + beta);
         next = v.project(w_.contacts, next, u);
       } else {
         next = u - way(i, length * direction(i) - beta * (u - before));
-        if constexpr (Touching) next = v.land(w_.contacts, next, u, vec3(slope[i]));
+        if constexpr (Touching) next = v.land(w_.contacts, next, u, slope);
       }
+      if (moved) w_.v.set_before(i, before);
+      m_.base[i] = quad(u);
+      m_.pull[i] = quad(pull);
       w_.v.set(i, v.hold(v.target, next));
     });
+    base_ = m_.base;
+    pull_ = m_.pull;
+    free_ = m_.free;
   }
 
   // the last trial counts only if it is better than the base, and that only if its energy is a number
@@ -245,7 +197,7 @@ class MultilevelRunner {
   PD_DEVICE void corotate() {
     const bool held = made_ > 0 && corotation_.control().held;
     const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_, Touching, held);
-    const CorotationInput<T> in = {w_.v.x, w_.v.u, w_.v.target, m_.base, w_.weights};
+    const CorotationInput<T> in = {w_.v.x, w_.v.u, w_.v.target, base_, w_.weights};
     if (plan.forget) corotated_ = false;
     if (plan.make) {
       ++made_;
@@ -256,7 +208,7 @@ class MultilevelRunner {
     }
     if constexpr (Touching) {
       if (corotated_)
-        team_ = hold_corotation(in, m_.free, m_.corotation, team_, shared_, c_.outer.scale,
+        team_ = hold_corotation(in, free_, m_.corotation, team_, shared_, c_.outer.scale,
                                 corotation_.control());
     }
   }
@@ -277,6 +229,50 @@ class MultilevelRunner {
     }
   }
 
+  // The same at the shared vertices; then, at all of them, sums for the judgement and for the pair from the base to the trial,
+  // whatever becomes of it.
+  PD_DEVICE void look_back(int k) {
+    newest_ = (newest_ + 1) % history;
+    iteration_ = k;
+    const int first_shared = w_.plan.patch_vertex[w_.plan.patches];
+    pass<outer_dots, T>([&](int i, T(&sum)[outer_dots]) {
+      ThreadSums sums = {{0, 0, 0}};
+      if (i < w_.plan.patches) {
+        for (int n = 0; n < 2; ++n) sums.value[n] = m_.patch_sums[i * sums_count + n];
+      }
+      if (i >= first_shared) {
+        const auto seen = w_.v.see(i);
+        look_at(i, seen, shared_force(w_, SharedPlaces(w_.plan, i - first_shared)), sums);
+      }
+      for (int n = 0; n < 2; ++n) sum[dots_energy + n] = T(sums.value[n]);
+      const Vec3<T> u = vec3(w_.v.u[i]);
+      if (w_.settings().tolerance > 0) {
+        const Vec3<T> way = u - vec3(w_.v.target[i]);
+        sum[dots_way] = dot(way, way);
+      }
+      if (k == 0) return;
+      const Vec3<T> change = u - vec3(m_.base[i]);
+      sum[dots_change] = dot(change, change);
+      if (!lbfgs_) return;
+      const Vec3<T> fresh = vec3(m_.fresh[i]), pull = vec3(m_.pull[i]);
+      const Vec3<T> s = let_through(i, change), y = let_through(i, fresh - pull);
+      const Vec3<T> g = known(i, Touching ? m_.fresh_free[i] * fresh : fresh);
+      Vec3<T> ways[history];
+      see_pairs(m_.s, i, ways);
+#pragma unroll
+      for (int j = 0; j < history; ++j) {
+        if (j != newest_ && !c_.pairs.valid[j]) continue;
+        const Vec3<T> way = j == newest_ ? s : ways[j];
+        sum[dots_with + j] = dot(way, y);
+        sum[dots_pulled + j] = dot(way, g);
+      }
+      sum[dots_back] = dot(s, let_through(i, pull));
+      sum[dots_turn] = dot(y, y);
+      m_.s[newest_ * vertices() + i] = quad(s);
+      m_.y[newest_ * vertices() + i] = quad(y);
+    });
+  }
+
   template <class Visit>
   PD_DEVICE void each_vertex(const Visit& visit) {
 #pragma unroll 1
@@ -285,14 +281,15 @@ class MultilevelRunner {
   }
 
   // visit(vertex, sums); then the totals are in c_.total. `Sum`: of the sums of a warp.
-  template <int Count, class Sum = double, class Visit>
+  template <int Count, class Sum, class Visit>
   PD_DEVICE void pass(const Visit& visit) {
-    add_up<Count, Sum>(w_.plan.vertices, visit);
+    pass<Count, Sum>(visit, Nothing{});
   }
 
-  // visit(number, sums) for numbers 0 ... count - 1, a lane each, chunk by chunk of them
-  template <int Count, class Sum = double, class Visit>
-  PD_DEVICE void add_up(int count, const Visit& visit) {
+  // Chunk by chunk of them, a lane each; before some are visited prepare(how many, which) is called by all of the block.
+  template <int Count, class Sum, class Visit, class Prepare>
+  PD_DEVICE void pass(const Visit& visit, const Prepare& prepare) {
+    const int count = w_.plan.vertices;
     const int together = call_.warps_of_chunk(), chunks = call_.chunks_of(count, together);
     const int groups = warps / together;  // chunks that a block works on at a time
     const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
@@ -305,6 +302,13 @@ class MultilevelRunner {
     };
 #pragma unroll 1
     for (int round = 0; chunk_of(round, 0) < chunks; ++round) {
+      if constexpr (!std::is_same_v<Prepare, Nothing>) {
+        const int each = together * warp_size;  // vertices of a chunk
+        const int ahead = (chunks - chunk_of(round, 0) + team_.blocks() - 1) / team_.blocks();
+        prepare(min(groups, ahead) * each,
+                [&](int t) { return chunk_of(round, t / each) * each + t % each; });
+        __syncthreads();
+      }
       Sum sum[Count] = {};
       const int from = (chunk_of(round, warp / together) * together + warp % together) * warp_size;
       if (from < count) {
@@ -323,11 +327,22 @@ class MultilevelRunner {
     team_.barrier();
     constexpr int each = (Count + warps - 1) / warps;  // sums of a warp
     double sum[each] = {};
+    constexpr int at_once = 4;
 #pragma unroll 1
-    for (int chunk = lane; chunk < chunks; chunk += warp_size) {
+    for (int chunk = lane; chunk < chunks; chunk += at_once * warp_size) {
+      double part[at_once][each];
 #pragma unroll
-      for (int n = 0; n < each; ++n)
-        sum[n] += dots[min(warp + n * warps, Count - 1) * chunks + chunk];
+      for (int u = 0; u < at_once; ++u) {
+#pragma unroll
+        for (int n = 0; n < each; ++n)
+          part[u][n] = dots[min(warp + n * warps, Count - 1) * chunks +
+                            min(chunk + u * warp_size, chunks - 1)];
+      }
+#pragma unroll
+      for (int u = 0; u < at_once; ++u) {
+#pragma unroll
+        for (int n = 0; n < each; ++n) sum[n] += chunk + u * warp_size < chunks ? part[u][n] : 0;
+      }
     }
     add_across_warp(sum);
 #pragma unroll
@@ -344,20 +359,30 @@ class MultilevelRunner {
     c_.done = c_.outer.ends(tolerance, w_.progress.schedule, change, way);
   }
 
+  // A warp, a lane a pair.
   PD_DEVICE void remember(int k) {
-    double with[history];
-    for (int j = 0; j < history; ++j) {
-      with[j] = c_.total[j];
-      c_.pairs.pulled[j] = c_.total[history + j];
+    const int j = int(threadIdx.x);
+    Pairs& pairs = c_.pairs;
+    if (j < history) {
+      pairs.product[j][newest_] = c_.total[dots_with + j];
+      if (c_.accepted) {
+        pairs.pulled[j] = c_.total[dots_pulled + j];
+      } else if (j == newest_) {
+        pairs.pulled[j] = c_.total[dots_back];
+      }
     }
-    c_.pairs.valid[newest_] = false;
-    if (k > 0) c_.pairs.add(newest_, with, c_.total[2 * history], c_.total[2 * history + 2]);
-    if (c_.outer.plain || c_.outer.diagonal) c_.pairs.clear();
+    if (j != 0) return;
+    pairs.valid[newest_] = false;
+    if (k > 0)
+      pairs.admit(newest_, c_.total[dots_with + newest_], c_.total[dots_change],
+                  c_.total[dots_turn]);
+    if (c_.outer.plain || c_.outer.diagonal) pairs.clear();
   }
 
   // the second loop of L-BFGS, and the slope g.d
-  PD_DEVICE void correct() {
-    pass<history + 1, T>([&](int i, T(&sum)[history + 1]) {
+  // `last`: the last part of the cycle has still to be done.
+  PD_DEVICE void correct(bool last) {
+    const auto visit = [&](int i, T(&sum)[history + 1]) {
       // before anything is written, that it may be asked for with the rest
       Vec3<T> y[history];
       see_pairs(m_.y, i, y);
@@ -370,7 +395,10 @@ class MultilevelRunner {
       for (int j = 0; j < history; ++j) {
         if (c_.pairs.valid[j]) sum[j] += dot(y[j], z);
       }
-      sum[history] += dot(vec3(m_.pull[i]), way(i, z));
+      sum[history] += dot(vec3(pull_[i]), way(i, z));
+    };
+    pass<history + 1, T>(visit, [&](int rows, const auto& row) {
+      if (last) cycle_.run_last(rows, row);
     });
     if (threadIdx.x < warp_size) PairLanes(c_.pairs, newest_).second_loop(c_.total, c_.factor);
     if (threadIdx.x == 0) {
@@ -416,21 +444,19 @@ class MultilevelRunner {
   // the part of a field along which contacts let a vertex go
   PD_DEVICE Vec3<T> open(int i, const Vec3<T>& field) const {
     if constexpr (!Touching) return field;
-    return m_.free[i] * field;
+    return free_[i] * field;
   }
 
   // the part of a field that M is to work on: not across contacts, nor where it knows nothing of a vertex
   PD_DEVICE Vec3<T> let_through(int i, const Vec3<T>& field) const {
-    return open(i, strangers_ && is_stranger(i) ? none() : field);
+    return open(i, known(i, field));
+  }
+  PD_DEVICE Vec3<T> known(int i, const Vec3<T>& field) const {
+    return strangers_ && is_stranger(i) ? none() : field;
   }
 
-  // the same before the first base is there, where nothing has moved yet
-  PD_DEVICE Vec3<T> let_through(int i, const Vec3<T>& field, int k) const {
-    return k == 0 ? none() : let_through(i, field);
-  }
-
-  PD_DEVICE void keep_directions(int i, int k) const {
-    if (!c_.accepted && k > 0) return;
+  PD_DEVICE void keep_directions(int i) const {
+    if (!c_.accepted) return;
     m_.gradient[i] = m_.fresh_gradient[i];
     m_.friction[i] = m_.fresh_friction[i];
     m_.free[i] = m_.fresh_free[i];
@@ -438,7 +464,7 @@ class MultilevelRunner {
 
   // A way that M has a say on, where it has: the rest goes along the pull, by the diagonal.
   PD_DEVICE Vec3<T> way(int i, const Vec3<T>& d) const {
-    const Vec3<T> plain = w_.v.u[i].w * vec3(m_.pull[i]);
+    const Vec3<T> plain = w_.v.u[i].w * vec3(pull_[i]);
     if (strangers_ && is_stranger(i)) return plain;
     if constexpr (!Touching) return d;
     return open(i, d) + (plain - open(i, plain));
@@ -454,7 +480,9 @@ class MultilevelRunner {
   bool lbfgs_, corotates_, corotated_ = false, strangers_;
   DeviceCorotation<T> corotation_;
   T trusted_;
-  double patch_sum_[2] = {0, 0};
+  // where it stands: of the trial that was accepted until the next one goes out
+  const Quad<T>*base_ = nullptr, *pull_ = nullptr;
+  const Mat3<T>* free_ = nullptr;
   int newest_ = 0, iteration_ = 0, used_ = 0;
   int made_ = 0, doubted_ = 0;  // small problems, and trials that had failed by then
   bool parity_ = false;

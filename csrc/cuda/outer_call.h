@@ -7,8 +7,11 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr int outer_dots =
-    2 * history + 3;  // sums that learning makes in its pass over the vertices
+// Sums of a pass over the vertices at a trial: what the shared ones have of the energy and of work against friction; s_j . y and
+// s_j . g for the pairs j, the newest one too; s . g of that at the base; |u - base|^2, |u - s|^2 and |y|^2.
+constexpr int dots_energy = 0, dots_with = 2, dots_pulled = dots_with + history;
+constexpr int dots_back = dots_pulled + history, dots_change = dots_back + 1;
+constexpr int dots_way = dots_change + 1, dots_turn = dots_way + 1, outer_dots = dots_turn + 1;
 constexpr int most_sums = outer_dots > turning_modes ? outer_dots : turning_modes;  // of any pass
 constexpr int ranges_count = 2;   // that a round of Ranges compares
 constexpr int most_chunks = 640;  // of vertices, whose sums every block adds up
@@ -63,9 +66,9 @@ struct OuterControl {
   Outer outer;
   Pairs pairs;
   double total[most_sums];
-  double factor[history];  // of the pairs' ways in the direction
-  double warp_dot[outer_warps][most_sums];
-  bool accepted, finite, done;
+  double factor[history];                               // of the pairs' ways in the direction
+  alignas(16) double warp_dot[outer_warps][most_sums];  // of passes; parts of the cycle's
+  bool accepted, done;
 };
 
 // The arrays of one team.

@@ -13,32 +13,49 @@ class PairLanes {
       : pairs_(pairs), newest_(newest), own_(int(threadIdx.x) % history) {}
 
   PD_DEVICE void first_loop() {
+    Numbers n;
+#pragma unroll
+    for (int a = 0; a < history; ++a) see(a, pairs_.product[own_][place(a)], n);
     double rest = pairs_.pulled[own_];
 #pragma unroll
     for (int a = 0; a < history; ++a) {
-      const int i = Pairs::older(newest_, a);
-      const double alpha = pairs_.valid[i] ? across(rest, i) * pairs_.inverse[i] : 0;
-      if (own_ == i) pairs_.alpha[i] = alpha;
-      // pairs older than i, to which it is a j
-      if (pairs_.valid[i] && age() > a) rest -= alpha * pairs_.product[own_][i];
+      const double alpha = n.valid[a] ? across(rest, place(a)) * n.inverse[a] : 0;
+      if (age() == a) pairs_.alpha[own_] = alpha;
+      // pairs older than this one, to which it is a j
+      if (n.valid[a] && age() > a) rest -= alpha * n.product[a];
     }
     __syncwarp();
   }
 
   PD_DEVICE void second_loop(const double* with, double* c) {
+    Numbers n;
+#pragma unroll
+    for (int a = 0; a < history; ++a) see(a, pairs_.product[place(a)][own_], n);
     double rest = with[own_];
+    const double alpha = pairs_.alpha[own_];
 #pragma unroll
     for (int a = history - 1; a >= 0; --a) {
-      const int i = Pairs::older(newest_, a);
       const double mine =
-          pairs_.valid[i] ? pairs_.alpha[i] - across(rest, i) * pairs_.inverse[i] : 0;
-      if (own_ == i) c[i] = mine;
-      if (pairs_.valid[i] && age() < a) rest += mine * pairs_.product[i][own_];
+          n.valid[a] ? across(alpha, place(a)) - across(rest, place(a)) * n.inverse[a] : 0;
+      if (age() == a) c[own_] = mine;
+      if (n.valid[a] && age() < a) rest += mine * n.product[a];
     }
     __syncwarp();
   }
 
  private:
+  // of the pairs by their age, asked for before the chain begins
+  struct Numbers {
+    double inverse[history], product[history];
+    bool valid[history];
+  };
+
+  PD_DEVICE void see(int a, double product, Numbers& n) const {
+    n.inverse[a] = pairs_.inverse[place(a)];
+    n.valid[a] = pairs_.valid[place(a)];
+    n.product[a] = product;
+  }
+  PD_DEVICE int place(int age) const { return Pairs::older(newest_, age); }
   PD_DEVICE int age() const { return (newest_ - own_ + history) % history; }
   PD_DEVICE static double across(double value, int from) {
     return __shfl_sync(whole_warp, value, from);

@@ -3,6 +3,7 @@
 #include "plan/aggregate.h"
 #include "plan/block_matrix.h"
 #include "plan/fine_matrix.h"
+#include "solver/multilevel.h"
 
 #include <algorithm>
 #include <array>
@@ -266,6 +267,47 @@ Step coarsen(const BlockMatrix& matrix, const std::vector<double>& inverse, doub
   return step;
 }
 
+// diag(factor scale) m
+BlockMatrix scaled(BlockMatrix m, double factor, const std::vector<double>& scale) {
+  for (std::int32_t row = 0; row < m.rows; ++row) {
+    for (std::int32_t e = m.start[row]; e < m.start[row + 1]; ++e) {
+      for (std::int64_t k = 0; k < m.block(); ++k)
+        m.value[e * m.block() + k] *= factor * scale[std::size_t(row) * m.height + k / m.width];
+    }
+  }
+  return m;
+}
+
+// sum += m, of which `sum` has all blocks
+void add_to(BlockMatrix& sum, const BlockMatrix& m) {
+  for (std::int32_t row = 0; row < m.rows; ++row) {
+    std::int32_t to = sum.start[row];
+    for (std::int32_t e = m.start[row]; e < m.start[row + 1]; ++e) {
+      while (sum.column[to] != m.column[e]) ++to;
+      for (std::int64_t k = 0; k < m.block(); ++k)
+        sum.value[to * m.block() + k] += m.value[e * m.block() + k];
+    }
+  }
+}
+
+// (I - S A) P, S = (keep first + second) D^-1 - second first D^-1 A D^-1 being what a level smooths by.
+BlockMatrix folded(const BlockMatrix& a, const std::vector<double>& inverse, const BlockMatrix& p,
+                   int threads) {
+  constexpr double once = Smoother::keep * Smoother::first + Smoother::second;
+  constexpr double twice = Smoother::second * Smoother::first;
+  const BlockMatrix image = multiply(a, p, threads);
+  BlockMatrix lift = scaled(multiply(a, scaled(image, twice, inverse), threads), 1, inverse);
+  add_to(lift, scaled(image, -once, inverse));
+  add_to(lift, p);
+  return lift;
+}
+
+// Lifts as a GPU has them, and their transposes.
+void fold(Step& step, const BlockMatrix& a, const std::vector<double>& inverse, int threads) {
+  step.lift = folded(a, inverse, step.lift, threads);
+  step.restriction = transpose(step.lift);
+}
+
 // The nodes below the middle level.
 Aggregates group_nodes(const BlockMatrix& matrix,
                        const std::vector<std::array<double, 3>>& position) {
@@ -317,11 +359,20 @@ void store(BlockMatrix& matrix, Numbers& start, Numbers& column, std::vector<dou
   value = std::move(matrix.value);
 }
 
-// Of the transposed matrix, where its values stand in the other is enough.
-void store(Transposed& transposed, Numbers& start, Numbers& column, Numbers& from) {
-  start = std::move(transposed.matrix.start);
-  column = std::move(transposed.matrix.column);
-  from = std::move(transposed.from);
+// Of the transposed matrix: where its values stand in the other, or these values, too.
+void store_nodes(Step& step, bool values, Numbers& start, Numbers& row, Numbers& from,
+                 std::vector<double>& value) {
+  start = std::move(step.restriction.matrix.start);
+  row = std::move(step.restriction.matrix.column);
+  if (!values) {
+    from = std::move(step.restriction.from);
+    return;
+  }
+  const std::int64_t block = step.lift.block();
+  for (const std::int32_t e : step.restriction.from) {
+    const auto first = step.lift.value.begin() + e * block;
+    value.insert(value.end(), first, first + block);
+  }
 }
 
 }  // namespace
@@ -360,11 +411,13 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
 
   const Tentative first = tentative(rest.candidates, 1, groups);
   Step step = coarsen(fine.matrix, t.fine_inverse, fine_smoothing, first.lift, threads);
+  if (scene.folded) fold(step, fine.matrix, t.fine_inverse, threads);
   t.level_sizes[level_fine_lifts] = step.lift.start.back();
   t.level_sizes[level_fine_nodes] = groups.count;
   store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
+  store_nodes(step, scene.folded, t.fine_node_start, t.fine_node_row, t.fine_node_lift,
+              t.fine_node_weight);
   store(step.lift, t.fine_lift_start, t.fine_lift_node, t.fine_lift_weight);
-  store(step.restriction, t.fine_node_start, t.fine_node_row, t.fine_node_lift);
   progress(0.7);
 
   BlockMatrix coarse = std::move(step.coarse);
@@ -373,12 +426,14 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
     const Aggregates last = group_nodes(coarse, mean_positions(rest.position, groups));
     const Tentative second = tentative(first.reduced, functions, last);
     step = coarsen(coarse, t.middle_inverse, middle_smoothing, second.lift, threads);
+    if (scene.folded) fold(step, coarse, t.middle_inverse, threads);
     t.level_sizes[level_middle_entries] = coarse.start.back();
     t.level_sizes[level_middle_lifts] = step.lift.start.back();
     t.level_sizes[level_middle_nodes] = last.count;
     store(coarse, t.middle_start, t.middle_column, t.middle_value);
+    store_nodes(step, scene.folded, t.middle_node_start, t.middle_node_row, t.middle_node_lift,
+                t.middle_node_weight);
     store(step.lift, t.middle_lift_start, t.middle_lift_node, t.middle_lift_weight);
-    store(step.restriction, t.middle_node_start, t.middle_node_row, t.middle_node_lift);
     coarse = std::move(step.coarse);
   }
   progress(0.8);

@@ -22,6 +22,7 @@ struct MultilevelScene {
   const double* stiffness;           // [count] Pa
   const double* inertia;             // [vertices] a, inf where a pin holds the vertex exactly [N/m]
   std::int64_t most_direct;          // vertices of a mesh that needs no levels: M is A^-1 itself
+  bool folded;                       // lifts as a GPU has them
 };
 
 // The table as vectors.

@@ -3,7 +3,9 @@
 //
 //   V Hc^-1 V^T + (I - V Ac^-1 (A V)^T) M (I - A V Ac^-1 V^T),   Ac = V^T A V,
 //
-// which is positive whatever M is (deflation, Nicolaides 1987). V has the rigid motions of four overlapping groups of vertices
+// which is positive whatever M is (deflation, Nicolaides 1987). With M = A^-1 it is M + V (Hc^-1 - Ac^-1) V^T, and that takes the
+// place of it where Hc <= Ac, which only contacts change, for any M <= A^-1: levels know smooth motions so well that iterations
+// are as many, and nothing has to be summed up after M. V has the rigid motions of four overlapping groups of vertices
 // with weights w_k: w_k e_a and w_k e_a x r. Hc is that of corotated linear elasticity, a |dx|^2 + w V |sym(dF R^T)|^2, which is
 // positive as well. All of it follows from products of sixteen numbers a vertex, (w_k, w_k r), with others.
 //

@@ -63,6 +63,11 @@ PD_HD void multilevel_iterations(Runner& run, const Settings& settings) {
 }
 
 // ---- M: a symmetric V-cycle, or A^-1 where the plan says so (Levels::direct)
+//
+// With S that smooths before and after, a prolongation P and B in place of the matrix below, a cycle is
+//   S r + S (r - A S r) + (I - S A) P B P^T (I - A S) r.
+// Its first two terms know nothing of the level below, so with F = (I - S A) P as lifts they are worked out meanwhile: what a GPU
+// does, where a cycle is as long as the phases that wait for one another (cuda/cycle.h). The CPU goes down and up, with P.
 
 // Chebyshev's polynomial of degree 2 for eigenvalues of D^-1 A in [1/4, 1], from zero (Saad 2003, algorithm 12.1):
 //   w = first / D r,   z = keep w + second / D (r - A w)
@@ -81,20 +86,23 @@ struct Level {
   const int32 *lift_start, *lift_node;
   const T* lift_weight;
   const int32 *node_start, *node_row, *node_lift;
+  const T* node_weight;
 };
 
 template <class T>
 PD_HD Level<1, T> fine_level(const Levels<T>& l) {
   return {l.vertices,         l.fine_nodes,      l.fine_start,      l.fine_column,
           l.fine_value,       l.fine_inverse,    l.fine_lift_start, l.fine_lift_node,
-          l.fine_lift_weight, l.fine_node_start, l.fine_node_row,   l.fine_node_lift};
+          l.fine_lift_weight, l.fine_node_start, l.fine_node_row,   l.fine_node_lift,
+          l.fine_node_weight};
 }
 
 template <class T>
 PD_HD Level<4, T> middle_level(const Levels<T>& l) {
   return {l.fine_nodes,         l.middle_nodes,      l.middle_start,      l.middle_column,
           l.middle_value,       l.middle_inverse,    l.middle_lift_start, l.middle_lift_node,
-          l.middle_lift_weight, l.middle_node_start, l.middle_node_row,   l.middle_node_lift};
+          l.middle_lift_weight, l.middle_node_start, l.middle_node_row,   l.middle_node_lift,
+          l.middle_node_weight};
 }
 
 // Sums of a row in turn, because each waits for its own last addition; they are added up last.
@@ -362,7 +370,11 @@ struct Pairs {
   // the pair in place `newest`: s_i . y of it with every s_i, |s|^2 and |y|^2
   PD_HD void add(int newest, const double (&with)[history], double ss, double yy) {
     for (int i = 0; i < history; ++i) product[i][newest] = with[i];
-    const double curvature = with[newest];
+    admit(newest, with[newest], ss, yy);
+  }
+
+  // the same when the products are there, s.y of the pair among them
+  PD_HD void admit(int newest, double curvature, double ss, double yy) {
     inverse[newest] = 1 / curvature;
     const double least = least_curvature * least_curvature * ss * yy;
     valid[newest] = curvature > 0 && curvature * curvature > least && curvature < HUGE_VAL;
