@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from cases import Case, beam, box, contact_block, on_sphere, slivers
-from multilevel_cases import IDS, SOLVERS
+from multilevel_cases import IDS, SOLVERS, swing
 from runs import displacement, moving, same_bits, simulate, simulator, state_of
 from test_determinism import assert_same_bits, different_environments
 from test_determinism import run as outputs
@@ -86,6 +86,34 @@ def test_pins_that_came_since_do_not_stall_it(solver: pd.Multilevel, stiffness: 
     sim.prepare_solver()
     assert look(60)[0] <= 1e-3
     assert look(60)[1] == 0.0
+
+
+def test_springs_that_it_does_not_know_leave_it_positive() -> None:
+    """Where they hold a vertex Hc is above Ac: the small problem has to go around M, else 28 trials fail here.
+
+    Its neighbours in a batch, in one of which M fits while the other has softer springs, do not notice.
+    """
+    case = swing(5, 1e7)
+    body, held = case.scene.solids[0], np.arange(5, len(case.positions), 97)
+
+    def scene(stiffness: float) -> Case:
+        parts = pd.Pin(body, held, stiffness=stiffness), pd.Gravity((0.0, -9.8, 0.0))
+        return Case(pd.Scene(body, *parts), case.positions, case.velocities, case.time_step)
+
+    stiff = scene(1e8)
+    ready = simulator(stiff, torch.float64, solver=pd.Multilevel(), iterations=600)
+    solution, first = displacement(ready, ready(state_of(stiff, ready))), stiff.problem().first_iterate()
+    sim = simulator(scene(1.0), torch.float64, solver=pd.Multilevel(), iterations=80)
+    springs = torch.ones(9, len(sim.pin_stiffness), dtype=torch.float64)
+    springs[4], springs[7] = 1e8, 1e-3
+    sim.pin_stiffness = torch.nn.Parameter(springs, requires_grad=False)  # behind its back
+    after, info = sim(state_of(case, sim, 9), return_info=True)
+    assert relative_error(displacement(sim, after, 4), solution, first) <= 2e-3
+    assert int(info.restarts[4]) <= 4
+    for environment in (4, 5, 7):
+        sim.pin_stiffness = torch.nn.Parameter(springs[environment].clone(), requires_grad=False)
+        alone = sim(state_of(case, sim))
+        assert torch.equal(alone.positions[0], after.positions[environment])
 
 
 def test_hard_pins_by_set_material_prepare_it_anew() -> None:

@@ -64,15 +64,19 @@ class Cost(NamedTuple):
 # are of one AVX-512 core, the GPU's of an H100, where Chebyshev's are those of `torchpd.kernel_costs`.
 CPU_CHEBYSHEV, CPU_MULTILEVEL = Cost(0.5, 45.0), Cost(2.0, 170.0)
 # Batches were measured with 1024 environments of 256 and 936 vertices, and with 16 of 3,321 and 10,309; the squares fit
-# these sizes. Up to MOST_DIRECT vertices M is an inverse, without levels.
-_SMALL_MULTILEVEL, _LARGE_MULTILEVEL = Cost(29.0, 3.0, 0.54, 0.57), Cost(36.0, 2.3, 0.35, 0.093)
+# these sizes. Up to MOST_DIRECT vertices M is an inverse, without levels; from some 12 thousand on it has three.
+_DIRECT = Cost(30.0, 3.0, 0.73, 0.49)
+_TWO_LEVELS, _THREE_LEVELS = Cost(37.0, 0.9, 0.5, 0.098), Cost(49.0, 2.05, 0.5, 0.098)
+_MOST_OF_TWO_LEVELS = 12_000
 
 
 def multilevel_cost(vertices: int, *, on_gpu: bool) -> Cost:
     """Of an iteration of `Multilevel`."""
     if not on_gpu:
         return CPU_MULTILEVEL
-    return _SMALL_MULTILEVEL if vertices <= MOST_DIRECT else _LARGE_MULTILEVEL
+    if vertices <= MOST_DIRECT:
+        return _DIRECT
+    return _TWO_LEVELS if vertices <= _MOST_OF_TWO_LEVELS else _THREE_LEVELS
 
 
 @dataclass(frozen=True)

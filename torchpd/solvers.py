@@ -136,7 +136,7 @@ class Multilevel:
     """Iterations with a multilevel approximation M of A^-1, A the constant matrix of projective dynamics.
 
     For stiff and for accurate steps: a dozen or two of iterations do, however stiff or fine the mesh, each at four to
-    five times the cost of a Jacobi iteration on a CPU, and 5 to 36 times on a GPU, where M of a mesh of up to 1024
+    five times the cost of a Jacobi iteration on a CPU, and 11 to 28 times on a GPU, where M of a mesh of up to 1024
     vertices is A^-1 itself unless it comes in batches (`Simulator(batch=...)`). The scene takes longer to compile.
 
     Every iterate is judged by its energy before the next one starts from it. After four failures in a row come two

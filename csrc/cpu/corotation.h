@@ -36,12 +36,13 @@ class Corotation {
     if (team_.rank == 0) shared_.inverse[lane] = {};
   }
 
-  // before M: V^T q
-  void measure(const Value* q) {
+  // Before M: V^T q, and what M is not to see of q in lanes where the small problem goes `around` it.
+  void measure(const Value* q, const bool (&around)[width]) {
     sum_up(shared_.numbers, q, own_);
-    double part[width][turning_modes];
-    for (int lane = 0; lane < width; ++lane)
-      shared_.inverse[lane].matrix.multiply(own_[lane], part[lane]);
+    double part[width][turning_modes] = {};
+    for (int lane = 0; lane < width; ++lane) {
+      if (around[lane]) shared_.inverse[lane].matrix.multiply(own_[lane], part[lane]);
+    }
     set_vectors(part);
   }
   // (I - A V Ac^-1 V^T) q
@@ -51,16 +52,13 @@ class Corotation {
     return q;
   }
 
-  // The same where nothing goes around M: its result lacks V (Hc^-1 - Ac^-1) V^T q, whatever the order.
-  void measure_lacking(const Value* q, const Real& scale) {
-    sum_up(shared_.numbers, q, own_);
-    set_lacking(own_, scale);
-  }
-
-  // After it: what its result lacks. q came multiplied by `scale`.
-  void answer(const Value* z, const Real& scale) {
+  // After it: what its result lacks, in other lanes V (Hc^-1 - Ac^-1) V^T q. q came multiplied by `scale`.
+  void answer(const Value* z, const bool (&around)[width], bool some, const Real& scale) {
     double image[width][turning_modes];
-    sum_up(shared_.images, z, image);
+    if (some) sum_up(shared_.images, z, image);
+    for (int lane = 0; lane < width; ++lane) {
+      if (!around[lane]) std::copy_n(own_[lane], turning_modes, image[lane]);
+    }
     set_lacking(image, scale);
   }
   Value with(std::int64_t i, Value z) const {

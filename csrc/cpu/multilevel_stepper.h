@@ -265,18 +265,18 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
   }
 
-  // the cycle, and what the small problem gives, with contacts around it
+  // the cycle, and what the small problem gives, around it where something holds vertices that M has free
   void run_corotated(const Real& scale) {
     Value *in = o_.cycle.input(), *z = o_.cycle.result();
-    if (!Touching || plan_.levels.direct) {
-      corotation_.measure_lacking(in, scale);
-      o_.cycle.run(team_);
-    } else {
-      corotation_.measure(in);
-      each_vertex([&](std::int64_t i) { in[i] = corotation_.without(i, in[i]); });
-      o_.cycle.run(team_);
-      corotation_.answer(z, scale);
+    bool around[width], some = false;
+    for (int lane = 0; lane < width; ++lane) {
+      around[lane] = !plan_.levels.direct && (Touching || misfit_[lane].strangers);
+      some = some || around[lane];
     }
+    corotation_.measure(in, around);
+    if (some) each_vertex([&](std::int64_t i) { in[i] = corotation_.without(i, in[i]); });
+    o_.cycle.run(team_);
+    corotation_.answer(z, around, some, scale);
     each_vertex([&](std::int64_t i) { z[i] = corotation_.with(i, z[i]); });
   }
 

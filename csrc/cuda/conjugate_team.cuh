@@ -35,6 +35,8 @@ struct ConjugateTeams {
 
 template <class T, bool Leveled>
 class ConjugateTeam {
+  static_assert(conjugate_threads<T> % (most_parts * warp_size) == 0);
+
  public:
   __device__ ConjugateTeam(const ConjugateTeams<T>& work, const ConjugateMemory<T>& memory,
                            std::int64_t environment, BlockTeam& team, std::byte* shared,

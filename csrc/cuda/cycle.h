@@ -42,6 +42,9 @@ PD_DEVICE Vec3<T> across_lanes(Vec3<T> sum, int most, int least) {
   return sum;
 }
 
+// Warps that share a node, at most; the warps of any block of a cycle are a multiple of it.
+constexpr int most_parts = 8;
+
 template <class T>
 class DeviceCycle {
  public:
@@ -68,15 +71,10 @@ class DeviceCycle {
   // result = M times what was set, there for all of the team when it returns
   PD_DEVICE void run() {
     run_but_last();
-    if (levels_.direct) {
-      solve_columns();
-    } else {
-      lift(fine_level(levels_), m_.fine, below_fine());
-    }
-    team_.barrier();
+    finish();
   }
 
-  // The same but for its last part, which run_last does. Between two barriers everything is done side by side.
+  // The same but for its last part, for which there are two ways below. Between two barriers everything is done side by side.
   PD_DEVICE void run_but_last() {
     const Level<1, T> fine = fine_level(levels_);
     const Level<4, T> middle = middle_level(levels_);
@@ -107,8 +105,18 @@ class DeviceCycle {
     team_.barrier();
   }
 
-  // At the vertices row(0 ... count - 1) that are there, for all threads of the block when they have met. `count` is a multiple
-  // of 32, and so are the places from which on rows follow each other.
+  // that part, by the team
+  PD_DEVICE void finish() {
+    if (levels_.direct) {
+      solve_columns();
+    } else {
+      lift(fine_level(levels_), m_.fine, below_fine());
+    }
+    team_.barrier();
+  }
+
+  // The same at the vertices row(0 ... count - 1) that are there, for all threads of the block when they have met. `count` is a
+  // multiple of 32, and so are the places from which on rows follow each other.
   template <class Row>
   PD_DEVICE void run_last(int count, const Row& row) {
     if (levels_.direct) {
@@ -134,8 +142,8 @@ class DeviceCycle {
  private:
   template <int B>
   static constexpr int lanes_of_lift = B == 1 ? 4 : 8;
-  static constexpr int at_once = sizeof(T) == 4 ? 8 : 4;   // entries of a node that a lane asks for
-  static constexpr int most_of_lane = 16, most_parts = 8;  // of them before more warps share a node
+  static constexpr int at_once = sizeof(T) == 4 ? 8 : 4;  // entries of a node that a lane asks for
+  static constexpr int most_of_lane = 16;                 // of them before more warps share a node
 
   // One entry of a row: where its vectors stand, and their factors.
   template <int Count>
@@ -286,6 +294,7 @@ class DeviceCycle {
     while (parts < most_parts &&
            entries > std::int64_t(parts) * level.nodes * warp_size * most_of_lane)
       parts *= 2;
+    // blocks have a multiple of most_parts warps
     const int warp = int(threadIdx.x) / warp_size, lane = int(threadIdx.x) % warp_size;
     const int together = int(blockDim.x) / warp_size / parts;
     const auto keep = [&](int at, const Vec3<T>& sum) {

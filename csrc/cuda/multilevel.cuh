@@ -8,6 +8,7 @@
 namespace pd {
 
 static_assert(sizeof(OuterControl) + pass_static_bytes <= outer_static_bytes);
+static_assert(sizeof(OuterControl::warp_dot) >= 4 * outer_warps * sizeof(Quad<double>));
 
 template <class T, bool Touching, int Threads>
 __global__ void __launch_bounds__(Threads, Threads == outer_threads ? 1 : small_outer_blocks)

@@ -55,14 +55,32 @@ class MultilevelRunner {
       write_sums<Visit::measure>(sums, m_.patch_sums + patch * sums_count);
     }
     team_.barrier();
+    // those of this thread, on the way to the shared vertices
+    patch_sum_[0] = patch_sum_[1] = 0;
+#pragma unroll 1
+    for (int patch = threadIdx.x; patch < w_.plan.patches; patch += blockDim.x) {
+      for (int n = 0; n < 2; ++n) patch_sum_[n] += m_.patch_sums[patch * sums_count + n];
+    }
     look_back(k);
   }
 
   // every block decides from the same sums, so all decide alike
   PD_DEVICE void judge(int) {
+    // the shared vertices' part is there
+    double sum[2] = {patch_sum_[0], patch_sum_[1]};
+    add_across_warp(sum);
+    const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
+    if (lane == 0) {
+      for (int n = 0; n < 2; ++n) c_.warp_dot[warp][n] = sum[n];
+    }
+    __syncthreads();
+    if (warp == 0) {
+      for (int n = 0; n < 2; ++n) sum[n] = lane < warps ? c_.warp_dot[lane][n] : 0;
+      add_across_warp(sum);
+    }
     if (threadIdx.x == 0) {
-      const double work = c_.outer.known ? c_.total[dots_energy + 1] : 0;
-      const double energy = c_.total[dots_energy] + work;
+      const double work = c_.outer.known ? c_.total[dots_energy + 1] + sum[1] : 0;
+      const double energy = (c_.total[dots_energy] + sum[0]) + work;
       c_.accepted = c_.outer.accept(energy, lbfgs_);
       // the friction of another base does other work
       if (c_.accepted) c_.outer.energy -= work;
@@ -104,8 +122,9 @@ class MultilevelRunner {
       }
       return T(scale) * q;
     };
-    // with contacts the small problem takes its part before the cycle, and gives what that lacks after it
-    const bool around = Touching && corotated_ && !w_.plan.levels.direct;
+    // where something holds vertices that M has free, the small problem takes its part before the cycle, and gives what that
+    // lacks after it
+    const bool around = corotated_ && !w_.plan.levels.direct && (Touching || strangers_);
     if (corotated_) {
       pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
         const Vec3<T> q = right_side(i);
@@ -116,19 +135,19 @@ class MultilevelRunner {
     } else {
       each_vertex([&](int i) { cycle_.set(i, right_side(i)); });
     }
-    if (around) {
+    // what follows the last part of the cycle in a pass has that part, too
+    const bool apart = around || !lbfgs_;
+    if (around)
       each_vertex([&](int i) { cycle_.set(i, corotation_.without(i, cycle_.right_side(i))); });
-      cycle_.run();
+    cycle_.run_but_last();
+    if (apart) cycle_.finish();
+    if (around) {
       pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
         corotation_.multiply_images(i, cycle_.result(i), sum);
       });
       corotation_.answer(c_.total, scale);
-    } else if (lbfgs_) {
-      cycle_.run_but_last();
-    } else {
-      cycle_.run();
     }
-    if (lbfgs_) correct(!around);
+    if (lbfgs_) correct(!apart);
   }
 
   // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi iteration
@@ -236,21 +255,19 @@ class MultilevelRunner {
     iteration_ = k;
     const int first_shared = w_.plan.patch_vertex[w_.plan.patches];
     pass<outer_dots, T>([&](int i, T(&sum)[outer_dots]) {
-      ThreadSums sums = {{0, 0, 0}};
-      if (i < w_.plan.patches) {
-        for (int n = 0; n < 2; ++n) sums.value[n] = m_.patch_sums[i * sums_count + n];
-      }
       if (i >= first_shared) {
+        ThreadSums sums = {{0, 0, 0}};
         const auto seen = w_.v.see(i);
         look_at(i, seen, shared_force(w_, SharedPlaces(w_.plan, i - first_shared)), sums);
+        for (int n = 0; n < 2; ++n) sum[dots_energy + n] = T(sums.value[n]);
       }
-      for (int n = 0; n < 2; ++n) sum[dots_energy + n] = T(sums.value[n]);
       const Vec3<T> u = vec3(w_.v.u[i]);
       if (w_.settings().tolerance > 0) {
         const Vec3<T> way = u - vec3(w_.v.target[i]);
         sum[dots_way] = dot(way, way);
       }
-      if (k == 0) return;
+      // no base yet, or nothing left to learn for
+      if (k == 0 || k == w_.settings().iterations) return;
       const Vec3<T> change = u - vec3(m_.base[i]);
       sum[dots_change] = dot(change, change);
       if (!lbfgs_) return;
@@ -483,6 +500,7 @@ class MultilevelRunner {
   // where it stands: of the trial that was accepted until the next one goes out
   const Quad<T>*base_ = nullptr, *pull_ = nullptr;
   const Mat3<T>* free_ = nullptr;
+  double patch_sum_[2] = {0, 0};
   int newest_ = 0, iteration_ = 0, used_ = 0;
   int made_ = 0, doubted_ = 0;  // small problems, and trials that had failed by then
   bool parity_ = false;

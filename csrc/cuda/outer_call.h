@@ -7,8 +7,9 @@
 
 namespace pd::inline PD_TARGET {
 
-// Sums of a pass over the vertices at a trial: what the shared ones have of the energy and of work against friction; s_j . y and
-// s_j . g for the pairs j, the newest one too; s . g of that at the base; |u - base|^2, |u - s|^2 and |y|^2.
+// Sums of a pass over the vertices at a trial u: what the shared ones have of the energy and of work against friction, in the
+// precision of the simulation, whose rounding the judgement allows for; s_j . y and s_j . g of the pairs j, the newest one too;
+// s . g of that with g at the base; |u - base|^2, |u|^2 from the target, and |y|^2.
 constexpr int dots_energy = 0, dots_with = 2, dots_pulled = dots_with + history;
 constexpr int dots_back = dots_pulled + history, dots_change = dots_back + 1;
 constexpr int dots_way = dots_change + 1, dots_turn = dots_way + 1, outer_dots = dots_turn + 1;
@@ -60,6 +61,9 @@ struct OuterCall {
   }
   PD_HD int chunks() const { return chunks_of(plan().vertices, warps_of_chunk()); }
 };
+
+static_assert(small_outer_threads % (most_parts * warp_size) == 0 &&
+              outer_threads % (most_parts * warp_size) == 0);
 
 // In shared memory: what all threads of a block go by; its first thread decides.
 struct OuterControl {

@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <stdexcept>
 #include <utility>
 
 namespace pd {
@@ -283,7 +284,8 @@ void add_to(BlockMatrix& sum, const BlockMatrix& m) {
   for (std::int32_t row = 0; row < m.rows; ++row) {
     std::int32_t to = sum.start[row];
     for (std::int32_t e = m.start[row]; e < m.start[row + 1]; ++e) {
-      while (sum.column[to] != m.column[e]) ++to;
+      while (to < sum.start[row + 1] && sum.column[to] != m.column[e]) ++to;
+      if (to == sum.start[row + 1]) throw std::logic_error("a matrix level lacks its diagonal");
       for (std::int64_t k = 0; k < m.block(); ++k)
         sum.value[to * m.block() + k] += m.value[e * m.block() + k];
     }

@@ -3,11 +3,15 @@
 //
 //   V Hc^-1 V^T + (I - V Ac^-1 (A V)^T) M (I - A V Ac^-1 V^T),   Ac = V^T A V,
 //
-// which is positive whatever M is (deflation, Nicolaides 1987). With M = A^-1 it is M + V (Hc^-1 - Ac^-1) V^T, and that takes the
-// place of it where Hc <= Ac, which only contacts change, for any M <= A^-1: levels know smooth motions so well that iterations
-// are as many, and nothing has to be summed up after M. V has the rigid motions of four overlapping groups of vertices
-// with weights w_k: w_k e_a and w_k e_a x r. Hc is that of corotated linear elasticity, a |dx|^2 + w V |sym(dF R^T)|^2, which is
-// positive as well. All of it follows from products of sixteen numbers a vertex, (w_k, w_k r), with others.
+// which is positive whatever M is (deflation, Nicolaides 1987). With M = A^-1 it is M + V (Hc^-1 - Ac^-1) V^T, and that takes its
+// place where nothing but elements and inertias that M knows makes Hc, so that Hc <= Ac: no contacts, nor springs much stiffer
+// than M knows. Levels are so near to A^-1 on V (0.79 of it at least, on slivers; 0.95 on even meshes) that iterations are as
+// many, and nothing has to be summed up after M. There M comes times theta < 2, and what it has of V must be 1 - 1 / theta of
+// A^-1 at least for the whole to be positive, 0.44 for the theta of 1.8.
+//
+// V has the rigid motions of four overlapping groups of vertices with weights w_k: w_k e_a and w_k e_a x r. Hc is that of
+// corotated linear elasticity, a |dx|^2 + w V |sym(dF R^T)|^2, which is positive as well. All of it follows from products of
+// sixteen numbers a vertex, (w_k, w_k r), with others.
 //
 // Contacts: with the projector P on what they leave free, P (..) P is what an iteration uses. M P alone would let a body that
 // lies on the ground go down as if there were none: (P M P) instead of (P A P)^-1. The second term has no such motions, and Hc

@@ -361,7 +361,8 @@ struct Pairs {
   double inverse[history] = {};           // 1 / s_i . y_i
   double pulled[history] = {};            // s_i . g
   double alpha[history] = {};
-  bool valid[history] = {};
+  bool valid[history] =
+      {};  // what a pair that is not has in the other arrays may be anything, NaN too
 
   PD_HD void clear() {
     for (bool& v : valid) v = false;
