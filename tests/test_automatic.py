@@ -205,7 +205,7 @@ def test_few_environments_get_the_solver_that_was_faster(size: str, monkeypatch:
     assert chosen[0] is pd.Chebyshev
     assert chosen[-1] is pd.Multilevel
     # alone they get Chebyshev where sixteen get Multilevel
-    if size == "10k":
+    if size == "3k":
         alone = pd.Simulator(subject.scene(mesh, 1e5), subject.time_step, solver="auto", batch=1, progress=False)
         assert isinstance(alone.solver, pd.Chebyshev)
         assert chosen[1] is pd.Multilevel
