@@ -22,7 +22,7 @@ help:
 	@echo "make coverage    run the tests and report the lines of torchpd/ that they miss"
 	@echo "make lint        ruff, mypy and clang-format        make format repairs what can be repaired"
 	@echo "make bench       measure the speed                  BENCH_ARGS='--help'"
-	@echo "make cuda-check  compile every CUDA source; no GPU needed"
+	@echo "make cuda-check  compile every CUDA source; no GPU needed    CHECK_ARGS=--quick"
 	@echo "make clean       remove what was built, but not $(VENV)"
 
 setup: $(VENV)/extension.stamp $(VENV)/package.stamp
@@ -52,7 +52,7 @@ bench: setup
 	$(BIN)/python benchmarks/run.py $(BENCH_ARGS)
 
 cuda-check: $(VENV)/requirements.stamp
-	$(BIN)/python tools/cuda_check.py
+	$(BIN)/python tools/cuda_check.py $(CHECK_ARGS)
 
 clean:
 	rm -rf build dist *.egg-info torchpd/_C*.so .pytest_cache .mypy_cache .ruff_cache .coverage

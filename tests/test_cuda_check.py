@@ -110,9 +110,18 @@ def test_glue_is_compiled_as_in_a_build_with_cuda(tool: dict[str, Any]) -> None:
         path for path in csrc.glob("**/*.cpp") if "cuda" in path.parts[-2:-1] or "TORCHPD_CUDA" in path.read_text()
     }
     assert {csrc / name for name in tool["GLUE"]} == wanted
-    command = tool["command_for"]("nvcc", csrc / "cuda" / "ops.cpp", ["-I", "x"])
+    command = tool["command_for"]("nvcc", csrc / "cuda" / "ops.cpp", ["-I", "x"], ("80",))
     assert {"-DTORCHPD_CUDA", "-std=c++20", "-I", "x"} <= set(command)
     assert "-fsyntax-only" in " ".join(command)
+
+
+def test_a_quick_check_takes_one_architecture_a_source(tool: dict[str, Any]) -> None:
+    sources = sorted((ROOT / "csrc").glob("**/*.cu"))
+    everything = tool["choose_targets"](sources, quick=False)
+    assert everything == {source: tool["targets_of"](source) for source in sources}
+    quick = tool["choose_targets"](sources, quick=True)
+    assert all(len(quick[source]) == 1 and set(quick[source]) < set(everything[source]) for source in sources)
+    assert {target for targets in quick.values() for target in targets} >= set(tool["TARGETS"])
 
 
 def test_a_table_is_made_of_reports(tool: dict[str, Any], tmp_path: Path) -> None:

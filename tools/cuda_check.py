@@ -4,6 +4,8 @@ The C++ sources of a CUDA build are read too, as far as the compiler's syntax ch
 
 What ptxas says about registers, spills and shared memory is kept in build/cuda-check/, one report per source, and with
 --table FILE as one table (CSV) of all kernels; benchmarks/results/cuda-registers.csv is the one of this repository.
+--quick takes one architecture a source, in turn, which is half the work: where that table is not stale, as a test
+demands, all have been compiled when it was made.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -63,11 +65,19 @@ def targets_of(source: Path) -> tuple[str, ...]:
     return TARGETS + (NEWER_TARGETS if source.name in NEWER_SOURCES else ())
 
 
-def command_for(nvcc: str, source: Path, folders: list[str]) -> list[str]:
+def choose_targets(sources: Sequence[Path], *, quick: bool) -> dict[Path, tuple[str, ...]]:
+    """The architectures to compile for: all of a source, or one of them, in turn."""
+    targets = {source: targets_of(source) for source in sources}
+    if quick:
+        return {source: (all_of[i % len(all_of)],) for i, (source, all_of) in enumerate(targets.items())}
+    return targets
+
+
+def command_for(nvcc: str, source: Path, folders: list[str], architectures: Sequence[str]) -> list[str]:
     command = [nvcc, "-c", str(source), "-o", os.devnull, "-DTORCHPD_CUDA", *folders]
     if source.suffix == ".cpp":
         return [*command, *GLUE_FLAGS]
-    targets = [f"-gencode=arch=compute_{target},code=sm_{target}" for target in targets_of(source)]
+    targets = [f"-gencode=arch=compute_{target},code=sm_{target}" for target in architectures]
     return [*command, *nvcc_flags(), *targets, "-Xptxas=-v"]
 
 
@@ -181,22 +191,31 @@ def write_table(path: Path, reports: list[Path], made_of: str) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Compile every CUDA source; no GPU needed.")
     parser.add_argument("--table", type=Path, help="file for a table of the kernels' registers and spills (CSV)")
+    parser.add_argument("--quick", action="store_true", help="one architecture a source, in turn")
     options = parser.parse_args()
+    if options.quick and options.table is not None:
+        parser.error("--table is of all architectures, so it does not go with --quick")
     nvcc = find_tool("nvcc")
     if nvcc is None:
         print("cuda-check: skipped, there is no nvcc (set CUDA_HOME to the folder of a CUDA toolkit)")
         return 0
     sources = sorted(CSRC.glob("**/*.cu"))
     everything = [*sources, *(CSRC / name for name in GLUE)]
+    targets = choose_targets(everything, quick=options.quick)
     folders = include_folders()
     REPORTS.mkdir(parents=True, exist_ok=True)
     made_of = fingerprint()  # now: who changes a source meanwhile makes the table stale
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        passed = list(pool.map(lambda source: compile_source(command_for(nvcc, source, folders), source), everything))
-    usual, newer = (" and ".join(f"sm_{target}" for target in targets) for targets in (TARGETS, NEWER_TARGETS))
+        passed = list(
+            pool.map(
+                lambda source: compile_source(command_for(nvcc, source, folders, targets[source]), source), everything
+            )
+        )
+    usual, newer = (" and ".join(f"sm_{target}" for target in names) for names in (TARGETS, NEWER_TARGETS))
+    all_of_them = f"{usual}, {', '.join(NEWER_SOURCES)} for {newer} too"
     print(
-        f"cuda-check: {sum(passed)} of {len(everything)} sources of a CUDA build compile for {usual}, "
-        f"{', '.join(NEWER_SOURCES)} for {newer} too, with {nvcc}"
+        f"cuda-check: {sum(passed)} of {len(everything)} sources of a CUDA build compile for "
+        f"{'one architecture each' if options.quick else all_of_them}, with {nvcc}"
     )
     if options.table and all(passed):
         write_table(options.table, [report_of(source) for source in sources], made_of)
