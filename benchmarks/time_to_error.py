@@ -198,7 +198,7 @@ def judged(row: Row) -> Row:
 
 
 def table(rows: list[Row]) -> str:
-    """As the README has it."""
+    """All numbers, a row for each body."""
     lines = [
         '| vertices | Young\'s modulus | guarded Chebyshev | `Multilevel` | times faster | `solver="auto"` |',
         "|---|---|---|---|---|---|",
@@ -226,7 +226,7 @@ def table(rows: list[Row]) -> str:
 
 
 def matrix(rows: list[Row]) -> str:
-    """Short, as the README has it: milliseconds of Chebyshev / Multilevel and their ratio, by size and stiffness."""
+    """Short, as docs/accuracy.md has it: milliseconds of Chebyshev / Multilevel and their ratio, by size and stiffness."""
     stiffnesses = sorted({row["youngs"] for row in rows})
     lines = [
         "| vertices | " + " | ".join(f"{youngs:.0e} Pa" for youngs in stiffnesses) + " |",

@@ -1,4 +1,4 @@
-"""Every block of Python in the README runs, one after another, with smaller numbers."""
+"""Every block of Python in README.md and docs/ runs, those of a file one after another, with smaller numbers."""
 
 from __future__ import annotations
 
@@ -21,9 +21,18 @@ SMALLER = {
 }  # fmt: skip
 
 
-def blocks() -> list[str]:
-    text = (Path(__file__).parents[1] / "README.md").read_text()
-    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+ROOT = Path(__file__).parents[1]
+FILES = {"README.md": 4, "docs/accuracy.md": 2, "docs/gpu.md": 2, "docs/patches.md": 1}  # blocks of each
+
+
+def blocks(file: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / file).read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_every_file_with_code_is_tried() -> None:
+    files = [path.relative_to(ROOT).as_posix() for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))]
+    assert {file: len(blocks(file)) for file in files if blocks(file)} == FILES
+    assert all(any(usual in block for file in FILES for block in blocks(file)) for usual in SMALLER)
 
 
 def stiff_middle() -> pd.Scene:
@@ -35,37 +44,41 @@ def stiff_middle() -> pd.Scene:
 
 
 def swinging() -> tuple[pd.Simulator, pd.State]:
-    """What the block with `tune` takes for granted."""
+    """What the blocks with `tune` take for granted."""
     sim = pd.Simulator(stiff_middle(), iterations=256, progress=False)
     state = sim.rest_state()
     state.velocities[..., 1] = state.positions[..., 0] ** 2
     return sim, state
 
 
-def test_every_block_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("file", FILES)
+def test_every_block_runs(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     body = trimesh.creation.icosphere(subdivisions=2)
     body.apply_scale([1.0, 0.7, 0.8])
     body.export("spot.obj")
-    found, names, used = blocks(), {}, set[str]()
-    assert len(found) == 6
     values: dict[str, Any] = {}
-    for block in found:
-        small = block
-        for usual, fewer in SMALLER.items():
-            used |= {usual} if usual in small else set()
-            small = small.replace(usual, fewer)
+    if file != "README.md":  # which says what to import
+        values = {"torch": torch, "trimesh": trimesh, "pd": pd, "scene": stiff_middle()}
+    names: dict[str, torch.Tensor] = {}
+    for block in blocks(file):
         if '"cuda"' in block and missing_gpu():
             continue
+        for usual, fewer in SMALLER.items():
+            block = block.replace(usual, fewer)
         if "sim.tune" in block:
             values["sim"], values["state"] = swinging()
         if "RigidPieces" in block:
             values["scene"] = stiff_middle()
             values["state"] = pd.Simulator(values["scene"], iterations=256, progress=False).rest_state()
         torch.manual_seed(0)
-        exec(small, values)
+        exec(block, values)
         names |= {name: value for name, value in values.items() if isinstance(value, torch.Tensor)}
-    assert used == set(SMALLER)
     assert all(bool(value.isfinite().all()) for value in names.values())
-    assert "Simulator(" in capsys.readouterr().out
-    assert (tmp_path / "spot.glb").stat().st_size > 0
+    if file == "README.md":
+        assert names
+        assert "Simulator(" in capsys.readouterr().out
+    if "patches" in "".join(blocks(file)):
+        assert (tmp_path / "spot.glb").stat().st_size > 0

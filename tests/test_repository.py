@@ -86,7 +86,28 @@ def test_nothing_is_left_unfinished() -> None:
     assert found == []
 
 
-@pytest.mark.parametrize("file", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md"])
+PROSE = sorted(
+    str(path.relative_to(ROOT)) for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("benchmarks/*.md"))
+)
+
+
+@pytest.mark.parametrize("file", PROSE)
+def test_links_lead_somewhere(file: str) -> None:
+    """To files that are there, and to headings of Markdown."""
+    text = (ROOT / file).read_text(encoding="utf-8")
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if "://" in link:
+            continue
+        name, _, heading = link.partition("#")
+        target = (ROOT / file).parent / name if name else ROOT / file
+        assert target.exists(), link
+        if heading:
+            titles = re.findall(r"^#+ (.+)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+            anchors = {re.sub(r"[^\w\- ]", "", title).lower().replace(" ", "-") for title in titles}
+            assert heading in anchors, link
+
+
+@pytest.mark.parametrize("file", PROSE)
 def test_prose_is_wrapped(file: str) -> None:
     """At 120 columns, as code is; tables, and words longer than that, cannot be."""
     prose = re.sub(r"```.*?```", "", (ROOT / file).read_text(encoding="utf-8"), flags=re.DOTALL).splitlines()

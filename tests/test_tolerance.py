@@ -94,7 +94,7 @@ def hung(kind: str, youngs: float) -> tuple[pd.Simulator, pd.State, Any]:
 def test_parts_that_turn_are_not_taken_for_still(kind: str, stiffest: float, device: torch.device) -> None:
     """The matrix of projective dynamics resists their turning, and first iterates hardly move: 0.8 were left.
 
-    From a corner, at 1e9 Pa, iterations stall on their way, with 28 times the tolerance left: see the README.
+    From a corner, at 1e9 Pa, iterations stall on their way, with 28 times the tolerance left: see docs/limits.md.
     """
     for youngs in (1e7, stiffest):
         sim, state, solution = hung(kind, youngs)

@@ -55,7 +55,7 @@ class Simulator(Model):
         tolerance: an environment stops iterating when |x - x*| is about tolerance |x - s| or less, s being where
             inertia, forces and springs alone would take the vertices, so that |x - s| is what elasticity and contacts
             do, or what gravity does if that is more; 0 never. The error is judged by the changes of iterations and by
-            how slow the slowest mode can be, from the weights of the step: see the limits in the README.
+            how slow the slowest mode can be, from the weights of the step: see docs/limits.md.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "cluster", "grid" or "stream", see
             `torchpd.regimes`; "auto" takes the first that fits, and with `batch` the quickest. Changes nothing on the
             CPU.
