@@ -226,7 +226,7 @@ def table(rows: list[Row]) -> str:
 
 
 def matrix(rows: list[Row]) -> str:
-    """Short, as docs/accuracy.md has it: milliseconds of Chebyshev / Multilevel and their ratio, by size and stiffness."""
+    """Short, for docs/accuracy.md: milliseconds of Chebyshev / Multilevel and their ratio, by size and stiffness."""
     stiffnesses = sorted({row["youngs"] for row in rows})
     lines = [
         "| vertices | " + " | ".join(f"{youngs:.0e} Pa" for youngs in stiffnesses) + " |",

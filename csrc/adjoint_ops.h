@@ -280,13 +280,35 @@ inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier)
   return op.call(t.after, multiplier, t.material[place_in_material("stiffness")], t.plan);
 }
 
+// Environments of whose ends the loss knows anything. One of no number that it leaves out must not spoil what it shares.
+class Asked {
+ public:
+  Asked(const Tensor& grad_positions, const Tensor& grad_velocities) {
+    // what is alone shares nothing
+    if (grad_positions.size(0) < 2 || grad_positions[0].numel() == 0) return;
+    const auto some = [](const Tensor& gradient) { return gradient.ne(0.0).flatten(1).any(1); };
+    is_ = some(grad_positions).logical_or_(some(grad_velocities));
+  }
+
+  // [batch, ...], 0 for others
+  Tensor only(const Tensor& each) const {
+    if (!is_.defined()) return each;
+    std::vector<std::int64_t> shape(each.dim(), 1);
+    shape[0] = -1;
+    return at::where(is_.view(shape), each, 0.0);
+  }
+
+ private:
+  Tensor is_;
+};
+
 // -l . dr/dp of every environment, for an array p of the material, from its formulas for all of them.
 class MaterialGradients {
  public:
   // `elastic`: K l, undefined where nobody has worked it out
   MaterialGradients(const AdjointTensors& t, const Tensor& multiplier, const Tensor& elastic,
-                    double time_step)
-      : t_(t), multiplier_(multiplier), elastic_(elastic), h_(time_step) {}
+                    const Asked& asked, double time_step)
+      : t_(t), multiplier_(multiplier), elastic_(elastic), asked_(asked), h_(time_step) {}
 
   // of the array in a place; what environments share has the sum over them
   Tensor of(std::size_t place) const {
@@ -300,7 +322,8 @@ class MaterialGradients {
   }
 
  private:
-  static Tensor reduce(const Tensor& each, const Tensor& like, std::int64_t own) {
+  Tensor reduce(const Tensor& every, const Tensor& like, std::int64_t own) const {
+    const Tensor each = asked_.only(every);
     return like.dim() == own ? each.sum(0) : each.sum_to_size(like.sizes());
   }
 
@@ -364,6 +387,7 @@ class MaterialGradients {
   const AdjointTensors& t_;
   const Tensor& multiplier_;
   const Tensor& elastic_;
+  const Asked& asked_;
   double h_;
 };
 
@@ -405,8 +429,9 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
       solution, error, grad_velocities, material[place_in_material("masses")],
       material[place_in_material("damping")], passed_on.grad_positions, passed_on.elastic,
       passed_on.projector, passed_on.stuck, passed_on.sliding, time_step);
-  std::vector<Tensor> found{x, v, multiplier};
-  const MaterialGradients gradients(t, multiplier, elastic, time_step);
+  const Asked asked(grad_positions, grad_velocities);
+  std::vector<Tensor> found{asked.only(x), asked.only(v), asked.only(multiplier)};
+  const MaterialGradients gradients(t, multiplier, elastic, asked, time_step);
   for (std::size_t i = 0; i < material.size(); ++i) {
     if (!wanted || wanted->get(i)) found.push_back(gradients.of(i));
   }

@@ -80,8 +80,9 @@ void refuse_contacts(const c10::List<bool>& wanted, at::TensorList material) {
   };
   const bool planes = without("planes"), spheres = without("spheres");
   TORCH_CHECK(!planes && !spheres, "torchpd: a step has no derivative for ", planes ? "planes" : "",
-              planes && spheres ? " and " : "", spheres ? "spheres" : "", "; detach them, or sim.",
-              planes ? "planes" : "spheres", ".requires_grad_(False)");
+              planes && spheres ? " and " : "", spheres ? "spheres" : "", "; detach them, or call ",
+              planes ? "sim.planes.requires_grad_(False)" : "", planes && spheres ? " and " : "",
+              spheres ? "sim.spheres.requires_grad_(False)" : "");
 }
 
 // What autograd does not look at, and both functions have to know; `info` is handed out past it, a report, not a function to

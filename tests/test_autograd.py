@@ -176,3 +176,35 @@ def test_a_loss_may_be_of_any_size(factor: float, solver: pd.solvers.Solver, dev
     )
     for one, other in zip(usual, scaled, strict=True):
         torch.testing.assert_close(other.double() / factor, one.double(), rtol=1e-3, atol=1e-4 * float(one.abs().max()))
+
+
+@pytest.mark.parametrize("parts", [(), (pd.Ground(-0.02, friction=0.3),)], ids=["free", "rough ground"])
+def test_a_loss_may_leave_out_an_environment_of_no_number(
+    parts: tuple[pd.scene.Part, ...], device: torch.device
+) -> None:
+    """Then what environments share has the gradient of the others, by the bits."""
+    solid = pd.Solid(pd.shapes.box((0.1, 0.1, 0.1), (2, 2, 2)), youngs=1e4)
+    pin = pd.Pin(solid, solid.mesh.vertices[:, 1] > 0.09, stiffness=100.0)
+    scene = pd.Scene(solid, pin, pd.Gravity(), pd.Damping(0.1), *parts)
+    sim = pd.Simulator(scene, 1 / 60, 40, dtype=torch.float64, progress=False).to(device)
+    shared = [getattr(sim, name) for name in ("stiffness", "masses", "gravity", "damping", "pin_stiffness")]
+    state = sim.rest_state(3)
+    state.velocities[:] = torch.tensor([[0.3, -1.0, 0.1], [0.0, -2.0, 0.0], [0.5, -0.5, 0.0]])[:, None]
+    state.velocities[1, 3] = torch.nan
+    push = torch.zeros_like(state.positions).requires_grad_()
+
+    def gradients(kept: torch.Tensor) -> list[torch.Tensor]:
+        for array in shared:
+            array.requires_grad_()
+        track = sim.rollout(state, 2, forces=push)
+        ends = track.state().where(kept, sim.rest_state(3))
+        loss = (ends.positions.square().sum((1, 2)) + ends.velocities[..., 0].sum(1))[kept].sum()
+        return list(torch.autograd.grad(loss, [push, *shared]))
+
+    kept = torch.tensor([True, False, True], device=device)
+    found = gradients(kept)
+    assert all(bool(gradient.isfinite().all()) for gradient in found)
+    assert not bool(found[0][1].any())
+    state.velocities[1, 3] = 0.0
+    for gradient, expected in zip(found, gradients(kept), strict=True):
+        assert torch.equal(gradient, expected)

@@ -52,11 +52,11 @@ def block(
     return pd.Simulator(scene, 1 / 60, 100, pd.Multilevel(), dtype=torch.float64, progress=False)
 
 
-def error_after(sim: pd.Simulator, state: pd.State, iterations: int) -> float:
-    """Of |h v - u|."""
-    sim.iterations = 300
+def error_after(sim: pd.Simulator, state: pd.State, iterations: int, *, solved: float = 1e-9) -> float:
+    """Of |h v - u|; `solved`: residual of the step to compare with."""
+    sim.iterations = 300 if solved <= 1e-9 else 2000
     solution, info = sim(state, return_info=True)
-    assert float(info.residual) <= 1e-9
+    assert float(info.residual) <= solved
     scale = float((state.positions + state.velocities / 60 - solution.positions).norm())
     sim.iterations = iterations
     return float((sim(state).positions - solution.positions).norm()) / scale
@@ -74,6 +74,17 @@ def test_stiffness_costs_nothing_on_contacts(on: str, youngs: float, friction: f
     for _ in range(2 if on == "ground" else 3):
         state = sim(state)
     assert error_after(sim, state, 24) <= 1e-3
+
+
+@pytest.mark.parametrize("youngs", [1e6, 1e7])
+def test_a_smooth_face_of_many_vertices_slides(youngs: float) -> None:
+    """M is too soft there for the ways in which it bends: with the usual theta trials fail, and it takes 45 and 64."""
+    sim = block((24, 4, 24), (0.8, 0.13, 0.8), youngs, pd.Ground(0.0))
+    state = sim.rest_state()
+    state.velocities[:] = torch.tensor([1.0, -1.0, 0.3])
+    for _ in range(6):
+        state = sim(state)
+    assert error_after(sim, state, 27, solved=1e-5) <= 1e-3
 
 
 def test_slips_that_turn_do_not_stall_it() -> None:
@@ -162,16 +173,6 @@ def test_many_contacts_do_not_stall_it(solver: pd.Multilevel) -> None:
     assert error(found) < 4 * error(after(pd.Chebyshev(), 256)[0])
     assert error(found) < 0.1
     assert back < 40
-
-
-def test_automatic_leaves_slivers_that_land_to_chebyshev() -> None:
-    """As many iterations as the forecast gives Multilevel without contacts leave 0.98."""
-    sim, _ = plate(3e4)
-    made = pd.Simulator(sim.scene, 1 / 60, solver="auto", dtype=torch.float64, progress=False)
-    assert isinstance(made.solver, pd.Chebyshev)
-    assert "slivers on contacts may keep Multilevel from working" in repr(made)
-    scene = pd.Scene(*sim.scene.solids, pd.Gravity())
-    assert isinstance(pd.Simulator(scene, 1 / 60, solver="auto", progress=False).solver, pd.Multilevel)
 
 
 @pytest.mark.parametrize("name", ["ground", "sphere", "sliding"])

@@ -3,10 +3,11 @@
 The smallest ratio mu of inertia to diagonal bounds the spectrum of D^-1 A from below, and with it the rate of the
 Jacobi and Chebyshev iterations. What `Multilevel` needs does not depend on the mesh, but on mu n^(2/3), n vertices of a
 body: about rho L^2 / (E h^2), how far a wave travels in a step against the size L of the body. It grows with the
-logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. Smooth contacts make
-no difference to the usual one on small meshes without slivers; cubes of 343, 2197 and 15,625 vertices that slide need
-13, 32 and 91 iterations to 1e-3, which the last two constants fit. On 197 random scenes nine of ten needed 0.3 to 1.5
-times the forecast, meshes with slivers the least (`benchmarks/forecast.py`).
+logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. On 197 random scenes
+nine of ten needed 0.3 to 1.5 times the forecast, meshes with slivers the least (`benchmarks/forecast.py`).
+
+With contacts `Multilevel` is expected to need what Chebyshev does. Where a body rests or slides it takes a tenth of
+that, but a stiff one that lands falls to accelerated Jacobi iterations, and nothing says beforehand which step that is.
 `Simulator.tune` measures instead.
 
 Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
@@ -33,7 +34,6 @@ __all__ = [
     "forecast",
     "has_contacts",
     "has_friction",
-    "knows_contacts",
     "spectrum_of",
     "warn_of_few_iterations",
 ]
@@ -41,10 +41,7 @@ __all__ = [
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
 # iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
 _LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
-# with contacts times (n^(1/3) / cells)^growth: a flat face that is held has more modes than the small problem knows of
-_HELD_CELLS, _HELD_GROWTH = 8.0, 1.3
 _MOST = 10_000
-_SLIVERS = 0.2  # `Spectrum.even` of a mesh that has them
 FAR_TOO_FEW = 0.1  # error that is left
 
 
@@ -57,7 +54,6 @@ class Spectrum(NamedTuple):
 
     least: float  # mu: smallest ratio a / D of a vertex that is free, in (0, 1]
     slow: float  # the same for modes that reach across the mesh, which one flat element does not slow down
-    even: float = 1.0  # mu over the mean ratio: above a half without slivers, far below with them
 
 
 class Forecast(NamedTuple):
@@ -97,7 +93,7 @@ def spectrum_of(sim: Model) -> Spectrum | None:
     floor = (1.0 - _LARGEST_RHO) / Chebyshev().numbers()["relaxation"]
     slow = float(torch.maximum(ratio.amin(1), mean.clamp(max=floor)).min())
     valid = math.isfinite(least) and 0.0 < least <= slow <= 1.0
-    return Spectrum(least, slow, float((ratio.amin(1) / mean).min())) if valid else None
+    return Spectrum(least, slow) if valid else None
 
 
 def _limit(rho: float) -> float:
@@ -128,12 +124,10 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     numbers = solver.numbers()
     if spectrum is None or not numbers["weighted"]:
         return None
-    if isinstance(solver, Multilevel) and knows_contacts(sim, solver, spectrum):
+    if isinstance(solver, Multilevel) and not has_contacts(sim):
         body = max(len(solid.mesh.vertices) for solid in sim.scene.solids)
         reach = min(spectrum.slow * body ** (2.0 / 3.0), 1.0)
         decade = _LEVELS_LEAST + _LEVELS_SLOPE[solver.outer] * math.log10(1.0 / reach)
-        if has_contacts(sim):
-            decade *= max(1.0, (body ** (1.0 / 3.0) / _HELD_CELLS) ** _HELD_GROWTH)
         return Forecast(math.log(10.0) / decade)
     theta, rho = numbers["relaxation"], numbers["rho"]
     slowest = 1.0 - theta * spectrum.slow
@@ -145,12 +139,6 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0
     left = max(_decay(slowest, limit), _decay(middle, limit), 1e-3)
     return Forecast(-math.log(min(left, 1.0 - 1e-15)))
-
-
-def knows_contacts(sim: Model, solver: Multilevel, spectrum: Spectrum) -> bool:
-    """Whether the scene's contacts leave the iterations that it needs; with friction or slivers they may not."""
-    smooth = solver.outer == "corotated" and not has_friction(sim) and spectrum.even > _SLIVERS
-    return smooth or not has_contacts(sim)
 
 
 def has_contacts(sim: Model) -> bool:

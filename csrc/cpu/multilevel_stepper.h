@@ -166,7 +166,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     Real alpha[history] = {}, scale;
     for (int lane = 0; lane < width; ++lane) {
       for (int j = 0; j < history; ++j) Lanes::set_lane(alpha[j], lane, T(pairs_[lane].alpha[j]));
-      Lanes::set_lane(scale, lane, T(set_.relaxation / outer_[lane].scale));
+      Lanes::set_lane(scale, lane, T(outer_[lane].weight(set_.relaxation, is_held(lane))));
     }
     Value* in = o_.cycle.input();
     each_vertex([&](std::int64_t i) {
@@ -196,7 +196,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       const double limit = accelerates ? schedule_[lane].limit : Outer::momentum_limit();
       const double b =
           accelerates || (goes && !lbfgs_ && !outer.plain) ? outer.extrapolation(limit) : 0;
-      outer.send(b, has_[lane], corotates_ && made_[lane] == 0);
+      outer.send(b, has_[lane], corotates_ && made_[lane] == 0, is_held(lane));
       Lanes::set_lane(beta, lane, T(b));
       Lanes::set_lane(length, lane, T(goes ? (1 + b) * outer.length() : 0));
       Lanes::set_lane(plain, lane, T(goes && outer.plain ? 1 : 0));
@@ -234,14 +234,18 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   }
 
  private:
+  // whether contacts are in the small problem
+  bool is_held(int lane) const {
+    if constexpr (!Touching) return false;
+    return made_[lane] > 0 && corotation_.is_held(lane);
+  }
+
   // The lanes whose small problem is made at iteration k, of where they stand.
   void corotate(int k) {
     bool asks[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
-      bool held = false;
-      if constexpr (Touching) held = made_[lane] > 0 && corotation_.is_held(lane);
       const TurningPlan plan(k, made_[lane], outer_[lane].restarts - doubted_[lane], Touching,
-                             held);
+                             is_held(lane));
       asks[lane] = false;
       // alone it would not have come here
       if (outer_[lane].diagonal) continue;

@@ -108,7 +108,7 @@ class MultilevelRunner {
   // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
   PD_DEVICE void precondition() {
     if (corotates_) corotate();
-    const double scale = w_.settings().relaxation / c_.outer.scale;
+    const double scale = c_.outer.weight(w_.settings().relaxation, is_held());
     const auto right_side = [&](int i) {
       Vec3<T> q = let_through(i, vec3(pull_[i]));
       if (lbfgs_) {
@@ -158,7 +158,7 @@ class MultilevelRunner {
     __syncthreads();
     if (threadIdx.x == 0) {
       c_.total[0] = extrapolates ? c_.outer.extrapolation(limit) : 0;
-      c_.outer.send(c_.total[0], corotated_, corotates_ && made_ == 0);
+      c_.outer.send(c_.total[0], corotated_, corotates_ && made_ == 0, is_held());
     }
     ++used_;
     __syncthreads();
@@ -213,9 +213,11 @@ class MultilevelRunner {
   PD_DEVICE std::int64_t vertices() const { return w_.plan.vertices; }
   PD_DEVICE static Vec3<T> none() { return {T(0), T(0), T(0)}; }
 
+  // whether contacts are in the small problem
+  PD_DEVICE bool is_held() const { return Touching && made_ > 0 && corotation_.control().held; }
+
   PD_DEVICE void corotate() {
-    const bool held = made_ > 0 && corotation_.control().held;
-    const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_, Touching, held);
+    const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_, Touching, is_held());
     const CorotationInput<T> in = {w_.v.x, w_.v.u, w_.v.target, base_, w_.weights};
     if (plan.forget) corotated_ = false;
     if (plan.make) {

@@ -29,6 +29,7 @@ struct HeldVertex {
   // off the normals that hold it
   Mat3<T> projector = {{{T(1), T(0), T(0)}, {T(0), T(1), T(0)}, {T(0), T(0), T(1)}}};
   bool stuck = false;  // friction holds it
+  T carried = T(1);    // and it goes so far as its start does, along the surface
   T curvature = T(0);  // of the surface that it slides on, times the push
   int contacts = 0;    // that hold it
   Vec3<T> first_normal = {};
@@ -49,9 +50,13 @@ struct HeldVertex {
     curvature = multiply_add(push, curved, curvature);
     for (Vec3<T>& of : slides) of = {T(0), T(0), T(0)};
     ++contacts;
+    carried = T(1);
     if (contacts == 1) {
       first_normal = normal;
       first_friction = friction;
+      // it ends where the line from the centre to its start, moved along, meets the ball
+      const T begins = T(1) - curved * dot(moved - motion, normal);
+      if (sticks && begins > T(0)) carried = T(1) / begins;
       if (friction > T(0) && !sticks)
         slide_on(normal, push, friction, motion, curved, slip, slipped);
     } else if (contacts == 2 && curvature == T(0)) {
@@ -170,9 +175,10 @@ struct AdjointVertex {
       const std::int64_t at = environment * call.plan.vertices + vertex;
       for (int row = 0; row < 3; ++row) {
         T* to = call.projector + 9 * at + 3 * row;
-        to[0] = held.projector.row[row].x;
-        to[1] = held.projector.row[row].y;
-        to[2] = held.projector.row[row].z;
+        const Vec3<T> free = (held.stuck ? held.carried : T(1)) * held.projector.row[row];
+        to[0] = free.x;
+        to[1] = free.y;
+        to[2] = free.z;
       }
       call.stuck[at] = held.stuck;
       for (int n = 0; n < slide_count; ++n) {

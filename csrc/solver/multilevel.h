@@ -247,6 +247,11 @@ constexpr double momentum_rho = 0.9995;  // that of M A is not known, and this l
 constexpr double share_of_turns = 0.25;
 constexpr double kept_by_turns = 0.5, kept_by_corotation = 0.25;
 
+// Of theta, while contacts without friction hold vertices. There P M P has eigenvalues beyond 1 for the ways in which a face
+// bends: 4 for a cube of 15,625 vertices, and theta times them, if more than 2, fails one trial after another. A quarter would
+// serve large faces better, and small ones worse.
+constexpr double relaxed_on_contacts = 0.5;
+
 // Rounding of E, relative: a rise that says nothing.
 template <class T>
 PD_HD constexpr double energy_noise() {
@@ -276,6 +281,11 @@ struct Outer {
     const int halved =
         failures < patience ? failures - 1 : patience - 1;  // what more fail goes another way
     return halved > 0 ? 1.0 / double(1 << halved) : 1.0;
+  }
+
+  // Of M in a step; `held`: the small problem has contacts in it.
+  PD_HD double weight(double relaxation, bool held) const {
+    return (held && !friction ? relaxed_on_contacts : 1) * relaxation / scale;
   }
 
   // Whether to go on from a trial of this energy. False for NaN, unless there is nothing to go back to.
@@ -322,10 +332,11 @@ struct Outer {
   }
 
   // Of the trial that goes out next, with momentum b, by a direction that has the small problem's part or not; `waits`: that is
-  // still to be made, and until then a part that turns may hardly move at all.
-  PD_HD void send(double b, bool corotated, bool waits) {
+  // still to be made, and until then a part that turns may hardly move at all; `held`: see weight.
+  PD_HD void send(double b, bool corotated, bool waits, bool held) {
     omega = plain || diagonal ? 1 + b : 0;
-    const double full = corotated ? 1 : waits ? 0 : share_of_turns;
+    const double most = held && !friction ? relaxed_on_contacts : 1;
+    const double full = corotated ? most : waits ? 0 : share_of_turns;
     share = {full * fits * length(), corotated ? kept_by_corotation : kept_by_turns};
   }
 
