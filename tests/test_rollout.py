@@ -104,6 +104,37 @@ def test_moving_sphere_drags_in_a_rollout(dtype: torch.dtype, device: torch.devi
     assert float((own.positions - moved.positions).abs().max()) <= 1e4 * torch.finfo(dtype).eps
 
 
+def rough_ball(dtype: torch.dtype, device: torch.device) -> tuple[pd.Simulator, pd.State, pd.Sphere]:
+    """A block at rest on a ball so rough that its velocity shows."""
+    ball = pd.Sphere((0.15, -1.0, 0.15), 1.0, friction=20.0)
+    case = contact_block(ball, pd.Damping(5.0))
+    sim = simulator(case, dtype, device, iterations=30)
+    return sim, sim.rollout(state_of(case, sim), 30, 30).state(), ball
+
+
+def test_velocity_of_a_sphere_is_from_the_step_before(dtype: torch.dtype, device: torch.device) -> None:
+    """Where it comes with its velocity on some steps, and where it is left out, in the scene's place."""
+    sim, state, ball = rough_ball(dtype, device)
+    home = tensor_of(np.array([0.15, -1.0, 0.15]), sim)
+    shift = tensor_of(np.array([0.002, 0.0, 0.0]), sim)
+    places = [home, *(home + shift * number for number in (1, 2, 4, 0, 1, 3, 0, 5))]  # from before the first step
+    omitted, told = (3, 6), (1, 5)
+
+    def row(step: int) -> torch.Tensor:
+        return torch.cat([places[step + 1], (places[step + 1] - places[step]) / sim.time_step])
+
+    def sparse(step: int) -> dict[pd.Sphere, torch.Tensor]:
+        return {} if step in omitted else {ball: row(step) if step in told else places[step + 1]}
+
+    def full(step: int) -> dict[pd.Sphere, torch.Tensor]:
+        return {} if step in omitted else {ball: row(step)}
+
+    found, expected = (sim.rollout(state, 8, targets=targets) for targets in (sparse, full))
+    assert same_bits(found, expected)
+    still = sim.rollout(state, 8, targets=lambda step: {ball: torch.cat([places[step + 1], torch.zeros_like(home)])})
+    assert not same_bits(still, expected)
+
+
 def test_moving_sphere_takes_the_present_time_step(dtype: torch.dtype, device: torch.device) -> None:
     """A simulator whose time step was replaced drags as one that was made with it."""
     ball = pd.Sphere((0.15, -1.0, 0.15), 1.0, friction=20.0)

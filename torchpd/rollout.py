@@ -22,6 +22,7 @@ __all__ = ["PerStep", "Rollout", "roll"]
 
 PerStep = Callable[[int], Any]
 _MOVES_OF_BAR = 50
+_SPHERES = list(MATERIAL_ROWS).index("spheres")
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,21 +100,18 @@ def _in_pieces(sim: Simulator, call: Rollout, bar: Any) -> Track:
 def _one_by_one(sim: Simulator, call: Rollout, bar: Any) -> Track:
     states, rows = [], []
     state, batch = call.state, call.state[0].shape[0]
-    centres = {part: sim.spheres[..., number, :3] for part, number in sim.anchors.spheres.items()}
     material = _constant_material(sim, call)
     for step in range(call.steps):
         if callable(call.targets):
-            now = call.targets(step)
-            if isinstance(now, Mapping):
-                now, centres = sim.anchors.with_velocities(now, centres, batch=batch, time_step=sim.time_step)
-            material = sim.material_at(now, batch)
+            material = _material_after(sim, material, call.targets(step), batch)
+        elif step > 0:
+            material = _moved_on(material, 1)
         recorded = (step + 1) % call.every == 0
         forces = call.forces
         if callable(forces):
             forces = forces(step)
             sim.check_state(state, forces=forces)
         state, row = sim.advance(state, forces, material, call.start, report=call.report and recorded)
-        material = _moved_on(material, 1)
         if recorded:
             states.append(state)
             rows.append(row)
@@ -122,6 +120,13 @@ def _one_by_one(sim: Simulator, call: Rollout, bar: Any) -> Track:
         return _piece(sim, replace(call, steps=0, forces=None), sim.material())
     info = Info.from_rows(torch.stack(rows))
     return Track(torch.stack([s[0] for s in states]), torch.stack([s[1] for s in states]), info)
+
+
+def _material_after(sim: Simulator, before: list[Tensor], targets: Targets | None, batch: int) -> list[Tensor]:
+    """The material of a step with these targets, after one with the material `before`."""
+    if isinstance(targets, Mapping):
+        targets = sim.anchors.with_velocities(targets, before[_SPHERES], batch=batch, time_step=sim.time_step)
+    return sim.material_at(targets, batch)
 
 
 def _moved_on(material: list[Tensor], steps: int) -> list[Tensor]:

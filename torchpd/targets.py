@@ -89,19 +89,19 @@ class Anchors:
         return torch.cat([value[..., :3].expand(*lead, 3), own.expand(*lead, 2), motion.expand(*lead, 3)], dim=-1)
 
     def with_velocities(
-        self, targets: Mapping[Any, Tensor], last: dict[int, Tensor], *, batch: int, time_step: float
-    ) -> tuple[dict[Any, Tensor], dict[int, Tensor]]:
-        """Adds to the centres of spheres how fast they came there since the last step."""
-        filled, last = dict(targets), dict(last)
+        self, targets: Mapping[Any, Tensor], before: Tensor, *, batch: int, time_step: float
+    ) -> dict[Any, Tensor]:
+        """Adds to centres of spheres how fast they came there from where the spheres were `before` [.., S, 8]."""
+        filled = dict(targets)
         for part, value in targets.items():
             if id(part) not in self.spheres:
                 continue
-            value = self._checked("targets of a Sphere", value, batch, [(3,), (6,)], last[id(part)])
+            last = before[..., self.spheres[id(part)], :3]
+            value = self._checked("targets of a Sphere", value, batch, [(3,), (6,)], last)
             if value.shape[-1] == 3:
-                velocity = (value - last[id(part)]) / time_step
+                velocity = (value - last) / time_step
                 filled[part] = torch.cat([value.expand(velocity.shape), velocity], dim=-1)
-                last[id(part)] = value
-        return filled, last
+        return filled
 
     @staticmethod
     def moved_on(spheres: Tensor, steps: int) -> Tensor:
