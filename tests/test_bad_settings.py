@@ -112,6 +112,8 @@ def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
     ):
         with pytest.raises(ValueError, match=message):
             sim.rollout(state, steps, every)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="first must be a whole number >= 0, got -1"):
+        sim.rollout(state, 1, first=-1)
     for batch in (-1, 1.5):
         with pytest.raises(ValueError, match="batch must be a whole number >= 0"):
             sim.rest_state(batch)  # type: ignore[arg-type]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -133,6 +135,40 @@ def test_velocity_of_a_sphere_is_from_the_step_before(dtype: torch.dtype, device
     assert same_bits(found, expected)
     still = sim.rollout(state, 8, targets=lambda step: {ball: torch.cat([places[step + 1], torch.zeros_like(home)])})
     assert not same_bits(still, expected)
+
+
+def test_rollouts_one_after_another_are_one(dtype: torch.dtype, device: torch.device) -> None:
+    """Bit for bit, where balls move: by centres alone, left out on the step between, and by a constant velocity."""
+    sim, state, ball = rough_ball(dtype, device)
+    home = tensor_of(np.array([0.15, -1.0, 0.15]), sim)
+    shift = tensor_of(np.array([0.002, 0.0, 0.0]), sim)
+    push = 0.01 * torch.ones_like(state.positions)
+    asked: list[int] = []
+
+    def centres(step: int) -> dict[pd.Sphere, torch.Tensor]:
+        asked.append(step)
+        return {ball: home + shift * (step + 1)}
+
+    def sometimes(step: int) -> dict[pd.Sphere, torch.Tensor]:
+        return {} if step == 3 else centres(step)
+
+    def forces(step: int) -> torch.Tensor:
+        return push * step
+
+    constant = {ball: torch.cat([home + shift, shift / sim.time_step])}
+    cases: list[dict[str, Any]] = [{"targets": targets} for targets in (centres, sometimes, constant)]
+    for arguments in (*cases, {"targets": constant, "forces": forces}):
+        whole = sim.rollout(state, 8, **arguments)
+        asked.clear()
+        begun = sim.rollout(state, 4, **arguments)
+        ended = sim.rollout(begun.state(), 4, first=4, **arguments)
+        both = pd.Track(
+            *(torch.cat([getattr(t, name) for t in (begun, ended)]) for name in whole._fields[:2]), whole.info
+        )
+        assert same_bits(both, whole)
+        assert min(asked, default=0) == 0
+        restarted = sim.rollout(begun.state(), 4, **arguments)
+        assert not same_bits(restarted, ended)
 
 
 def test_moving_sphere_takes_the_present_time_step(dtype: torch.dtype, device: torch.device) -> None:

@@ -189,7 +189,7 @@ class Sphere(_Key):
     """A ball that vertices cannot enter, with Coulomb friction. `targets` of a step may move its centre.
 
     For friction to carry a body along a step has to be told the centre's velocity too, `targets={ball: [..., 6]}`;
-    `rollout` works it out of the centres.
+    `rollout` works it out of the centres that a function of the step number gives, the first from the scene's on.
 
     Args:
         center: [3] in m.

@@ -36,6 +36,7 @@ class Rollout:
     targets: Targets | PerStep | None
     start: str
     report: bool
+    first: int  # number of the first step
 
     @property
     def records(self) -> int:
@@ -64,7 +65,10 @@ def roll(sim: Simulator, call: Rollout, *, progress: bool) -> Track:
 
 
 def _constant_material(sim: Simulator, call: Rollout) -> list[Tensor]:
-    return sim.material() if callable(call.targets) else sim.material_at(call.targets, call.state[0].shape[0])
+    if callable(call.targets):
+        return sim.material()
+    material = sim.material_at(call.targets, call.state[0].shape[0])
+    return _moved_on(material, call.first) if call.first else material
 
 
 def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
@@ -101,12 +105,15 @@ def _one_by_one(sim: Simulator, call: Rollout, bar: Any) -> Track:
     states, rows = [], []
     state, batch = call.state, call.state[0].shape[0]
     material = _constant_material(sim, call)
-    for step in range(call.steps):
+    if callable(call.targets) and call.first:
+        # only for where its spheres were
+        material = sim.material_at(call.targets(call.first - 1), batch)
+    for step in range(call.first, call.first + call.steps):
         if callable(call.targets):
             material = _material_after(sim, material, call.targets(step), batch)
-        elif step > 0:
+        elif step > call.first:
             material = _moved_on(material, 1)
-        recorded = (step + 1) % call.every == 0
+        recorded = (step + 1 - call.first) % call.every == 0
         forces = call.forces
         if callable(forces):
             forces = forces(step)

@@ -35,7 +35,7 @@ class Simulator(Model):
     The values that training may change are parameters (without gradient until asked), for all environments or, with a
     leading batch, for each: `stiffness` [E] Pa, `masses` [V] kg, `gravity` [3] m/s^2, `damping` [] 1/s,
     `pin_stiffness` [P] N/m, `pin_targets` [P, 3] m, `planes` [C, 5] (unit normal, height, friction), `spheres` [S, 8]
-    (centre, radius, friction, velocity). `set_material` checks and replaces them. What an optimiser writes, or
+    (centre, radius, friction, motion in a step). `set_material` checks and replaces them. What an optimiser writes, or
     `torch.func.functional_call` gives, no step checks, as that would wait for a GPU: where it is NaN, or stiffness,
     masses or springs are negative, `Info.residual` is NaN. Let an optimiser learn the logarithm of those.
 
@@ -169,6 +169,7 @@ class Simulator(Model):
         *,
         forces: Tensor | PerStep | None = None,
         targets: Targets | PerStep | None = None,
+        first: int = 0,
         start: str = "velocity",
         return_info: bool = False,
         progress: bool = False,
@@ -180,8 +181,12 @@ class Simulator(Model):
             steps: how many.
             every: steps from one record to the next; the track has steps // every records.
             forces: constant, or a function of the step number.
-            targets: constant (a sphere with a velocity goes on with it), or a function of the step number (a sphere's
-                velocity then follows from its centres).
+            targets: constant (a sphere with a velocity goes on with it), or a function of the step number. A sphere's
+                centre that comes from a function without a velocity has that of its way from where the sphere was at
+                the end of the step before: where the scene has it before step 0 and after steps that leave it out.
+            first: number of the first step, where this rollout goes on from another: `rollout(state, 9)` ends as
+                `rollout(rollout(state, 5).state(), 4, first=5)` does. For where spheres were, a function of targets is
+                asked for the step before, too.
             start: first iterate of every step, "velocity" or "inertial".
             return_info: fill in residual and energy of the recorded steps; NaN otherwise, see `Info`.
             progress: show a bar.
@@ -190,9 +195,11 @@ class Simulator(Model):
             Track of the recorded states.
         """
         steps, every = check_whole("steps", steps, minimum=0), check_whole("every", every, minimum=1)
+        first = check_whole("first", first, minimum=0)
         if not _is_start(start):
             raise ValueError(f'rollout: start must be "velocity" or "inertial", got {_in_short(start)}')
-        return roll(self, Rollout(state, steps, every, forces, targets, start, return_info), progress=progress)
+        call = Rollout(state, steps, every, forces, targets, start, return_info, first)
+        return roll(self, call, progress=progress)
 
     def capture(
         self,
