@@ -222,12 +222,16 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
         ({"masses": masses}, ValueError, r"masses must be positive .*, got -0\.5 at \[4\] \(2 in all\)"),
         ({"masses": masses.repeat(2, 1)}, ValueError, r"masses must be positive .*, got -0\.5 at \[0, 4\] \(4 in all"),
         ({"masses": math.nan}, ValueError, "masses must be finite .*, got nan at"),
+        ({"gravity": -9.81}, ValueError, r"gravity must be \[3\], or with a batch in front, got one number, -9\.81$"),
+        ({"planes": 1.0}, ValueError, r"planes must be \[1, 5\], or with a batch in front, got one number, 1$"),
+        ({"spheres": torch.tensor(0.5)}, ValueError, r"spheres must be \[1, 8\], .*, got one number, 0\.5$"),
+        ({"pin_targets": 0.0}, ValueError, r"pin_targets must be \[3, 3\], .*, got one number, 0$"),
         (
             {"pin_stiffness": 0.0},
             ValueError,
             "pin_stiffness must be positive, inf for pins that hold exactly, .*, got 0",
         ),
-        ({"gravity": math.nan}, ValueError, "gravity must be finite .*, got nan"),
+        ({"gravity": (0.0, math.nan, 0.0)}, ValueError, "gravity must be finite .*, got nan"),
         ({"damping": -1.0}, ValueError, r"damping must be >= 0 in torch\.float32, got -1\.0$"),
         (
             {"planes": torch.tensor([[0.0, 2.0, 0.0, 0.0, 0.0]])},
@@ -240,6 +244,13 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
         with pytest.raises(kind, match=f"^set_material: {message}"):
             sim.set_material(**arrays)  # type: ignore[arg-type]
     assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
+
+
+def test_one_number_is_for_what_has_one_each() -> None:
+    sim = small_simulator()
+    sim.set_material(stiffness=2e4, masses=torch.tensor(0.5), damping=0.25, pin_stiffness=1e3)
+    for name, number in (("stiffness", 2e4), ("masses", 0.5), ("damping", 0.25), ("pin_stiffness", 1e3)):
+        assert bool((getattr(sim, name) == number).all())
 
 
 def test_material_that_rounds_to_nothing_is_refused() -> None:

@@ -234,8 +234,9 @@ class Model(nn.Module):
         (`torch.nn.utils.parametrize`) for all. One that is there is written to through its `right_inverse`.
 
         Args:
-            arrays: by name, see `Simulator`. Shapes and values are checked here, once, and that batches agree with each
-                other and with those of the arrays that stay. Pins that hold others, or much harder, make the matrix of
+            arrays: by name, see `Simulator`; one number is for all elements, vertices or pins of `stiffness`, `masses`
+                or `pin_stiffness`. Shapes and values are checked here, once, and that batches agree with each other and
+                with those of the arrays that stay. Pins that hold others, or much harder, make the matrix of
                 `Multilevel` anew, see `prepare_solver`; a captured step wants to be captured again then.
         """
         check_has_values("set_material", self.device)
@@ -301,11 +302,12 @@ class Model(nn.Module):
             )
         tensor = tensor.to(dtype=self.dtype, device=self.device)
         shape = tuple(own.shape[own.dim() - MATERIAL_ROWS[name].dims :])
-        tensor = tensor.expand(shape) if tensor.dim() == 0 else tensor
+        alone = tensor.dim() == 0
+        if alone and MATERIAL_ROWS[name].width == 1:
+            tensor = tensor.expand(shape)
         if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
-            raise ValueError(
-                f"set_material: {name} must be {list(shape)}, or with a batch in front, got {list(tensor.shape)}"
-            )
+            came = f"one number, {tensor.item():g}" if alone else list(tensor.shape)
+            raise ValueError(f"set_material: {name} must be {list(shape)}, or with a batch in front, got {came}")
         check_material("set_material", name, tensor)
         return tensor.contiguous()
 
