@@ -57,6 +57,29 @@ def test_compiled_rollout_is_the_rollout(solver: Solver) -> None:
     assert torch.equal(torch.compile(play, fullgraph=True, backend="aot_eager")(*state), play(*state))
 
 
+def test_compiled_rollouts_that_go_one_by_one() -> None:
+    """Functions of the step number, and records of some steps where a gradient is wanted."""
+    sim, state = small(torch.float64, iterations=200)
+    (ball,) = sim.scene.spheres
+    place = sim.spheres[0, :3].clone()
+    sim.stiffness.requires_grad_()
+
+    def functions(x: Tensor, v: Tensor) -> Tensor:
+        track = sim.rollout(
+            pd.State(x, v), 4, forces=lambda k: 0.1 * k * v, targets=lambda k: {ball: place + 1e-3 * (k + 1)}, first=2
+        )
+        return track.positions.mean(dim=2)
+
+    def sparse(x: Tensor, v: Tensor) -> Tensor:
+        return sim.rollout(pd.State(x, v), 4, every=2).positions.mean(dim=2)
+
+    for play in (functions, sparse):
+        means = torch.compile(play, fullgraph=True, backend="aot_eager")(*state), play(*state)
+        assert torch.equal(*means)
+        found, expected = (torch.autograd.grad(mean.square().sum(), sim.stiffness)[0] for mean in means)
+        assert float((found - expected).abs().max()) <= 64 * ULP[torch.float64] * float(expected.abs().max())
+
+
 def test_compiled_step_takes_pins_and_spheres_as_keys() -> None:
     """Named in the function, given to it, and in a mapping; another part is no other step by mistake."""
     body = pd.Solid(pd.shapes.box((1.0, 0.2, 0.2), (5, 1, 1)), youngs=1e5)

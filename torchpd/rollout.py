@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import torch
 from torch import Tensor
@@ -60,7 +60,10 @@ def roll(sim: Simulator, call: Rollout, *, progress: bool) -> Track:
     one_by_one = varies or (call.every > 1 and call.tracks_gradient(sim.material()))
     if not (one_by_one or progress):
         return _piece(sim, call, _constant_material(sim, call))
-    with tqdm(total=call.steps, desc="simulating", unit="step", disable=not progress, leave=False) as bar:
+    if not progress:
+        # no bar that is switched off: torch.compile cannot make one
+        return _one_by_one(sim, call, None)
+    with tqdm(total=call.steps, desc="simulating", unit="step", leave=False) as bar:
         return _one_by_one(sim, call, bar) if one_by_one else _in_pieces(sim, call, bar)
 
 
@@ -86,7 +89,7 @@ def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
     return Track(positions, velocities, Info.from_rows(rows))
 
 
-def _in_pieces(sim: Simulator, call: Rollout, bar: Any) -> Track:
+def _in_pieces(sim: Simulator, call: Rollout, bar: tqdm[NoReturn]) -> Track:
     """So that the bar moves."""
     size = max(call.every, call.steps // _MOVES_OF_BAR // call.every * call.every)
     material = _constant_material(sim, call)
@@ -101,7 +104,7 @@ def _in_pieces(sim: Simulator, call: Rollout, bar: Any) -> Track:
     return Track(torch.cat([t.positions for t in tracks]), torch.cat([t.velocities for t in tracks]), info)
 
 
-def _one_by_one(sim: Simulator, call: Rollout, bar: Any) -> Track:
+def _one_by_one(sim: Simulator, call: Rollout, bar: tqdm[NoReturn] | None) -> Track:
     states, rows = [], []
     state, batch = call.state, call.state[0].shape[0]
     material = _constant_material(sim, call)
@@ -122,7 +125,8 @@ def _one_by_one(sim: Simulator, call: Rollout, bar: Any) -> Track:
         if recorded:
             states.append(state)
             rows.append(row)
-        bar.update(1)
+        if bar is not None:
+            bar.update(1)
     if not states:
         return _piece(sim, replace(call, steps=0, forces=None), sim.material())
     info = Info.from_rows(torch.stack(rows))
