@@ -9,8 +9,10 @@ import pytest
 import torch
 import torch._dynamo.compiled_autograd
 from adjoint_cases import body
+from runs import same_bits
 
 import torchpd as pd
+from torchpd.diagonal import step_diagonal
 
 
 def test_forward_mode_is_refused() -> None:
@@ -98,6 +100,24 @@ def test_material_that_is_copied_loses_its_history_aloud() -> None:
     assert float(slope) == pytest.approx(float((gradient * sim.stiffness.detach()).sum()), rel=1e-12)
     with torch.no_grad():
         sim.set_material(stiffness=factor * sim.stiffness)  # there is no history to lose
+
+
+def test_material_in_any_layout_is_material() -> None:
+    """As functional_call brings it, with targets and without, and as a parametrization makes it."""
+    sim, _ = body(iterations=10)
+    state = sim.rest_state(2)
+    wide = {name: array.detach().expand(2, *array.shape) for name, array in sim.named_parameters()}
+    expected = sim(state)
+    for targets in (None, sim.pin_targets.detach()):
+        assert same_bits(torch.func.functional_call(sim, wide, (state,), {"targets": targets}), expected)
+    gradient, diagonal = sim.gradient(expected), step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)
+    for name, array in wide.items():
+        setattr(sim, name, torch.nn.Parameter(array, requires_grad=False))
+    assert same_bits(sim(state), expected)
+    assert same_bits(sim.rollout(state, 1).state(), expected)
+    assert torch.equal(sim.gradient(expected), gradient)
+    for one, other in zip(step_diagonal(sim.plan.arrays, sim.material(), sim.time_step), diagonal, strict=True):
+        assert torch.equal(one, other.expand_as(one))
 
 
 def test_what_has_no_derivative_says_so() -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from .material import MATERIAL_ROWS
 from .ops import INFO_WIDTH
 from .state import Info, State
 from .targets import Targets
@@ -53,7 +54,7 @@ class CapturedStep:
         self._rows = torch.empty(rows, dtype=torch.float64, device=sim.device) if report else None
         # the graph knows addresses only: what lies there has to live as long as it does
         own = dict(targets) if isinstance(targets, Mapping) else targets
-        self._alive = ([array.detach() for array in sim.material()], forces, own, start)
+        self._alive = ([getattr(sim, name).detach() for name in MATERIAL_ROWS], forces, own, start)
 
         def run(moved: State) -> None:
             sim.step_(moved, forces, targets, start, info=self._rows)

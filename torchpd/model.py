@@ -216,8 +216,8 @@ class Model(nn.Module):
             self.plan = plan_for_solver(self, self.material())
 
     def material(self) -> list[Tensor]:
-        """The differentiable arrays in the order of the ops."""
-        return [getattr(self, name) for name in MATERIAL_ROWS]
+        """The differentiable arrays in the order of the ops, contiguous whatever a call or a parametrization gives."""
+        return [getattr(self, name).contiguous() for name in MATERIAL_ROWS]
 
     def __copy__(self) -> Self:
         """Torch lets no parametrized module be copied as a pickle would."""

@@ -310,7 +310,7 @@ class Simulator(Model):
             positions: [B, V, 3], or a `State`.
         """
         positions = self.positions_of(positions, "positions")
-        result: Tensor = _ops.gradient(positions, self.stiffness, list(self.plan.arrays))
+        result: Tensor = _ops.gradient(positions, self.stiffness.contiguous(), list(self.plan.arrays))
         return result
 
     def step_gradient(
