@@ -156,3 +156,24 @@ def test_a_parametrized_simulator_is_tuned_and_audited() -> None:
     assert sim.iterations == promise.iterations
     after = sim(state)
     assert bool(promise.audit(sim, state, after).all())
+
+
+def test_tuning_asks_for_no_new_optimiser() -> None:
+    """The study has environments of its own, in copies; what is learned or made stays as it is."""
+    sim = simulator()
+    sim.set_material(stiffness=sim.stiffness * torch.linspace(0.5, 1.5, 6, dtype=torch.float64)[:, None])
+    learned = [sim.stiffness.requires_grad_(), sim.pin_targets.requires_grad_()]
+    places = sim.pin_targets.detach().expand(6, -1, 3).contiguous()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        promise = sim.tune(error=1e-2, targets=places)
+    assert all(now is then for now, then in zip((sim.stiffness, sim.pin_targets), learned, strict=True))
+    assert all(array.requires_grad for array in learned)
+    made = simulator()
+    made.set_material(stiffness=sim.stiffness.detach())
+    for name, how in (("stiffness", Exponential()), ("pin_targets", torch.nn.Identity())):
+        parametrize.register_parametrization(made, name, how)
+    again = made.tune(error=1e-2, targets=places)
+    assert again.studied_error == pytest.approx(promise.studied_error, rel=1e-6)
+    assert all(parametrize.is_parametrized(made, name) for name in ("stiffness", "pin_targets"))
+    assert torch.allclose(made.stiffness, sim.stiffness, rtol=1e-14)

@@ -11,7 +11,6 @@ The converged step has no friction: where vertices stick, every position inside 
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
@@ -24,6 +23,7 @@ from torch import Tensor
 from .contact_newton import ContactNewton
 from .effects import Ground, Sphere
 from .material import MATERIAL_ROWS
+from .parametrized import plain_copy
 from .reference import StepProblem, step_problem
 from .scene import Part, Scene
 from .solvers import Chebyshev, Multilevel, Solver
@@ -126,7 +126,7 @@ def scene_without_friction(scene: Scene) -> Scene:
 def frictionless(sim: Simulator, dtype: torch.dtype | None = None) -> Simulator:
     """A copy of the simulator with its present material, smooth contacts, and no stop before the last iteration."""
     with torch.inference_mode(False), torch.no_grad():
-        twin = copy.deepcopy(sim)
+        twin = plain_copy(sim)
         if dtype is not None:
             twin = twin.to(dtype)
         twin.tolerance = 0.0

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+import copy
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils.parametrize import ParametrizationList
+from torch.nn.utils.parametrize import ParametrizationList, is_parametrized, type_before_parametrizations
 
-__all__ = ["invert", "parametrization"]
+__all__ = ["invert", "parametrization", "plain_copy"]
+
+_Module = TypeVar("_Module", bound=nn.Module)
 
 
 def parametrization(module: nn.Module, name: str) -> ParametrizationList:
@@ -49,3 +52,18 @@ def invert(module: nn.Module, name: str, wanted: Tensor) -> tuple[Tensor, Tensor
             f"than these: set sim.parametrizations.{name} itself, or give it what it can make"
         )
     return original, made
+
+
+def plain_copy(module: _Module) -> _Module:
+    """A deep copy whose arrays are numbers, which nothing makes and nobody learns: any others may replace them."""
+    with torch.inference_mode(False), torch.no_grad():
+        copied = copy.deepcopy(module)
+        if is_parametrized(copied):
+            made: Any = copied.parametrizations
+            arrays = {name: getattr(copied, name).detach().clone() for name in made}
+            # remove_parametrizations would take the properties from the class, which the copy shares with the module
+            copied.__class__ = type_before_parametrizations(copied)
+            del copied.parametrizations
+            for name, array in arrays.items():
+                copied.register_parameter(name, nn.Parameter(array, requires_grad=False))
+        return copied.requires_grad_(False)

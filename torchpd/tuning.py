@@ -28,6 +28,7 @@ from .contenders import safe_solvers
 from .diagonal import step_diagonal
 from .forecast import has_friction
 from .material import MATERIAL_ROWS, environments_of_material, fingerprint
+from .parametrized import plain_copy
 from .promise import Promise, Trial
 from .solvers import Chebyshev, Multilevel, Solver
 from .state import State
@@ -165,7 +166,7 @@ def _with_targets(sim: Simulator, targets: Targets | None, batch: int) -> Simula
     if targets is None:
         return sim
     places = dict(zip(MATERIAL_ROWS, sim.material_at(targets, batch), strict=True))
-    placed = copy.deepcopy(sim)
+    placed = plain_copy(sim)
     placed.set_material(**{name: places[name].detach() for name in ("pin_targets", "spheres")})
     return placed
 
@@ -247,7 +248,7 @@ def _of_environments(sim: Simulator, items: list[int], batch: int) -> Simulator:
         for name, row in MATERIAL_ROWS.items()
         if getattr(sim, name).dim() > row.dims and len(getattr(sim, name)) == batch
     }
-    picked = copy.deepcopy(sim)
+    picked = plain_copy(sim)
     picked.set_material(**own)
     return picked
 
