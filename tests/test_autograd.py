@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gc
+import warnings
 import weakref
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -100,6 +102,27 @@ def test_material_that_is_copied_loses_its_history_aloud() -> None:
     assert float(slope) == pytest.approx(float((gradient * sim.stiffness.detach()).sum()), rel=1e-12)
     with torch.no_grad():
         sim.set_material(stiffness=factor * sim.stiffness)  # there is no history to lose
+
+
+def test_parts_of_a_scene_lose_their_history_aloud() -> None:
+    solid = pd.Solid(pd.shapes.box((1.0, 1.0, 1.0), (1, 1, 1)), 1e4)
+    one, three = torch.ones((), requires_grad=True), torch.ones(3, requires_grad=True)
+    makers: dict[str, Callable[[], object]] = {
+        "Solid.youngs": lambda: pd.Solid(solid.mesh, youngs=1e4 * one),
+        "Solid.density": lambda: pd.Solid(solid.mesh, 1e4, density=1e3 * one),
+        "Gravity.vector": lambda: pd.Gravity(three),
+        "Pin.stiffness": lambda: pd.Pin(solid, [0], stiffness=one),
+        "Damping.rate": lambda: pd.Damping(one),
+        "Ground.height": lambda: pd.Ground(one),
+        "Sphere.center": lambda: pd.Sphere(three, 1.0),
+        "TetMesh.vertices": lambda: pd.TetMesh(torch.tensor(solid.mesh.vertices).requires_grad_(), solid.mesh.tets),
+    }
+    for name, make in makers.items():
+        with pytest.warns(UserWarning, match=rf"^{name} is copied as numbers, so no gradient gets to what .* detach"):
+            make()
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter("error")
+            make()
 
 
 def test_material_in_any_layout_is_material() -> None:

@@ -55,6 +55,10 @@ def from_file() -> None:
     pd.TetMesh.from_file(file)
 
 
+def described() -> None:
+    pd.Gravity(torch.tensor([0.0, -9.81, 0.0], requires_grad=True))
+
+
 CALLS: dict[str, Callable[[], object]] = {
     "turned": lambda: pd.TetMesh(CORNERS, [[0, 2, 1, 3]]),
     "flat": lambda: pd.TetMesh(CORNERS, [[0, 1, 1, 3], [0, 1, 2, 3]], drop_degenerate=True),
@@ -66,6 +70,7 @@ CALLS: dict[str, Callable[[], object]] = {
     ),
     "few iterations": lambda: pd.Simulator(pd.Scene(pd.Solid(pd.shapes.box((2.0, 0.1, 0.1), (40, 2, 2)), 1e8)), 1 / 30),
     "copied": copied,
+    "described": described,
     "tuned": swung,
     "backward": lambda: crumpled()[1].backward(),
     "compiled": lambda: crumpled(compiled=True)[1].backward(),

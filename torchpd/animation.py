@@ -53,7 +53,7 @@ def write_surface(
         keyframes: most key frames that a .glb may hold, at least 2.
     """
     target = _output(path, (".usdc", ".usda", ".usd", ".glb"))
-    motion = as_array("frames", frames, np.float64)
+    motion = as_array("frames", frames, np.float64, for_picture=True)
     check_shape("frames", motion, (None, None, 3), "positions [m] in every frame")
     check_finite("frames", motion)
     rate = check_scalar("frames_per_second", frames_per_second)

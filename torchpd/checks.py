@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .warn import warn_user
+
 __all__ = [
     "NO_VALUES",
     "as_array",
@@ -35,9 +37,17 @@ def check_has_values(name: str, device: torch.device) -> None:
         raise RuntimeError(f"{name}: {NO_VALUES}")
 
 
-def as_array(name: str, value: Any, dtype: Any = None) -> NDArray[Any]:
-    """A private contiguous copy of numbers, sequences, arrays or tensors as a NumPy array."""
+def as_array(name: str, value: Any, dtype: Any = None, *, for_picture: bool = False) -> NDArray[Any]:
+    """A private contiguous copy of numbers, sequences, arrays or tensors as a NumPy array.
+
+    A warning says where a gradient ends, but of what is only looked at nobody expects one.
+    """
     if isinstance(value, torch.Tensor):
+        if value.requires_grad and torch.is_grad_enabled() and not for_picture:
+            warn_user(
+                f"{name} is copied as numbers, so no gradient gets to what they were made of: give what is learned to "
+                "calls by torch.func.functional_call(sim, {...}, (state,)), or detach() it"
+            )
         value = value.detach().cpu()
         if value.is_floating_point() and value.element_size() < 4:
             value = value.float()  # NumPy has no bfloat16; nothing is lost

@@ -100,7 +100,7 @@ def frame_camera(
         aspect: width / height of the picture.
         margin: fraction of the picture left free at each border.
     """
-    seen = as_array("points", points, np.float64).reshape(-1, 3)
+    seen = as_array("points", points, np.float64, for_picture=True).reshape(-1, 3)
     check_finite("points", seen)
     if len(seen) == 0:
         raise ValueError("points must hold at least one point, got none")
@@ -151,7 +151,7 @@ class Studio:
         size: tuple[int, int] = (480, 360),
         samples: int = 9,
     ) -> None:
-        motion = as_array("frames", frames, np.float64)
+        motion = as_array("frames", frames, np.float64, for_picture=True)
         motion = motion[None] if motion.ndim == 2 else motion
         check_shape("frames", motion, (None, None, 3), "positions [m] in every frame")
         check_finite("frames", motion)
@@ -168,7 +168,7 @@ class Studio:
 
     def render(self, vertices: Any) -> Picture:
         """The picture of one frame [n, 3]; the same bits for the same input."""
-        frame = as_array("vertices", vertices, np.float64)
+        frame = as_array("vertices", vertices, np.float64, for_picture=True)
         check_shape("vertices", frame, (self._count, 3), "positions of the vertices that the studio was made for [m]")
         check_finite("vertices", frame)
         positions = self.surface.split(frame)

@@ -32,7 +32,7 @@ class SmoothSurface:
     """
 
     def __init__(self, vertices: Any, triangles: Any, *, crease: float = 60.0) -> None:
-        positions = as_array("vertices", vertices, np.float64)
+        positions = as_array("vertices", vertices, np.float64, for_picture=True)
         check_shape("vertices", positions, (None, 3), "positions [m]")
         check_finite("vertices", positions)
         faces = as_array("triangles", triangles)
