@@ -48,6 +48,7 @@ def test_settings_of_a_simulator_are_checked() -> None:
             TypeError,
             r"solver must be Jacobi, Chebyshev, Multilevel or \"auto\", got 'jacobi'",
         ),
+        ({"dtype": "float32"}, ValueError, r"dtype must be torch\.float32 or torch\.float64, got 'float32'"),
         ({"dtype": torch.float16}, ValueError, r"dtype must be torch\.float32 or torch\.float64, got torch\.float16"),
     ):
         with pytest.raises(kind, match=message):
@@ -149,6 +150,31 @@ def test_forces_and_starts_are_checked(name: str, sim: pd.Simulator) -> None:
                 step(state, start=value)
 
 
+@pytest.mark.parametrize("forces", [torch.zeros(4, 2, 27, 3), [torch.zeros(2, 27, 3)] * 4], ids=["tensor", "list"])
+def test_forces_of_every_step_are_a_function(forces: Any, sim: pd.Simulator) -> None:
+    message = r"forces must be .*, got (\[4, 2, 27, 3\]|list); for a rollout whose steps differ give a function"
+    with pytest.raises((TypeError, ValueError), match=message):
+        sim.rollout(sim.rest_state(2), 4, forces=forces)
+
+
+@pytest.mark.parametrize("info", [True, "all", np.zeros((2, 6))])
+def test_what_is_no_info_is_refused(info: Any, sim: pd.Simulator) -> None:
+    with pytest.raises(
+        TypeError, match=rf"step_: info must be None or a float64 tensor \[2, 6\] .* {type(info).__name__}"
+    ):
+        sim.step_(sim.rest_state(2), info=info)
+
+
+def test_records_that_are_not_there_are_refused(sim: pd.Simulator) -> None:
+    state = sim.rest_state()
+    with pytest.raises(IndexError, match=r"Track\.state: the track has no record, steps // every is 0"):
+        sim.rollout(state, 0).state()
+    track = sim.rollout(state, 2)
+    for record in (2, -3):
+        with pytest.raises(IndexError, match=rf"Track\.state: record must lie in -2\.\.1, got {record}"):
+            track.state(record)
+
+
 @pytest.mark.parametrize("start", [None, 1.0, [0.0], np.zeros((2, 27, 3)), pd.State(torch.zeros(1), torch.zeros(1))])
 def test_what_is_no_start_is_refused(start: Any, sim: pd.Simulator) -> None:
     state = sim.rest_state(2)
@@ -212,7 +238,11 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
     sparse, unreal = torch.ones(48).to_sparse(), torch.ones(48, device="meta")
     for arrays, kind, message in (
         ({"youngs": 1e5}, TypeError, r"no array 'youngs'; there are stiffness, masses"),
-        ({"stiffness": torch.ones(3)}, ValueError, r"stiffness must be \[48\], or with a batch in front, got \[3\]"),
+        (
+            {"stiffness": torch.ones(3)},
+            ValueError,
+            r"stiffness must be \[48\], .* got \[3\]; tetrahedra of the scene: 48",
+        ),
         ({"stiffness": torch.ones(48) > 0}, TypeError, r"stiffness must hold real numbers, got torch\.bool"),
         ({"stiffness": sparse}, TypeError, r"stiffness must be dense and have values, got torch\.sparse_coo on cpu"),
         ({"stiffness": unreal}, TypeError, r"stiffness must be dense and have values, got torch\.strided on meta"),
@@ -223,9 +253,13 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
         ({"masses": masses.repeat(2, 1)}, ValueError, r"masses must be positive .*, got -0\.5 at \[0, 4\] \(4 in all"),
         ({"masses": math.nan}, ValueError, "masses must be finite .*, got nan at"),
         ({"gravity": -9.81}, ValueError, r"gravity must be \[3\], or with a batch in front, got one number, -9\.81$"),
-        ({"planes": 1.0}, ValueError, r"planes must be \[1, 5\], or with a batch in front, got one number, 1$"),
-        ({"spheres": torch.tensor(0.5)}, ValueError, r"spheres must be \[1, 8\], .*, got one number, 0\.5$"),
-        ({"pin_targets": 0.0}, ValueError, r"pin_targets must be \[3, 3\], .*, got one number, 0$"),
+        (
+            {"planes": 1.0},
+            ValueError,
+            r"planes must be \[1, 5\], or with a batch in front, got one number, 1; planes of the scene: 1",
+        ),
+        ({"spheres": torch.tensor(0.5)}, ValueError, r"spheres must be \[1, 8\], .*, got one number, 0\.5;"),
+        ({"pin_targets": 0.0}, ValueError, r"pin_targets must be \[3, 3\], .*, got one number, 0;"),
         (
             {"pin_stiffness": 0.0},
             ValueError,
@@ -244,6 +278,19 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
         with pytest.raises(kind, match=f"^set_material: {message}"):
             sim.set_material(**arrays)  # type: ignore[arg-type]
     assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
+
+
+def test_a_state_dict_of_another_scene_is_refused_in_its_own_name() -> None:
+    solid = pd.Solid(pd.shapes.box((1.0, 1.0, 1.0), (1, 1, 1)), 1e5)
+    other = pd.Simulator(pd.Scene(solid, *(part for part in scene().parts if isinstance(part, pd.Gravity))), 1 / 60, 2)
+    sim = small_simulator()
+    before = [array.clone() for array in sim.material()]
+    with pytest.raises(ValueError, match=r"^Simulator\.load_state_dict: stiffness must be \[48\], .*, got \[6\]; tetr"):
+        sim.load_state_dict(other.state_dict())
+    assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
+    two = {**sim.state_dict(), "masses": sim.masses.repeat(2, 1), "gravity": sim.gravity.repeat(3, 1)}
+    with pytest.raises(ValueError, match=r"^Simulator\.load_state_dict: arrays must be of one number of environments"):
+        sim.load_state_dict(two)
 
 
 def test_one_number_is_for_what_has_one_each() -> None:

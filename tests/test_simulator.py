@@ -188,7 +188,7 @@ def test_what_needs_values_says_that_meta_has_none(solver: Solver, tmp_path: Pat
     assert re.search(way_out, repr(sim))
     for name, call in (
         ("set_material", lambda: sim.set_material(stiffness=1e5)),
-        ("set_material", lambda: sim.load_state_dict(values)),
+        (r"Simulator\.load_state_dict", lambda: sim.load_state_dict(values)),
         ("prepare_solver", sim.prepare_solver),
         ("tune", lambda: sim.tune(error=0.1)),
         ("estimate_rho", lambda: pd.estimate_rho(sim, sim.rest_state())),
@@ -296,3 +296,16 @@ def test_states_of_some_environments_are_replaced() -> None:
     for wrong in (torch.tensor([True]), done.float(), done[None]):
         with pytest.raises(ValueError, match=r"State.where: condition must be bool \[3\], one for each"):
             new.where(wrong, old)
+    for other, message in (
+        (
+            pd.State(*(t[:2] for t in old)),
+            r"other must have positions \[3, 45, 3\], or those of one .*, got \[2, 45, 3\]",
+        ),
+        (pd.State(old.positions, old.velocities[:2]), r"other must have velocities .*, got \[2, 45, 3\]"),
+        (old.to(torch.float64), r"other must have positions torch\.float32 on cpu, got torch\.float64 on cpu"),
+        (old.positions, "other must be a State, got Tensor"),
+    ):
+        with pytest.raises((TypeError, ValueError), match=f"^State.where: {message}"):
+            new.where(done, other)
+    one = sim.rest_state()
+    assert same_bits(new.where(done, one), new.where(done, sim.rest_state(3)))

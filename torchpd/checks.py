@@ -13,6 +13,7 @@ from .warn import warn_user
 
 __all__ = [
     "NO_VALUES",
+    "STEPS_DIFFER",
     "as_array",
     "check_finite",
     "check_has_values",
@@ -25,6 +26,8 @@ __all__ = [
     "check_whole",
 ]
 
+# ends errors about forces and targets of every step
+STEPS_DIFFER = "; for a rollout whose steps differ give a function of their number"
 NO_VALUES = (
     'the simulator is on "meta", where arrays have no values; sim.to_empty(device="cpu") and then '
     "sim.load_state_dict(...) give it some"
@@ -71,17 +74,20 @@ def check_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...], m
         raise ValueError(f"{name} must be [{want}] ({meaning}), got {list(array.shape)}")
 
 
-def check_like(name: str, value: Any, positions: torch.Tensor, meaning: str) -> None:
-    """A tensor of the shape, precision and device of positions; reads no value, so that nothing waits for a GPU."""
+def check_like(name: str, value: Any, positions: torch.Tensor, meaning: str, *, fix: str = "") -> None:
+    """A tensor of the shape, precision and device of positions; reads no value, so that nothing waits for a GPU.
+
+    `fix` ends the errors about what has another shape or none.
+    """
     like = f"like positions ({meaning}), got"
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{name} must be a tensor {list(positions.shape)} {like} {type(value).__name__}")
+        raise TypeError(f"{name} must be a tensor {list(positions.shape)} {like} {type(value).__name__}{fix}")
     if value.dtype != positions.dtype or value.device != positions.device:
         raise TypeError(
             f"{name} must be {positions.dtype} on {positions.device} {like} {value.dtype} on {value.device}"
         )
     if value.shape != positions.shape:
-        raise ValueError(f"{name} must be {list(positions.shape)} {like} {list(value.shape)}")
+        raise ValueError(f"{name} must be {list(positions.shape)} {like} {list(value.shape)}{fix}")
 
 
 def check_finite(name: str, array: NDArray[Any]) -> None:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MATERIAL_ROWS",
+    "check_array",
     "check_batches",
     "check_material",
     "environments_of_material",
@@ -76,6 +77,31 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
         _require(tensor[..., 4] >= 0, f"{full}: friction (column 4)", ">= 0", tensor)
 
 
+def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Tensor:
+    """What is to replace the array `own` of a simulator, in its precision and on its device."""
+    row = MATERIAL_ROWS[name]
+    try:
+        tensor = (value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")).detach()
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{owner}: {name} must be a number or a tensor, got {value!r}") from None
+    if tensor.is_complex() or tensor.dtype == torch.bool:
+        raise TypeError(f"{owner}: {name} must hold real numbers, got {tensor.dtype}")
+    if tensor.layout != torch.strided or tensor.is_meta:
+        raise TypeError(f"{owner}: {name} must be dense and have values, got {tensor.layout} on {tensor.device}")
+    tensor = tensor.to(dtype=own.dtype, device=own.device)
+    shape = tuple(own.shape[own.dim() - row.dims :])
+    alone = tensor.dim() == 0
+    if alone and row.width == 1:
+        tensor = tensor.expand(shape)
+    if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
+        came = f"one number, {tensor.item():g}" if alone else list(tensor.shape)
+        things = {"tet": "tetrahedra", "vertex": "vertices"}.get(row.rows, f"{row.rows}s")
+        scene = "" if row.rows == "one" else f"; {things} of the scene: {shape[0]}"
+        raise ValueError(f"{owner}: {name} must be {list(shape)}, or with a batch in front, got {came}{scene}")
+    check_material(owner, name, tensor)
+    return tensor.contiguous()
+
+
 def fingerprint(arrays: Iterable[Tensor]) -> str:
     """Of shapes and bits: another one where any number differs. Brings the arrays to the CPU."""
     found = hashlib.blake2b(digest_size=16)
@@ -85,17 +111,17 @@ def fingerprint(arrays: Iterable[Tensor]) -> str:
     return found.hexdigest()
 
 
-def check_batches(new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None:
+def check_batches(owner: str, new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None:
     """Refuse arrays of different numbers of environments; those without a batch, or with one of 1, serve any number."""
     first: tuple[int, str] | None = None
     for name in MATERIAL_ROWS:
         array, stays = new.get(name, kept[name]), "" if name in new else " (kept)"
         count = len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1
         if count == 0:
-            raise ValueError(f"set_material: {name} must be of at least one environment, got {list(array.shape)}")
+            raise ValueError(f"{owner}: {name} must be of at least one environment, got {list(array.shape)}")
         if first is not None and count not in (1, first[0]):
             raise ValueError(
-                f"set_material: arrays must be of one number of environments, or of all, got those of {first[0]} "
+                f"{owner}: arrays must be of one number of environments, or of all, got those of {first[0]} "
                 f"environments in {first[1]}, of {count} in {name}{stays}; replace them in one call"
             )
         if count != 1:

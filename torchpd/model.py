@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
 from .automatic import Choice, choose_solver
-from .checks import check_has_values, check_like, check_whole
+from .checks import STEPS_DIFFER, check_has_values, check_like, check_whole
 from .forecast import warn_of_few_iterations
-from .material import MATERIAL_ROWS, check_batches, check_material, material_of
+from .material import MATERIAL_ROWS, check_array, check_batches, material_of
 from .multilevel import has_levels, has_strangers
 from .parametrized import invert, parametrization
 from .placing import check_wanted_device, move_plan, plan_anew, plan_for_solver, plan_on
@@ -239,19 +239,26 @@ class Model(nn.Module):
                 with those of the arrays that stay. Pins that hold others, or much harder, make the matrix of
                 `Multilevel` anew, see `prepare_solver`; a captured step wants to be captured again then.
         """
-        check_has_values("set_material", self.device)
-        checked = {name: self._checked_material(name, value) for name, value in arrays.items()}
+        self._replace_material("set_material", arrays)
+
+    def _replace_material(self, owner: str, arrays: Mapping[str, Tensor | float]) -> None:
+        """What `set_material` does, for whom errors name."""
+        check_has_values(owner, self.device)
+        for name in arrays:
+            if name not in MATERIAL_ROWS:
+                raise TypeError(f"{owner}: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}")
+        checked = {name: check_array(owner, name, value, getattr(self, name)) for name, value in arrays.items()}
         for name, value in arrays.items():
             if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
                 warn_user(
-                    f"set_material copies the numbers of {name}, so no gradient gets to what they were made of: give "
+                    f"{owner} copies the numbers of {name}, so no gradient gets to what they were made of: give "
                     f'it to calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it'
                 )
-        check_batches(checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
+        check_batches(owner, checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
         with _ordinary():
             originals = {}
             for name in [name for name in checked if is_parametrized(self, name)]:
-                originals[name], checked[name] = invert(self, name, checked[name])
+                originals[name], checked[name] = invert(owner, self, name, checked[name])
             parameters = {
                 name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)
                 for name, tensor in checked.items()
@@ -286,31 +293,6 @@ class Model(nn.Module):
             return self.plan
         return plan_for_solver(self, material)
 
-    def _checked_material(self, name: str, value: Tensor | float) -> Tensor:
-        if name not in MATERIAL_ROWS:
-            raise TypeError(f"set_material: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}")
-        own = getattr(self, name)
-        try:
-            tensor = (value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")).detach()
-        except (TypeError, ValueError, RuntimeError):
-            raise TypeError(f"set_material: {name} must be a number or a tensor, got {value!r}") from None
-        if tensor.is_complex() or tensor.dtype == torch.bool:
-            raise TypeError(f"set_material: {name} must hold real numbers, got {tensor.dtype}")
-        if tensor.layout != torch.strided or tensor.is_meta:
-            raise TypeError(
-                f"set_material: {name} must be dense and have values, got {tensor.layout} on {tensor.device}"
-            )
-        tensor = tensor.to(dtype=self.dtype, device=self.device)
-        shape = tuple(own.shape[own.dim() - MATERIAL_ROWS[name].dims :])
-        alone = tensor.dim() == 0
-        if alone and MATERIAL_ROWS[name].width == 1:
-            tensor = tensor.expand(shape)
-        if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
-            came = f"one number, {tensor.item():g}" if alone else list(tensor.shape)
-            raise ValueError(f"set_material: {name} must be {list(shape)}, or with a batch in front, got {came}")
-        check_material("set_material", name, tensor)
-        return tensor.contiguous()
-
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """As of `torch.nn.Module`, but all arrays or none: torch loads what it can before it refuses other names.
 
@@ -341,7 +323,8 @@ class Model(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Checks values, and takes arrays of every environment where this simulator had shared ones."""
         with torch.no_grad():
-            self.set_material(**{n: state_dict[prefix + n] for n in MATERIAL_ROWS if prefix + n in state_dict})
+            arrays = {n: state_dict[prefix + n] for n in MATERIAL_ROWS if prefix + n in state_dict}
+            self._replace_material(f"{type(self).__name__}.load_state_dict", arrays)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def check_state(self, state: State, *, forces: Tensor | None = None) -> None:
@@ -354,7 +337,7 @@ class Model(nn.Module):
         self._check_kind("state", state[0])
         check_like("velocities", state[1], state[0], "m/s")
         if forces is not None:
-            check_like("forces", forces, state[0], "N")
+            check_like("forces", forces, state[0], "N", fix=STEPS_DIFFER)
 
     def _check_kind(self, name: str, positions: Tensor) -> None:
         own = self.rest_positions

@@ -20,7 +20,7 @@ def parametrization(module: nn.Module, name: str) -> ParametrizationList:
     return found
 
 
-def invert(module: nn.Module, name: str, wanted: Tensor) -> tuple[Tensor, Tensor]:
+def invert(owner: str, module: nn.Module, name: str, wanted: Tensor) -> tuple[Tensor, Tensor]:
     """What to make an array of, and what that makes: `wanted`, up to rounding. Nothing is changed.
 
     Raises:
@@ -31,12 +31,12 @@ def invert(module: nn.Module, name: str, wanted: Tensor) -> tuple[Tensor, Tensor
     kind = " and ".join(type(one).__name__ for one in steps)
     if wanted.shape != shape:
         raise ValueError(
-            f"set_material: {name} is made by the parametrization {kind}, of {list(shape)}, and keeps its shape, got "
+            f"{owner}: {name} is made by the parametrization {kind}, of {list(shape)}, and keeps its shape, got "
             f"{list(wanted.shape)}: take the parametrization away first, and put it back for the other batch"
         )
     if not makes.is_tensor or not all(hasattr(one, "right_inverse") for one in steps):
         raise ValueError(
-            f"set_material: {name} is made by the parametrization {kind}, which has no right_inverse to say of what "
+            f"{owner}: {name} is made by the parametrization {kind}, which has no right_inverse to say of what "
             f"one tensor: set sim.parametrizations.{name} itself, or take the parametrization away"
         )
     original = wanted.clone()
@@ -48,7 +48,7 @@ def invert(module: nn.Module, name: str, wanted: Tensor) -> tuple[Tensor, Tensor
     fits = original.shape == makes.original.shape and made.shape == shape
     if not (fits and torch.allclose(made, wanted, rtol=1e-3, atol=0.0, equal_nan=True)):
         raise ValueError(
-            f"set_material: the parametrization {kind} of {name} makes other numbers of what its right_inverse gives "
+            f"{owner}: the parametrization {kind} of {name} makes other numbers of what its right_inverse gives "
             f"than these: set sim.parametrizations.{name} itself, or give it what it can make"
         )
     return original, made

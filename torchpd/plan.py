@@ -172,7 +172,7 @@ def compile_plan(
         progress: show a bar when the mesh is large.
     """
     if dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}")
     tets = len(values.tets)
     with compiling(tets, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_plan(

@@ -148,6 +148,11 @@ class Simulator(Model):
             raise ValueError(
                 "step_ overwrites the state, so it must not require gradients; detach it or call the simulator"
             )
+        if not (info is None or isinstance(info, Tensor)):
+            raise TypeError(
+                f"step_: info must be None or a float64 tensor {[len(state[0]), INFO_WIDTH]} to fill in, got "
+                f"{type(info).__name__}"
+            )
         given, inertial = _first_iterate(start, state[0])
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(

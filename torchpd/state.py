@@ -28,15 +28,34 @@ class State(NamedTuple):
         return State(self.positions.clone(), self.velocities.clone())
 
     def where(self, condition: Tensor, other: State) -> State:
-        """Environments of this state where `condition` [B] holds, of another one elsewhere: resets of some."""
+        """Environments of this state where `condition` [B] holds, of another one elsewhere: resets of some.
+
+        The other state has as many environments, or one for all.
+        """
         if condition.dtype != torch.bool or condition.shape != self.positions.shape[:1]:
             raise ValueError(
                 f"State.where: condition must be bool [{len(self.positions)}], one for each environment, got "
                 f"{condition.dtype} {list(condition.shape)}"
             )
+        self._check_other(other)
         chosen = condition[:, None, None]
         pairs = zip(self, other, strict=True)
         return State(*(torch.where(chosen, mine, theirs) for mine, theirs in pairs))
+
+    def _check_other(self, other: Any) -> None:
+        if not isinstance(other, (tuple, list)) or len(other) != 2:
+            raise TypeError(f"State.where: other must be a State, got {type(other).__name__}")
+        for name, mine, theirs in zip(self._fields, self, other, strict=True):
+            if theirs.dtype != mine.dtype or theirs.device != mine.device:
+                raise TypeError(
+                    f"State.where: other must have {name} {mine.dtype} on {mine.device}, got {theirs.dtype} on "
+                    f"{theirs.device}"
+                )
+            if theirs.shape not in (mine.shape, (1, *mine.shape[1:])):
+                raise ValueError(
+                    f"State.where: other must have {name} {list(mine.shape)}, or those of one environment, got "
+                    f"{list(theirs.shape)}"
+                )
 
     def detach(self) -> State:
         """The same numbers without their history, as `Tensor.detach`."""
@@ -85,7 +104,14 @@ class Track(NamedTuple):
 
     def state(self, record: int = -1) -> State:
         """One record as a state to go on from."""
-        return State(self.positions[record], self.velocities[record])
+        try:
+            return State(self.positions[record], self.velocities[record])
+        except IndexError:
+            count = len(self.positions)
+            there = (
+                f"record must lie in {-count}..{count - 1}" if count else "the track has no record, steps // every is 0"
+            )
+            raise IndexError(f"Track.state: {there}, got {record}") from None
 
 
 # torch.load refuses other classes; these hold tensors and run nothing of their own

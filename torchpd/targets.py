@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .checks import STEPS_DIFFER
 from .scene import Scene
 
 __all__ = ["Anchors", "Targets"]
@@ -46,6 +47,7 @@ class Anchors:
         if not isinstance(targets, Mapping):
             raise TypeError(
                 f"targets must be a tensor or a mapping from parts to tensors, got {type(targets).__name__}"
+                f"{STEPS_DIFFER}"
             )
         for part, value in targets.items():
             if id(part) in self.pins:
@@ -74,8 +76,8 @@ class Anchors:
         if not any(came[-len(shape) :] == shape and came[: -len(shape)] in front for shape in shapes):
             wanted = " or ".join(str(list(shape)) for shape in shapes)
             raise ValueError(
-                f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}; for a "
-                "rollout whose steps differ a function of their number"
+                f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}"
+                f"{STEPS_DIFFER}"
             )
         if value.dtype != like.dtype or value.device != like.device:
             raise TypeError(f"{name} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}")
