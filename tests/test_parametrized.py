@@ -73,6 +73,37 @@ def test_gradients_reach_the_logarithm_through_a_rollout() -> None:
     )
 
 
+class Motion(torch.nn.Module):
+    """What docs/limits.md advises."""
+
+    def __init__(self, sim: pd.Simulator) -> None:
+        super().__init__()
+        self.sim = sim
+
+    def forward(self, state: pd.State) -> tuple[Tensor, Tensor, Tensor]:
+        track = self.sim.rollout(state, 3)
+        return track.positions, self.sim.energy(track.state()), self.sim.gradient(track.state())
+
+
+def test_functional_call_reaches_rollouts_in_a_module() -> None:
+    sim, (made, _) = simulator(), parametrized(Exponential())
+    logarithm = sim.stiffness.detach().log().requires_grad_()
+    state = sim.rest_state(2)
+    given = {"sim.stiffness": 2.0 * logarithm.exp()}
+    found = torch.func.functional_call(Motion(sim), given, (state,))
+    made.set_material(stiffness=2.0 * sim.stiffness)
+    original = made.parametrizations.stiffness.original.requires_grad_()  # type: ignore[union-attr, operator]
+    for mine, theirs in zip(found, Motion(made)(state), strict=True):
+        assert torch.allclose(mine, theirs, rtol=1e-12, atol=1e-12)
+        weights = torch.arange(mine.numel(), dtype=torch.float64).view_as(mine)
+        slopes = [
+            torch.autograd.grad((weights * result).sum(), leaf, retain_graph=True)[0]
+            for result, leaf in ((mine, logarithm), (theirs, original))
+        ]
+        assert float(slopes[1].abs().max()) > 0.0
+        torch.testing.assert_close(*slopes, rtol=1e-6, atol=1e-9 * float(slopes[1].abs().max()))
+
+
 def test_set_material_goes_through_the_right_inverse(tmp_path: Path) -> None:
     sim, logarithm = parametrized(Exponential())
     sim.set_material(stiffness=5e4, masses=2.0 * sim.masses)
