@@ -218,6 +218,15 @@ def match_faces(tets: Index) -> tuple[Index, NDArray[np.bool_]]:
     return order, begins
 
 
+def _check_fill(value: Numbers, count: int) -> Array:
+    fill = as_array("TetMesh.fill", value, np.float64)
+    check_shape("TetMesh.fill", fill, (count,), "the share of each tet that is material")
+    bad = np.flatnonzero(~((fill > 0.0) & (fill <= 1.0)))
+    if bad.size:
+        raise ValueError(f"TetMesh.fill must lie in (0, 1], got {fill[bad[0]]} at {int(bad[0])} ({bad.size} in all)")
+    return fill
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class TetMesh:
     """A tetrahedral mesh. Every tet has positive volume: det(x1 - x0, x2 - x0, x3 - x0) > 0.
@@ -228,6 +237,8 @@ class TetMesh:
     Args:
         vertices: positions [V, 3] in m.
         tets: vertex numbers [E, 4].
+        fill: how much of each tet is material, in (0, 1] [E], or None for all of it: the lattice of `tetrahedralize`
+            reaches beyond its surface. `Solid` multiplies density and Young's modulus by it.
         drop_unreferenced: leave out vertices that no tet uses (otherwise an error).
         drop_degenerate: leave out tets whose volume is zero within rounding, or that name a vertex twice (otherwise
             an error).
@@ -235,14 +246,22 @@ class TetMesh:
 
     vertices: Array
     tets: Index
+    fill: Array | None
     embedding: Embedding | None
     flipped: int
 
     def __init__(
-        self, vertices: Numbers, tets: Numbers, *, drop_unreferenced: bool = False, drop_degenerate: bool = False
+        self,
+        vertices: Numbers,
+        tets: Numbers,
+        *,
+        fill: Numbers | None = None,
+        drop_unreferenced: bool = False,
+        drop_degenerate: bool = False,
     ) -> None:
         points = check_points("TetMesh.vertices", vertices)
         elements = check_elements("TetMesh.tets", tets, 4, len(points))
+        shares = None if fill is None else _check_fill(fill, len(elements))
         fix = "pass drop_degenerate=True to leave them out"
         if not drop_degenerate:
             refuse("TetMesh.tets", has_repeated_corner(elements), elements, "corners must differ", fix)
@@ -251,6 +270,7 @@ class TetMesh:
             flat = is_flat(points, elements, signed)
         if drop_degenerate and flat.any():
             warn(f"TetMesh: {int(flat.sum())} of {len(flat)} tets have no volume and were left out")
+            shares = None if shares is None else shares[~flat]
             elements, signed, flat = elements[~flat], signed[~flat], flat[~flat]
             if not len(elements):
                 raise ValueError("TetMesh.tets: no tet has a volume; are all vertices in one plane?")
@@ -261,7 +281,7 @@ class TetMesh:
             elements[inverted] = elements[inverted][:, [0, 1, 3, 2]]
             warn(f"TetMesh: {flipped} of {len(elements)} tets had inverted winding and were turned")
         kept, elements = compact("TetMesh", elements, len(points), drop=drop_unreferenced)
-        store(self, vertices=points[kept], tets=elements, embedding=None, flipped=flipped)
+        store(self, vertices=points[kept], tets=elements, fill=shares, embedding=None, flipped=flipped)
 
     @classmethod
     def from_file(cls, path: PathLike, *, drop_degenerate: bool = False) -> TetMesh:
@@ -304,7 +324,7 @@ class TetMesh:
 
     def quality(self) -> MeshQuality:
         """Volumes, dihedral angles and element bounds l_e of every tet; print it for a summary."""
-        return measure_quality(self.vertices, self.tets)
+        return measure_quality(self.vertices, self.tets, self.fill)
 
     def with_embedding(self, embedding: Embedding | None) -> TetMesh:
         """The same mesh carrying another surface along (or none)."""
@@ -318,7 +338,8 @@ class TetMesh:
                 "it names); make one with torchpd.embed(surface, mesh)"
             )
         mesh: TetMesh = object.__new__(TetMesh)
-        store(mesh, vertices=self.vertices, tets=self.tets, embedding=embedding, flipped=self.flipped)
+        fields = {"vertices": self.vertices, "tets": self.tets, "fill": self.fill, "flipped": self.flipped}
+        store(mesh, **fields, embedding=embedding)
         return mesh
 
     def transformed(self, matrix: Numbers) -> TetMesh:
@@ -326,7 +347,7 @@ class TetMesh:
         linear, offset = affine("TetMesh.transformed: matrix", matrix)
         # A reflection inverts every tet: two corners change places, and with them their weights.
         corners = [0, 1, 3, 2] if np.linalg.det(linear) < 0 else [0, 1, 2, 3]
-        mesh = TetMesh(self.vertices @ linear.T + offset, self.tets[:, corners])
+        mesh = TetMesh(self.vertices @ linear.T + offset, self.tets[:, corners], fill=self.fill)
         if self.embedding is None:
             return mesh
         return mesh.with_embedding(self.embedding.transformed(matrix, corners))
@@ -341,4 +362,8 @@ class TetMesh:
 
     def __repr__(self) -> str:
         carried = "" if self.embedding is None else f", carrying {self.embedding.surface}"
-        return f"TetMesh({len(self.vertices)} vertices, {len(self.tets)} tets{carried})"
+        filled = ""
+        if self.fill is not None:
+            volumes = determinants(self.vertices, self.tets)
+            filled = f", {float((self.fill * volumes).sum() / volumes.sum()):.0%} filled"
+        return f"TetMesh({len(self.vertices)} vertices, {len(self.tets)} tets{filled}{carried})"

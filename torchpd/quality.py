@@ -23,6 +23,7 @@ class MeshQuality:
     min_dihedral: Array  # [E] rad, 70.5 degrees in the regular tet
     max_dihedral: Array  # [E] rad
     element_bounds: Array  # [E] l_e, between 4/3 (regular) and 4 (sliver): what a stable diagonal has to carry
+    fill: Array | None  # [E] how much of each tet is material, see `TetMesh`
     pieces: int  # face-, edge- or vertex-connected pieces
 
     def __repr__(self) -> str:
@@ -33,8 +34,9 @@ class MeshQuality:
             ("element bound l_e (4/3 .. 4)", self.element_bounds, ".4f"),
         )
         pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} separate pieces"
+        filled = "" if self.fill is None else f", of which {float((self.fill * self.volumes).sum()):.6g} m^3 are filled"
         lines = [
-            f"{len(self.volumes)} tets in {pieces}, volume {self.volumes.sum():.6g} m^3",
+            f"{len(self.volumes)} tets in {pieces}, volume {self.volumes.sum():.6g} m^3{filled}",
             f"{'':30}{'min':>12}{'median':>12}{'max':>12}",
         ]
         for name, values, form in rows:
@@ -94,7 +96,7 @@ def _count_pieces(tets: Index) -> int:
     return int(connected_components(graph, directed=False, return_labels=False))
 
 
-def measure_quality(vertices: Array, tets: Index) -> MeshQuality:
+def measure_quality(vertices: Array, tets: Index, fill: Array | None = None) -> MeshQuality:
     """Measure every tet of a valid mesh."""
     gradients, volumes = shape_gradients(vertices, tets)
     normals = _unit(gradients)
@@ -104,5 +106,6 @@ def measure_quality(vertices: Array, tets: Index) -> MeshQuality:
         min_dihedral=angles.min(axis=1),
         max_dihedral=angles.max(axis=1),
         element_bounds=element_bounds(normals),
+        fill=fill,
         pieces=_count_pieces(tets),
     )

@@ -25,8 +25,8 @@ class SceneValues:
 
     rest_positions: Array  # [V, 3] m
     tets: Index  # [E, 4]
-    stiffness: Array  # [E] Young's modulus, Pa
-    density: Array  # [E] kg/m^3
+    stiffness: Array  # [E] Young's modulus, Pa, times how full the tet is
+    density: Array  # [E] kg/m^3, times how full the tet is
     masses: Array  # [V] kg, lumped: density * volume / 4 to each corner
     pin_vertices: Index  # [P]
     pin_stiffness: Array  # [P] N/m, inf where the pin is hard
@@ -36,6 +36,11 @@ class SceneValues:
     spheres: Array  # [S, 5] center, radius, friction
     damping: float  # 1/s
     component: Index  # [V] number of the connected piece of mesh that a vertex belongs to
+
+
+def _filled(solid: Solid, values: Array) -> Array:
+    """What the material of a tet that is partly empty amounts to in all of it."""
+    return values if solid.mesh.fill is None else values * solid.mesh.fill
 
 
 def _lumped_masses(positions: Array, tets: Index, density: Array) -> Array:
@@ -131,14 +136,14 @@ class Scene:
         positions = np.concatenate([solid.mesh.vertices for solid in self.solids])
         starts = [self.vertex_range(solid).start for solid in self.solids]
         tets = np.concatenate([s.mesh.tets + start for s, start in zip(self.solids, starts, strict=True)])
-        density = np.concatenate([solid.density for solid in self.solids])
+        density = np.concatenate([_filled(solid, solid.density) for solid in self.solids])
         pin_vertices = self._pinned()
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         gravity, damping = self._all(Gravity), self._all(Damping)
         return SceneValues(
             rest_positions=positions,
             tets=tets,
-            stiffness=np.concatenate([solid.youngs for solid in self.solids]),
+            stiffness=np.concatenate([_filled(solid, solid.youngs) for solid in self.solids]),
             density=density,
             masses=_lumped_masses(positions, tets, density),
             pin_vertices=pin_vertices,
