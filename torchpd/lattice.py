@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-__all__ = ["Lattice"]
+__all__ = ["Lattice", "candidates", "split_long"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -26,6 +26,8 @@ Mask = NDArray[np.bool_]
 
 # Counts as touching, in cubes: far above rounding (1e-13 for 1000 cubes), far below anything that can be seen.
 _TOUCH = 1e-9
+# How far to look for other tets around a point, in cubes: beyond what counts as touching, far below a tet.
+_NUDGE = 1e-6
 # Triangle-tet pairs tested at a time, to bound memory.
 _CHUNK = 200_000
 
@@ -59,18 +61,22 @@ def _corner_table() -> NDArray[np.int64]:
 
 
 _CORNERS = _corner_table()
+# From every corner of every kind of tet to its middle: one direction into each tet around a vertex.
+_AROUND = 0.5 * (_CORNERS.mean(axis=2, keepdims=True) - _CORNERS).reshape(-1, 3)
 
 
-def _apart(ours: Array, theirs: Array, axes: Array) -> Mask:
-    """Whether the projections [P, axes, points] of two bodies lie apart along any axis [..., axes, 3]."""
-    margin = _TOUCH * np.linalg.norm(axes, axis=-1)
+def _apart(ours: Array, theirs: Array, axes: Array, slack: float) -> Mask:
+    """Whether the projections [P, axes, points] of two bodies lie apart by `slack` along any axis [..., axes, 3]."""
+    margin = slack * np.linalg.norm(axes, axis=-1)
     after = ours.min(axis=-1) > theirs.max(axis=-1) + margin
     before = theirs.min(axis=-1) > ours.max(axis=-1) + margin
     return np.asarray((after | before).any(axis=-1))
 
 
-def _overlaps(triangles: Array, tet: Array) -> Mask:
+def _overlaps(triangles: Array, tet: Array, slack: float = _TOUCH) -> Mask:
     """Whether closed triangles [P, 3, 3] and one closed tet [4, 3] meet: the separating axis theorem, all 23 axes.
+
+    With a negative slack: whether triangles enter the tet by that much, and do not only touch it.
 
     Two convex polyhedra are apart exactly when they are apart along a face normal of one of them or along the cross
     product of an edge of each. A vanishing axis (a triangle without area) never separates: at worst a tet too many.
@@ -78,32 +84,37 @@ def _overlaps(triangles: Array, tet: Array) -> Mask:
     """
     spans = tet[[1, 2, 3, 2, 3, 3]] - tet[[0, 0, 0, 1, 1, 2]]
     faces = np.cross(spans[[0, 1, 2, 3]], spans[[1, 2, 0, 4]])
-    meet = ~_apart(np.swapaxes(triangles @ faces.T, 1, 2), faces @ tet.T, faces)
+    meet = ~_apart(np.swapaxes(triangles @ faces.T, 1, 2), faces @ tet.T, faces, slack)
     left = triangles[meet]
     edges = left[:, [1, 2, 0]] - left
     crossed = np.cross(edges[:, :, None], spans[None, None]).reshape(len(left), 18, 3)
     axes = np.concatenate([np.cross(edges[:, :1], edges[:, 1:2]), crossed], axis=1)
-    meet[meet] = ~_apart(axes @ np.swapaxes(left, 1, 2), axes @ tet.T, axes)
+    meet[meet] = ~_apart(axes @ np.swapaxes(left, 1, 2), axes @ tet.T, axes, slack)
     return meet
 
 
-def _split_long(triangles: Array) -> Array:
-    """The same surface in triangles whose edges are at most one cube long, by halving longest edges."""
-    done = []
+def split_long(triangles: Array) -> tuple[Array, Index]:
+    """The same surface in triangles whose edges are at most one cube long, and of which triangle each is a part.
+
+    Halves longest edges. An edge of two triangles is cut alike in both, so that what is closed stays so, to the bit.
+    """
+    done, parents = [triangles[:0]], [np.arange(0)]
+    source = np.arange(len(triangles))
     while len(triangles):
         lengths = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2)
         long = lengths.max(axis=1) > 1.0
         done.append(triangles[~long])
-        triangles, lengths = triangles[long], lengths[long]
+        parents.append(source[~long])
+        triangles, lengths, source = triangles[long], lengths[long], np.tile(source[long], 2)
         # Turn each triangle so that its longest edge comes first, then cut that edge in the middle.
         turn = (np.argmax(lengths, axis=1)[:, None] + np.arange(3)) % 3
         a, b, c = np.moveaxis(np.take_along_axis(triangles, turn[:, :, None], axis=1), 1, 0)
         middle = 0.5 * (a + b)
         triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    return np.concatenate(done) if done else triangles
+    return np.concatenate(done), np.concatenate(parents)
 
 
-def _candidates(low: Array, high: Array, shape: tuple[int, ...]) -> tuple[Index, Index]:
+def candidates(low: Array, high: Array, shape: tuple[int, ...]) -> tuple[Index, Index]:
     """Pairs (box number, cube index [P, 3]) for the integer points of boxes [low, high]."""
     first = np.maximum(np.ceil(low), 0).astype(np.int64)
     last = np.minimum(np.floor(high), np.array(shape) - 1).astype(np.int64)
@@ -192,24 +203,37 @@ class Lattice:
 
     def touched(self, triangles: Array, report: Callable[[Iterable[int]], Iterable[int]] = iter) -> Mask:
         """Which tets [axis, i, j, k, edge] meet any of the triangles [T, 3, 3] (in m)."""
-        pieces = _split_long(self.coordinates(triangles))
-        low, high = pieces.min(axis=1) - _TOUCH, pieces.max(axis=1) + _TOUCH
+        pieces, _ = split_long(self.coordinates(triangles))
         touched = np.zeros(self._tet_shape(), dtype=bool)
         # The tets around corners and centres of the pieces are touched for certain; the others have to be tested.
         samples = np.concatenate([*np.moveaxis(pieces, 1, 0), pieces.mean(axis=1)])
         touched.reshape(-1)[self._locate(samples)[0]] = True
+        return touched | self._meeting(pieces, ~touched, _TOUCH, report)
+
+    def entered(self, triangles: Array, asked: Mask) -> Mask:
+        """Which of the tets in question the triangles [T, 3, 3] (in m) reach into: touching alone does not count."""
+        if not asked.any():
+            return np.zeros_like(asked)
+        return self._meeting(split_long(self.coordinates(triangles))[0], asked, -_TOUCH, iter)
+
+    def _meeting(
+        self, pieces: Array, asked: Mask, slack: float, report: Callable[[Iterable[int]], Iterable[int]]
+    ) -> Mask:
+        """Which of the tets in question meet any of the small triangles (in cubes)."""
+        low, high = pieces.min(axis=1) - _TOUCH, pieces.max(axis=1) + _TOUCH
+        found = np.zeros_like(asked)
         for kind in report(range(12)):
             axis, edge = divmod(kind, 4)
             tet = 0.5 * _CORNERS[axis, edge]
-            box, cubes = _candidates(low - tet.max(axis=0), high - tet.min(axis=0), self.shape)
-            unknown = ~touched[axis, cubes[:, 0], cubes[:, 1], cubes[:, 2], edge]
+            box, cubes = candidates(low - tet.max(axis=0), high - tet.min(axis=0), self.shape)
+            unknown = asked[axis, cubes[:, 0], cubes[:, 1], cubes[:, 2], edge]
             box, cubes = box[unknown], cubes[unknown]
             for start in range(0, len(box), _CHUNK):
                 chosen = slice(start, start + _CHUNK)
                 at = cubes[chosen]
-                hit = at[_overlaps(pieces[box[chosen]] - at[:, None], tet)]
-                touched[axis, hit[:, 0], hit[:, 1], hit[:, 2], edge] = True
-        return touched
+                hit = at[_overlaps(pieces[box[chosen]] - at[:, None], tet, slack)]
+                found[axis, hit[:, 0], hit[:, 1], hit[:, 2], edge] = True
+        return found
 
     def enclosed(self, walls: Mask) -> Mask:
         """Which tets cannot be reached from outside through faces between tets that are no walls."""
@@ -230,6 +254,31 @@ class Lattice:
     def locate(self, points: Array) -> tuple[Index, Array]:
         """The number of the tet around each point (in m), and its barycentric coordinates [n, 4], none negative."""
         return self._locate(self.coordinates(points))
+
+    def locate_among(self, points: Array, kept: Mask) -> tuple[Index, Array]:
+        """As `locate`, but points on a face, an edge or a vertex of several tets get one that is kept, if there is one.
+
+        Weights may be negative by rounding then.
+        """
+        place = self.coordinates(points)
+        numbers, weights = self._locate(place)
+        lost = np.flatnonzero(~kept.reshape(-1)[numbers])
+        for step in _AROUND:
+            if not len(lost):
+                break
+            other, _ = self._locate(place[lost] + _NUDGE * step)
+            good = kept.reshape(-1)[other]
+            numbers[lost[good]] = other[good]
+            weights[lost[good]] = self._weights(other[good], place[lost[good]])
+            lost = lost[~good]
+        return numbers, weights
+
+    def _weights(self, tets: Index, place: Array) -> Array:
+        """Barycentric coordinates of points (in cubes), each in a tet of its own."""
+        axis, i, j, k, edge = np.unravel_index(tets, self._tet_shape())
+        corners = np.stack([i, j, k], axis=1)[:, None] + 0.5 * _CORNERS[axis, edge]
+        system = np.concatenate([np.ones((len(tets), 1, 4)), np.swapaxes(corners - place[:, None], 1, 2)], axis=1)
+        return np.asarray(np.linalg.solve(system, np.tile([[1.0], [0.0], [0.0], [0.0]], (len(tets), 1, 1)))[..., 0])
 
     def _locate(self, place: Array) -> tuple[Index, Array]:
         """Tets and barycentric coordinates of points in cubes.
