@@ -415,6 +415,7 @@ def test_scenes_are_checked() -> None:
     for parts, kind, message in (
         ((), ValueError, "Scene needs at least one body"),
         ((pd.Gravity(),), ValueError, "Scene needs at least one body"),
+        (([solid, pd.Gravity()],), TypeError, r"got list; pass them one by one, Scene\(\*parts\)"),
         ((solid, "gravity"), TypeError, "Scene: parts are bodies and effects of torchpd, got str"),
         ((solid, solid), ValueError, "the same part is given twice"),
         ((solid, pd.Gravity(), pd.Gravity()), ValueError, "at most one Gravity, got 2"),

@@ -57,8 +57,15 @@ def _components(count: int, tets: Index) -> Index:
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
+def _no_part(part: object) -> TypeError:
+    fix = "; pass them one by one, Scene(*parts)" if isinstance(part, (list, tuple)) else ""
+    return TypeError(f"Scene: parts are bodies and effects of torchpd, got {type(part).__name__}{fix}")
+
+
 class Scene:
     """Bodies and effects, in any order. Compiled once by `Simulator`.
+
+    Several bodies share gravity, grounds and spheres, and do not meet: they pass through each other and themselves.
 
     Args:
         parts: `Solid`, `Pin`, `Gravity`, `Ground`, `Sphere`, `Damping`. At least one `Solid`; at most one `Gravity`
@@ -68,7 +75,7 @@ class Scene:
     def __init__(self, *parts: Part) -> None:
         for part in parts:
             if not isinstance(part, Part):
-                raise TypeError(f"Scene: parts are bodies and effects of torchpd, got {type(part).__name__}")
+                raise _no_part(part)
         self.parts: tuple[Part, ...] = parts
         if not self.solids:
             raise ValueError("Scene needs at least one body, for example Solid(mesh, youngs=1e5, density=1000.0)")
