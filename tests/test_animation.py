@@ -181,3 +181,23 @@ def test_bad_requests_are_named(tmp_path: Path) -> None:
         write_film(tmp_path / "film.gif", [], frames_per_second=1.0)
     with pytest.raises(ValueError, match="frames_per_second must be positive"):
         write_film(tmp_path / "film.gif", _film(1, 16, 32), frames_per_second=-1.0)
+
+
+@pytest.mark.parametrize("ending", [".glb", ".usdc"])
+def test_folders_that_are_missing_are_made(tmp_path: Path, ending: str) -> None:
+    frames, triangles = _motion(2)
+    path = write_surface(tmp_path / "a" / f"b{ending}", frames, triangles, frames_per_second=24.0)
+    assert path.stat().st_size > 0
+
+
+def test_films_make_their_folder(tmp_path: Path) -> None:
+    picture = np.zeros((16, 16, 3), dtype=np.uint8)
+    assert write_film(tmp_path / "a" / "b.gif", [picture, picture], frames_per_second=10.0).is_file()
+
+
+def test_a_track_of_several_environments_is_told_to_choose(tmp_path: Path) -> None:
+    frames, triangles = _motion(2)
+    with pytest.raises(
+        ValueError, match=r"got \[2, 1, 8, 3\], those of several environments; choose one: frames\[:, 0\]"
+    ):
+        write_surface(tmp_path / "b.glb", frames[:, None], triangles, frames_per_second=24.0)

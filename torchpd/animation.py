@@ -45,7 +45,7 @@ def write_surface(
     frame takes 24 bytes per vertex, so a long motion is thinned out to `keyframes` of its frames.
 
     Args:
-        path: of the file; an existing one is replaced.
+        path: of the file; an existing one is replaced, a folder that is missing is made.
         frames: [T, n, 3] positions.
         triangles: [m, 3] vertex numbers.
         frames_per_second: of `frames`, in simulated time.
@@ -54,6 +54,11 @@ def write_surface(
     """
     target = _output(path, (".usdc", ".usda", ".usd", ".glb"))
     motion = as_array("frames", frames, np.float64, for_picture=True)
+    if motion.ndim == 4:
+        raise ValueError(
+            f"frames must be [n, n, 3] (positions [m] in every frame), got {list(motion.shape)}, those of several "
+            "environments; choose one: frames[:, 0]"
+        )
     check_shape("frames", motion, (None, None, 3), "positions [m] in every frame")
     check_finite("frames", motion)
     rate = check_scalar("frames_per_second", frames_per_second)
@@ -63,6 +68,7 @@ def write_surface(
             f"got {len(motion)}, {rate} and {keyframes}"
         )
     surface = SmoothSurface(motion[0], triangles)
+    target.parent.mkdir(parents=True, exist_ok=True)
     if target.suffix.lower() == ".glb":
         chosen = np.unique(np.linspace(0, len(motion) - 1, min(keyframes, len(motion))).round().astype(int))
         target.write_bytes(_glb(surface, motion[chosen], chosen / rate, color))
@@ -75,7 +81,7 @@ def write_film(path: str | Path, images: Sequence[Picture], *, frames_per_second
     """Write pictures as a film: `.gif` (needs Pillow; plays for ever) or `.mp4` (H.264; needs imageio-ffmpeg).
 
     Args:
-        path: of the file; an existing one is replaced.
+        path: of the file; an existing one is replaced, a folder that is missing is made.
         images: of one size.
         frames_per_second: of the film.
     """
@@ -85,6 +91,7 @@ def write_film(path: str | Path, images: Sequence[Picture], *, frames_per_second
         raise ValueError("images must be at least one, all of one size")
     if rate <= 0.0:
         raise ValueError(f"frames_per_second must be positive, got {rate}")
+    target.parent.mkdir(parents=True, exist_ok=True)
     if target.suffix.lower() == ".gif":
         _write_gif(target, images, rate)
     else:
