@@ -136,6 +136,18 @@ def test_missing_package_is_said_before_the_work(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("words", [["demo"], ["demo", "--patches"], ["study"]])
+def test_a_file_in_the_way_of_the_folder_is_named_at_once(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "afile").touch()
+    for out in (tmp_path / "afile", tmp_path / "afile" / "below"):
+        assert main([*words, "--out", str(out)]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("torchpd: --out must be a folder, or the name of one to be made, got the file")
+        assert said.count("\n") == 1
+
+
 def test_version_and_doctor(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--version"])

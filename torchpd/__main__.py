@@ -125,6 +125,13 @@ def _demo(arguments: argparse.Namespace) -> str:
     return run_patch_demo(chosen) if patches else run_demo(chosen)
 
 
+def _check_out(out: Path) -> None:
+    """Say that a file is in the way of the folder before the work, and not after it."""
+    there = next((place for place in (out, *out.parents) if place.exists()), None)
+    if there is not None and not there.is_dir():
+        raise NotADirectoryError(f"--out must be a folder, or the name of one to be made, got the file {there}")
+
+
 def _doctor() -> int:
     from .doctor import problems, report
 
@@ -141,6 +148,7 @@ def main(words: Sequence[str] | None = None) -> int:
             warnings.showwarning = lambda message, *_, **__: print(f"note: {message}", file=sys.stderr)
             if arguments.command == "doctor":
                 return _doctor()
+            _check_out(arguments.out)
             print(_study(arguments) if arguments.command == "study" else _demo(arguments))
     except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
         print(f"torchpd: {_one_line(error)}", file=sys.stderr)
