@@ -92,6 +92,14 @@ def test_scene_comes_back(tmp_path: Path) -> None:
     assert first.mesh is second.mesh
 
 
+def test_regions_come_back(tmp_path: Path) -> None:
+    box = pd.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    mesh = pd.TetMesh(box.vertices, box.tets, regions=[1, 1, 2, 2, 3, 3])
+    pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e4))).save(tmp_path / "sim")
+    loaded = pd.Simulator.load(tmp_path / "sim").scene.solids[0].mesh
+    np.testing.assert_array_equal(loaded.regions, mesh.regions)
+
+
 def test_mesh_and_surface_come_back(tmp_path: Path) -> None:
     vertices = pd.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
     with pytest.warns(pd.MeshWarning):

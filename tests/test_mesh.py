@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from torchpd import shapes
+from torchpd.effects import Solid
 from torchpd.embedding import embed_triangles
 from torchpd.mesh import MeshWarning, TetMesh, TriMesh
 
@@ -425,6 +426,112 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     shapes.single_tet().to_file(tmp_path / "tets.vtk")
     with pytest.raises(ValueError, match="holds no triangles"):
         TriMesh.from_file(tmp_path / "tets.vtk")
+
+
+def test_a_file_says_what_it_leaves_out(tmp_path: Path) -> None:
+    mesh = shapes.single_tet()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mesh.to_file(tmp_path / "bare.vtu")
+    carrying = mesh.with_embedding(embed_triangles(mesh, mesh.boundary()))
+    with pytest.warns(MeshWarning, match=r"a\.vtu is without the embedded surface, for which .*Simulator\.save"):
+        carrying.to_file(tmp_path / "a.vtu")
+    partly = TetMesh(mesh.vertices, mesh.tets, fill=[0.5])
+    with pytest.warns(MeshWarning, match=r"b\.vtu is without the fill, for which"):
+        partly.to_file(tmp_path / "b.vtu")
+
+
+@pytest.mark.parametrize("name", ["tets.xyz", "tets", "tets.stl", "tets.obj", "tets.svg"])
+def test_files_that_cannot_hold_tets_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match=rf"cannot write .*{name}.*must end in \.mesh, \.msh, \.vtk or \.vtu"):
+        shapes.single_tet().to_file(tmp_path / name)
+
+
+def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"TetMesh\.to_file: there is no folder .*nowhere for tets\.vtu"):
+        shapes.single_tet().to_file(tmp_path / "nowhere" / "tets.vtu")
+
+
+def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "broken.mesh").write_text("MeshVersionFormatted 2\nDimension 3\nVertices\n2\n0 0\n")
+    with pytest.raises(ValueError, match=r"cannot read broken\.mesh through meshio: \S+ \S+") as caught:
+        TetMesh.from_file(tmp_path / "broken.mesh")
+    assert "meshio: 1" not in str(caught.value)
+    assert capfd.readouterr().err == ""
+    (tmp_path / "what.xyz").write_text("0 0 0")
+    with pytest.raises(ValueError, match=r"cannot read what\.xyz: .*must end in \.mesh, \.msh, \.vtk or \.vtu"):
+        TetMesh.from_file(tmp_path / "what.xyz")
+
+
+@pytest.mark.parametrize(("kind", "corners"), [("tetra10", 10), ("hexahedron", 8)])
+def test_other_volume_cells_get_advice_that_fits(tmp_path: Path, kind: str, corners: int) -> None:
+    points = np.random.default_rng(0).random((corners, 3))
+    meshio.Mesh(points, [(kind, np.arange(corners)[None])]).write(tmp_path / "other.vtu")
+    with pytest.raises(ValueError, match=f"got {kind}; split its cells into tetrahedra of four vertices") as caught:
+        TetMesh.from_file(tmp_path / "other.vtu")
+    assert "tetrahedralize" not in str(caught.value)
+
+
+def test_a_tet_that_comes_twice_is_refused_or_left_out() -> None:
+    mesh = shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
+    turned = mesh.tets[[7, 5, 7]][:, [1, 2, 0, 3]]  # an even permutation: as good a tet
+    tets = np.concatenate([mesh.tets, turned])
+    with pytest.raises(ValueError, match=r"every tet must come once \(that at 7 comes again.* at 48 \(3 in all\)"):
+        TetMesh(mesh.vertices, tets)
+    with pytest.warns(MeshWarning, match="3 of 51 tets come twice and were left out"):
+        once = TetMesh(mesh.vertices, tets, drop_degenerate=True)
+    np.testing.assert_array_equal(once.tets, mesh.tets)
+
+
+# Regions:
+
+
+@pytest.mark.parametrize("suffix", [".mesh", ".msh", ".vtk", ".vtu"])
+def test_regions_survive_a_file(tmp_path: Path, suffix: str) -> None:
+    box = jittered_box()
+    mesh = TetMesh(box.vertices, box.tets, regions=np.arange(len(box.tets)) % 3 + 1)
+    mesh.to_file(tmp_path / f"box{suffix}")
+    again = TetMesh.from_file(tmp_path / f"box{suffix}")
+    np.testing.assert_array_equal(again.regions, mesh.regions)
+    for other in (mesh.transformed(np.diag([1.0, -1.0, 1.0])), mesh.with_embedding(None)):
+        np.testing.assert_array_equal(other.regions, mesh.regions)
+    youngs = np.where(mesh.regions == 2, 1e6, 1e5)
+    assert Solid(mesh, youngs).youngs[1] == 1e6
+    assert box.regions is None
+
+
+def test_physical_groups_of_gmsh_become_regions(tmp_path: Path) -> None:
+    # Two volumes, and a surface with a group of its own, which is no region of tets.
+    points = np.vstack([CORNERS, [[1.0, 1.0, 1.0]]])
+    blocks = [("triangle", [[0, 1, 2]]), ("tetra", TET), ("tetra", [[1, 2, 3, 4]])]
+    groups = [np.array([9]), np.array([1]), np.array([2])]
+    data = {"gmsh:physical": groups, "gmsh:geometrical": groups}
+    meshio.Mesh(points, blocks, cell_data=data).write(tmp_path / "two.msh", file_format="gmsh22")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MeshWarning)
+        mesh = TetMesh.from_file(tmp_path / "two.msh")
+    assert mesh.regions is not None
+    assert mesh.regions.tolist() == [1, 2]
+    assert mesh.embedding is not None
+
+
+def test_physical_groups_of_the_newer_format_become_regions(tmp_path: Path) -> None:
+    (tmp_path / "two.msh").write_text(
+        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n"
+        "$Entities\n0 0 0 2\n1 0 0 0 1 1 1 1 7 0\n2 0 0 0 1 1 1 1 8 0\n$EndEntities\n"
+        "$Nodes\n1 5 1 5\n3 1 0 5\n1\n2\n3\n4\n5\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 1 1\n$EndNodes\n"
+        "$Elements\n2 2 1 2\n3 1 4 1\n1 1 2 3 4\n3 2 4 1\n2 2 3 4 5\n$EndElements\n"
+    )
+    mesh = TetMesh.from_file(tmp_path / "two.msh")
+    assert mesh.regions is not None
+    assert mesh.regions.tolist() == [7, 8]
+
+
+def test_bad_regions_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"TetMesh\.regions must be \[1\]"):
+        TetMesh(CORNERS, TET, regions=[1, 2])
+    with pytest.raises(TypeError, match=r"TetMesh\.regions must hold integers, got float64"):
+        TetMesh(CORNERS, TET, regions=[1.5])
 
 
 def test_an_embedding_must_belong_to_its_mesh() -> None:

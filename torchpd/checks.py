@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -138,11 +139,11 @@ def check_whole(name: str, value: Any, *, minimum: int) -> int:
     return number
 
 
-def check_target_file(path: str | Path) -> Path:
+def check_target_file(path: str | os.PathLike[str], name: str = "save") -> Path:
     """A file that can be written, or written over."""
     target = Path(path)
     if not target.parent.is_dir():
-        raise FileNotFoundError(f"save: there is no folder {target.parent} for {target.name}")
+        raise FileNotFoundError(f"{name}: there is no folder {target.parent} for {target.name}")
     if target.is_dir():
-        raise IsADirectoryError(f"save: path must name a file, got the folder {target}")
+        raise IsADirectoryError(f"{name}: path must name a file, got the folder {target}")
     return target

@@ -108,8 +108,8 @@ def _distinct_meshes(scene: Scene) -> list[TetMesh]:
 
 def _mesh_arrays(mesh: TetMesh) -> dict[str, NDArray[Any]]:
     arrays = {"vertices": mesh.vertices, "tets": mesh.tets}
-    if mesh.fill is not None:
-        arrays["fill"] = mesh.fill
+    optional = {"fill": mesh.fill, "regions": mesh.regions}
+    arrays.update({name: array for name, array in optional.items() if array is not None})
     if mesh.embedding is not None:
         surface = mesh.embedding.surface
         arrays["embedding.tets"] = mesh.embedding.tets
@@ -233,8 +233,10 @@ def _solver(record: Record) -> Solver:
 
 def _mesh(number: int, record: Record, tensors: _Tensors) -> TetMesh:
     prefix = f"mesh.{number}"
-    fill = tensors.array(f"{prefix}.fill") if tensors.has(f"{prefix}.fill") else None
-    mesh = TetMesh(tensors.array(f"{prefix}.vertices"), tensors.array(f"{prefix}.tets"), fill=fill)
+    fill, regions = (
+        tensors.array(f"{prefix}.{name}") if tensors.has(f"{prefix}.{name}") else None for name in ("fill", "regions")
+    )
+    mesh = TetMesh(tensors.array(f"{prefix}.vertices"), tensors.array(f"{prefix}.tets"), fill=fill, regions=regions)
     # what was turned when the mesh was made is not inverted any more
     store(mesh, flipped=record["flipped"])
     if not tensors.has(f"{prefix}.embedding.tets"):

@@ -22,6 +22,7 @@ from .mesh_checks import (
     check_points,
     compact,
     determinants,
+    find_repeated,
     has_repeated_corner,
     is_flat,
     refuse,
@@ -29,6 +30,16 @@ from .mesh_checks import (
     store,
     translation,
     warn,
+)
+from .mesh_files import (
+    MESHIO_SUFFIXES,
+    SURFACE_SUFFIXES,
+    cells_of,
+    existing,
+    read_content,
+    regions_of,
+    without_tets,
+    write_tets,
 )
 from .quality import MeshQuality, measure_quality
 
@@ -43,37 +54,6 @@ PathLike = str | os.PathLike[str]
 
 # Face k lies opposite corner k; seen from outside its corners run counter-clockwise when the tet has positive volume.
 TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
-
-
-_MESHIO_SUFFIXES = {".mesh", ".msh", ".vtk", ".vtu"}
-_SURFACE_SUFFIXES = {".glb", ".gltf", ".obj", ".off", ".stl"}  # formats without tetrahedra; not all that meshio reads
-
-
-def _existing(path: PathLike) -> Path:
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"no such mesh file: {file}")
-    return file
-
-
-def _read_cells(owner: str, file: Path) -> tuple[NDArray[Any], dict[str, NDArray[Any]]]:
-    """Points, and the corner numbers of each type of cell in a file that meshio reads."""
-    import meshio
-
-    try:
-        content = meshio.read(file)
-    except (meshio.ReadError, ValueError, SystemExit) as error:  # meshio exits the process on files that it cannot read
-        raise ValueError(f"{owner} cannot read {file.name} through meshio: {error}") from error
-    types = {block.type for block in content.cells if len(block.data)}
-    cells = {kind: np.concatenate([b.data for b in content.cells if b.type == kind and len(b.data)]) for kind in types}
-    return content.points, cells
-
-
-def _without_tets(file: Path, came: str) -> ValueError:
-    return ValueError(
-        f"TetMesh.from_file: {file.name} must hold tetrahedra (cells of type tetra), got {came}; "
-        "turn a surface into tetrahedra with torchpd.tetrahedralize(path, cells=...)"
-    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -148,9 +128,10 @@ class TriMesh:
         """
         import trimesh
 
-        file = _existing(path)
-        if file.suffix.lower() in _MESHIO_SUFFIXES:
-            points, cells = _read_cells("TriMesh.from_file", file)
+        file = existing(path)
+        if file.suffix.lower() in MESHIO_SUFFIXES:
+            content = read_content("TriMesh.from_file", file)
+            points, cells = content.points, cells_of(content)
             if "triangle" not in cells:
                 raise ValueError(f"TriMesh.from_file: {file.name} holds no triangles")
             # The vertices inside are no part of the surface: that they are left out is nothing to report.
@@ -227,6 +208,14 @@ def _check_fill(value: Numbers, count: int) -> Array:
     return fill
 
 
+def _check_regions(value: Numbers, count: int) -> Index:
+    regions = as_array("TetMesh.regions", value)
+    check_shape("TetMesh.regions", regions, (count,), "the region of each tet")
+    if regions.dtype.kind not in "iu":
+        raise TypeError(f"TetMesh.regions must hold integers, got {regions.dtype}")
+    return np.asarray(regions, dtype=np.int64)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class TetMesh:
     """A tetrahedral mesh. Every tet has positive volume: det(x1 - x0, x2 - x0, x3 - x0) > 0.
@@ -239,14 +228,17 @@ class TetMesh:
         tets: vertex numbers [E, 4].
         fill: how much of each tet is material, in (0, 1] [E], or None for all of it: the lattice of `tetrahedralize`
             reaches beyond its surface. `Solid` multiplies density and Young's modulus by it.
+        regions: a whole number for each tet [E], what it belongs to, or None. A material of each is
+            `Solid(mesh, youngs=np.where(mesh.regions == 2, 1e6, 1e5))`.
         drop_unreferenced: leave out vertices that no tet uses (otherwise an error).
-        drop_degenerate: leave out tets whose volume is zero within rounding, or that name a vertex twice (otherwise
-            an error).
+        drop_degenerate: leave out tets whose volume is zero within rounding, that name a vertex twice, or that came
+            before (otherwise an error).
     """
 
     vertices: Array
     tets: Index
     fill: Array | None
+    regions: Index | None
     embedding: Embedding | None
     flipped: int
 
@@ -256,49 +248,75 @@ class TetMesh:
         tets: Numbers,
         *,
         fill: Numbers | None = None,
+        regions: Numbers | None = None,
         drop_unreferenced: bool = False,
         drop_degenerate: bool = False,
     ) -> None:
         points = check_points("TetMesh.vertices", vertices)
         elements = check_elements("TetMesh.tets", tets, 4, len(points))
         shares = None if fill is None else _check_fill(fill, len(elements))
+        groups = None if regions is None else _check_regions(regions, len(elements))
         fix = "pass drop_degenerate=True to leave them out"
         if not drop_degenerate:
             refuse("TetMesh.tets", has_repeated_corner(elements), elements, "corners must differ", fix)
         with np.errstate(over="ignore", invalid="ignore"):
             signed = determinants(points, elements)
             flat = is_flat(points, elements, signed)
-        if drop_degenerate and flat.any():
-            warn(f"TetMesh: {int(flat.sum())} of {len(flat)} tets have no volume and were left out")
-            shares = None if shares is None else shares[~flat]
-            elements, signed, flat = elements[~flat], signed[~flat], flat[~flat]
+        twice, first = find_repeated(elements)
+        if drop_degenerate and (flat.any() or twice.any()):
+            for bad, fault in ((flat, "have no volume"), (twice & ~flat, "come twice")):
+                if bad.any():
+                    warn(f"TetMesh: {int(bad.sum())} of {len(bad)} tets {fault} and were left out")
+            kept = ~(flat | twice)
+            shares = None if shares is None else shares[kept]
+            groups = None if groups is None else groups[kept]
+            elements, signed, flat, twice = elements[kept], signed[kept], flat[kept], twice[kept]
             if not len(elements):
                 raise ValueError("TetMesh.tets: no tet has a volume; are all vertices in one plane?")
         refuse("TetMesh.tets", flat, elements, "volumes must not vanish (compared with rounding of the vertices)", fix)
+        if twice.any():
+            again = f"every tet must come once (that at {first} comes again, with a volume of its own)"
+            refuse("TetMesh.tets", twice, elements, again, fix)
         inverted = signed < 0
         flipped = int(inverted.sum())
         if flipped:
             elements[inverted] = elements[inverted][:, [0, 1, 3, 2]]
             warn(f"TetMesh: {flipped} of {len(elements)} tets had inverted winding and were turned")
-        kept, elements = compact("TetMesh", elements, len(points), drop=drop_unreferenced)
-        store(self, vertices=points[kept], tets=elements, fill=shares, embedding=None, flipped=flipped)
+        used, elements = compact("TetMesh", elements, len(points), drop=drop_unreferenced)
+        store(
+            self,
+            vertices=points[used],
+            tets=elements,
+            fill=shares,
+            regions=groups,
+            embedding=None,
+            flipped=flipped,
+        )
 
     @classmethod
     def from_file(cls, path: PathLike, *, drop_degenerate: bool = False) -> TetMesh:
         """Read the tets of a volume mesh (.mesh, .msh, .vtk, .vtu, ...) through meshio.
 
         Triangles of the file, the outer surface or another one inside, are carried along as `embedding`. Vertices that
-        no tet uses are left out with a `MeshWarning`, and the triangles with them.
+        no tet uses are left out with a `MeshWarning`, and the triangles with them. The physical groups of a .msh, or
+        references of a .mesh, become `regions`.
         """
         from .embedding import embed_triangles
 
-        file = _existing(path)
-        if file.suffix.lower() in _SURFACE_SUFFIXES:
-            raise _without_tets(file, "a surface")
-        points, cells = _read_cells("TetMesh.from_file", file)
+        file = existing(path)
+        if file.suffix.lower() in SURFACE_SUFFIXES:
+            raise without_tets(file, ["a surface"])
+        content = read_content("TetMesh.from_file", file)
+        points, cells = content.points, cells_of(content)
         if "tetra" not in cells:
-            raise _without_tets(file, ", ".join(sorted(cells)) or "nothing")
-        mesh = cls(points, cells["tetra"], drop_unreferenced=True, drop_degenerate=drop_degenerate)
+            raise without_tets(file, cells)
+        mesh = cls(
+            points,
+            cells["tetra"],
+            regions=regions_of(content),
+            drop_unreferenced=True,
+            drop_degenerate=drop_degenerate,
+        )
         triangles = cells.get("triangle", np.empty((0, 3), dtype=np.int64)).astype(np.int64)
         triangles = triangles[~has_repeated_corner(triangles)]
         if not len(triangles) or len(mesh.vertices) != len(points):
@@ -306,10 +324,18 @@ class TetMesh:
         return mesh.with_embedding(embed_triangles(mesh, triangles))
 
     def to_file(self, path: PathLike) -> None:
-        """Write in the format of the file's suffix (.mesh, .msh, .vtk, .vtu, ...) through meshio."""
-        import meshio
+        """Write in the format of the file's suffix (.mesh, .msh, .vtk, .vtu, ...) through meshio.
 
-        meshio.Mesh(self.vertices, [("tetra", self.tets)]).write(Path(path))
+        Vertices, tets and regions; that an embedded surface and the fill are left out a `MeshWarning` says.
+        """
+        file = write_tets(path, self.vertices, self.tets, self.regions)
+        parts = {"the embedded surface": self.embedding, "the fill": self.fill}
+        lost = [name for name, part in parts.items() if part is not None]
+        if lost:
+            warn(
+                f"TetMesh.to_file: {file.name} is without {' and '.join(lost)}, for which mesh files have no place; "
+                "Simulator.save keeps them, and mesh.embedding.surface.to_file(...) writes a surface"
+            )
 
     @property
     def bounds(self) -> Array:
@@ -338,8 +364,7 @@ class TetMesh:
                 "it names); make one with torchpd.embed(surface, mesh)"
             )
         mesh: TetMesh = object.__new__(TetMesh)
-        fields = {"vertices": self.vertices, "tets": self.tets, "fill": self.fill, "flipped": self.flipped}
-        store(mesh, **fields, embedding=embedding)
+        store(mesh, **(vars(self) | {"embedding": embedding}))
         return mesh
 
     def transformed(self, matrix: Numbers) -> TetMesh:
@@ -347,7 +372,7 @@ class TetMesh:
         linear, offset = affine("TetMesh.transformed: matrix", matrix)
         # A reflection inverts every tet: two corners change places, and with them their weights.
         corners = [0, 1, 3, 2] if np.linalg.det(linear) < 0 else [0, 1, 2, 3]
-        mesh = TetMesh(self.vertices @ linear.T + offset, self.tets[:, corners], fill=self.fill)
+        mesh = TetMesh(self.vertices @ linear.T + offset, self.tets[:, corners], fill=self.fill, regions=self.regions)
         if self.embedding is None:
             return mesh
         return mesh.with_embedding(self.embedding.transformed(matrix, corners))

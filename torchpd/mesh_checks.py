@@ -20,6 +20,7 @@ __all__ = [
     "check_points",
     "compact",
     "determinants",
+    "find_repeated",
     "has_repeated_corner",
     "is_flat",
     "refuse",
@@ -86,6 +87,26 @@ def check_elements(name: str, value: Numbers, corners: int, count: int) -> Index
 def has_repeated_corner(elements: Index) -> NDArray[np.bool_]:
     ordered = np.sort(elements, axis=1)
     return np.asarray((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
+
+
+def find_repeated(tets: Index) -> tuple[NDArray[np.bool_], int]:
+    """Which tets have the corners of an earlier one, in any order, and the earlier one of the first of them.
+
+    Equal tets have equal sums of random words, one a vertex; only where two sums are equal the corners are compared.
+    """
+    words = np.random.default_rng(0).integers(0, 2**63, int(tets.max()) + 1, dtype=np.uint64)
+    sums = words[tets].sum(axis=1, dtype=np.uint64)
+    repeated = np.zeros(len(tets), dtype=bool)
+    ordered = np.sort(sums)
+    equal = ordered[1:][ordered[1:] == ordered[:-1]]
+    if not len(equal):
+        return repeated, -1
+    suspects = np.flatnonzero(np.isin(sums, equal))
+    _, first, number = np.unique(np.sort(tets[suspects], axis=1), axis=0, return_index=True, return_inverse=True)
+    origin = suspects[first[number.reshape(-1)]]
+    repeated[suspects] = origin != suspects
+    found = np.flatnonzero(repeated)
+    return repeated, int(origin[suspects == found[0]][0]) if len(found) else -1
 
 
 def determinants(points: Array, tets: Index) -> Array:
