@@ -6,7 +6,7 @@ import io
 import os
 import sys
 from collections.abc import Collection
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -49,15 +49,16 @@ def read_content(owner: str, file: Path) -> Any:
 
     if file.suffix.lower() not in meshio.extension_to_filetypes:
         raise ValueError(f"{owner} cannot read {file.name}: {_ENDINGS}")
-    said = io.StringIO()
+    said, warned = io.StringIO(), io.StringIO()
     try:
-        # meshio says on stderr what is wrong with a file, and exits the process
-        with redirect_stderr(said):
+        # meshio prints what is wrong with a file, sums it up on stderr, and exits the process
+        with redirect_stdout(said), redirect_stderr(warned):
             content = meshio.read(file)
     except (meshio.ReadError, ValueError, SystemExit) as error:
-        words = " ".join(said.getvalue().split()).removeprefix("Error: ")
+        words = " ".join((said.getvalue().strip() or warned.getvalue()).split()).removeprefix("Error: ")
         raise ValueError(f"{owner} cannot read {file.name} through meshio: {words or error}") from error
-    sys.stderr.write(said.getvalue())
+    sys.stdout.write(said.getvalue())
+    sys.stderr.write(warned.getvalue())
     return content
 
 
