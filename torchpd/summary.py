@@ -85,6 +85,8 @@ def _effect_lines(sim: Simulator) -> list[str]:
     scene = sim.scene
     tets = sum(len(solid.mesh.tets) for solid in scene.solids)
     lines = [f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step an iteration"]
+    if any(solid.mesh.fill is not None for solid in scene.solids):
+        lines.append("fill: stiffness and masses are those of the material times how full a tetrahedron is (mesh.fill)")
     hard = sum(len(pin.vertices) for pin in scene.pins if pin.stiffness is None)
     soft = sum(len(pin.vertices) for pin in scene.pins) - hard
     if hard:
