@@ -253,12 +253,11 @@ def _slabs(lattice: Lattice, found: list[_Intervals]) -> Iterator[tuple[slice, N
         slab = slice(start, min(start + thick, lattice.shape[0]))
         low = np.array([start * _SAMPLES, 0, 0])
         counts = np.array([(slab.stop - start) * _SAMPLES, samples[1], samples[2]])
-        opinions = np.stack([_covered(inner, axis, low, counts) for axis, inner in enumerate(found)])
-        sure = opinions >= 0.5
-        inside = sure.sum(axis=0) >= 2
-        least = np.where(sure, opinions, np.float32(1.0)).min(axis=0)
-        most = np.where(sure, np.float32(0.0), opinions).max(axis=0)
-        yield slab, np.where(inside, least, most)
+        x, y, z = (_covered(inner, axis, low, counts) for axis, inner in enumerate(found))
+        less, more = np.minimum(x, y), np.maximum(x, y)
+        least, most = np.minimum(less, z), np.maximum(more, z)
+        middle = np.maximum(less, np.minimum(more, z))
+        yield slab, np.where(least >= 0.5, least, np.where(most < 0.5, most, middle))
 
 
 def _covered(inner: _Intervals, axis: int, low: Index, counts: Index) -> NDArray[np.float32]:
@@ -280,7 +279,8 @@ def _covered(inner: _Intervals, axis: int, low: Index, counts: Index) -> NDArray
         np.add.at(steps, at, sign * (1.0 - part))
         np.add.at(steps, at + int(np.prod(shape[axis + 1 :])), sign * part)
     covered = np.cumsum(steps.reshape(shape), axis=axis, dtype=np.float32)
-    return np.clip(np.take(covered, range(counts[axis]), axis=axis), 0.0, 1.0)
+    inside = covered[tuple(slice(count) for count in counts)]
+    return np.clip(inside, 0.0, 1.0, out=inside)
 
 
 def _cubes_of(walls: Mask) -> Mask:
