@@ -154,7 +154,8 @@ class Multilevel:
             most steps, after three iterations, for the time of one or two more. Bodies that bend or spin need a third
             to two thirds of the iterations of "lbfgs", bodies that rest or slide with friction a tenth to a third,
             others as many.
-        relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8.
+        relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8. "corotated" takes half
+            of it while contacts without friction hold vertices, where M is too soft.
     """
 
     outer: Literal["corotated", "lbfgs", "momentum"] = "corotated"
