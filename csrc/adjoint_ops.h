@@ -72,8 +72,9 @@ AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
 }
 
 // The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1, vertices], and of
-// a scene with contacts the projector off the normals that hold a vertex [batch, vertices, 3, 3], whether friction holds it
-// [batch, vertices], and what it slides along [batch, vertices, 5, 3], else of no environments.
+// a scene with contacts the projector off the normals that hold a vertex [batch, vertices, 3, 3], of one that sticks to a ball
+// times how far it goes as its start does, whether friction holds it [batch, vertices], and what it slides along [batch,
+// vertices, 5, 3], else of no environments.
 template <class Backend>
 AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_velocities,
                               const Tensor& after, const Tensor& positions,

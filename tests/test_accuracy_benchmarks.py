@@ -1,4 +1,4 @@
-"""The scripts behind the README's numbers on accuracy: what they count and how they judge."""
+"""The scripts behind the numbers of docs/accuracy.md: what they count and how they judge."""
 
 from __future__ import annotations
 

@@ -152,6 +152,23 @@ def test_what_lands_reaches_the_aim(youngs: float, friction: float) -> None:
     assert max(errors) <= AIM
 
 
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_few_iterations_on_smooth_contacts_are_multilevels(friction: float) -> None:
+    """Those of Chebyshev leave 1e-2 of a cube that slides, and with friction Multilevel may leave more."""
+    body = pd.Solid(pd.shapes.box((0.3, 0.3, 0.3), (6, 6, 6)), 1e7)
+    scene = pd.Scene(body, pd.Gravity(), pd.Ground(0.0, friction=friction))
+    few = pd.Simulator(scene, 1 / 60, 64, solver="auto", dtype=torch.float64, progress=False)
+    assert few.iterations == 64
+    assert few.solver == (pd.Multilevel() if friction == 0.0 else few.solver)
+    assert isinstance(few.solver, pd.Chebyshev) == (friction > 0.0)
+    assert isinstance(
+        pd.Simulator(scene, 1 / 60, 4000, solver="auto", dtype=torch.float64, progress=False).solver, pd.Chebyshev
+    )
+    if friction == 0.0:
+        assert "64 of Multilevel leave less" in repr(few)
+        assert "expected where what is stiff lands" in repr(few)
+
+
 def test_time_of_a_batch() -> None:
     """2 + 4 * 0.5 us of one environment, 500 vertices; two others take turns, or 0.8 * 0.5 us each, or 1.2 / 4 more.
 

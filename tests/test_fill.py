@@ -68,6 +68,11 @@ def filled(mesh: pd.TetMesh) -> float:
         (ball(4), 20, 0.005),
         (block(1.0, 0.13, 0.087), 10, 0.04),  # less than a cell thick: faces pass close to edges of the lattice
         (block(1.0, 0.13, 0.087), 20, 0.01),
+        # faces in planes of samples
+        (block(1.0, 0.25, 0.25), 6, 0.02),
+        (block(1.0, 0.25, 0.25), 10, 0.01),
+        (block(1.0, 0.35, 0.35), 10, 0.01),
+        (block(1.0, 1.0, 0.05), 10, 0.02),
         (pd.shapes.octopus(), 14, 0.03),  # arms of about a cell
         (ball().translated((1e4, -1e4, 3e3)), 9, 0.02),
         (ball().scaled(1e-3), 9, 0.02),
@@ -221,7 +226,7 @@ def test_meshes_say_how_full_they_are() -> None:
     mesh = pd.tetrahedralize(block(1.0, 0.1, 0.1), cells=20)
     assert "74% filled, carrying" in repr(mesh)  # of 1.35 times the volume
     assert "of which 0.01 m^3 are filled" in str(mesh.quality())
-    assert "times how full a tetrahedron is" in str(pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e4))))
+    assert "times how full tetrahedra are" in str(pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e4))))
 
 
 # Stiffness:

@@ -139,6 +139,16 @@ def test_contacts_are_expected_to_leave_multilevel_what_chebyshev_takes() -> Non
         assert rate(solver, contact) == pytest.approx(plain, rel=0.05)
 
 
+def test_what_may_be_hard_to_multilevel_is_no_warning() -> None:
+    """Most steps on contacts take it a tenth of that."""
+    scene = pd.Scene(pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (4, 4, 4)), 1e8), pd.Gravity(), pd.Ground())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pd.Simulator(scene, 1 / 60, solver=pd.Multilevel(), progress=False)
+    with pytest.warns(UnsolvedWarning):
+        pd.Simulator(scene, 1 / 60, progress=False)
+
+
 def test_a_default_that_is_far_too_small_is_said_once_and_printed() -> None:
     def compiled(**options: Any) -> list[warnings.WarningMessage]:
         with warnings.catch_warnings(record=True) as said:

@@ -11,7 +11,8 @@ the error of the step: iterate far enough, and look at the residual.
 A GPU solves every environment in one launch, whatever it takes, so a CUDA graph can record it.
 
 Contacts: the normal direction of a vertex that a contact holds is taken out of the system; a vertex that friction holds
-moves with its start. What a vertex that slides against friction adds stands in `torchpd.sliding`.
+moves with its start, on a ball about its centre. What a vertex that slides against friction adds stands in
+`torchpd.sliding`.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from .forecast import Forecast, Spectrum, forecast, has_contacts, spectrum_of
+from .forecast import Forecast, Spectrum, forecast, has_contacts, has_friction, spectrum_of
 from .gpu import H100
 from .kernel_costs import iteration_microseconds
 from .multilevel import MOST_DIRECT
@@ -95,8 +95,9 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
 
     Args:
         sim: scene, time step, material, device, and the batch to choose for.
-        iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error. None
-            sets as many as are expected to reach an error of `AIM`, times `MARGIN`, and with a tolerance `PATIENCE`.
+        iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error, but
+            Chebyshev with friction. None sets as many as are expected to reach an error of `AIM`, times `MARGIN`, and
+            with a tolerance `PATIENCE`.
     """
 
     def chosen(enough: int, why: str) -> Choice:
@@ -111,6 +112,9 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     if has_contacts(sim):
         plain = _known(forecast(sim, chebyshev, spectrum))
         why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
+        few = iterations is not None and iterations < _enough(plain)
+        if few and not has_friction(sim) and runs(_LEVELS[0], sim):
+            return _LEVELS[0], chosen(_enough(plain), f"{why}, and {iterations} of Multilevel leave less")
         return chebyshev, chosen(_enough(plain), f"{why}, and what lands may keep Multilevel from working")
     plain, lasting, short = (_known(forecast(sim, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
     saves = short.iterations(AIM) - lasting.iterations(AIM) >= MAKING

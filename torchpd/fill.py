@@ -32,6 +32,8 @@ LEAST_FILL = 0.05
 _SAMPLES = 6
 # A part that is thinner than this, in cubes on average, encloses nothing: a surface and its own way back.
 _THIN = 1e-3
+# Rounding of a covered length.
+_TIE = 1e-3
 # Samples in work at a time, and small triangles, to bound memory.
 _SLAB = 5_000_000
 _CHUNK = 20_000
@@ -245,7 +247,7 @@ def _slabs(lattice: Lattice, found: list[_Intervals]) -> Iterator[tuple[slice, N
 
     Each axis has an opinion, the covered length of its grid line. Where most of them say inside (more than half), or
     outside, those that agree and are least sure are right: where a face passes, the line that is steepest to it. An
-    axis that is alone may look through a crack.
+    axis that is alone may look through a crack. Half is both, since a face may lie in a plane of samples.
     """
     samples = np.array(lattice.shape) * _SAMPLES
     thick = max(1, int(_SLAB // (_SAMPLES * samples[1] * samples[2])))
@@ -257,7 +259,7 @@ def _slabs(lattice: Lattice, found: list[_Intervals]) -> Iterator[tuple[slice, N
         less, more = np.minimum(x, y), np.maximum(x, y)
         least, most = np.minimum(less, z), np.maximum(more, z)
         middle = np.maximum(less, np.minimum(more, z))
-        yield slab, np.where(least >= 0.5, least, np.where(most < 0.5, most, middle))
+        yield slab, np.where(least >= 0.5 - _TIE, least, np.where(most <= 0.5 + _TIE, most, middle))
 
 
 def _covered(inner: _Intervals, axis: int, low: Index, counts: Index) -> NDArray[np.float32]:

@@ -237,8 +237,9 @@ class Model(nn.Module):
 
         Args:
             arrays: by name, see `Simulator`; one number is for all elements, vertices or pins of `stiffness`, `masses`
-                or `pin_stiffness`. Shapes and values are checked here, once, and that batches agree with each other and
-                with those of the arrays that stay. Pins that hold others, or much harder, make the matrix of
+                or `pin_stiffness`. It counts as it is: where tetrahedra are partly full (`mesh.fill`) multiply
+                `sim.stiffness` instead. Shapes and values are checked here, once, and that batches agree with each
+                other and with those of the arrays that stay. Pins that hold others, or much harder, make the matrix of
                 `Multilevel` anew, see `prepare_solver`; a captured step wants to be captured again then.
         """
         self._replace_material("set_material", arrays)

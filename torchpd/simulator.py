@@ -191,7 +191,7 @@ class Simulator(Model):
                 the end of the step before: where the scene has it before step 0 and after steps that leave it out.
             first: number of the first step, where this rollout goes on from another: `rollout(state, 9)` ends as
                 `rollout(rollout(state, 5).state(), 4, first=5)` does. For where spheres were, a function of targets is
-                asked for the step before, too.
+                asked for the step before, too; others are moved on by an addition for each step before.
             start: first iterate of every step, "velocity" or "inertial".
             return_info: fill in residual and energy of the recorded steps; NaN otherwise, see `Info`.
             progress: show a bar.

@@ -8,7 +8,7 @@ import torch
 
 from . import _C
 from .checks import NO_VALUES
-from .forecast import FAR_TOO_FEW, forecast
+from .forecast import FAR_TOO_FEW, forecast, is_bound
 from .gpu import step_bytes
 from .material import environments_of_material
 from .plan import any_of
@@ -52,8 +52,9 @@ def _expectation_lines(sim: Simulator) -> list[str]:
     if expected is not None:
         left = expected.error(sim.iterations)
         verdict = f"; {sim.iterations} leave about {left:.1g}: far too few" if left > FAR_TOO_FEW else ""
+        hardest = " where what is stiff lands" if is_bound(sim) else ""
         counts = " and ".join(f"{error:g} after {expected.words(error)}" for error in (1e-2, 1e-3))
-        lines.append(f"expected: an error of {counts} iterations, from the weights alone{verdict}")
+        lines.append(f"expected{hardest}: an error of {counts} iterations, from the weights alone{verdict}")
         if sim.tolerance and expected.iterations(sim.tolerance) > sim.iterations:
             words = expected.words(sim.tolerance)
             lines.append(
@@ -86,7 +87,9 @@ def _effect_lines(sim: Simulator) -> list[str]:
     tets = sum(len(solid.mesh.tets) for solid in scene.solids)
     lines = [f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step an iteration"]
     if any(solid.mesh.fill is not None for solid in scene.solids):
-        lines.append("fill: stiffness and masses are those of the material times how full a tetrahedron is (mesh.fill)")
+        lines.append(
+            "fill: stiffness and masses are those of the material times how full tetrahedra are (mesh.fill), unless set"
+        )
     hard = sum(len(pin.vertices) for pin in scene.pins if pin.stiffness is None)
     soft = sum(len(pin.vertices) for pin in scene.pins) - hard
     if hard:
