@@ -70,7 +70,8 @@ class Solid(_Part):
     w V / 2 |F - R|^2, w = Young's modulus at Poisson ratio 0 (Vyatkin and Dolgovesov 2023, where st = w / 2).
 
     Tetrahedra that are partly empty (`mesh.fill`, of `tetrahedralize`) weigh and resist as much less: the simulator's
-    `stiffness` and `masses` are those of the material times the fill (Nesme et al. 2009, for embedded surfaces).
+    `stiffness` and `masses` are those of the material times the fill, stiffness times a tenth at least (Nesme et al.
+    2009, for embedded surfaces).
 
     Args:
         mesh: the rest shape.

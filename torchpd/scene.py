@@ -25,7 +25,7 @@ class SceneValues:
 
     rest_positions: Array  # [V, 3] m
     tets: Index  # [E, 4]
-    stiffness: Array  # [E] Young's modulus, Pa, times how full the tet is
+    stiffness: Array  # [E] Young's modulus, Pa, times how full the tet is, a tenth at least
     density: Array  # [E] kg/m^3, times how full the tet is
     masses: Array  # [V] kg, lumped: density * volume / 4 to each corner
     pin_vertices: Index  # [P]
@@ -38,9 +38,14 @@ class SceneValues:
     component: Index  # [V] number of the connected piece of mesh that a vertex belongs to
 
 
-def _filled(solid: Solid, values: Array) -> Array:
+# What contacts and pins hold are vertices of tets that are partly empty: far softer ones would be squashed flat, and a
+# step would have several solutions.
+_LEAST_RESISTANCE = 0.1
+
+
+def _filled(solid: Solid, values: Array, least: float = 0.0) -> Array:
     """What the material of a tet that is partly empty amounts to in all of it."""
-    return values if solid.mesh.fill is None else values * solid.mesh.fill
+    return values if solid.mesh.fill is None else values * np.maximum(solid.mesh.fill, least)
 
 
 def _lumped_masses(positions: Array, tets: Index, density: Array) -> Array:
@@ -150,7 +155,7 @@ class Scene:
         return SceneValues(
             rest_positions=positions,
             tets=tets,
-            stiffness=np.concatenate([_filled(solid, solid.youngs) for solid in self.solids]),
+            stiffness=np.concatenate([_filled(solid, solid.youngs, _LEAST_RESISTANCE) for solid in self.solids]),
             density=density,
             masses=_lumped_masses(positions, tets, density),
             pin_vertices=pin_vertices,
