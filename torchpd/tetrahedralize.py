@@ -48,10 +48,10 @@ def tetrahedralize(
 
     Of its volume, `mesh.fill` says which share of each tet lies inside of the surface. `Solid` multiplies density and
     Young's modulus by it, so that a body weighs what the surface encloses (to 2 % and less; 3 % where it is about one
-    cell thick) and is about as stiff. No share is less than 0.05, for the solvers,
-    and none makes a tet softer than a tenth. What encloses nothing, a sheet or a
-    surface that stays open, is a body of the tets that it passes: these are full. For the whole lattice to be material,
-    leave the shares out: `TetMesh(mesh.vertices, mesh.tets).with_embedding(mesh.embedding)`.
+    cell thick) and is about as stiff. No share is less than 0.05, for the solvers, and none makes a tet softer than a
+    tenth. What encloses nothing, a sheet or a surface that stays open, is a body of the tets that it passes: these are
+    full. For the whole lattice to be material, leave the shares out: `TetMesh(mesh.vertices,
+    mesh.tets).with_embedding(mesh.embedding)`.
 
     "tetwild" follows the surface closely with tets of varying shape; it needs the package pytetwild.
 
