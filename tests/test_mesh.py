@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from pathlib import Path
 
-import meshio
 import numpy as np
 import pytest
 import torch
@@ -15,26 +13,15 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from mesh_cases import jittered_box, signed_volumes
 
 from torchpd import shapes
-from torchpd.effects import Solid
 from torchpd.embedding import embed_triangles
 from torchpd.mesh import MeshWarning, TetMesh, TriMesh
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 TET = np.array([[0, 1, 2, 3]])
 U = np.finfo(np.float64).eps / 2
-
-
-def signed_volumes(mesh: TetMesh) -> np.ndarray:
-    x = mesh.vertices[mesh.tets]
-    return np.linalg.det(x[:, 1:] - x[:, :1]) / 6.0
-
-
-def jittered_box(amount: float = 0.2) -> TetMesh:
-    mesh = shapes.box((1.0, 0.8, 0.6), (4, 4, 3))
-    noise = np.random.default_rng(0).uniform(-amount, amount, mesh.vertices.shape)
-    return TetMesh(mesh.vertices + 0.2 * noise, mesh.tets)
 
 
 # What a mesh is:
@@ -337,143 +324,6 @@ def test_bad_motions_are_refused(call, message: str) -> None:
         call(shapes.single_tet())
 
 
-# Files:
-
-
-@pytest.mark.parametrize("suffix", [".mesh", ".msh", ".vtk", ".vtu"])
-def test_tets_survive_a_file(tmp_path: Path, suffix: str) -> None:
-    mesh = jittered_box()
-    mesh.to_file(tmp_path / f"box{suffix}")
-    again = TetMesh.from_file(tmp_path / f"box{suffix}")
-    np.testing.assert_array_equal(again.tets, mesh.tets)
-    np.testing.assert_allclose(again.vertices, mesh.vertices, atol=1e-15)
-
-
-def test_triangles_of_a_volume_file_ride_along(tmp_path: Path) -> None:
-    mesh = jittered_box()
-    meshio.Mesh(mesh.vertices, [("tetra", mesh.tets), ("triangle", mesh.boundary())]).write(tmp_path / "both.vtu")
-    both = TetMesh.from_file(tmp_path / "both.vtu")
-    assert both.embedding is not None
-    np.testing.assert_array_equal(both.embedding.apply(both.vertices), both.embedding.surface.vertices)
-    assert both.embedding.surface.volume() == pytest.approx(signed_volumes(mesh).sum(), rel=1e-12)
-    surface = TriMesh.from_file(tmp_path / "both.vtu")
-    np.testing.assert_array_equal(surface.triangles, both.embedding.surface.triangles)
-
-
-def test_unreferenced_vertices_of_a_file_are_dropped_and_reported(tmp_path: Path) -> None:
-    meshio.Mesh(np.vstack([CORNERS, [[5.0, 5, 5]]]), [("tetra", TET)]).write(tmp_path / "loose.vtk")
-    with pytest.warns(MeshWarning, match="1 of 5 vertices"):
-        mesh = TetMesh.from_file(tmp_path / "loose.vtk")
-    assert len(mesh.vertices) == 4
-
-
-@pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".glb"])
-def test_surfaces_survive_a_file(tmp_path: Path, suffix: str) -> None:
-    mesh = shapes.box((1.0, 2.0, 3.0), (2, 2, 2))
-    surface = embed_triangles(mesh, mesh.boundary()).surface
-    surface.to_file(tmp_path / f"box{suffix}")
-    again = TriMesh.from_file(tmp_path / f"box{suffix}")
-    assert len(again.triangles) == len(surface.triangles)
-    # The formats keep float32 at least: relative 6e-8 in each of three coordinates.
-    assert again.volume() == pytest.approx(6.0, rel=1e-6)
-
-
-def test_texture_coordinates_and_quads_survive(tmp_path: Path) -> None:
-    lines = ["v 0 0 0", "v 1 0 0", "v 1 1 0", "v 0 1 0", "vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1", "f 1/1 2/2 3/3 4/4"]
-    (tmp_path / "quad.obj").write_text("\n".join(lines) + "\n")
-    surface = TriMesh.from_file(tmp_path / "quad.obj")
-    assert len(surface.triangles) == 2
-    assert surface.uvs is not None
-    np.testing.assert_allclose(surface.uvs, surface.vertices[:, :2])
-    assert TriMesh.from_trimesh(surface.to_trimesh()).uvs is not None
-
-
-def test_scenes_are_joined_with_their_places() -> None:
-    one = trimesh.creation.box((1, 1, 1))
-    scene = trimesh.Scene()
-    scene.add_geometry(one)
-    scene.add_geometry(one, transform=trimesh.transformations.translation_matrix([3, 0, 0]))
-    surface = TriMesh.from_trimesh(scene)
-    np.testing.assert_allclose(surface.bounds, [[-0.5, -0.5, -0.5], [3.5, 0.5, 0.5]])
-    with pytest.raises(TypeError, match="must be a Trimesh or a Scene, got int"):
-        TriMesh.from_trimesh(3)
-
-
-def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no such mesh file: .*nothing\.mesh"):
-        TetMesh.from_file(tmp_path / "nothing.mesh")
-    with pytest.raises(FileNotFoundError, match="no such mesh file"):
-        TriMesh.from_file(tmp_path / "nothing.obj")
-    (tmp_path / "broken.vtu").write_text("this is not a mesh")
-    with pytest.raises(ValueError, match=r"cannot read broken\.vtu"):
-        TetMesh.from_file(tmp_path / "broken.vtu")
-    (tmp_path / "what.xyzzy").write_text("this is not a mesh")
-    for kind in (TetMesh, TriMesh):
-        with pytest.raises(ValueError, match=r"cannot read what\.xyzzy"):
-            kind.from_file(tmp_path / "what.xyzzy")
-    surface_file = tmp_path / "surface.vtk"
-    meshio.Mesh(CORNERS[:3], [("triangle", [[0, 1, 2]])]).write(surface_file)
-    with pytest.raises(ValueError, match=r"must hold tetrahedra .*got triangle; .*torchpd\.tetrahedralize"):
-        TetMesh.from_file(surface_file)
-    # texture coordinates that are not one a vertex stop meshio
-    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS[:3]) + "vt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\n"
-    (tmp_path / "textured.obj").write_text(corners + "f 1/1 2/2 3/4\n")
-    assert len(TriMesh.from_file(tmp_path / "textured.obj").triangles) == 1
-    with pytest.raises(
-        ValueError, match=r"textured\.obj must hold tetrahedra .*got a surface; .*torchpd\.tetrahedralize"
-    ):
-        TetMesh.from_file(tmp_path / "textured.obj")
-    shapes.single_tet().to_file(tmp_path / "tets.vtk")
-    with pytest.raises(ValueError, match="holds no triangles"):
-        TriMesh.from_file(tmp_path / "tets.vtk")
-
-
-def test_a_file_says_what_it_leaves_out(tmp_path: Path) -> None:
-    mesh = shapes.single_tet()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        mesh.to_file(tmp_path / "bare.vtu")
-    carrying = mesh.with_embedding(embed_triangles(mesh, mesh.boundary()))
-    with pytest.warns(MeshWarning, match=r"a\.vtu is without the embedded surface, for which .*Simulator\.save"):
-        carrying.to_file(tmp_path / "a.vtu")
-    partly = TetMesh(mesh.vertices, mesh.tets, fill=[0.5])
-    with pytest.warns(MeshWarning, match=r"b\.vtu is without the fill, for which"):
-        partly.to_file(tmp_path / "b.vtu")
-
-
-@pytest.mark.parametrize("name", ["tets.xyz", "tets", "tets.stl", "tets.obj", "tets.svg"])
-def test_files_that_cannot_hold_tets_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(ValueError, match=rf"cannot write .*{name}.*must end in \.mesh, \.msh, \.vtk or \.vtu"):
-        shapes.single_tet().to_file(tmp_path / name)
-
-
-def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"TetMesh\.to_file: there is no folder .*nowhere for tets\.vtu"):
-        shapes.single_tet().to_file(tmp_path / "nowhere" / "tets.vtu")
-
-
-def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "broken.mesh").write_text("MeshVersionFormatted 2\nDimension 3\nVertices\n2\n0 0\n")
-    with pytest.raises(ValueError, match=r"cannot read broken\.mesh through meshio: cannot reshape array of size 2"):
-        TetMesh.from_file(tmp_path / "broken.mesh")
-    (tmp_path / "hello.mesh").write_text("hello\n")
-    with pytest.raises(ValueError, match=r"cannot read hello\.mesh through meshio: Unknown keyword 'hello'"):
-        TetMesh.from_file(tmp_path / "hello.mesh")
-    assert capfd.readouterr() == ("", "")
-    (tmp_path / "what.xyz").write_text("0 0 0")
-    with pytest.raises(ValueError, match=r"cannot read what\.xyz: .*must end in \.mesh, \.msh, \.vtk or \.vtu"):
-        TetMesh.from_file(tmp_path / "what.xyz")
-
-
-@pytest.mark.parametrize(("kind", "corners"), [("tetra10", 10), ("hexahedron", 8)])
-def test_other_volume_cells_get_advice_that_fits(tmp_path: Path, kind: str, corners: int) -> None:
-    points = np.random.default_rng(0).random((corners, 3))
-    meshio.Mesh(points, [(kind, np.arange(corners)[None])]).write(tmp_path / "other.vtu")
-    with pytest.raises(ValueError, match=f"got {kind}; split its cells into tetrahedra of four vertices") as caught:
-        TetMesh.from_file(tmp_path / "other.vtu")
-    assert "tetrahedralize" not in str(caught.value)
-
-
 def test_a_tet_that_comes_twice_is_refused_or_left_out() -> None:
     mesh = shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
     turned = mesh.tets[[7, 5, 7]][:, [1, 2, 0, 3]]  # an even permutation: as good a tet
@@ -483,57 +333,6 @@ def test_a_tet_that_comes_twice_is_refused_or_left_out() -> None:
     with pytest.warns(MeshWarning, match="3 of 51 tets come twice and were left out"):
         once = TetMesh(mesh.vertices, tets, drop_degenerate=True)
     np.testing.assert_array_equal(once.tets, mesh.tets)
-
-
-# Regions:
-
-
-@pytest.mark.parametrize("suffix", [".mesh", ".msh", ".vtk", ".vtu"])
-def test_regions_survive_a_file(tmp_path: Path, suffix: str) -> None:
-    box = jittered_box()
-    mesh = TetMesh(box.vertices, box.tets, regions=np.arange(len(box.tets)) % 3 + 1)
-    mesh.to_file(tmp_path / f"box{suffix}")
-    again = TetMesh.from_file(tmp_path / f"box{suffix}")
-    np.testing.assert_array_equal(again.regions, mesh.regions)
-    for other in (mesh.transformed(np.diag([1.0, -1.0, 1.0])), mesh.with_embedding(None)):
-        np.testing.assert_array_equal(other.regions, mesh.regions)
-    youngs = np.where(mesh.regions == 2, 1e6, 1e5)
-    assert Solid(mesh, youngs).youngs[1] == 1e6
-    assert box.regions is None
-
-
-def test_physical_groups_of_gmsh_become_regions(tmp_path: Path) -> None:
-    # Two volumes, and a surface with a group of its own, which is no region of tets.
-    points = np.vstack([CORNERS, [[1.0, 1.0, 1.0]]])
-    blocks = [("triangle", [[0, 1, 2]]), ("tetra", TET), ("tetra", [[1, 2, 3, 4]])]
-    groups = [np.array([9]), np.array([1]), np.array([2])]
-    data = {"gmsh:physical": groups, "gmsh:geometrical": groups}
-    meshio.Mesh(points, blocks, cell_data=data).write(tmp_path / "two.msh", file_format="gmsh22")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MeshWarning)
-        mesh = TetMesh.from_file(tmp_path / "two.msh")
-    assert mesh.regions is not None
-    assert mesh.regions.tolist() == [1, 2]
-    assert mesh.embedding is not None
-
-
-def test_physical_groups_of_the_newer_format_become_regions(tmp_path: Path) -> None:
-    (tmp_path / "two.msh").write_text(
-        "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n"
-        "$Entities\n0 0 0 2\n1 0 0 0 1 1 1 1 7 0\n2 0 0 0 1 1 1 1 8 0\n$EndEntities\n"
-        "$Nodes\n1 5 1 5\n3 1 0 5\n1\n2\n3\n4\n5\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 1 1\n$EndNodes\n"
-        "$Elements\n2 2 1 2\n3 1 4 1\n1 1 2 3 4\n3 2 4 1\n2 2 3 4 5\n$EndElements\n"
-    )
-    mesh = TetMesh.from_file(tmp_path / "two.msh")
-    assert mesh.regions is not None
-    assert mesh.regions.tolist() == [7, 8]
-
-
-def test_bad_regions_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"TetMesh\.regions must be \[1\]"):
-        TetMesh(CORNERS, TET, regions=[1, 2])
-    with pytest.raises(TypeError, match=r"TetMesh\.regions must hold integers, got float64"):
-        TetMesh(CORNERS, TET, regions=[1.5])
 
 
 def test_an_embedding_must_belong_to_its_mesh() -> None:

@@ -1,0 +1,21 @@
+"""A mesh that is no grid, and volumes by their signs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchpd import shapes
+from torchpd.mesh import TetMesh
+
+__all__ = ["jittered_box", "signed_volumes"]
+
+
+def signed_volumes(mesh: TetMesh) -> np.ndarray:
+    x = mesh.vertices[mesh.tets]
+    return np.linalg.det(x[:, 1:] - x[:, :1]) / 6.0
+
+
+def jittered_box(amount: float = 0.2) -> TetMesh:
+    mesh = shapes.box((1.0, 0.8, 0.6), (4, 4, 3))
+    noise = np.random.default_rng(0).uniform(-amount, amount, mesh.vertices.shape)
+    return TetMesh(mesh.vertices + 0.2 * noise, mesh.tets)
