@@ -59,6 +59,17 @@ def irregular(*, seed: int = 0) -> Case:
     return Case(pd.Scene(body, held, pd.Gravity((0.0, -9.8, 0.0))), np.array(mesh.vertices), velocities, 1.0 / 30.0)
 
 
+def landing(youngs: float, *, friction: float = 0.0, size: float = 0.02, cells: int = 4) -> Case:
+    """A tilted cube that a step takes into the ground: sound crosses one of 2 cm and 1e6 Pa 26 times in it."""
+    vertices, tets = box((size, size, size), (cells, cells, cells))
+    c, s = np.cos(0.35), np.sin(0.35)
+    vertices = vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    ground = pd.Ground(float(vertices[:, 1].min()) - 0.001 * size, friction=friction)
+    scene = pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), youngs), pd.Gravity(), ground)
+    velocities = np.tile([0.3, -0.3, 0.1], (len(vertices), 1))
+    return Case(scene, vertices, velocities, 1.0 / 60.0)
+
+
 def many_bodies(count: int = 300) -> Case:
     """Single tetrahedra that nothing joins, every other one held at a corner."""
     corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])

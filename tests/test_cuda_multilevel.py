@@ -11,7 +11,7 @@ import pytest
 import torch
 from cases import Case, beam, contact_block, on_sphere, slivers
 from devices import require_gpu
-from multilevel_cases import build_levels, irregular, many_bodies, precondition, swing
+from multilevel_cases import build_levels, irregular, landing, many_bodies, precondition, swing
 from on_gpu import GPU, device_work, host_waits, moved, relative
 from runs import arguments_of, noise, same_bits, simulator, small, state_of
 from scipy.sparse import csr_array
@@ -36,6 +36,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "ground": lambda: contact_block(pd.Ground(), velocity=(0.0, -1.0, 0.0), youngs=1e6, cells=4),
     "sphere": lambda: on_sphere(0.3),
     "sliding": lambda: contact_block(pd.Ground(friction=0.5), velocity=(1.0, -1.0, 0.0), youngs=1e6, cells=4),
+    "landing": lambda: landing(1e6),
+    "rough landing": lambda: landing(1e5, friction=0.5),
 }
 
 
@@ -112,7 +114,7 @@ def test_preconditioner_is_that_of_the_cpu(name: str, dtype: torch.dtype) -> Non
 @pytest.mark.parametrize("name", CASES)
 def test_iterates_are_those_of_the_cpu(name: str, outer: str) -> None:
     case = CASES[name]()
-    sims = pair(case, torch.float64, SOLVERS[outer], iterations=8)
+    sims = pair(case, torch.float64, SOLVERS[outer], iterations=20 if "landing" in name else 8)
     after = [sim(state_of(case, sim, 2), return_info=True, **arguments_of(case, sim, 2)) for sim in sims]
     (cpu, expected), (gpu, info) = after
     # rounding grows with every iteration; contacts that one of two roundings touches differ by it
@@ -165,11 +167,11 @@ def test_material_that_it_was_not_made_for(outer: str) -> None:
 
 @pytest.mark.usefixtures("most_direct")
 @pytest.mark.parametrize("outer", SOLVERS)
-@pytest.mark.parametrize("name", ["slivers", "beam", "ground", "sphere", "sliding"])
+@pytest.mark.parametrize("name", ["slivers", "beam", "ground", "sphere", "sliding", "landing", "rough landing"])
 def test_an_environment_does_not_know_of_the_others(name: str, outer: str, dtype: torch.dtype) -> None:
     """Alone by many blocks, in a batch by fewer, and among more than run at once."""
     case = CASES[name]()
-    sim = simulator(case, dtype, GPU, solver=SOLVERS[outer], iterations=6)
+    sim = simulator(case, dtype, GPU, solver=SOLVERS[outer], iterations=48 if "landing" in name else 6)
     factor = torch.linspace(0.5, 1.5, 4096, dtype=dtype, device=GPU)[:, None, None]
     state = state_of(case, sim, 4096)
     state = pd.State(state.positions, factor * state.velocities)
@@ -179,6 +181,19 @@ def test_an_environment_does_not_know_of_the_others(name: str, outer: str, dtype
         few = sim(pd.State(state.positions[first:last], state.velocities[first:last]))
         assert same_bits(few, pd.State(together.positions[first:last], together.velocities[first:last]))
     assert not torch.equal(together.velocities[0], together.velocities[1])
+
+
+def test_landings_that_a_tolerance_ends_have_the_same_bits_alone_and_in_a_batch() -> None:
+    case = landing(1e5)
+    sim = simulator(case, torch.float32, GPU, solver=pd.Multilevel(), iterations=96, tolerance=1e-3)
+    factor = torch.linspace(0.5, 1.5, 64, device=GPU)[:, None, None]
+    state = state_of(case, sim, 64)
+    state = pd.State(state.positions, factor * state.velocities)
+    together, info = sim(state, return_info=True)
+    assert len(set(info.iterations.tolist())) > 4
+    for i in (0, 13, 63):
+        alone = sim(pd.State(state.positions[i : i + 1], state.velocities[i : i + 1]))
+        assert same_bits(alone, pd.State(together.positions[i : i + 1], together.velocities[i : i + 1]))
 
 
 @pytest.mark.parametrize("cells", [13, 17])

@@ -155,7 +155,10 @@ def plate(youngs: float) -> tuple[pd.Simulator, pd.State]:
 
 @pytest.mark.parametrize("solver", [pd.Multilevel("lbfgs"), pd.Multilevel()], ids=["lbfgs", "corotated"])
 def test_many_contacts_do_not_stall_it(solver: pd.Multilevel) -> None:
-    """Where M fails again and again it becomes accelerated Jacobi: one iteration after four failures left 0.97."""
+    """Of slivers, where M fails again and again: a single Jacobi iteration after four failures left 0.97 in 256.
+
+    "lbfgs" becomes accelerated Jacobi there. "corotated" shortens its trials, which gets further.
+    """
     sim, state = plate(3e4)
     first = state.positions + state.velocities / 60
 
@@ -170,9 +173,15 @@ def test_many_contacts_do_not_stall_it(solver: pd.Multilevel) -> None:
         return float((positions - solution).norm() / (first - solution).norm())
 
     found, back = after(solver, 256)
-    assert error(found) < 4 * error(after(pd.Chebyshev(), 256)[0])
-    assert error(found) < 0.1
-    assert back < 40
+    jacobi = error(after(pd.Chebyshev(), 256)[0])
+    if solver == pd.Multilevel():
+        assert error(found) < jacobi / 4
+        assert error(after(solver, 64)[0]) < 0.15
+        assert back < 128
+    else:
+        assert error(found) < 4 * jacobi
+        assert error(found) < 0.1
+        assert back < 40
 
 
 @pytest.mark.parametrize("name", ["ground", "sphere", "sliding"])

@@ -7,9 +7,9 @@ logarithm of that, with constants fitted to random scenes and to beams of 936 to
 without contacts nine of ten needed 0.3 to 1.5 times the forecast, meshes with slivers the least, on 65 with contacts
 Chebyshev 0.6 to 1.9 times (`benchmarks/forecast.py`).
 
-With contacts `Multilevel` may need what Chebyshev does, a bound: a stiff body that lands falls to accelerated Jacobi
-iterations, and nothing says beforehand which step that is. Those 65 needed 0.01 to 0.8 of it, half of them 0.2 or less.
-`Simulator.tune` measures instead.
+With contacts the forecast of `Multilevel` is that of the step in which a stiff body of slivers lands on a face: a
+seventh of what Chebyshev needs, but two square roots of it at least, which even meshes need. With friction, and
+without its small problem, it is a bound: what Chebyshev needs. `Simulator.tune` measures instead.
 
 Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
 """
@@ -43,6 +43,8 @@ __all__ = [
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
 # iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
 _LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
+# of Multilevel where something lands, in those of Chebyshev for an error of 1e-3 and in their square roots
+_LANDING_SHARE, LANDING_ROOTS = 1.0 / 7.0, 2.0
 _MOST = 10_000
 FAR_TOO_FEW = 0.1  # error that is left
 
@@ -134,13 +136,17 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     theta, rho = numbers["relaxation"], numbers["rho"]
     slowest = 1.0 - theta * spectrum.slow
     limit = 0.0
-    # what contacts keep from working is mostly accelerated Jacobi
     if isinstance(solver, (Chebyshev, Multilevel)):
         limit = _limit(rho if rho > 0.0 else slowest)
     # the error has little of the modes at the upper end of the spectrum, [mu, 1], but half of it of the middle
     middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0
     left = max(_decay(slowest, limit), _decay(middle, limit), 1e-3)
-    return Forecast(-math.log(min(left, 1.0 - 1e-15)))
+    rate = -math.log(min(left, 1.0 - 1e-15))
+    lands = isinstance(solver, Multilevel) and solver.outer == "corotated" and not has_friction(sim)
+    if lands:
+        plain = math.log(1e3) / rate
+        rate = math.log(1e3) / max(_LANDING_SHARE * plain, LANDING_ROOTS * math.sqrt(plain))
+    return Forecast(rate)
 
 
 def is_bound(sim: Model) -> bool:

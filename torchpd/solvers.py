@@ -140,9 +140,11 @@ class Multilevel:
     vertices is A^-1 itself unless it comes in batches (`Simulator(batch=...)`). The scene takes longer to compile.
 
     Every iterate is judged by its energy before the next one starts from it. After four failures in a row come two
-    accelerated Jacobi iterations, then four, eight and so on, until M serves again; with friction eight after two
-    failures, then sixteen. What makes trials fail is a stiff face that lands, since M learns of a contact only when a
-    trial has found it. "lbfgs" and "momentum" know nothing of contacts; with friction "lbfgs" gives way at once.
+    accelerated Jacobi iterations, then four, eight and so on, until M serves again. Where contacts may hold a body
+    trials of "corotated" that fail are shortened instead: M learns of a contact only when a trial has found it, and a
+    stiff face that lands hovers within micrometres of many. Twelve failures bring Jacobi iterations there, and with
+    friction the first two, three times, because unsettled normal forces lead astray. "lbfgs" and "momentum" know
+    nothing of contacts; with friction "lbfgs" gives way at once.
     M is made of the material when the simulator is, see `Simulator.prepare_solver`; an environment that differs gets
     M / s, s its largest ratio of inertia or stiffness to that material. `Info.rho` says how unlike the two are.
 
@@ -151,7 +153,8 @@ class Multilevel:
             usual one, is "lbfgs" with another M for motions in which whole parts of a body turn, for which A is far too
             stiff: on the rigid motions of four overlapping groups of vertices it has the inverse of the energy's second
             derivative, that of corotated elasticity, with springs where contacts hold vertices. That is made once in
-            most steps, after three iterations, for the time of one or two more. Bodies that bend or spin need a third
+            most steps, after three iterations, or one where there are contacts, for the time of one or two more; in
+            steps that land, after each that leads far. Bodies that bend or spin need a third
             to two thirds of the iterations of "lbfgs", bodies that rest or slide with friction a tenth to a third,
             others as many.
         relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8. "corotated" takes half

@@ -51,11 +51,11 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
       const bool rough = Lanes::lane(friction, lane) > 0;
-      outer_[lane].begin(misfit_[lane], rough, corotates_, energy_noise<T>(),
+      outer_[lane].begin(misfit_[lane], Touching, rough, corotates_, energy_noise<T>(),
                          this->stop_[lane].fall);
       pairs_[lane] = {};
       made_[lane] = doubted_[lane] = 0;
-      has_[lane] = false;
+      has_[lane] = holds_[lane] = false;
       if (corotates_) corotation_.forget(lane);
       schedule_[lane].rho = misfit_[lane].spread;
     }
@@ -113,7 +113,13 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       // directions are those of another step at first
       const Value s = k == 0 ? none_ : let_through(i, change);
       const Value y = k == 0 ? none_ : let_through(i, o_.fresh[i] - o_.pull[i]);
-      if constexpr (Touching) keep_directions(i);
+      if constexpr (Touching) {
+        for (int a = 0; corotates_ && a < 3; ++a) {
+          const Value d = Lanes::value(o_.fresh_free[i].row[a]) - Lanes::value(o_.free[i].row[a]);
+          sum[2 * history + 3] = multiply_add(d, d, sum[2 * history + 3]);
+        }
+        keep_directions(i);
+      }
       // what momentum goes on along
       w_.before[i] = choose(o_.base[i], w_.before[i]);
       o_.base[i] = choose(w_.u[i], o_.base[i]);
@@ -137,6 +143,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     double total[dots];
     for (int lane = 0; lane < width; ++lane) {
       add_up(lane, total);
+      outer_[lane].walk(total[2 * history]);
+      if (outer_[lane].accepted && !(total[2 * history + 3] == 0)) holds_[lane] = false;
       stop(lane, k, total[2 * history], total[2 * history + 1]);
       if (!lbfgs_) continue;
       double with[history];
@@ -146,7 +154,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       }
       pairs_[lane].valid[newest_] = false;
       if (k > 0) pairs_[lane].add(newest_, with, total[2 * history], total[2 * history + 2]);
-      if (outer_[lane].plain || outer_[lane].diagonal) pairs_[lane].clear();
+      if (!outer_[lane].teaches()) pairs_[lane].valid[newest_] = false;
+      if (outer_[lane].forgets()) pairs_[lane].clear();
       pairs_[lane].first_loop(newest_);
     }
     team_.barrier();
@@ -244,18 +253,21 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   void corotate(int k) {
     bool asks[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
-      const TurningPlan plan(k, made_[lane], outer_[lane].restarts - doubted_[lane], Touching,
-                             is_held(lane));
+      Outer& outer = outer_[lane];
+      const TurningPlan plan(k, made_[lane], outer.restarts - doubted_[lane], Touching,
+                             outer.turns());
       asks[lane] = false;
       // alone it would not have come here
-      if (outer_[lane].diagonal) continue;
+      if (outer.diagonal) continue;
       asks[lane] = !done_[lane] && plan.make;
       some = some || asks[lane];
       if (plan.forget) corotation_.forget(lane);
       has_[lane] = asks[lane] || (has_[lane] && !plan.forget);
       if (!asks[lane]) continue;
       ++made_[lane];
-      doubted_[lane] = outer_[lane].restarts;
+      doubted_[lane] = outer.restarts;
+      outer.strayed = 0;
+      holds_[lane] = false;
     }
     double scales[width];
     for (int lane = 0; lane < width; ++lane) scales[lane] = outer_[lane].scale;
@@ -263,8 +275,10 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     corotated_ = std::any_of(has_, has_ + width, [](bool has) { return has; });
     if constexpr (Touching) {
       bool holds[width];
-      for (int lane = 0; lane < width; ++lane)
-        holds[lane] = has_[lane] && !done_[lane] && !outer_[lane].diagonal;
+      for (int lane = 0; lane < width; ++lane) {
+        holds[lane] = has_[lane] && !holds_[lane] && !done_[lane] && !outer_[lane].diagonal;
+        holds_[lane] = holds_[lane] || holds[lane];
+      }
       if (corotated_) corotation_.hold(o_.free, holds, scales);
     }
   }
@@ -414,6 +428,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       strangers_ = false;  // strangers: vertices that M knows too little of, in any lane
   int newest_ = 0, iteration_ = 0;
   bool has_[width] = {};                        // a small problem
+  bool holds_[width] = {};                      // and in it what contacts hold at the base
   int made_[width] = {}, doubted_[width] = {};  // times, and failed trials by then
   Corotation<Lanes> corotation_;
   Value none_ = Lanes::value({Real(T(0)), Real(T(0)), Real(T(0))});

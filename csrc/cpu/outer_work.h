@@ -13,7 +13,7 @@ struct OuterWork {
   using Value = typename Lanes::Value;
   using Wide = typename Lanes::Wide;
 
-  static constexpr int dots = 2 * history + 3;  // sums that one pass may make
+  static constexpr int dots = 2 * history + 4;  // sums that one pass may make
   static constexpr int chunk = 256;             // vertices that one of them covers
 
   Cycle<Lanes> cycle;

@@ -33,7 +33,7 @@ class MultilevelRunner {
     trusted_ = T(misfit.trusted);
     if (threadIdx.x == 0) {
       const bool stops = w_.settings().tolerance > 0;
-      c_.outer.begin(misfit, w_.contacts.friction() > T(0), corotates_, energy_noise<T>(),
+      c_.outer.begin(misfit, Touching, w_.contacts.friction() > T(0), corotates_, energy_noise<T>(),
                      stops ? w_.progress.stop.fall : 0);
       c_.pairs = {};
       c_.done = false;
@@ -87,6 +87,7 @@ class MultilevelRunner {
     }
     __syncthreads();
     const bool moves = c_.accepted;
+    if (moves && !(c_.total[dots_held] == 0)) holds_ = false;
     base_ = moves ? w_.v.u : m_.base;
     pull_ = moves ? m_.fresh : m_.pull;
     free_ = moves ? m_.fresh_free : m_.free;
@@ -96,7 +97,10 @@ class MultilevelRunner {
   PD_DEVICE void learn(int k) {
     if (threadIdx.x < warp_size) {
       if (lbfgs_) remember(k);
-      if (threadIdx.x == 0) stop(k, c_.total[dots_change], c_.total[dots_way]);
+      if (threadIdx.x == 0) {
+        c_.outer.walk(c_.total[dots_change]);
+        stop(k, c_.total[dots_change], c_.total[dots_way]);
+      }
       __syncwarp();
       if (lbfgs_) PairLanes(c_.pairs, newest_).first_loop();
     }
@@ -217,20 +221,24 @@ class MultilevelRunner {
   PD_DEVICE bool is_held() const { return Touching && made_ > 0 && corotation_.control().held; }
 
   PD_DEVICE void corotate() {
-    const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_, Touching, is_held());
+    const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_, Touching,
+                           c_.outer.turns());
     const CorotationInput<T> in = {w_.v.x, w_.v.u, w_.v.target, base_, w_.weights};
     if (plan.forget) corotated_ = false;
     if (plan.make) {
       ++made_;
       doubted_ = c_.outer.restarts;
       corotated_ = true;
+      holds_ = false;
       team_ = make_corotation(in, m_.corotation, team_, shared_, call_.shared_corotation,
                               c_.outer.scale, corotation_.with_plan(call_.plan()));
+      if (threadIdx.x == 0) c_.outer.strayed = 0;
     }
     if constexpr (Touching) {
-      if (corotated_)
+      if (corotated_ && !holds_)
         team_ = hold_corotation(in, free_, m_.corotation, team_, shared_, c_.outer.scale,
                                 corotation_.control());
+      holds_ = corotated_;
     }
   }
 
@@ -272,6 +280,12 @@ class MultilevelRunner {
       if (k == 0 || k == w_.settings().iterations) return;
       const Vec3<T> change = u - vec3(m_.base[i]);
       sum[dots_change] = dot(change, change);
+      if constexpr (Touching) {
+        for (int a = 0; corotates_ && a < 3; ++a) {
+          const Vec3<T> d = m_.fresh_free[i].row[a] - m_.free[i].row[a];
+          sum[dots_held] += dot(d, d);
+        }
+      }
       if (!lbfgs_) return;
       const Vec3<T> fresh = vec3(m_.fresh[i]), pull = vec3(m_.pull[i]);
       const Vec3<T> s = let_through(i, change), y = let_through(i, fresh - pull);
@@ -395,7 +409,8 @@ class MultilevelRunner {
     if (k > 0)
       pairs.admit(newest_, c_.total[dots_with + newest_], c_.total[dots_change],
                   c_.total[dots_turn]);
-    if (c_.outer.plain || c_.outer.diagonal) pairs.clear();
+    if (!c_.outer.teaches()) pairs.valid[newest_] = false;
+    if (c_.outer.forgets()) pairs.clear();
   }
 
   // the second loop of L-BFGS, and the slope g.d
@@ -497,6 +512,7 @@ class MultilevelRunner {
   DeviceCycle<T> cycle_;
   std::byte* shared_;
   bool lbfgs_, corotates_, corotated_ = false, strangers_;
+  bool holds_ = false;  // the small problem knows what contacts hold at the base
   DeviceCorotation<T> corotation_;
   T trusted_;
   // where it stands: of the trial that was accepted until the next one goes out

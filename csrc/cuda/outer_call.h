@@ -9,10 +9,11 @@ namespace pd::inline PD_TARGET {
 
 // Sums of a pass over the vertices at a trial u: what the shared ones have of the energy and of work against friction, in the
 // precision of the simulation, whose rounding the judgement allows for; s_j . y and s_j . g of the pairs j, the newest one too;
-// s . g of that with g at the base; |u - base|^2, |u|^2 from the target, and |y|^2.
+// s . g of that with g at the base; |u - base|^2, |u|^2 from the target, |y|^2, and how much what contacts leave free differs.
 constexpr int dots_energy = 0, dots_with = 2, dots_pulled = dots_with + history;
 constexpr int dots_back = dots_pulled + history, dots_change = dots_back + 1;
-constexpr int dots_way = dots_change + 1, dots_turn = dots_way + 1, outer_dots = dots_turn + 1;
+constexpr int dots_way = dots_change + 1, dots_turn = dots_way + 1;
+constexpr int dots_held = dots_turn + 1, outer_dots = dots_held + 1;
 constexpr int most_sums = outer_dots > turning_modes ? outer_dots : turning_modes;  // of any pass
 constexpr int ranges_count = 2;   // that a round of Ranges compares
 constexpr int most_chunks = 640;  // of vertices, whose sums every block adds up

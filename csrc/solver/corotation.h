@@ -31,8 +31,10 @@ constexpr int turning_pairs = turning_modes * (turning_modes + 1) / 2;
 constexpr double turning_noise = 1e-6;  // of Ac: modes that depend on others
 constexpr int turning_begins = 3;       // iterations before: the first iterates are too far away,
 constexpr int touching_begins = 1;      // but where contacts may hold M leads far astray without
-constexpr int turning_doubts = 3;       // failed trials that make it out of date
-constexpr int turning_most = 3;         // times that a step makes it, the first one too
+
+// Without contacts:
+constexpr int turning_doubts = 3;  // failed trials that make it out of date
+constexpr int turning_most = 3;    // times that a step makes it, the first one too
 
 // Where the product of two modes stands, i not before j: group by group, the modes of one with those of the other.
 PD_HD constexpr int turning_pair(int i, int j) {
@@ -50,15 +52,15 @@ PD_HD constexpr bool strain_has(int mode, int c) {
 }
 
 // Whether the small problem is to be made at iteration k, which it was `made` times before, `failed` trials ago. If not, whether
-// it is to be forgotten: a step that goes on failing does without, but where contacts, which make it fail, hold it now.
+// it is to be forgotten: a step that goes on failing does without, but for contacts. There it is made anew where `turns`.
 struct TurningPlan {
   bool make, forget;
 
-  PD_HD TurningPlan(int k, int made, int failed, bool touching, bool held) {
-    const bool doubted = made > 0 && failed >= turning_doubts;
-    make = made > 0 ? doubted && made < turning_most
-                    : k >= (touching ? touching_begins : turning_begins);
-    forget = doubted && !make && !held;
+  PD_HD TurningPlan(int k, int made, int failed, bool touching, bool turns) {
+    const bool doubted = made > 0 && failed >= turning_doubts && !touching;
+    const int begins = touching ? touching_begins : turning_begins;
+    make = made == 0 ? k >= begins : touching ? turns : doubted && made < turning_most;
+    forget = doubted && !make;
   }
 };
 
