@@ -9,7 +9,8 @@ Chebyshev 0.6 to 1.9 times (`benchmarks/forecast.py`).
 
 With contacts the forecast of `Multilevel` is that of the step in which a stiff body of slivers lands on a face: a
 seventh of what Chebyshev needs, but two square roots of it at least, which even meshes need. With friction, and
-without its small problem, it is a bound: what Chebyshev needs. `Simulator.tune` measures instead.
+without its small problem, it is a bound: what Chebyshev needs. Nine of ten of those 65 scenes, most of which do not
+land in the step that is measured, needed 0.1 to 1.15 of it, half of them 0.5. `Simulator.tune` measures instead.
 
 Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
 """
