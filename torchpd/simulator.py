@@ -48,7 +48,7 @@ class Simulator(Model):
             expected to leave a tenth of the error or more an `UnsolvedWarning` says so; `print(sim)` tells for any.
         solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later. None is Chebyshev.
             "auto" takes Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner on the device,
-            Chebyshev in scenes with contacts, and as many iterations as that takes unless they are given, four times as
+            Chebyshev where there is friction, and as many iterations as that takes unless they are given, four times as
             many where a `tolerance` ends easy steps; `print(sim)` says why. It chooses anew when the simulator moves to
             another device and in `prepare_solver`.
         dtype: precision, torch.float32 or torch.float64.
