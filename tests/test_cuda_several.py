@@ -125,7 +125,7 @@ def test_many_pieces_share_a_block() -> None:
     case = crowd()
     sim = on_gpu(case, torch.float32, "block", iterations=6)
     assert sim.plan.size("most_pairs") <= _C.most_sharing_pairs
-    assert sim.plan.size("pieces") == 40
+    assert sim.plan.size("pieces") == 41
     everything = unlike(sim, 3000)
     together = some(sim, everything, slice(None))
     for first, last in ((0, 1), (17, 400), (2999, 3000)):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from cases import box
 from device_plans import (  # noqa: F401  (fixtures)
+    BLOCK,
+    GRID,
     LANES,
     SENDERS,
     SIZES,
@@ -210,3 +214,19 @@ def test_parts_hold_each_free_vertex_once(plan: Arrays, values: SceneValues) -> 
     pairs = np.unique(np.stack([plan.slot_piece[moving], values.component[user[moving]]]), axis=1)
     np.testing.assert_array_equal(pairs[0], np.arange(len(plan.piece_start) - 1))  # one component each
     assert len(np.unique(pairs[1])) == len(pairs[1])
+
+
+@pytest.mark.parametrize("kernel", [BLOCK, GRID, STREAM])
+def test_parts_of_a_block_keep_all_its_warps_busy(case: tuple[str, int], kernel: int) -> None:
+    """64 vertices at most, in order, and full but for the last of a piece in a patch."""
+    plan = arrays_of(case, kernel)
+    sizes = np.diff(plan.part_start)
+    for first, last in itertools.pairwise(plan.patch_part):
+        pieces = plan.slot_piece[plan.part_slot[plan.part_start[first:last]]]
+        for piece in np.unique(pieces):
+            mine = sizes[first:last][pieces == piece]
+            if kernel == BLOCK:
+                assert (mine[:-1] == 64).all()
+                assert mine[-1] <= 64
+            else:
+                assert len(mine) == 1

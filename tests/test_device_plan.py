@@ -58,6 +58,7 @@ def test_kernels_differ_in_rest_shapes_and_in_how_patches_exchange_alone(case: t
     """So that what is shown of the plan for one of them holds for all but a cluster: see test_cluster_plan.py."""
     plans = {kernel: arrays_of(case, kernel) for kernel in KERNELS if kernel != CLUSTER}
     own = {"sizes", "pair_rest", "pair_factor", "slot_rest", "slot_fixed", "patch_unit", "slot_sender", "shared_place"}
+    parts = {"patch_part", "part_start", "piece_start", "piece_part"}  # of 64 vertices at most in a block
     entries = {"pair_corner": 65535, "slot_row": 32767 << 16}  # what is not an entry, which a pipeline has elsewhere
     for kernel, plan in plans.items():
         assert len(plan.slot_copy) == 0
@@ -65,7 +66,7 @@ def test_kernels_differ_in_rest_shapes_and_in_how_patches_exchange_alone(case: t
             array, expected = getattr(plan, row.name), getattr(plans[GRID], row.name)
             if kernel == STREAM and row.name in entries:
                 array, expected = array & entries[row.name], expected & entries[row.name]
-            if row.name not in own:
+            if row.name not in own and not (kernel == BLOCK and row.name in parts):
                 np.testing.assert_array_equal(array, expected, row.name)
     assert len(plans[BLOCK].slot_sender) == len(plans[STREAM].slot_sender) == 0
     assert len(plans[BLOCK].shared_place) == len(plans[GRID].shared_place) == 0

@@ -102,7 +102,7 @@ def test_springs_that_it_does_not_know_leave_it_positive() -> None:
 
     stiff = scene(1e8)
     ready = simulator(stiff, torch.float64, solver=pd.Multilevel(), iterations=600)
-    solution, first = displacement(ready, ready(state_of(stiff, ready))), stiff.problem().first_iterate()
+    solution, first = displacement(ready, ready(state_of(stiff, ready))), stiff.problem().course()
     sim = simulator(scene(1.0), torch.float64, solver=pd.Multilevel(), iterations=80)
     springs = torch.ones(9, len(sim.pin_stiffness), dtype=torch.float64)
     springs[4], springs[7] = 1e8, 1e-3

@@ -152,11 +152,15 @@ def test_shared_vertices_list_all_their_slots_in_patch_order(plan: Plan) -> None
         assert len(mine) >= 2
 
 
-def test_free_pieces_are_numbered(plan: Plan, values: SceneValues) -> None:
+def test_loose_pieces_are_numbered(plan: Plan, values: SceneValues) -> None:
     order = plan.vertex_order.numpy()
     group = np.empty(len(order), dtype=np.int64)
     group[order] = plan.vertex_group.numpy()
-    held = np.isin(values.component, values.component[values.pin_vertices])
+    hard = values.pin_vertices[np.isinf(values.pin_stiffness)]
+    held = np.zeros(len(order), dtype=bool)
+    for number in np.unique(values.component[hard]):
+        points = values.rest_positions[hard[values.component[hard] == number]]
+        held |= (values.component == number) & (np.linalg.matrix_rank(points - points[0]) > 1)
     np.testing.assert_array_equal(group < 0, held)
     sizes = plan.group_size.numpy()
     np.testing.assert_array_equal(np.bincount(group[group >= 0], minlength=len(sizes)), sizes)

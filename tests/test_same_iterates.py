@@ -101,6 +101,42 @@ def restarting(cells: tuple[int, int, int] = (10, 2, 2), youngs: float = 100.0, 
     return stirred(Case(scene, vertices, 0.0 * vertices, 1.0 / 60.0), size=size)
 
 
+def sliding(*planes: pd.Ground, spin: float = 0.0) -> Case:
+    """A hard block on one of the planes at least, which its targets lie below: it moves along and turns on the spot."""
+    case = contact_block(*planes, velocity=(1.0, 0.0, 0.3), gravity=(2.0, -9.8, 1.0), youngs=1e6)
+    x = case.positions
+    turning = np.cross([0.0, spin, 0.0], x - x.mean(axis=0))
+    return stirred(Case(case.scene, x, case.velocities + turning, case.time_step), size=1e-5)
+
+
+def hung(*held: int, stiffness: float | None = None, ground: float = -9.0) -> Case:
+    """A hard bar that swings, under forces, from these vertices, which move."""
+    rng = np.random.default_rng(3)
+    vertices, tets = box((0.6, 0.1, 0.1), (6, 1, 1))
+    body = pd.Solid(pd.TetMesh(vertices, tets), 2e5)
+    pin = pd.Pin(body, list(held)) if stiffness is None else pd.Pin(body, list(held), stiffness=stiffness)
+    scene = pd.Scene(body, pin, pd.Gravity(), pd.Ground(ground))
+    pins = scene.values().pin_targets
+    extras = {"forces": rng.standard_normal(vertices.shape), "pin_targets": pins + [0.0, 0.01, 0.0]}
+    return stirred(Case(scene, vertices, 0.0 * vertices, 1.0 / 60.0, extras=extras), size=1e-4)
+
+
+def among_planes() -> Case:
+    """Three hard blocks among eleven planes: one touches the tenth, one a wall that it slides to, one nothing."""
+    vertices, tets = box((0.3, 0.2, 0.2), (3, 2, 2))
+    places = ((0.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 0.0, 2.0))
+    blocks = [pd.Solid(pd.TetMesh(vertices + place, tets), 1e6) for place in places]
+    above = [pd.Ground(-10.0 - k, normal=(0.0, 1.0, 0.0)) for k in range(8)]
+    walls = [pd.Ground(1e-4, normal=(0.0, 0.02, -1.0)), pd.Ground(-0.5, normal=(-1.0, 0.0, 0.0))]
+    scene = pd.Scene(*blocks, pd.Gravity(), above[0], pd.Ground(0.0), *above[1:], *walls)
+    x = scene.values().rest_positions
+    v = np.repeat([[1.0, 0.0, 4.0], [1.0, 0.0, 0.0], [14.0, 0.0, -1.0]], len(vertices), axis=0)
+    return stirred(Case(scene, x, v, 1.0 / 60.0), size=1e-5)
+
+
+RESTARTS = pd.Chebyshev(rho=0.9999)
+
+
 RESTARTS = pd.Chebyshev(rho=0.9999)
 CASES: dict[str, Callable[[], Case]] = {
     "pins, velocity start": lambda: pinned("velocity"),
@@ -113,6 +149,15 @@ CASES: dict[str, Callable[[], Case]] = {
     "ball, friction": lambda: on_ball(0.5, 0.0),
     "moving ball, friction": lambda: on_ball(0.5, 0.01),
     "corner": in_a_corner,
+    "turning on the ground": lambda: sliding(pd.Ground(0.0, normal=(0.02, 1.0, 0.0)), spin=3.0),
+    "sliding against friction": lambda: sliding(pd.Ground(0.0, friction=0.3)),
+    "sliding, turning, friction": lambda: sliding(pd.Ground(0.0, friction=0.3), spin=3.0),
+    "sliding along an edge": lambda: sliding(pd.Ground(0.0), pd.Ground(-0.3, normal=(-1.0, 0.1, 0.0)), spin=3.0),
+    "among many planes": among_planes,
+    "hung from a point": lambda: hung(0),
+    "hung from an edge": lambda: hung(0, 1),
+    "hung from an edge, on the ground": lambda: hung(0, 1, ground=-1e-4),
+    "hung from springs": lambda: hung(0, 1, 2, stiffness=300.0),
 }
 # Rounding of an iterate: some fifty operations an iteration, and the extrapolation (omega < 2) lets differences grow
 # like k^2 at worst: 50 * 20^2 u is 2e-12 in float64 and 1e-3 in float32. Errors of random sign stay well below that; a

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import _C
-from .plan import KERNELS, compiling, free_pieces, internal_numbers
+from .plan import KERNELS, compiling, internal_numbers, loose_pieces
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 
@@ -41,7 +41,7 @@ def compile_device_plan(
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
     if kernel not in range(len(KERNELS)):
         raise ValueError(f"kernel must be 0, 1, 2 or 3, got {kernel}")
-    piece, _ = free_pieces(values)
+    piece, _ = loose_pieces(values)
     with compiling(len(values.tets), progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_device_plan(
             values.rest_positions, values.tets, patches, kernel, dtype == torch.float32, piece, advance

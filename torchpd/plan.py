@@ -17,7 +17,7 @@ from . import _C
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, PLAN_TABLE, PlanRow
 
-__all__ = ["KERNELS", "Plan", "any_of", "compile_plan", "compiling", "free_pieces", "internal_numbers", "kernel_of"]
+__all__ = ["KERNELS", "Plan", "any_of", "compile_plan", "compiling", "internal_numbers", "kernel_of", "loose_pieces"]
 
 _WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
 # by their number in the `sizes` of a GPU's plan
@@ -133,14 +133,25 @@ def any_of(names: Sequence[str]) -> str:
     return f"{', '.join(before)} or {last}" if before else last
 
 
-def free_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Number of the unpinned piece that each vertex belongs to (-1: pinned), and the size of each such piece."""
+def loose_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Number of the piece that each vertex belongs to and that can move rigidly (-1: it cannot), and each one's size.
+
+    Soft pins leave a connected piece all rigid motions, hard ones turns where they lie at a point or along a line.
+    """
     pieces = int(values.component.max()) + 1
-    free = np.ones(pieces, dtype=bool)
-    free[values.component[values.pin_vertices]] = False
-    number = np.where(free, np.cumsum(free) - 1, -1)
+    loose = np.ones(pieces, dtype=bool)
+    hard = values.pin_vertices[np.isinf(values.pin_stiffness)]
+    points, of = values.rest_positions[hard], values.component[hard]
+    count = np.maximum(np.bincount(of, minlength=pieces), 1)[:, None]
+    mean = np.stack([np.bincount(of, weights=axis, minlength=pieces) for axis in points.T], axis=1) / count
+    arms = points - mean[of]
+    spread = np.zeros((pieces, 3, 3))
+    np.add.at(spread, of, arms[:, :, None] * arms[:, None, :])
+    size = np.linalg.eigvalsh(spread)
+    loose[size[:, 1] > 1e-8 * size[:, 2]] = False
+    number = np.where(loose, np.cumsum(loose) - 1, -1)
     group = number[values.component].astype(np.int32)
-    return group, np.bincount(group[group >= 0], minlength=int(free.sum())).astype(np.int32)
+    return group, np.bincount(group[group >= 0], minlength=int(loose.sum())).astype(np.int32)
 
 
 def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
@@ -182,7 +193,7 @@ def compile_plan(
             advance,
         )
     internal = internal_numbers(arrays["vertex_order"])
-    group, group_size = free_pieces(values)
+    group, group_size = loose_pieces(values)
     arrays["vertex_group"] = group[arrays["vertex_order"]]
     arrays["group_size"] = group_size
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)

@@ -225,14 +225,14 @@ class StepProblem:
         return csr_array(diags_array(np.repeat(self.weight, 3)) + wide.T @ (inner @ wide))
 
     def first_iterate(self, start: str | Array = "velocity") -> Array:
-        """u_0: "velocity" h v, "inertial" s, or positions [V, 3]; pins at their targets, momentum, then contact."""
+        """u_0: "velocity" h v, "inertial" s, or positions [V, 3]; pins at their targets, contact, then momentum."""
         if isinstance(start, str):
             guesses = {"velocity": self.time_step * self.velocities, "inertial": self.target}
             if start not in guesses:
                 raise ValueError(f'start must be "velocity", "inertial" or positions [V, 3], got "{start}"')
-            guess = self.shift_momentum(self._hold(guesses[start]))
-        else:
-            guess = self._hold(np.asarray(start, dtype=np.float64) - self.positions)
+            guess = self._hold(guesses[start])
+            return self.align(self.project(guess, guess))
+        guess = self._hold(np.asarray(start, dtype=np.float64) - self.positions)
         return self.project(guess, guess)
 
     def course(self) -> Array:
@@ -243,34 +243,85 @@ class StepProblem:
     def _hold(self, displacement: Array) -> Array:
         return np.where(self.free[:, None], displacement, self.target)
 
-    @cached_property
-    def _shiftable(self) -> Mask:
-        """Vertices of connected components that no pin holds, hard or soft."""
-        held = np.unique(self.values.component[self.values.pin_vertices])
-        return ~np.isin(self.values.component, held)
+    def align(self, displacement: Array) -> Array:
+        """Move every component as a rigid body to where E is least, as far as pins and contacts leave it to go there.
 
-    def shift_momentum(self, displacement: Array) -> Array:
-        """Translate every unpinned component by sum a (s - u) / sum a, the minimum of E along translations.
-
-        A component that would then touch or enter a contact stays: its momentum is not its own.
+        E is then sum a / 2 |x + u - (x + s)|^2, so that it is a weighted fit of two sets of points (Kabsch 1976). Hard
+        pins at a point or along a line leave turns about that; smooth planes the turn about their normal and the way
+        along all of them; a plane with friction the way along it, shortened as by Coulomb; other contacts nothing.
         """
-        component, count = self.values.component, int(self.values.component.max()) + 1
-        lack = self.weight[:, None] * (self.target - displacement)
-        total = np.bincount(component, weights=self.weight, minlength=count)
-        mean = np.stack([np.bincount(component, weights=axis, minlength=count) for axis in lack.T], axis=1)
-        shifted = displacement + (mean / total[:, None])[component]
-        touching = np.isin(component, component[self.smallest_gap(shifted) <= 0.0])
-        return np.where((self._shiftable & ~touching)[:, None], shifted, displacement)
+        moved = displacement.copy()
+        for piece in range(int(self.values.component.max()) + 1):
+            of = self.values.component == piece
+            moved[of] = self._aligned(displacement, of)
+        return np.where(self.free[:, None], moved, displacement)
+
+    def _aligned(self, displacement: Array, of: Mask) -> Array:
+        """Of one component, [n, 3]."""
+        u, weight = displacement[of], self.weight[of, None] / self.weight[of].sum()
+        y, z = self.positions[of] + u, self.positions[of] + self.target[of]
+        middle, lag = (weight * y).sum(axis=0), (weight * (z - y)).sum(axis=0)
+        covariance = (weight * (z - middle - lag)).T @ (y - middle)
+        pinned = ~self.free[of]
+        turn = nearest_rotation(covariance)
+        if pinned.any():
+            at_rest = self.values.rest_positions[of][pinned]
+            if np.linalg.matrix_rank(at_rest - at_rest.mean(axis=0), tol=1e-6) > 1:
+                return u
+            pivot = y[pinned].mean(axis=0)
+            _, sizes, directions = np.linalg.svd(y[pinned] - pivot, full_matrices=True)
+            apart = 1e-4 * np.sqrt((weight * (y - middle) ** 2).sum() * pinned.sum())
+            if (sizes[1:] > apart).any():
+                return u
+            covariance = (weight * (z - pivot)).T @ (y - pivot)
+            turn = _turn_about(directions[0], covariance) if sizes[0] > apart else nearest_rotation(covariance)
+            middle, lag = pivot, np.zeros(3)
+        turned = (y - middle) @ turn.T + middle + lag
+        far = self.values.planes[8:]
+        if _least_gap(turned, far, self.sphere_centers, self.values.spheres) <= 0.0:
+            return u
+        touched = [bool((turned @ plane[:3] <= plane[3]).any()) for plane in self.values.planes[:8]]
+        if not any(touched):
+            return u + turned - y
+        if pinned.any():
+            return u
+        planes = self.values.planes[:8][touched]
+        turn, shift = np.eye(3), self._way_on(planes, y, u, lag)
+        if np.linalg.matrix_rank(planes[:, :3], tol=1e-6) == 1 and not planes[:, 4].any():
+            turn = _turn_about(planes[0, :3], covariance)
+        on = y + (y - middle) @ (turn - np.eye(3)).T + shift
+        others = np.concatenate([self.values.planes[:8][~np.array(touched)], far])
+        fits = _least_gap(on, others, self.sphere_centers, self.values.spheres) > 0.0
+        return np.asarray(u + on - y if fits else u)
+
+    @staticmethod
+    def _way_on(planes: Array, y: Array, u: Array, lag: Array) -> Array:
+        """How far a component at y that touches planes goes along all of them of the way `lag` to its targets [3]."""
+        normals, friction = planes[:, :3], planes[:, 4]
+        _, sizes, directions = np.linalg.svd(normals)
+        span = directions[: int((sizes > 1e-6).sum())]
+        along = lag - span.T @ (span @ lag)
+        if not friction.any():
+            return along if len(span) < 3 else np.zeros(3)
+        across = float(lag @ normals[0])
+        lies = y @ normals[0] - planes[0, 3] < -0.01 * across
+        if len(planes) > 1 or not lies.any():
+            return np.zeros(3)
+        slips = u[lies] - np.outer(u[lies] @ normals[0], normals[0])
+        free, rub = slips.mean(axis=0) + along, -friction[0] * across
+        left = np.linalg.norm(free) - rub
+        if left <= 0.0:  # friction stops it, unless it holds a vertex already
+            slides = 4.0 * (slips**2).sum(axis=1).min() > (slips.mean(axis=0) ** 2).sum()
+            return np.asarray(-slips.mean(axis=0) if slides else np.zeros(3))
+        way = left * free / np.linalg.norm(free) - slips.mean(axis=0)
+        # slips that differ leave a doubt about where friction acts: what is within it is left to the iterations
+        doubt = rub * min(2.0, np.sqrt(slips.var(axis=0).sum()) / left)
+        return np.asarray(max(0.0, 1.0 - doubt / max(np.linalg.norm(way), 1e-300)) * way)
 
     def smallest_gap(self, displacement: Array) -> Array:
         """Distance of every vertex to the nearest contact surface, negative inside [V]; inf without contacts."""
         positions = self.positions + displacement
-        gaps = np.full(len(positions), np.inf)
-        for plane in self.values.planes:
-            gaps = np.minimum(gaps, positions @ plane[:3] - plane[3])
-        for center, sphere in zip(self.sphere_centers, self.values.spheres, strict=True):
-            gaps = np.minimum(gaps, np.linalg.norm(positions - center, axis=1) - sphere[3])
-        return gaps
+        return _gaps(positions, self.values.planes, self.sphere_centers, self.values.spheres)
 
     def project(self, displacement: Array, around: Array | None = None) -> Array:
         """P(u): out of the planes one after another, then out of the spheres; hard pins stay.
@@ -297,6 +348,31 @@ class StepProblem:
         scale = (self.weighted_diagonal if diagonal is None else diagonal)[:, None]
         stepped = displacement - self.gradient(displacement) / scale
         return np.asarray(scale * (displacement - self.project(stepped, displacement)))
+
+
+def _gaps(positions: Array, planes: Array, centers: Array, spheres: Array) -> Array:
+    """Distance of every position to the nearest of planes and spheres [n]; inf without any."""
+    gaps = np.full(len(positions), np.inf)
+    for plane in planes:
+        gaps = np.minimum(gaps, positions @ plane[:3] - plane[3])
+    for center, sphere in zip(centers, spheres, strict=True):
+        gaps = np.minimum(gaps, np.linalg.norm(positions - center, axis=1) - sphere[3])
+    return gaps
+
+
+def _least_gap(positions: Array, planes: Array, centers: Array, spheres: Array) -> float:
+    return float(_gaps(positions, planes, centers, spheres).min())
+
+
+def _turn_about(normal: Array, covariance: Array) -> Array:
+    """The rotation R about a normal that maximises tr(R^T covariance), by its angle."""
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first /= np.linalg.norm(first)
+    frame = np.stack([first, np.cross(normal, first)])
+    flat = frame @ covariance @ frame.T
+    angle = np.arctan2(flat[1, 0] - flat[0, 1], flat[0, 0] + flat[1, 1])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.asarray(np.outer(normal, normal) + frame.T @ turn @ frame)
 
 
 def _push_out(displacement: Array, normals: Array, gaps: Array, motion: Array, friction: float) -> Array:

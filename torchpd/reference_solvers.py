@@ -37,7 +37,7 @@ Observer = Callable[[int, Array], None]
 class Iterates:
     """The end of an iteration and what it went through."""
 
-    displacement: Array  # [V, 3] u_K, momentum shifted where the start was
+    displacement: Array  # [V, 3] u_K, aligned as the start was
     residual: float  # |r(u_K)| / |r(x + h v)|, with the diagonal of the iteration
     iterations: int  # carried out
     restarts: list[int] = field(default_factory=list)  # iterations k whose check found the energy risen
@@ -131,7 +131,7 @@ def _iterate(
             if left <= tolerance * _way(problem, previous):
                 result.converged = True
                 break
-    result.displacement = problem.shift_momentum(current)
+    result.displacement = problem.align(current)
     scale = float(np.linalg.norm(problem.residual(problem.course(), diagonal)))
     last = float(np.linalg.norm(problem.residual(result.displacement, diagonal)))
     result.residual = last / scale if scale > 0.0 else 0.0

@@ -1,8 +1,8 @@
 // Runner of solver/step.h on the CPU: one environment by a team of threads, or W environments by one thread.
 #pragma once
 #include "cpu/inputs.h"
+#include "cpu/rigid.h"
 #include "cpu/sweep.h"
-#include "cpu/translation.h"
 #include "math/chebyshev.h"
 #include "solver/step.h"
 #include "solver/vertex.h"
@@ -75,22 +75,26 @@ class Stepper {
       used_[lane] = 0;
       done_[lane] = false;
     }
+    started_ = false;
     team_.barrier();
   }
 
-  // Exact minimum of E along the translation of every piece that nothing holds or touches: its momentum is then right
-  // however few iterations follow.
-  void translate() {
-    const bool given_first = set_.start == StartKind::given && used_[0] == 0;
-    if (plan_.groups == 0 || given_first) return;
+  // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
+  void align() {
+    const bool first = !started_;
+    started_ = true;
+    if (plan_.groups == 0 || (first && set_.start == StartKind::given)) return;
     if (team_.rank == 0) {
-      find_shifts(plan_, w_);
-      if constexpr (Touching) drop_touching_shifts(plan_, w_, contacts_);
-      for (int i = 0; i < plan_.vertices; ++i) {
-        if (plan_.vertex_group[i] < 0) continue;
-        w_.u[i] = w_.u[i] + w_.shift[plan_.vertex_group[i]];
-        if (used_[0] == 0) w_.before[i] = w_.u[i];
-      }
+      sum_pieces(plan_, w_);
+      free_motions(plan_, w_);
+      if constexpr (Touching) limit_motions(plan_, w_, contacts_);
+    }
+    team_.barrier();
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      if (plan_.vertex_group[i] < 0) continue;
+      const Vec3<Real> moved = w_.motion[plan_.vertex_group[i]].of(Lanes::vec3(w_.x[i] + w_.u[i]));
+      w_.u[i] = vertex(i).hold(w_.u[i], w_.u[i] + Lanes::value(moved));
+      if (first) w_.before[i] = w_.u[i];
     }
     team_.barrier();
   }
@@ -347,6 +351,7 @@ class Stepper {
   SoftStop stop_[width];
   int used_[width] = {};
   bool done_[width] = {};
+  bool started_ = false;  // has a first iterate
 };
 
 }  // namespace pd::inline PD_TARGET

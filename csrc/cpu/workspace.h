@@ -2,6 +2,7 @@
 #pragma once
 #include "cpu/lanes.h"
 #include "effects/contact.h"
+#include "solver/rigid.h"
 
 #include <cstdint>
 #include <memory>
@@ -18,6 +19,13 @@ using Storage = std::unique_ptr<std::byte[], FreeAligned>;
 inline Storage allocate_zeroed(std::size_t bytes) {
   return Storage(new (std::align_val_t{64}) std::byte[bytes]());
 }
+
+// of a piece that no pin holds, see solver/rigid.h
+template <class Wide>
+struct GroupSums {
+  Wide rigid[RigidSums::count];
+  Wide gaps[Touch::planes + 1], slips[Touch::slips], slowest;
+};
 
 constexpr int shared_chunk = 256;  // shared vertices that one sum covers
 
@@ -37,9 +45,10 @@ struct Workspace {
   Value *x, *velocity, *force, *target, *u, *before;  // [vertices]
   Real *inertia, *inverse;                            // [vertices] a, 1 / D (0: does not move)
   Value *origin, *shared_force;                       // [slots]
-  Part* parts[2];  // iterations alternate, so that nobody overwrites what others read
-  Value* shift;    // [groups]
-  Wide *group_moment, *group_weight;  // [3 groups], [groups]
+  Part* parts[2];               // iterations alternate, so that nobody overwrites what others read
+  GroupSums<Wide>* group_sums;  // [groups]
+  RigidMotion<Real>* motion;    // [groups]
+  Real (*touched)[Touch::planes];  // [groups] 1 for each of the first planes that it touches
   Plane<Real>* planes;
   Ball<Real>* balls;
   T* weight;  // [elements], or [elements, W] when stiffness differs between environments
@@ -79,9 +88,9 @@ struct Workspace {
     place(origin, plan.slots, base);
     place(shared_force, plan.shared ? plan.slots : 0, base);
     for (Part*& array : parts) place(array, part_count, base);
-    place(shift, plan.groups, base);
-    place(group_moment, 3 * plan.groups, base);
-    place(group_weight, plan.groups, base);
+    place(group_sums, plan.groups, base);
+    place(motion, plan.groups, base);
+    place(touched, plan.groups, base);
     place(planes, material.planes_count, base);
     place(balls, material.spheres_count, base);
     place(weight,

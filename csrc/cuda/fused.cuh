@@ -2,7 +2,7 @@
 #pragma once
 #include "cuda/arena.h"
 #include "cuda/fused_halo.h"
-#include "cuda/fused_momentum.h"
+#include "cuda/fused_rigid.h"
 #include "cuda/fused_start.h"
 #include "cuda/fused_visit.h"
 #include "cuda/launch.h"
@@ -258,8 +258,8 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaun
   // with one tetrahedron a thread has its weight itself
   const bool own = launch.kind == Blocks::cluster && near_once(sizeof(T));
   arena.place(s.weights, own ? 0 : teams * plan.blocks * 2 * pair_lanes);
-  arena.place(s.shift, teams * launch.patches * plan.pieces);
-  arena.place(s.part_sum, teams * plan.parts * 4);
+  arena.place(s.pieces, teams * launch.patches * plan.pieces);
+  arena.place(s.part_sum, teams * plan.parts * PartSums::count);
   return s;
 }
 

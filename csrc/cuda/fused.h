@@ -106,21 +106,23 @@ class FusedRunner {
     __syncthreads();
   }
 
-  // Exact minimum of E along the translation of every piece that nothing holds or touches: its momentum is then right
-  // however few iterations follow.
-  PD_DEVICE void translate() {
+  // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
+  PD_DEVICE void align() {
     if constexpr (Clustered) release();
     settle();
     const bool given_first = set_.start == StartKind::given && !started_;
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || given_first) return;
-    find_shifts();
-    if constexpr (Touching) drop_touching_shifts();
+    move_pieces<Rigid::free>();
+    if constexpr (Touching) {
+      move_pieces<Rigid::touching>();
+      if (contacts_.has_several()) move_pieces<Rigid::beside>();
+    }
     each_slot([&](int s) {
-      const int piece = plan_.slot_piece[patch_.first_slot + s];
-      if (piece < 0) return;
-      const Vec3<T> u = vec3(v_.u[s]) + vec3(shift(piece));
+      const int number = plan_.slot_piece[patch_.first_slot + s];
+      if (number < 0 || !(v_.u[s].w > 0)) return;  // of no piece, or pinned
+      const Vec3<T> u = vec3(v_.u[s]) + piece(number).motion.of(vec3(v_.x[s]) + vec3(v_.u[s]));
       move(s, u);
       if (first) v_.set_before(s, u);
     });
@@ -227,11 +229,11 @@ class FusedRunner {
   PD_DEVICE T* weights() const {
     return memory_.weights + std::int64_t(team_) * plan_.blocks * 2 * pair_lanes;
   }
-  PD_DEVICE Quad<T>& shift(int piece) const {
-    return memory_.shift[(std::int64_t(team_) * plan_.patches + index_) * plan_.pieces + piece];
+  PD_DEVICE Piece<T>& piece(int piece) const {
+    return memory_.pieces[(std::int64_t(team_) * plan_.patches + index_) * plan_.pieces + piece];
   }
   PD_DEVICE double* part_sums() const {
-    return memory_.part_sum + std::int64_t(team_) * plan_.parts * 4;
+    return memory_.part_sum + std::int64_t(team_) * plan_.parts * PartSums::count;
   }
   PD_DEVICE Word* letter_box() const {
     return memory_.letters + (std::int64_t(team_) * 2 + (round_ & 1)) * plan_.slots * Letter::words;
@@ -443,18 +445,14 @@ class FusedRunner {
   PD_DEVICE void weigh_with(const T* stiffness, bool bounded);
   PD_DEVICE T weigh_own(const T* stiffness, bool bounded);
 
-  // ---- momentum: cuda/fused_momentum.h
+  // ---- rigid motions: cuda/fused_rigid.h
 
-  PD_DEVICE void find_shifts();
-  PD_DEVICE void drop_touching_shifts();
+  template <Rigid What>
+  PD_DEVICE void move_pieces();
   template <class Visit>
   PD_DEVICE void each_part(const Visit& visit) const;
   template <class Visit>
   PD_DEVICE void each_piece(const Visit& visit) const;
-  PD_DEVICE int local(int at) const { return plan_.part_slot[at] - patch_.first_slot; }
-
-  // past the first level of cache, which does not see what other blocks wrote
-  PD_DEVICE double part_sum(int at) const { return __ldcg(part_sums() + at); }
 
   // ---- results
 

@@ -3,6 +3,7 @@
 #include "cuda/halo.h"
 #include "cuda/inputs.h"
 #include "cuda/launch.h"
+#include "cuda/rigid.h"
 #include "cuda/team.h"
 #include "plan/shared_memory.h"
 
@@ -20,10 +21,10 @@ template <class T>
 struct FusedScratch {
   Quad<T>* vertex[vertex_arrays];  // [teams, slots] those that are not in shared memory
   T* weights;                      // [teams, blocks, 2, 32] w V
-  Quad<T>* shift;                  // [teams, patches, pieces]
-  double* part_sum;                // [teams, parts, 4] of the vertices that a patch owns of a piece
-  Word* letters;                   // of a grid: [teams, 2, slots, words] forces on shared vertices
-  Word* sums;                      // of a grid: [teams, 2, patches, sums_count]
+  Piece<T>* pieces;                // [teams, patches, pieces]
+  double* part_sum;  // [teams, parts, PartSums::count] of the vertices that a patch owns of a piece
+  Word* letters;     // of a grid: [teams, 2, slots, words] forces on shared vertices
+  Word* sums;        // of a grid: [teams, 2, patches, sums_count]
 };
 
 template <class T>

@@ -91,8 +91,8 @@ SeveralScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const Several
   arena.place(s.x, many * plan.slots);
   arena.place(s.velocity, many * plan.slots);
   arena.place(s.weights, many * plan.blocks * 2 * pair_lanes);
-  arena.place(s.shift, many * plan.pieces);
-  arena.place(s.part_sum, many * plan.parts * 4);
+  arena.place(s.pieces, many * plan.pieces);
+  arena.place(s.part_sum, many * plan.parts * PartSums::count);
   return s;
 }
 

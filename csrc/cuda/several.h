@@ -4,8 +4,8 @@
 // Which threads work on an environment, and which others there are in its block, never decides in which order something is
 // added up, so neither decides the bits: whoever launches it may choose both by the batch.
 #pragma once
-#include "cuda/momentum.h"
 #include "cuda/patch.h"
+#include "cuda/rigid.h"
 #include "cuda/several_call.h"
 #include "cuda/team.h"
 #include "cuda/vertices.h"
@@ -95,20 +95,23 @@ class SeveralRunner {
     __syncthreads();
   }
 
-  // Exact minimum of E along the translation of every piece that nothing holds or touches: its momentum is then right
-  // however few iterations follow.
-  PD_DEVICE void translate() {
+  // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
+  PD_DEVICE void align() {
     settle();
     const bool given_first = set_.start == StartKind::given && !started_;
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || given_first) return;
-    find_shifts();
-    if constexpr (Touching) drop_touching_shifts();
+    move_pieces<Rigid::free>();
+    if constexpr (Touching) {
+      move_pieces<Rigid::touching>();
+      if (contacts(0).has_several()) move_pieces<Rigid::beside>();
+    }
     each_slot([&](const Seat& seat, int i) {
-      const int piece = plan_.slot_piece[seat.at];
-      if (piece < 0) return;
-      const Vec3<T> u = vec3(v_.u[i]) + vec3(shift(seat.environment, piece));
+      const int number = plan_.slot_piece[seat.at];
+      if (number < 0 || !(v_.u[i].w > 0)) return;  // of no piece, or pinned
+      const RigidMotion<T>& motion = piece(seat.environment, number).motion;
+      const Vec3<T> u = vec3(v_.u[i]) + motion.of(vec3(v_.x[i]) + vec3(v_.u[i]));
       move(i, u);
       if (first) v_.set_before(i, u);
     });
@@ -181,12 +184,12 @@ class SeveralRunner {
     return memory_.weights +
            (first_of_block_ + environment) * unsigned(2 * pair_lanes * plan_.blocks);
   }
-  PD_DEVICE Quad<T>& shift(int environment, int piece) const {
-    return memory_.shift[std::int64_t(first_of_block_ + environment) * plan_.pieces + piece];
+  PD_DEVICE Piece<T>& piece(int environment, int piece) const {
+    return memory_.pieces[std::int64_t(first_of_block_ + environment) * plan_.pieces + piece];
   }
   PD_DEVICE double* part_sum(int environment, int part) const {
     return memory_.part_sum +
-           (std::int64_t(first_of_block_ + environment) * plan_.parts + part) * 4;
+           (std::int64_t(first_of_block_ + environment) * plan_.parts + part) * PartSums::count;
   }
 
   // ---- who works on what
@@ -416,38 +419,19 @@ class SeveralRunner {
     read_ahead(first_pair_);
   }
 
-  // ---- momentum: cuda/momentum.h
+  // ---- rigid motions: cuda/rigid.h
 
-  PD_DEVICE void find_shifts() {
+  template <Rigid What>
+  PD_DEVICE void move_pieces() {
     each_part([&](int e, int part, int begin, int end) {
-      double sum[4];
-      sum_part(v_, begin, end, [&](int at) { return e * slots() + plan_.part_slot[at]; }, sum);
-      if (lane() == 0) {
-        for (int c = 0; c < 4; ++c) part_sum(e, part)[c] = sum[c];
-      }
-    });
-    __syncthreads();
-    each_piece([&](int e, int piece) {
-      double sum[4];
-      over_parts(plan_, piece, Add{}, [&](int part, int c) { return part_sum(e, part)[c]; }, sum);
-      if (lane() == 0) shift(e, piece) = shift_of<T>(sum);
-    });
-    __syncthreads();
-  }
-
-  // a piece that the shift would leave touching a contact gets none
-  PD_DEVICE void drop_touching_shifts() {
-    each_part([&](int e, int part, int begin, int end) {
-      const Vec3<T> moved = vec3(shift(e, plan_.slot_piece[plan_.part_slot[begin]]));
       const auto index = [&](int at) { return e * slots() + plan_.part_slot[at]; };
-      const double least = least_gap(v_, contacts(e), begin, end, index, moved);
-      if (lane() == 0) part_sum(e, part)[0] = least;
+      const Piece<T>& piece = this->piece(e, plan_.slot_piece[plan_.part_slot[begin]]);
+      sum_part<What>(v_, contacts(e), plan_.pins > 0, begin, end, index, piece, part_sum(e, part));
     });
     __syncthreads();
     each_piece([&](int e, int piece) {
-      double least[1];
-      over_parts(plan_, piece, Least{}, [&](int part, int) { return part_sum(e, part)[0]; }, least);
-      if (lane() == 0 && !(least[0] > 0)) shift(e, piece) = {};
+      const auto read = [&](int part, int n) { return part_sum(e, part)[n]; };
+      move_piece<What>(plan_, piece, contacts(e), read, this->piece(e, piece));
     });
     __syncthreads();
   }

@@ -2,6 +2,7 @@
 #pragma once
 #include "cuda/collect.h"
 #include "cuda/inputs.h"
+#include "cuda/rigid.h"
 #include "plan/shared_memory.h"
 
 namespace pd::inline PD_TARGET {
@@ -20,8 +21,8 @@ template <class T>
 struct SeveralScratch {
   Quad<T>*x, *velocity;  // [blocks, together, slots]
   T* weights;            // [blocks, together, blocks of pairs, 2, 32] w V
-  Quad<T>* shift;        // [blocks, together, pieces]
-  double* part_sum;      // [blocks, together, parts, 4]
+  Piece<T>* pieces;      // [blocks, together, pieces]
+  double* part_sum;      // [blocks, together, parts, PartSums::count]
 };
 
 // From one pair or vertex of a thread to its next one: environments, and what is left.

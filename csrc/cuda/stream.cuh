@@ -32,8 +32,8 @@ StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
   arena.place(m.sums, step.batch * call.sum_rows() * sums_count);
   arena.place(m.progress, step.batch);
   arena.place(m.omega, step.batch * guard_period);
-  arena.place(m.shift, step.batch * plan.pieces);
-  arena.place(m.part_sum, step.batch * plan.parts * 4);
+  arena.place(m.pieces, step.batch * plan.pieces);
+  arena.place(m.part_sum, step.batch * plan.parts * PartSums::count);
   arena.place(m.planes, step.batch * material.planes_count);
   arena.place(m.balls, step.batch * material.spheres_count);
   return m;
@@ -118,13 +118,17 @@ class StreamRunner {
     started_ = false;
   }
 
-  void translate() {
+  void align() {
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
-    find<ShiftTask::moments>();
-    if constexpr (Touching) find<ShiftTask::gaps>();
-    launcher_.run(stream_shift<T>, patches_, vertex_threads, 0, call_, first);
+    move_pieces<Rigid::free>();
+    if constexpr (Touching) {
+      move_pieces<Rigid::touching>();
+      const Material<T>& material = call_.step.material;
+      if (material.planes_count + material.spheres_count > 1) move_pieces<Rigid::beside>();
+    }
+    launcher_.run(stream_align<T>, patches_, vertex_threads, 0, call_, first);
   }
 
   void iterate(int k) {
@@ -227,8 +231,8 @@ class StreamRunner {
                   call_, record);
   }
 
-  template <ShiftTask What>
-  void find() {
+  template <Rigid What>
+  void move_pieces() {
     const std::int64_t batch = call_.step.batch;
     launcher_.run(stream_parts<What, T>, blocks_for(batch * plan_.parts * warp_size),
                   vertex_threads, 0, call_);

@@ -3,7 +3,7 @@
 #include "cuda/collect.h"
 #include "cuda/half.h"
 #include "cuda/handoff.h"
-#include "cuda/momentum.h"
+#include "cuda/rigid.h"
 #include "cuda/vertices.h"
 #include "plan/shared_memory.h"
 
@@ -25,8 +25,8 @@ struct StreamMemory {
   double* sums;           // [batch, patches + blocks of shared vertices, sums_count]
   Progress* progress;     // [batch]
   double* omega;          // [batch, guard_period] of the next iterations
-  Quad<T>* shift;         // [batch, pieces]
-  double* part_sum;       // [batch, parts, 4]
+  Piece<T>* pieces;       // [batch, pieces]
+  double* part_sum;       // [batch, parts, PartSums::count]
   Plane<T>* planes;       // [batch, planes]
   Ball<T>* balls;         // [batch, balls]
 };
@@ -97,11 +97,11 @@ struct StreamWork {
   PD_DEVICE double* sum_row(int row) const {
     return call.memory.sums + (environment * call.sum_rows() + row) * sums_count;
   }
-  PD_DEVICE Quad<T>& shift(int piece) const {
-    return call.memory.shift[environment * plan.pieces + piece];
+  PD_DEVICE Piece<T>& piece(int piece) const {
+    return call.memory.pieces[environment * plan.pieces + piece];
   }
   PD_DEVICE double* part_sum(int part) const {
-    return call.memory.part_sum + (environment * plan.parts + part) * 4;
+    return call.memory.part_sum + (environment * plan.parts + part) * PartSums::count;
   }
 };
 
@@ -377,11 +377,9 @@ PD_DEVICE std::int64_t thread_number() {
   return std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
 }
 
-// ---- momentum: a warp for each part, then for each piece
+// ---- rigid motions: cuda/rigid.h
 
-enum class ShiftTask { moments, gaps };
-
-template <ShiftTask What, class T>
+template <Rigid What, class T>
 __global__ void __launch_bounds__(vertex_threads)
     stream_parts(const __grid_constant__ StreamCall<T> call) {
   const int parts = call.step.plan.parts;
@@ -391,18 +389,11 @@ __global__ void __launch_bounds__(vertex_threads)
   const int part = int(warp % parts);
   const int begin = w.plan.part_start[part], end = w.plan.part_start[part + 1];
   const auto index = [&](int at) { return w.plan.slot_vertex[w.plan.part_slot[at]]; };
-  double sum[4] = {0, 0, 0, 0};
-  if constexpr (What == ShiftTask::moments) {
-    sum_part(w.v, begin, end, index, sum);
-  } else {
-    const Vec3<T> shift = vec3(w.shift(w.plan.slot_piece[w.plan.part_slot[begin]]));
-    sum[0] = least_gap(w.v, w.contacts, begin, end, index, shift);
-  }
-  if (threadIdx.x % warp_size != 0) return;
-  for (int c = 0; c < 4; ++c) w.part_sum(part)[c] = sum[c];
+  const Piece<T>& piece = w.piece(w.plan.slot_piece[w.plan.part_slot[begin]]);
+  sum_part<What>(w.v, w.contacts, w.plan.pins > 0, begin, end, index, piece, w.part_sum(part));
 }
 
-template <ShiftTask What, class T>
+template <Rigid What, class T>
 __global__ void __launch_bounds__(vertex_threads)
     stream_pieces(const __grid_constant__ StreamCall<T> call) {
   const int pieces = call.step.plan.pieces;
@@ -410,29 +401,21 @@ __global__ void __launch_bounds__(vertex_threads)
   if (warp >= call.step.batch * pieces) return;
   const StreamWork<T, true> w(call, warp / pieces);
   const int piece = int(warp % pieces);
-  const auto read = [&](int part, int c) { return w.part_sum(part)[c]; };
-  const bool leader = threadIdx.x % warp_size == 0;
-  if constexpr (What == ShiftTask::moments) {
-    double sum[4];
-    over_parts(w.plan, piece, Add{}, read, sum);
-    if (leader) w.shift(piece) = shift_of<T>(sum);
-  } else {
-    double least[1];
-    over_parts(w.plan, piece, Least{}, read, least);
-    if (leader && !(least[0] > 0)) w.shift(piece) = {};
-  }
+  const auto read = [&](int part, int n) { return w.part_sum(part)[n]; };
+  move_piece<What>(w.plan, piece, w.contacts, read, w.piece(piece));
 }
 
 // `first`: before any iteration, which has no iterate before it
 template <class T>
 __global__ void __launch_bounds__(vertex_threads)
-    stream_shift(const __grid_constant__ StreamCall<T> call, bool first) {
+    stream_align(const __grid_constant__ StreamCall<T> call, bool first) {
   const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
   const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const int piece = w.plan.slot_piece[patch.first_slot + s], i = patch.vertex(s);
-    if (piece < 0 || !patch.owns(s)) continue;
-    const Vec3<T> u = vec3(w.v.u[i]) + vec3(w.shift(piece));
+    if (piece < 0 || !patch.owns(s) || !(w.v.u[i].w > 0)) continue;
+    const Vec3<T> y = vec3(w.v.x[i]) + vec3(w.v.u[i]);
+    const Vec3<T> u = vec3(w.v.u[i]) + w.piece(piece).motion.of(y);
     w.v.set(i, u);
     if (first) w.v.set_before(i, u);
   }

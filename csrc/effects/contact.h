@@ -192,9 +192,12 @@ struct Contacts {
     return most;
   }
 
-  PD_HD R least_gap(const Vec3<R>& x) const {
+  PD_HD bool has_several() const { return plane_count + ball_count > 1; }
+
+  // of all balls, and of the planes from the `first` on
+  PD_HD R least_gap(const Vec3<R>& x, int first) const {
     R least(HUGE_VAL);
-    for (int i = 0; i < plane_count; ++i) least = lesser(least, gap(planes[i], x));
+    for (int i = first; i < plane_count; ++i) least = lesser(least, gap(planes[i], x));
     for (int i = 0; i < ball_count; ++i) least = lesser(least, gap(balls[i], x));
     return least;
   }

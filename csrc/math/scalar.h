@@ -52,6 +52,14 @@ PD_HD double lesser(double a, double b) { return b < a ? b : a; }
 PD_HD float select(bool take, float a, float b) { return take ? a : b; }
 PD_HD double select(bool take, double a, double b) { return take ? a : b; }
 PD_HD bool any(bool a) { return a; }
+template <class To>
+PD_HD To convert(float a) {
+  return To(a);
+}
+template <class To>
+PD_HD To convert(double a) {
+  return To(a);
+}
 
 template <class T>
 PD_HD constexpr T epsilon() {

@@ -26,6 +26,7 @@ constexpr std::int64_t none = 65535;                      // entries of a patch 
 constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
 // numbers of kernels, as DeviceKernel has them
 constexpr int block_kernel = 0, cluster_kernel = 1, grid_kernel = 2, stream_kernel = 3;
+constexpr int small_part = 64;  // vertices
 
 struct Mesh {
   const double* positions;
@@ -361,8 +362,8 @@ void place_forces(DeviceMeshPlan& plan) {
   }
 }
 
-// The vertices of each piece without pins, patch by patch: every vertex in the first patch that has it.
-void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pieces) {
+// The vertices of each loose piece, patch by patch, in parts of `most` at most: every vertex in the first patch that has it.
+void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pieces, int most) {
   plan.patch_part = plan.part_start = {0};
   plan.piece_start.assign(pieces + 1, 0);
   std::vector<std::int32_t> part_piece;
@@ -377,7 +378,8 @@ void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pie
     std::sort(mine.begin(), mine.end());
     for (std::size_t i = 0; i < mine.size(); ++i) {
       plan.part_slot.push_back(mine[i].second);
-      if (i + 1 < mine.size() && mine[i + 1].first == mine[i].first) continue;
+      const std::int32_t size = std::int32_t(plan.part_slot.size()) - plan.part_start.back();
+      if (i + 1 < mine.size() && mine[i + 1].first == mine[i].first && size < most) continue;
       plan.part_start.push_back(std::int32_t(plan.part_slot.size()));
       part_piece.push_back(mine[i].first);
     }
@@ -462,7 +464,9 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
   if (kernel == stream_kernel) place_forces(plan);
   if (kernel == cluster_kernel) link_copies(plan);
   const std::int32_t pieces = *std::max_element(piece, piece + vertices) + 1;
-  if (pieces > 0) add_parts(plan, piece, pieces);
+  // where few blocks hold an environment all their warps are to be busy
+  const bool few = kernel == block_kernel || kernel == cluster_kernel;
+  if (pieces > 0) add_parts(plan, piece, pieces, few ? small_part : int(vertices));
   plan.sizes = count_sizes(plan, made, count, pieces, kernel);
   progress(1.0);
   return plan;

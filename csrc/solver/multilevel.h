@@ -41,9 +41,9 @@ PD_HD void multilevel_step(Runner& run, const Settings& settings) {
   run.predict();
   if (settings.report) run.measure_course();
   run.start();
-  run.translate();
+  run.align();
   run.descend();  // multilevel_iterations
-  run.translate();
+  run.align();
   if (settings.report) run.measure();
   run.finish();
 }

@@ -61,14 +61,14 @@ template <class Runner>
 PD_HD void step(Runner& run, const Settings& settings) {
   run.predict();  // targets s: where inertia, forces and springs would take each vertex
   if (settings.report) run.measure_course();
-  run.start();      // first iterate, on the pins and out of the contacts
-  run.translate();  // free pieces: exact along their translation
+  run.start();  // first iterate, on the pins and out of the contacts
+  run.align();  // pieces that pins leave loose: exact along rigid motions
   for (int k = 0; k < settings.iterations; ++k) {
     // local step on every element, then one Jacobi iteration on every vertex, accelerated and projected
     run.iterate(k);
     if (run.finished()) break;
   }
-  run.translate();
+  run.align();
   if (settings.report) run.measure();
   run.finish();  // new positions and velocities
 }

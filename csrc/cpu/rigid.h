@@ -1,0 +1,125 @@
+// The rigid motions of solver/rigid.h, by one thread.
+#pragma once
+#include "cpu/workspace.h"
+
+namespace pd::inline PD_TARGET {
+
+template <class Lanes, class Visit>
+void each_in_a_piece(const Plan<typename Lanes::Scalar>& plan, const Visit& visit) {
+  for (int i = 0; i < plan.vertices; ++i) {
+    if (plan.vertex_group[i] >= 0) visit(i, plan.vertex_group[i]);
+  }
+}
+
+template <class Lanes>
+void sum_pieces(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w) {
+  using Real = typename Lanes::Real;
+  const auto widen = [](const Vec3<Real>& a) {
+    return Vec3{Lanes::widen(a.x), Lanes::widen(a.y), Lanes::widen(a.z)};
+  };
+  for (int g = 0; g < plan.groups; ++g) w.group_sums[g] = {};
+  each_in_a_piece<Lanes>(plan, [&](int i, int g) {
+    const auto lag = widen(Lanes::vec3(w.target[i] - w.u[i]));
+    const auto y = widen(Lanes::vec3(w.x[i])) + widen(Lanes::vec3(w.u[i]));
+    const auto a = Lanes::widen(w.inertia[i]);
+    add_rigid(w.group_sums[g].rigid, a, y, lag);
+    if (plan.pins > 0) add_pin(w.group_sums[g].rigid, RigidSums::pins, a, y);
+  });
+}
+
+template <class Lanes>
+void set_motion(Workspace<Lanes>& w, int g, int lane, const RigidMotion<double>& motion) {
+  using T = typename Lanes::Scalar;
+  RigidMotion<typename Lanes::Real>& to = w.motion[g];
+  const auto set = [&](Vec3<typename Lanes::Real>& v, const Vec3<double>& a) {
+    Lanes::set_lane(v.x, lane, T(a.x));
+    Lanes::set_lane(v.y, lane, T(a.y));
+    Lanes::set_lane(v.z, lane, T(a.z));
+  };
+  for (int r = 0; r < 3; ++r) set(to.turn.row[r], motion.turn.row[r]);
+  set(to.center, motion.center);
+  set(to.shift, motion.shift);
+}
+
+// Of one environment.
+template <int Count, class Lanes>
+void read_lane(const typename Lanes::Wide (&sum)[Count], int lane, double (&one)[Count]) {
+  for (int n = 0; n < Count; ++n) one[n] = Lanes::lane(sum[n], lane);
+}
+
+template <class Lanes>
+RigidFit fit_of(const Workspace<Lanes>& w, int g, int lane) {
+  double sum[RigidSums::count];
+  read_lane<RigidSums::count, Lanes>(w.group_sums[g].rigid, lane, sum);
+  return RigidFit(sum);
+}
+
+template <class Lanes>
+void free_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w) {
+  for (int g = 0; g < plan.groups; ++g) {
+    for (int lane = 0; lane < Lanes::environments; ++lane)
+      set_motion(w, g, lane, fit_of(w, g, lane).free());
+  }
+}
+
+template <class Lanes>
+void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
+                   const Contacts<typename Lanes::Real>& contacts) {
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Wide = typename Lanes::Wide;
+  const auto at = [&](int i) { return Lanes::vec3(w.x[i] + w.u[i]); };
+  for (int g = 0; g < plan.groups; ++g) {
+    GroupSums<Wide>& sums = w.group_sums[g];
+    for (Wide& least : sums.gaps) least = Wide(HUGE_VAL);
+    for (Wide& sum : sums.slips) sum = Wide(0.0);
+    sums.slowest = Wide(HUGE_VAL);
+  }
+  each_in_a_piece<Lanes>(plan, [&](int i, int g) {
+    GroupSums<Wide>& sums = w.group_sums[g];
+    const auto near = [&](int k, const Real& gap) {
+      sums.gaps[k] = lesser(sums.gaps[k], Lanes::widen(gap));
+    };
+    const Vec3<Real> u = Lanes::vec3(w.u[i]);
+    add_touch(sums.slips, sums.slowest, contacts, at(i), u, w.motion[g], near);
+  });
+  for (int g = 0; g < plan.groups; ++g) {
+    for (int lane = 0; lane < Lanes::environments; ++lane) {
+      const GroupSums<Wide>& sums = w.group_sums[g];
+      unsigned touched = 0;
+      for (int k = 0; k <= Touch::planes; ++k) {
+        const bool touches = !(Lanes::lane(sums.gaps[k], lane) > 0);
+        touched |= touches ? 1u << k : 0u;
+        if (k < Touch::planes) Lanes::set_lane(w.touched[g][k], lane, T(touches));
+      }
+      double slips[Touch::slips];
+      read_lane<Touch::slips, Lanes>(sums.slips, lane, slips);
+      const auto plane = [&](int k) {
+        const Plane<Real>& p = contacts.planes[k];
+        const auto number = [&](const Real& a) { return Lanes::lane(Lanes::widen(a), lane); };
+        const Vec3<double> normal = {number(p.normal.x), number(p.normal.y), number(p.normal.z)};
+        return Plane<double>{normal, number(p.height), number(p.friction)};
+      };
+      const double slowest = Lanes::lane(sums.slowest, lane);
+      set_motion(w, g, lane,
+                 motion_on_contacts(fit_of(w, g, lane), touched, slips, slowest, plane));
+    }
+  }
+  if (!contacts.has_several()) return;
+  // what is left must not lead into other contacts
+  for (int g = 0; g < plan.groups; ++g) w.group_sums[g].gaps[0] = Wide(HUGE_VAL);
+  each_in_a_piece<Lanes>(plan, [&](int i, int g) {
+    const auto touches = [&](int k) { return w.touched[g][k] > Real(T(0)); };
+    const Vec3<Real> y = at(i);
+    const Real least = least_gap_beside(contacts, y + w.motion[g].of(y), touches);
+    w.group_sums[g].gaps[0] = lesser(w.group_sums[g].gaps[0], Lanes::widen(least));
+  });
+  for (int g = 0; g < plan.groups; ++g) {
+    for (int lane = 0; lane < Lanes::environments; ++lane) {
+      if (!(Lanes::lane(w.group_sums[g].gaps[0], lane) > 0))
+        set_motion(w, g, lane, fit_of(w, g, lane).still());
+    }
+  }
+}
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,262 @@
+// Rigid motions of a connected piece. They strain nothing, so along them E is the sum of a / 2 |u - s|^2 alone, springs included,
+// least where the piece fits its targets best: a weighted fit of two sets of points, known in closed form (Kabsch 1976, Horn 1987).
+// With positions y = x + u, targets z = x + s and means weighted by a
+//   u += (R - I) (y - mean y) + mean (z - y),   R = argmax over rotations of tr(R^T H),   H = sum a (z - mean z) (y - mean y)^T
+// Few iterations cannot turn or shift a stiff piece as a whole; after this its momentum is right, linear and angular. Pins that hold
+// a piece at one point p leave it the turn about p, with p in place of both means; pins along a line the turn about that.
+//
+// What a piece touches balances part of its momentum. A plane leaves it the turn about the normal and the way along the plane;
+// planes that meet leave the way along their edge. Neither moves any vertex towards a plane. With friction the way along a
+// plane is shortened by friction times the way that the plane stops, which is Coulomb's law for the sum of all forces where all
+// vertices slide the same way; turns are left to the iterations.
+#pragma once
+#include "effects/contact.h"
+#include "math/rotation.h"
+
+namespace pd::inline PD_TARGET {
+
+// Sums over the vertices of a piece, in double.
+struct RigidSums {
+  static constexpr int weight = 0, position = 1, lag = 4, spread = 7, turn = 13;
+  static constexpr int pins = 22, pin_position = 23, pin_spread = 26, count = 32;
+};
+
+// Adds a vertex of weight a at y, from which its target is `lag` away, to sums over a; y; z - y; y y^T; (z - y) y^T.
+template <class W, int Count>
+PD_HD void add_rigid(W (&sum)[Count], const W& a, const Vec3<W>& y, const Vec3<W>& lag) {
+  using S = RigidSums;
+  const W at[3] = {y.x, y.y, y.z}, way[3] = {a * lag.x, a * lag.y, a * lag.z};
+  sum[S::weight] = sum[S::weight] + a;
+  int n = S::spread;
+  for (int r = 0; r < 3; ++r) {
+    const W moment = a * at[r];
+    sum[S::position + r] = sum[S::position + r] + moment;
+    sum[S::lag + r] = sum[S::lag + r] + way[r];
+    for (int c = r; c < 3; ++c, ++n) sum[n] = multiply_add(moment, at[c], sum[n]);
+    for (int c = 0; c < 3; ++c)
+      sum[S::turn + 3 * r + c] = multiply_add(way[r], at[c], sum[S::turn + 3 * r + c]);
+  }
+}
+
+// Adds a vertex that a pin holds on its target, where a is 0, to sums over 1; y; y y^T from sum[first] on.
+template <class W, int Count>
+PD_HD void add_pin(W (&sum)[Count], int first, const W& a, const Vec3<W>& y) {
+  const W at[3] = {y.x, y.y, y.z}, pinned = select(a > W(0.0), W(0.0), W(1.0));
+  sum[first] = sum[first] + pinned;
+  int n = first + RigidSums::pin_spread - RigidSums::pins;
+  for (int r = 0; r < 3; ++r) {
+    const W held = pinned * at[r];
+    sum[first + 1 + r] = sum[first + 1 + r] + held;
+    for (int c = r; c < 3; ++c, ++n) sum[n] = multiply_add(held, at[c], sum[n]);
+  }
+}
+
+// y += turn (y - center) + shift
+template <class T>
+struct RigidMotion {
+  Mat3<T> turn;  // R - I
+  Vec3<T> center, shift;
+
+  PD_HD Vec3<T> of(const Vec3<T>& y) const { return turn * (y - center) + shift; }
+};
+
+// Pins lie at one point, or on one line, that are no further off than this share of the piece's size.
+constexpr double pins_apart = 1e-4;
+
+// R - I is not known better, in double.
+constexpr double least_turn = 4e-15;
+
+// What pins leave to a piece.
+enum class Hold { none, point, line, all };
+
+// What the sums say about a piece: where it turns, its shift, H, and the line along which pins hold it.
+struct RigidFit {
+  Hold hold = Hold::none;
+  Vec3<double> center, shift, axis = {0, 0, 0};
+  Mat3<double> covariance;
+
+  PD_HD explicit RigidFit(const double (&sum)[RigidSums::count]) {
+    using S = RigidSums;
+    const double share = sum[S::weight] > 0 ? 1.0 / sum[S::weight] : 0.0;
+    double middle[3], way[3], h[3][3];
+    for (int r = 0; r < 3; ++r) {
+      middle[r] = share * sum[S::position + r];
+      way[r] = share * sum[S::lag + r];
+    }
+    int n = S::spread;
+    for (int r = 0; r < 3; ++r) {
+      for (int c = r; c < 3; ++c, ++n)
+        h[r][c] = h[c][r] = sum[n] - sum[S::position + r] * middle[c];
+    }
+    const double square = share * (h[0][0] + h[1][1] + h[2][2]);
+    for (int r = 0; r < 3; ++r) {
+      for (int c = 0; c < 3; ++c) h[r][c] += sum[S::turn + 3 * r + c] - sum[S::lag + r] * middle[c];
+      covariance.row[r] = {h[r][0], h[r][1], h[r][2]};
+    }
+    center = {middle[0], middle[1], middle[2]};
+    shift = {way[0], way[1], way[2]};
+    if (sum[S::pins] > 0) turn_about_pins(sum, pins_apart * pins_apart * square);
+  }
+
+  PD_HD RigidMotion<double> still() const { return {{}, center, {0, 0, 0}}; }
+
+  // Of a piece that touches nothing.
+  PD_HD RigidMotion<double> free() const {
+    if (hold == Hold::all) return still();
+    if (hold == Hold::line) return {turn_about(axis), center, shift};
+    const double size = square_root(frobenius(covariance, covariance));
+    Mat3<double> turn = nearest_rotation((1.0 / (size > 0 ? size : 1.0)) * covariance);
+    turn.row[0].x -= 1.0;
+    turn.row[1].y -= 1.0;
+    turn.row[2].z -= 1.0;
+    // less is rounding, which would keep what drifts from coming to rest
+    if (frobenius(turn, turn) < least_turn * least_turn) turn = {};
+    return {turn, center, shift};
+  }
+
+  // The turn about a normal alone: R - I = sin [n]x + (1 - cos) (n n^T - I).
+  PD_HD Mat3<double> turn_about(const Vec3<double>& n) const {
+    const Vec3<double> image = covariance * n;
+    const double along =
+        covariance.row[0].x + covariance.row[1].y + covariance.row[2].z - dot(n, image);
+    const double across = dot(n, axis_of(covariance));
+    const double size = square_root(along * along + across * across);
+    if (!(size > 0)) return {};
+    const double sine = across / size, lift = 1.0 - along / size;
+    Mat3<double> turn = sine * cross_matrix(n);
+    const double axis[3] = {n.x, n.y, n.z};
+    for (int r = 0; r < 3; ++r) turn.row[r] = multiply_add(lift * axis[r], n, turn.row[r]);
+    turn.row[0].x -= lift;
+    turn.row[1].y -= lift;
+    turn.row[2].z -= lift;
+    return turn;
+  }
+
+ private:
+  // The middle of the pins becomes the center; `apart`: square of how far from a point or a line they may be.
+  PD_HD void turn_about_pins(const double (&sum)[RigidSums::count], double apart) {
+    using S = RigidSums;
+    const double share = 1.0 / sum[S::pins];
+    const Vec3<double> pivot = share * Vec3<double>{sum[S::pin_position], sum[S::pin_position + 1],
+                                                    sum[S::pin_position + 2]};
+    const double middle[3] = {pivot.x, pivot.y, pivot.z};
+    double p[3][3];
+    int n = S::pin_spread;
+    for (int r = 0; r < 3; ++r) {
+      for (int c = r; c < 3; ++c, ++n) p[r][c] = p[c][r] = share * sum[n] - middle[r] * middle[c];
+    }
+    const SignedSvd<double> svd = signed_svd(Mat3<double>{
+        {{p[0][0], p[0][1], p[0][2]}, {p[1][0], p[1][1], p[1][2]}, {p[2][0], p[2][1], p[2][2]}}});
+    hold = svd.s[1] > apart ? Hold::all : svd.s[0] > apart ? Hold::line : Hold::point;
+    axis = {svd.u.row[0].x, svd.u.row[1].x, svd.u.row[2].x};
+    const Vec3<double> arm = center - pivot, reach = sum[S::weight] * (arm + shift);
+    const double out[3] = {reach.x, reach.y, reach.z};
+    for (int r = 0; r < 3; ++r) covariance.row[r] = multiply_add(out[r], arm, covariance.row[r]);
+    center = pivot;
+    shift = {0, 0, 0};
+  }
+};
+
+// What a piece would touch if it moved freely: a bit for each of the first planes, and one for all other contacts together. And how
+// vertices slip that lie on those planes that have friction: sums of the slips, of their squares and of 1.
+struct Touch {
+  static constexpr int planes = 8;
+  static constexpr unsigned others = 1u << planes;
+  static constexpr int slip = 0, square = 3, vertices = 4, slips = 5;
+};
+
+// A vertex lies on a plane when it is no further off than this share of the way that the plane stops.
+constexpr double lying = 0.01;
+
+// Adds a vertex at y = x + u, whose piece would move by `motion`, to the slips and the least of them, squared; `near(k, gap)` learns
+// how far from the first planes it would come, and at last from the other contacts.
+template <class W, class R, class Near>
+PD_HD void add_touch(W (&slips)[Touch::slips], W& slowest, const Contacts<R>& contacts,
+                     const Vec3<R>& y, const Vec3<R>& u, const RigidMotion<R>& motion,
+                     const Near& near) {
+  const R none(0), one(1);
+  const Vec3<R> moved = y + motion.of(y);
+  const int told = contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
+  for (int k = 0; k < told; ++k) {
+    const Plane<R>& plane = contacts.planes[k];
+    near(k, gap(plane, moved));
+    const R reach = -R(scalar_of<R>(lying)) * dot(motion.shift, plane.normal);
+    const R lies = select(gap(plane, y) < reach, one, none);
+    const R rubs = select(plane.friction > none, lies, none);
+    const Vec3<R> slip = rubs * tangential(u, plane.normal);
+    const R square = dot(slip, slip);
+    const R add[Touch::slips] = {slip.x, slip.y, slip.z, square, rubs};
+    for (int n = 0; n < Touch::slips; ++n) slips[n] = slips[n] + convert<double>(add[n]);
+    slowest = lesser(slowest, convert<double>(select(rubs > none, square, R(HUGE_VAL))));
+  }
+  near(Touch::planes, contacts.least_gap(moved, told));
+}
+
+// Of the contacts that a piece does not touch: `touches(k)` says which of the first planes it does.
+template <class R, class Touches>
+PD_HD R least_gap_beside(const Contacts<R>& contacts, const Vec3<R>& moved,
+                         const Touches& touches) {
+  constexpr int most = Touch::planes;
+  const int told = contacts.plane_count < most ? contacts.plane_count : most;
+  R least = contacts.least_gap(moved, told);
+  for (int k = 0; k < told; ++k)
+    least = lesser(least, select(touches(k), R(HUGE_VAL), gap(contacts.planes[k], moved)));
+  return least;
+}
+
+// Along a rough plane with normal n, that vertices slide on by `slips`, none of them by less than `slowest`, squared. Nothing moves
+// once iterations have converged: friction that could stop the whole piece does so unless it holds a vertex already, and where
+// slips differ it does not act along their mean alone, and what is within that doubt is left as it is.
+PD_HD Vec3<double> slide(const Vec3<double>& shift, const Vec3<double>& n, double friction,
+                         const double (&slips)[Touch::slips], double slowest) {
+  if (!(slips[Touch::vertices] > 0)) return {};
+  const double share = 1.0 / slips[Touch::vertices], across = dot(shift, n);
+  const Vec3<double> mean =
+      share * Vec3<double>{slips[Touch::slip], slips[Touch::slip + 1], slips[Touch::slip + 2]};
+  const Vec3<double> free = mean + subtract_product(shift, across, n);
+  const double length = square_root(dot(free, free)), rub = -friction * across;
+  const double left = length - rub;
+  if (!(left > 0)) return 4 * slowest > dot(mean, mean) ? -mean : Vec3<double>{};
+  const Vec3<double> way = (left / length) * free - mean;
+  const double spread = share * slips[Touch::square] - dot(mean, mean);  // of the slips, squared
+  const double uneven = spread > 0 ? square_root(spread) / left : 0.0;
+  const double doubt = rub * (uneven < 2.0 ? uneven : 2.0), size = square_root(dot(way, way));
+  if (!(size > doubt)) return {};
+  return (1.0 - doubt / size) * way;
+}
+
+// The motion that contacts leave to a piece that touches some of them; `plane(k)` are the first of them.
+template <class PlaneAt>
+PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touched,
+                                             const double (&slips)[Touch::slips], double slowest,
+                                             const PlaneAt& plane) {
+  constexpr double parallel = 1e-12;  // square of what a normal adds to others
+  if (touched == 0) return fit.free();
+  RigidMotion<double> motion = fit.still();
+  if (fit.hold != Hold::none || touched & Touch::others) return motion;
+  Vec3<double> normals[3];
+  int count = 0, touches = 0;
+  double friction = 0;
+  for (int k = 0; k < Touch::planes; ++k) {
+    if (!(touched >> k & 1)) continue;
+    const Plane<double> p = plane(k);
+    ++touches;
+    if (p.friction > friction) friction = p.friction;
+    Vec3<double> n = p.normal;
+    for (int j = 0; j < count; ++j) n = subtract_product(n, dot(n, normals[j]), normals[j]);
+    const double square = dot(n, n);
+    if (count < 3 && square > parallel) normals[count++] = (1.0 / square_root(square)) * n;
+  }
+  if (count == 3 || (friction > 0 && touches > 1)) return motion;
+  if (friction > 0) {
+    motion.shift = slide(fit.shift, normals[0], friction, slips, slowest);
+    return motion;
+  }
+  motion.shift = fit.shift;
+  for (int j = 0; j < count; ++j)
+    motion.shift = subtract_product(motion.shift, dot(motion.shift, normals[j]), normals[j]);
+  if (count == 1) motion.turn = fit.turn_about(normals[0]);
+  return motion;
+}
+
+}  // namespace pd::inline PD_TARGET
