@@ -125,8 +125,9 @@ FIELDS: dict[str, tuple[Any, str]] = {
     "a number": (1.0, r"a tensor \[2, 27, 3\] like positions \({}\), got float"),
     "an array": (np.zeros((2, 27, 3), np.float32), r"a tensor \[2, 27, 3\] like positions \({}\), got ndarray"),
     "doubles": (torch.zeros(2, 27, 3).double(), r"torch\.float32 on cpu like positions \({}\), got torch\.float64 on"),
-    "no batch": (torch.zeros(27, 3), r"\[2, 27, 3\] like positions \({}\), got \[27, 3\]"),
-    "another batch": (torch.zeros(1, 27, 3), r"\[2, 27, 3\] like positions \({}\), got \[1, 27, 3\]"),
+    "another batch": (torch.zeros(3, 27, 3), r"\[2, 27, 3\] like positions \({}\), got \[3, 27, 3\]"),
+    "other vertices": (torch.zeros(26, 3), r"\[2, 27, 3\] like positions \({}\), got \[26, 3\]"),
+    "one vector": (torch.zeros(3), r"\[2, 27, 3\] like positions \({}\), got \[3\]"),
 }
 
 
@@ -155,6 +156,16 @@ def test_forces_of_every_step_are_a_function(forces: Any, sim: pd.Simulator) -> 
     message = r"forces must be .*, got (\[4, 2, 27, 3\]|list); for a rollout whose steps differ give a function"
     with pytest.raises((TypeError, ValueError), match=message):
         sim.rollout(sim.rest_state(2), 4, forces=forces)
+    with pytest.raises((TypeError, ValueError), match=r"forces must be .*, got (\[4, 2, 27, 3\]|list)$"):
+        sim(sim.rest_state(2), forces)  # whose steps do not differ
+
+
+def test_targets_of_every_step_are_a_function(sim: pd.Simulator) -> None:
+    state, targets = sim.rest_state(2), torch.zeros(4, 2, 3, 3)
+    with pytest.raises(ValueError, match=r"targets must be .*, got \[4, 2, 3, 3\]; for a rollout whose steps differ"):
+        sim.rollout(state, 4, targets=targets)
+    with pytest.raises(ValueError, match=r"targets must be .*, got \[4, 2, 3, 3\]$"):
+        sim(state, targets=targets)
 
 
 @pytest.mark.parametrize("info", [True, "all", np.zeros((2, 6))])

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .checks import of_each
 from .contact_newton import ContactNewton
 from .effects import Ground, Sphere
 from .material import MATERIAL_ROWS
@@ -147,6 +148,7 @@ def problem_of(
 ) -> StepProblem:
     """The step of one environment in the reference, with the simulator's present material and without friction."""
     arrays = sim.material_at(targets, state[0].shape[0])
+    forces = of_each(forces, state[0].shape)
     material = {}
     for name, array in zip(MATERIAL_ROWS, arrays, strict=True):
         shared = array.dim() == MATERIAL_ROWS[name].dims

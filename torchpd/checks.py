@@ -25,9 +25,10 @@ __all__ = [
     "check_target_file",
     "check_vector",
     "check_whole",
+    "of_each",
 ]
 
-# ends errors about forces and targets of every step
+# ends errors of a rollout about its constant forces and targets
 STEPS_DIFFER = "; for a rollout whose steps differ give a function of their number"
 NO_VALUES = (
     'the simulator is on "meta", where arrays have no values; sim.to_empty(device="cpu") and then '
@@ -89,6 +90,13 @@ def check_like(name: str, value: Any, positions: torch.Tensor, meaning: str, *, 
         )
     if value.shape != positions.shape:
         raise ValueError(f"{name} must be {list(positions.shape)} {like} {list(value.shape)}{fix}")
+
+
+def of_each(value: Any, shape: torch.Size) -> Any:
+    """What all environments share, [V, 3] or [1, V, 3], as a view [B, V, 3]; anything else as it is."""
+    if not isinstance(value, torch.Tensor) or value.shape == shape:
+        return value
+    return value.expand(shape) if value.shape in (shape[1:], (1, *shape[1:])) else value
 
 
 def check_finite(name: str, array: NDArray[Any]) -> None:

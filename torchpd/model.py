@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
 from .automatic import Choice, choose_solver
-from .checks import STEPS_DIFFER, check_has_values, check_like, check_whole
+from .checks import check_has_values, check_like, check_whole, of_each
 from .forecast import warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_array, check_batches, material_of
 from .multilevel import has_levels, has_strangers
@@ -330,8 +330,11 @@ class Model(nn.Module):
             self._replace_material(f"{type(self).__name__}.load_state_dict", arrays)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
-    def check_state(self, state: State, *, forces: Tensor | None = None) -> None:
-        """Refuse what is no state, one of another precision or device, velocities and forces unlike its positions."""
+    def check_state(self, state: State, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:
+        """Refuse what is no state, one of another precision or device, velocities and forces unlike its positions.
+
+        Gives the forces of every environment; `fix` ends the errors about those of another shape.
+        """
         if not _is_pair(state):
             raise TypeError(
                 f"state must be a State, positions and velocities [B, {self.vertices}, 3], got "
@@ -339,8 +342,11 @@ class Model(nn.Module):
             )
         self._check_kind("state", state[0])
         check_like("velocities", state[1], state[0], "m/s")
-        if forces is not None:
-            check_like("forces", forces, state[0], "N", fix=STEPS_DIFFER)
+        if forces is None:
+            return None
+        forces = of_each(forces, state[0].shape)
+        check_like("forces", forces, state[0], "N", fix=fix)
+        return forces
 
     def _check_kind(self, name: str, positions: Tensor) -> None:
         own = self.rest_positions
@@ -377,12 +383,12 @@ class Model(nn.Module):
             "report": report,
         }
 
-    def material_at(self, targets: Targets | None, batch: int) -> list[Tensor]:
-        """The material with pins and spheres where `targets` puts them."""
+    def material_at(self, targets: Targets | None, batch: int, *, fix: str = "") -> list[Tensor]:
+        """The material with pins and spheres where `targets` puts them; `fix` ends errors about targets that do not."""
         if targets is None:
             return self.material()
         pins, spheres = self.anchors.place(
-            targets, self.pin_targets, self.spheres, batch=batch, time_step=self.time_step
+            targets, self.pin_targets, self.spheres, batch=batch, time_step=self.time_step, fix=fix
         )
         replaced = {"pin_targets": pins, "spheres": spheres}
         return [replaced.get(name, getattr(self, name)).contiguous() for name in MATERIAL_ROWS]

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from .checks import STEPS_DIFFER
 from .material import MATERIAL_ROWS
 from .ops import refuse_tangents
 from .state import Info, State, Track
@@ -54,7 +55,10 @@ class Rollout:
 
 def roll(sim: Simulator, call: Rollout, *, progress: bool) -> Track:
     """The recorded states."""
-    sim.check_state(call.state, forces=None if callable(call.forces) else call.forces)
+    if callable(call.forces):
+        sim.check_state(call.state)
+    else:
+        call = replace(call, forces=sim.check_state(call.state, forces=call.forces, fix=STEPS_DIFFER))
     varies = callable(call.forces) or callable(call.targets)
     # the op has a derivative where it records every state
     one_by_one = varies or (call.every > 1 and call.tracks_gradient(sim.material()))
@@ -70,7 +74,7 @@ def roll(sim: Simulator, call: Rollout, *, progress: bool) -> Track:
 def _constant_material(sim: Simulator, call: Rollout) -> list[Tensor]:
     if callable(call.targets):
         return sim.material()
-    material = sim.material_at(call.targets, call.state[0].shape[0])
+    material = sim.material_at(call.targets, call.state[0].shape[0], fix=STEPS_DIFFER)
     return _moved_on(material, call.first) if call.first else material
 
 
@@ -119,8 +123,7 @@ def _one_by_one(sim: Simulator, call: Rollout, bar: tqdm[NoReturn] | None) -> Tr
         recorded = (step + 1 - call.first) % call.every == 0
         forces = call.forces
         if callable(forces):
-            forces = forces(step)
-            sim.check_state(state, forces=forces)
+            forces = sim.check_state(state, forces=forces(step))
         state, row = sim.advance(state, forces, material, call.start, report=call.report and recorded)
         if recorded:
             states.append(state)

@@ -93,7 +93,8 @@ class Simulator(Model):
 
         Args:
             state: positions and velocities [B, V, 3] [m, m/s].
-            forces: on the vertices [B, V, 3] [N], constant during the step.
+            forces: on the vertices [B, V, 3] [N], or [V, 3] or [1, V, 3] for all environments; constant during the
+                step.
             targets: where pins and spheres are at the end of the step [m]: by part, or one tensor [P, 3] or [B, P, 3]
                 for all pins together. A sphere takes its centre [3] or [B, 3], and with its velocity [6] or [B, 6],
                 which friction then drags vertices along with.
@@ -105,7 +106,7 @@ class Simulator(Model):
             error follows that of the step), friction included, see `torchpd.sliding`; none for planes and spheres
             themselves, nor for `start`. Forward mode and `torch.func.grad` are not provided.
         """
-        self.check_state(state, forces=forces)
+        forces = self.check_state(state, forces=forces)
         material = self.material_at(targets, state[0].shape[0])
         after, rows = self.advance(state, forces, material, start, report=return_info)
         return (after, Info.from_rows(rows)) if return_info else after
@@ -143,7 +144,7 @@ class Simulator(Model):
         Args:
             info: rows [B, 6] float64 to fill in, see `Info.from_rows`; None leaves out residual and energy.
         """
-        self.check_state(state, forces=forces)
+        forces = self.check_state(state, forces=forces)
         if state[0].requires_grad or state[1].requires_grad:
             raise ValueError(
                 "step_ overwrites the state, so it must not require gradients; detach it or call the simulator"
@@ -185,10 +186,11 @@ class Simulator(Model):
             state: where to start.
             steps: how many.
             every: steps from one record to the next; the track has steps // every records.
-            forces: constant, or a function of the step number.
-            targets: constant (a sphere with a velocity goes on with it), or a function of the step number. A sphere's
-                centre that comes from a function without a velocity has that of its way from where the sphere was at
-                the end of the step before: where the scene has it before step 0 and after steps that leave it out.
+            forces: as in `forward`, constant, or a function of the step number.
+            targets: as in `forward`, constant (a sphere with a velocity goes on with it), or a function of the step
+                number. A sphere's centre that comes from a function without a velocity has that of its way from where
+                the sphere was at the end of the step before: where the scene has it before step 0 and after steps that
+                leave it out.
             first: number of the first step, where this rollout goes on from another: `rollout(state, 9)` ends as
                 `rollout(rollout(state, 5).state(), 4, first=5)` does. For where spheres were, a function of targets is
                 asked for the step before, too; others are moved on by an addition for each step before.
@@ -331,7 +333,7 @@ class Simulator(Model):
             forces: as in `forward`.
             targets: as in `forward`.
         """
-        self.check_state(state, forces=forces)
+        forces = self.check_state(state, forces=forces)
         before, positions = self.positions_of(state), self.positions_of(after, "after")
         check_like("after", positions, before, "m")
         material = self.material_at(targets, state[0].shape[0])

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .checks import STEPS_DIFFER
 from .scene import Scene
 
 __all__ = ["Anchors", "Targets"]
@@ -37,27 +36,29 @@ class Anchors:
         return Anchors, (self.scene,)
 
     def place(
-        self, targets: Targets | None, pins: Tensor, spheres: Tensor, *, batch: int, time_step: float
+        self, targets: Targets | None, pins: Tensor, spheres: Tensor, *, batch: int, time_step: float, fix: str = ""
     ) -> tuple[Tensor, Tensor]:
-        """`pin_targets` [.., P, 3] and `spheres` [.., S, 8] where `targets` puts them."""
+        """`pin_targets` [.., P, 3] and `spheres` [.., S, 8] where `targets` puts them.
+
+        `fix` ends the errors about what has another shape or is no targets.
+        """
         if targets is None:
             return pins, spheres
         if isinstance(targets, Tensor):
-            return self._checked("targets", targets, batch, [(self.pinned, 3)], pins), spheres
+            return self._checked("targets", targets, batch, [(self.pinned, 3)], pins, fix), spheres
         if not isinstance(targets, Mapping):
             raise TypeError(
-                f"targets must be a tensor or a mapping from parts to tensors, got {type(targets).__name__}"
-                f"{STEPS_DIFFER}"
+                f"targets must be a tensor or a mapping from parts to tensors, got {type(targets).__name__}{fix}"
             )
         for part, value in targets.items():
             if id(part) in self.pins:
                 rows = self.pins[id(part)]
-                value = self._checked("targets of a Pin", value, batch, [(rows.stop - rows.start, 3)], pins)
+                value = self._checked("targets of a Pin", value, batch, [(rows.stop - rows.start, 3)], pins, fix)
                 pins = _overwrite(pins, rows, value)
             elif id(part) in self.spheres:
                 number = self.spheres[id(part)]
-                value = self._checked("targets of a Sphere", value, batch, [(3,), (6,)], spheres).unsqueeze(-2)
-                row = self._row(spheres, number, value, time_step)
+                value = self._checked("targets of a Sphere", value, batch, [(3,), (6,)], spheres, fix)
+                row = self._row(spheres, number, value.unsqueeze(-2), time_step)
                 spheres = _overwrite(spheres, slice(number, number + 1), row)
             else:
                 raise ValueError(
@@ -66,7 +67,9 @@ class Anchors:
                 )
         return pins, spheres
 
-    def _checked(self, name: str, value: Tensor, batch: int, shapes: Sequence[tuple[int, ...]], like: Tensor) -> Tensor:
+    def _checked(
+        self, name: str, value: Tensor, batch: int, shapes: Sequence[tuple[int, ...]], like: Tensor, fix: str = ""
+    ) -> Tensor:
         if not isinstance(value, Tensor):
             raise TypeError(
                 f"{name} must be a tensor of {like.dtype} on {like.device}, got {type(value).__name__}; "
@@ -76,8 +79,7 @@ class Anchors:
         if not any(came[-len(shape) :] == shape and came[: -len(shape)] in front for shape in shapes):
             wanted = " or ".join(str(list(shape)) for shape in shapes)
             raise ValueError(
-                f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}"
-                f"{STEPS_DIFFER}"
+                f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}{fix}"
             )
         if value.dtype != like.dtype or value.device != like.device:
             raise TypeError(f"{name} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}")

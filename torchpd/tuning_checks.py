@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from .accuracy import ExactStep
+from .checks import check_like
 from .diagonal import step_diagonal
 from .material import MATERIAL_ROWS, environments_of_material
 from .state import State
@@ -35,6 +36,8 @@ def check_request(error: float | None, milliseconds: float | None) -> None:
 def check_start(sim: Simulator, state: State, forces: Tensor | None) -> None:
     """States, forces and material that can be studied."""
     sim.check_state(state, forces=forces)
+    if forces is not None:
+        check_like("forces", forces, state[0], "N")
     if state[0].dim() != 3 or not len(state[0]):
         raise ValueError(f"tune: state must hold environments [B, V, 3], at least one, got {list(state[0].shape)}")
     count = environments_of_material(sim)
