@@ -25,6 +25,7 @@ from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_so
 from .state import State
 from .targets import Anchors, Targets
 from .warn import warn_user
+from .written import Written
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from .promise import Promise
 
 __all__ = ["Model"]
+
+_PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
 
 
 class Model(nn.Module):
@@ -75,11 +78,13 @@ class Model(nn.Module):
         self._batch = _check_batch(batch)
         values = scene.values()
         self.anchors = Anchors(scene)
+        self._written = Written()
         with _ordinary():
             self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
             self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
             for name, value in material_of(values, dtype).items():
                 self.register_parameter(name, nn.Parameter(value, requires_grad=False))
+        self._written.remember_pins(self.pin_stiffness)
         self.choice: Choice | None = None  # of "auto"
         if _is_auto(solver):
             self._choose_solver(None if iterations is None else self.iterations)
@@ -278,6 +283,7 @@ class Model(nn.Module):
                     setattr(self, name, parameters[name])
                 else:
                     getattr(self, name).copy_(tensor)
+        self._written.remember_pins(self.pin_stiffness)
         self.plan = plan
         if learned := [name for name, parameter in parameters.items() if parameter.requires_grad]:
             warn_user(
@@ -350,6 +356,7 @@ class Model(nn.Module):
 
     def _check_kind(self, name: str, positions: Tensor) -> None:
         own = self.rest_positions
+        self._written.check_rest(own, self.scene)
         if positions.dtype != own.dtype or positions.device != own.device:
             raise TypeError(
                 f"{name} must be {own.dtype} on {own.device} like the simulator, got {positions.dtype} on "
@@ -385,13 +392,15 @@ class Model(nn.Module):
 
     def material_at(self, targets: Targets | None, batch: int, *, fix: str = "") -> list[Tensor]:
         """The material with pins and spheres where `targets` puts them; `fix` ends errors about targets that do not."""
+        material = self.material()
+        self._written.check_pins(material[_PIN_STIFFNESS])
         if targets is None:
-            return self.material()
+            return material
         pins, spheres = self.anchors.place(
             targets, self.pin_targets, self.spheres, batch=batch, time_step=self.time_step, fix=fix
         )
         replaced = {"pin_targets": pins, "spheres": spheres}
-        return [replaced.get(name, getattr(self, name)).contiguous() for name in MATERIAL_ROWS]
+        return [replaced.get(row, array).contiguous() for row, array in zip(MATERIAL_ROWS, material, strict=True)]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
