@@ -35,6 +35,15 @@ def test_energy_of_a_state(dtype: torch.dtype, device: torch.device) -> None:
     assert sim.energy(lifted, pulled).tolist() == pytest.approx([weight + motion] * 2, **close)
 
 
+def test_info_has_no_gradient(dtype: torch.dtype, device: torch.device) -> None:
+    """The energy of the state that it is of has one."""
+    sim = simulate(dtype, device)
+    sim.stiffness.requires_grad_()
+    after, info = sim(moving(sim), return_info=True)
+    assert not any(column.requires_grad for column in info)
+    assert bool(torch.autograd.grad(sim.energy(after).sum(), sim.stiffness)[0].any())
+
+
 def test_info_is_blank_unless_asked_for(dtype: torch.dtype, device: torch.device) -> None:
     sim = simulate(dtype, device)
     state = moving(sim)

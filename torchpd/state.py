@@ -65,6 +65,8 @@ class State(NamedTuple):
 class Info(NamedTuple):
     """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it.
 
+    Nothing here has a gradient: for one of an energy there is `Simulator.energy`, of the state that the step reached.
+
     Attributes:
         residual: |grad E| / |grad E at x + h v| of the step's objective E, less what contacts balance: 1 is no better
             than where the body would fly to, and as residuals weigh short waves, an error may be larger or smaller; at
