@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ import torchpd as pd
 
 CUBE = 0.05  # m
 MESH = pd.shapes.box((CUBE, CUBE, CUBE), (4, 4, 4))
+BAR = pd.shapes.box((0.6, 0.15, 0.15), (12, 3, 3))
 
 
 def cube(*parts: Any, time_step: float = 1 / 60, youngs: float = 1e5, **options: Any) -> pd.Simulator:
@@ -146,3 +148,48 @@ def test_a_pin_is_let_go_by_a_tiny_spring() -> None:
         assert float(fallen[0]) < 0.1
     with pytest.raises(ValueError, match=r"pin_stiffness must be positive, inf for pins that hold exactly.* got 0\.0"):
         sim.set_material(pin_stiffness=torch.tensor([[torch.inf] * 3, [0.0] * 3]))
+
+
+class Swing(torch.nn.Module):
+    """Height of the tip of a bar after 100 steps."""
+
+    def __init__(self, sim: pd.Simulator) -> None:
+        super().__init__()
+        self.sim = sim
+
+    def forward(self, state: pd.State) -> Tensor:
+        end = self.sim.rollout(state, 100).positions[-1, 0]
+        return end[self.sim.rest_positions[:, 0] > 0.599, 1].mean()
+
+
+def slopes(youngs: float, **options: Any) -> tuple[float, float]:
+    """Its derivative by a factor of the stiffness: by autograd, and by differences of the same steps."""
+    solid = pd.Solid(BAR, youngs=youngs, density=1000.0)
+    scene = pd.Scene(solid, pd.Pin(solid, BAR.vertices[:, 0] == 0.0), pd.Gravity())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        sim = pd.Simulator(scene, 1 / 60, dtype=torch.float64, progress=False, **options)
+    swing, state = Swing(sim), sim.rest_state()
+
+    def tip(factor: Tensor) -> Tensor:
+        height: Tensor = torch.func.functional_call(swing, {"sim.stiffness": factor * sim.stiffness}, (state,))
+        return height
+
+    one, change = torch.ones((), dtype=torch.float64), 1e-4
+    factor = one.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(tip(factor), factor)
+    with torch.no_grad():
+        difference = (tip((1.0 + change) * one) - tip((1.0 - change) * one)) / (2.0 * change)
+    return float(slope), float(difference)
+
+
+def test_gradients_are_those_of_converged_steps() -> None:
+    """A motion of unconverged steps has another derivative than the one that it is given."""
+    right, same = slopes(1e6, solver=pd.Multilevel(), iterations=16)
+    assert right == pytest.approx(same, rel=1e-5)
+    slope, difference = slopes(1e6)  # 64 iterations of Chebyshev
+    assert slope / right == pytest.approx(1.196, abs=0.01)
+    assert difference / right == pytest.approx(1.073, abs=0.01)
+    for tolerance, error in ((1e-3, 4e-3), (1e-4, 4e-4)):
+        slope, _ = slopes(1e6, solver=pd.Multilevel(), iterations=124, tolerance=tolerance)
+        assert slope == pytest.approx(right, rel=error)
