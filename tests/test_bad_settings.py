@@ -43,6 +43,7 @@ def test_settings_of_a_simulator_are_checked() -> None:
         ({"tolerance": math.nan}, ValueError, r"tolerance must lie in \[0, 1\), got nan"),
         ({"tolerance": None}, ValueError, r"tolerance must lie in \[0, 1\), got None"),
         ({"tolerance": "low"}, ValueError, r"tolerance must lie in \[0, 1\), got 'low'"),
+        ({"dt": 0.01}, TypeError, r"^Simulator\.__init__\(\) got an unexpected keyword argument 'dt'"),
         (
             {"solver": "jacobi"},
             TypeError,

@@ -93,6 +93,9 @@ class Model(nn.Module):
             if iterations is None:
                 warn_of_few_iterations(self)
 
+    # python's errors of arguments name the class that users know
+    __init__.__qualname__ = "Simulator.__init__"
+
     @property
     def vertices(self) -> int:
         """Vertices of all bodies."""
