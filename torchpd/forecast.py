@@ -51,7 +51,7 @@ FAR_TOO_FEW = 0.1  # error that is left
 
 
 class UnsolvedWarning(UserWarning):
-    """The default iterations are far too few for this scene, time step and material."""
+    """Iterations that nobody named, the default or those of "auto", are far too few for this time step and material."""
 
 
 class Spectrum(NamedTuple):
@@ -165,15 +165,33 @@ def has_friction(sim: Model) -> bool:
     return any(bool((getattr(sim, name)[..., 4] > 0.0).any()) for name in ("planes", "spheres"))
 
 
-def warn_of_few_iterations(sim: Model) -> None:
-    """Say so when the default number of iterations leaves most of the error: who gave none may not know of them."""
+def warn_of_few_iterations(sim: Model, changed: str | None = None, enough: float = FAR_TOO_FEW) -> bool:
+    """Say so when iterations that nobody named leave more than enough: who gave none may not know of them.
+
+    Args:
+        sim: with the default number of iterations, or that of "auto".
+        changed: what brought another material or time step; None when the simulator is made.
+        enough: the error that may be left.
+
+    Returns:
+        Whether it was said.
+    """
+    if sim.choice is None and is_bound(sim):
+        return False  # most steps need far fewer
     expected = forecast(sim)
-    if is_bound(sim):
-        return  # most steps need far fewer
-    if expected is not None and expected.error(sim.iterations) > FAR_TOO_FEW:
-        warn_user(
-            f"Simulator: the default of {sim.iterations} iterations leaves an error of about "
-            f"{expected.error(sim.iterations):.1g} of a step here (1: nothing solved); {expected.words(1e-2)} "
-            'reach 1e-2. Give iterations=..., or take solver="auto", or ask sim.tune(error=1e-2)',
-            UnsolvedWarning,
-        )
+    if expected is None or expected.error(sim.iterations) <= enough:
+        return False
+    count, left = sim.iterations, expected.error(sim.iterations)
+    what, verb, ways = f"the default of {count} iterations", "leaves", "Give iterations=..., or take"
+    if changed is not None:
+        what, verb, ways = f"{count} iterations", "now leave", "Set sim.iterations, or take"
+    ways += ' solver="auto", or ask sim.tune(error=1e-2)'
+    if sim.choice is not None:
+        what += ' that "auto" chose before'
+        ways = "sim.prepare_solver() chooses anew"
+    warn_user(
+        f"{changed or 'Simulator'}: {what} {verb} an error of about {left:.1g} of a step here (1: nothing solved); "
+        f"{expected.words(1e-2)} reach 1e-2. {ways}",
+        UnsolvedWarning,
+    )
+    return True

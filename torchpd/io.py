@@ -71,6 +71,7 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         "written_by": f"torchpd {__version__}",
         "time_step": sim.time_step,
         "iterations": sim.iterations,
+        "named_iterations": sim.named_iterations,
         "tolerance": sim.tolerance,
         "kernel": sim.kernel,
         "batch": sim.batch,
@@ -224,6 +225,8 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
             sim.plan = precondition_plan(sim.plan, sim.scene.values(), stiffness, inertia)
     if choice:  # of "auto", which chooses anew on another device
         sim.choice = Choice(**choice)
+    sim.named_iterations = record.get("named_iterations", True)  # files of before do not say
+    sim.judge_iterations("Simulator.load")
     return sim
 
 

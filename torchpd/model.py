@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
-from .automatic import Choice, choose_solver
+from .automatic import AIM, Choice, choose_solver
 from .checks import check_has_values, check_like, check_whole, of_each
-from .forecast import warn_of_few_iterations
+from .forecast import FAR_TOO_FEW, warn_of_few_iterations
 from .material import MATERIAL_ROWS, check_array, check_batches, material_of
 from .multilevel import has_levels, has_strangers
 from .parametrized import invert, parametrization
@@ -35,6 +35,10 @@ if TYPE_CHECKING:
 __all__ = ["Model"]
 
 _PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
+_OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness")  # what decides how many iterations a step takes
+# Shortest and longest time step for which iterations need no warning, nor for what lies between: long ones are slow,
+# and short ones overshoot with a relaxation for long ones.
+_EVERY, _NONE = (0.0, math.inf), (math.inf, 0.0)
 
 
 class Model(nn.Module):
@@ -67,7 +71,7 @@ class Model(nn.Module):
         if not isinstance(scene, Scene):
             raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
         self.scene = scene
-        self.time_step = time_step
+        self._time_step = _positive("time_step", time_step, "s")
         self.iterations = DEFAULT_ITERATIONS if iterations is None else iterations
         self._solver: Solver = Chebyshev()
         automatic = solver is None or _is_auto(solver)
@@ -90,8 +94,8 @@ class Model(nn.Module):
             self._choose_solver(None if iterations is None else self.iterations)
         else:
             self.solver = given
-            if iterations is None:
-                warn_of_few_iterations(self)
+            self.named_iterations = iterations is not None
+            self.judge_iterations(None)
 
     # python's errors of arguments name the class that users know
     __init__.__qualname__ = "Simulator.__init__"
@@ -140,12 +144,16 @@ class Model(nn.Module):
 
     @property
     def time_step(self) -> float:
-        """h [s]."""
+        """h [s]; setting it warns as `set_material` does where iterations become far too few."""
         return self._time_step
 
     @time_step.setter
     def time_step(self, time_step: float) -> None:
         self._time_step = _positive("time_step", time_step, "s")
+        shortest, longest = self._judged_steps
+        # where it changes in every step hardly any change shall cost more than to ask
+        if not (shortest <= self._time_step <= longest or _recording(self.device)):
+            self.judge_iterations("time_step")
 
     @property
     def iterations(self) -> int:
@@ -155,6 +163,26 @@ class Model(nn.Module):
     @iterations.setter
     def iterations(self, iterations: int) -> None:
         self._iterations = check_whole("Simulator: iterations", iterations, minimum=0)
+        self.named_iterations = True
+
+    @property
+    def named_iterations(self) -> bool:
+        """Whether somebody has given a number of iterations: then no warning says that they have become too few."""
+        return self._named_iterations
+
+    @named_iterations.setter
+    def named_iterations(self, named: bool) -> None:
+        self._named_iterations = named
+        self._judged_steps = _EVERY if named else _NONE
+
+    def judge_iterations(self, changed: str | None) -> None:
+        """Warn where iterations that nobody named are too few for what has `changed`, once; awaits a GPU until then."""
+        if self._judged_steps == _EVERY:
+            return
+        shortest, longest = _NONE if changed != "time_step" else self._judged_steps
+        self._judged_steps = _EVERY
+        if not warn_of_few_iterations(self, changed, FAR_TOO_FEW if self.choice is None else 10.0 * AIM):
+            self._judged_steps = min(shortest, self.time_step), max(longest, self.time_step)
 
     @property
     def tolerance(self) -> float:
@@ -179,6 +207,7 @@ class Model(nn.Module):
             return self._choose_solver(None)
         before = self._solver, self.choice
         self._solver, self.choice = check_solver(solver, self.device), None
+        self.named_iterations = self.named_iterations  # to another solver the same number is another promise
         if isinstance(solver, Multilevel) == has_levels(self.plan.arrays):
             return None
         try:
@@ -190,14 +219,15 @@ class Model(nn.Module):
 
     def _choose_solver(self, iterations: int | None) -> None:
         """What "auto" does, see `choose_solver`."""
-        before = self.plan, self._solver, self.choice, self.iterations
+        before = self.plan, self._solver, self.choice, self.iterations, self.named_iterations
         try:
             if self.plan.for_levels:
                 self.solver = Chebyshev()  # its kernel is one of the costs that are compared
             self.solver, choice = choose_solver(self, iterations)
             self.iterations, self.choice = choice.iterations, choice
+            self.named_iterations = not choice.sets_iterations
         except BaseException:
-            self.plan, self._solver, self.choice, self.iterations = before
+            self.plan, self._solver, self.choice, self.iterations, self.named_iterations = before
             raise
 
     def _choose_again(self, choice: Choice) -> None:
@@ -208,9 +238,11 @@ class Model(nn.Module):
     def prepare_solver(self) -> None:
         """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`, the choice of "auto".
 
-        Worth it after the material has changed unevenly, which `Info.rho` and `Info.residual` tell, or time_step has.
-        `set_material` does it by itself when it pins other vertices hard, frees some, or gives them much stiffer
-        springs. Takes 0.3 s for 8 thousand vertices, seconds for a million tetrahedra. Other solvers prepare nothing.
+        Worth it after the material has changed much, evenly or not, or time_step has, which `Info.rho` and
+        `Info.residual` tell, and for "auto" an `UnsolvedWarning`. `set_material` does it by itself only when it pins
+        other vertices hard, frees some, or gives them much stiffer springs: captured and compiled steps have to be made
+        again, and it takes 0.3 s for 8 thousand vertices, seconds for a million tetrahedra. Other solvers prepare
+        nothing.
         """
         check_has_values("prepare_solver", self.device)
         before = self.plan
@@ -248,7 +280,8 @@ class Model(nn.Module):
                 or `pin_stiffness`. It counts as it is: where tetrahedra are partly full (`mesh.fill`) multiply
                 `sim.stiffness` instead. Shapes and values are checked here, once, and that batches agree with each
                 other and with those of the arrays that stay. Pins that hold others, or much harder, make the matrix of
-                `Multilevel` anew, see `prepare_solver`; a captured step wants to be captured again then.
+                `Multilevel` anew, see `prepare_solver`; a captured step wants to be captured again then. Where the
+                default iterations, or those of "auto", become far too few an `UnsolvedWarning` says so, once.
         """
         self._replace_material("set_material", arrays)
 
@@ -288,6 +321,8 @@ class Model(nn.Module):
                     getattr(self, name).copy_(tensor)
         self._written.remember_pins(self.pin_stiffness)
         self.plan = plan
+        if any(name in checked for name in _OF_THE_RATE):
+            self.judge_iterations(owner)
         if learned := [name for name, parameter in parameters.items() if parameter.requires_grad]:
             warn_user(
                 f"the simulator has a new parameter for {' and '.join(learned)}, of another batch, which an optimiser "
@@ -444,6 +479,11 @@ def _ordinary() -> Iterator[None]:
     """
     with torch.inference_mode(False), torch.no_grad(), torch.device("cpu"):
         yield
+
+
+def _recording(device: torch.device) -> bool:
+    """Whether torch.compile or a CUDA graph is looking on, which can wait for no value."""
+    return torch.compiler.is_compiling() or (device.type == "cuda" and torch.cuda.is_current_stream_capturing())
 
 
 def _check_batch(batch: int | None) -> int | None:

@@ -47,12 +47,14 @@ class Simulator(Model):
         scene: what there is.
         time_step: h [s], positive.
         iterations: local and global steps of one time step, at most. None: 64, or what "auto" chooses. Where 64 are
-            expected to leave a tenth of the error or more an `UnsolvedWarning` says so; `print(sim)` tells for any.
+            expected to leave a tenth of the error or more an `UnsolvedWarning` says so, once, also when `set_material`,
+            `load_state_dict` or another `time_step` has brought that about; `print(sim)` tells for any.
         solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later. None is Chebyshev.
             "auto" takes Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner on the device,
             Chebyshev where there is friction, and as many iterations as that takes unless they are given, four times as
             many where a `tolerance` ends easy steps; `print(sim)` says why. It chooses anew when the simulator moves to
-            another device and in `prepare_solver`.
+            another device and in `prepare_solver`, which an `UnsolvedWarning` asks for where a change of material or
+            time step makes the old choice leave 1e-2 or more.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x - x*| is about tolerance |x - s| or less, s being where
             inertia, forces and springs alone would take the vertices, so that |x - s| is what elasticity and contacts

@@ -249,6 +249,7 @@ def _of_environments(sim: Simulator, items: list[int], batch: int) -> Simulator:
         if getattr(sim, name).dim() > row.dims and len(getattr(sim, name)) == batch
     }
     picked = plain_copy(sim)
+    picked.named_iterations = True  # those of the study are the study's to judge
     picked.set_material(**own)
     return picked
 
