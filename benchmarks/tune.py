@@ -24,7 +24,8 @@ from scipy.spatial import Delaunay
 from tqdm import tqdm
 
 import torchpd as pd
-from torchpd.accuracy import exact_steps, frictionless
+from torchpd.accuracy import exact_steps, settled_steps
+from torchpd.forecast import has_friction
 from torchpd.tuning import TuningWarning
 
 JUDGED_STEPS = (1, 5, 20, 45)  # of the other motion
@@ -93,19 +94,19 @@ def random_state(sim: pd.Simulator, rng: np.random.Generator) -> pd.State:
 @torch.no_grad()
 def judge(sim: pd.Simulator, state: pd.State) -> Row:
     """Errors of steps along the motion of the tuned simulator, and what the promise says of each."""
-    smooth = frictionless(sim)
+    solved = settled_steps if has_friction(sim) else exact_steps
     errors, raw, trusted, audits, residuals = [], [], [], [], []
     for step in range(max(JUDGED_STEPS) + 1):
-        after, info = smooth(state, return_info=True)
+        after, info = sim(state, return_info=True)
         if step in JUDGED_STEPS:
-            exact = exact_steps(smooth, state)[0]
+            exact = solved(sim, state)[0]
             if exact.moves(sim.dtype):
                 displacement = after.velocities[0].double().numpy() * sim.time_step
                 errors.append(exact.error_beyond_rounding(displacement, sim.dtype))
-                raw.append(exact.judge(displacement).position)
+                raw.append(exact.position_error(displacement))
                 trusted.append(bool(sim.promise.holds(info)[0]))
                 residuals.append(float(info.residual[0]))
-                audits.append(float(sim.promise.audit(smooth, state, after)[0]))
+                audits.append(float(sim.promise.audit(sim, state, after)[0]))
         state = after
     return {
         "errors": errors, "errors_with_rounding": raw, "trusted": trusted, "audits": audits, "residuals": residuals,

@@ -10,9 +10,17 @@ from cases import beam, contact_block, sliver_mesh
 from runs import full_scene, moving, simulate, simulator, state_of
 
 import torchpd as pd
-from torchpd.accuracy import exact_steps, frictionless, problem_of, scene_without_friction, select_state
+from torchpd import accuracy
+from torchpd.accuracy import (
+    exact_steps,
+    frictionless,
+    problem_of,
+    scene_without_friction,
+    select_state,
+    settled_steps,
+)
 from torchpd.contact_newton import ContactNewton
-from torchpd.reference import StepProblem
+from torchpd.reference import StepProblem, step_problem
 from torchpd.reference_solvers import newton, newton_step, solve_with_contact
 from torchpd.subjects import SUBJECTS
 
@@ -186,3 +194,51 @@ def test_rounding_is_told_from_motion() -> None:
     slack = 10.0 * 2.0**-23 * np.linalg.norm(step.problem.positions) / step.scale
     assert step.error_beyond_rounding(step.first, torch.float32) == pytest.approx(1.0 - slack, rel=1e-9)
     assert step.error_beyond_rounding(step.solution, torch.float32) == 0.0
+
+
+def rough_block(friction: float, youngs: float = 1e6) -> tuple[pd.Simulator, pd.State]:
+    """Two blocks, on the ground and falling onto it, both pushed along."""
+    solid = pd.Solid(pd.shapes.box((0.4, 0.2, 0.2), (6, 3, 3)), youngs)
+    scene = pd.Scene(solid, pd.Gravity((3.0, -9.81, 0.0)), pd.Ground(0.0, friction=friction))
+    sim = pd.Simulator(scene, 1 / 60, dtype=torch.float64, progress=False, iterations=64)
+    state = sim.rest_state(2)
+    state.positions[1, :, 1] += 0.01
+    state.velocities[..., 0] = 1.0
+    state.velocities[1, :, 1] = -2.0
+    return sim, state
+
+
+def test_settled_steps_are_the_fixed_point_of_friction() -> None:
+    """By the reference, whose projection has the cone; it holds vertices back by millimetres."""
+    sim, state = rough_block(0.8)
+    smooth = exact_steps(sim, state)
+    for item, step in enumerate(settled_steps(sim, state)):
+        x, v = (part[item].numpy() for part in state)
+        problem = step_problem(sim.scene.values(), x, v, sim.time_step)
+        left, course = (np.linalg.norm(problem.residual(u)) for u in (step.solution, problem.course()))
+        assert step.uncertainty < 1e-6
+        assert left < 1e-6 * course
+        assert np.abs(step.solution - smooth[item].solution).max() > 1e-3
+
+
+def test_settled_steps_without_friction_are_the_exact_ones() -> None:
+    sim, state = rough_block(0.0)
+    forces = torch.zeros_like(state.positions)
+    forces[1, :, 2] = 0.5
+    pairs = zip(
+        settled_steps(sim, state, forces=forces, enough=1e-9), exact_steps(sim, state, forces=forces), strict=True
+    )
+    for settled, exact in pairs:
+        assert exact.position_error(settled.solution) <= exact.uncertainty + settled.uncertainty
+        assert settled.uncertainty < 1e-8
+
+
+def test_steps_that_have_no_time_to_settle_are_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By about as much as they are wrong."""
+    sim, state = rough_block(0.8)
+    known = settled_steps(sim, state)
+    monkeypatch.setattr(accuracy, "_LEADING", 4)
+    monkeypatch.setattr(accuracy, "_SETTLING", (8, 16))
+    for rough, step in zip(settled_steps(sim, state), known, strict=True):
+        wrong = step.position_error(rough.solution)
+        assert rough.uncertainty > wrong / 3 > 1e-3

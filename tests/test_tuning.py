@@ -15,7 +15,7 @@ import torch
 
 import torchpd as pd
 from torchpd import tuning
-from torchpd.accuracy import exact_steps, frictionless
+from torchpd.accuracy import ExactStep, exact_steps, frictionless, settled_steps
 from torchpd.contenders import safe_solvers
 from torchpd.promise import Promise, Trial
 from torchpd.tuning import TuningWarning
@@ -528,6 +528,57 @@ def test_what_friction_leaves_out_is_said() -> None:
         sim.tune(state, error=1e-3, most=8)
     with pytest.warns(TuningWarning, match="cannot be had"):
         sim.tune(state, error=1e-3, most=1, candidates=[pd.Chebyshev(), pd.Multilevel()])
+
+
+def sliding(youngs: float, *, friction: float = 0.8) -> tuple[pd.Simulator, pd.State]:
+    """A block that falls a centimetre onto rough ground and is pushed along it, and its start."""
+    solid = pd.Solid(pd.shapes.box((0.4, 0.2, 0.2), (6, 3, 3)), youngs)
+    scene = pd.Scene(solid, pd.Gravity((3.0, -9.81, 0.0)), pd.Ground(-0.01, friction=friction))
+    sim = pd.Simulator(scene, 1 / 60, dtype=torch.float64, progress=False, iterations=64)
+    state = sim.rest_state()
+    state.velocities[..., 0] = 1.0
+    return sim, state
+
+
+def errors_of_a_slide(sim: pd.Simulator, state: pd.State, steps: int = 25) -> list[float]:
+    """Of its steps, with their friction."""
+    errors = []
+    for _ in range(steps):
+        after, (exact,) = sim(state), settled_steps(sim, state)
+        if exact.moves(sim.dtype):
+            assert exact.uncertainty < 1e-4
+            errors.append(exact.position_error(after.velocities[0].numpy() * sim.time_step))
+        state = after
+    return errors
+
+
+def test_friction_is_part_of_the_promise() -> None:
+    """The 49 iterations that reach 1e-2 on smooth ground leave 0.2."""
+    sim, state = sliding(1e6)
+    promise = sim.tune(state, error=1e-2)
+    assert promise.attained
+    # of another motion
+    state.velocities[..., 0], state.velocities[..., 2] = -0.7, 0.5
+    assert max(errors_of_a_slide(sim, state)) <= 1e-2
+    sim.iterations //= 3
+    assert max(errors_of_a_slide(sim, state)) > 1e-2
+    assert sim.planes[0, 4] == 0.8
+
+
+def test_steps_without_an_end_attain_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a body sticks and slips by turns: no error is smaller than what is not known of the step."""
+
+    def unsettled(*given: object, **named: object) -> list[ExactStep]:
+        steps = settled_steps(*given, **named)  # type: ignore[arg-type]
+        return [dataclasses.replace(step, uncertainty=0.2) for step in steps]
+
+    monkeypatch.setattr(tuning, "settled_steps", unsettled)
+    sim, state = sliding(1e5)
+    with pytest.warns(TuningWarning, match="error 0.01 not reached"):
+        promise = sim.tune(state, error=1e-2, most=128)
+    assert not promise.attained
+    assert promise.error >= 0.2
+    assert sim.tune(state, error=0.5).attained
 
 
 def test_a_singular_system_is_named() -> None:

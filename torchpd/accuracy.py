@@ -6,14 +6,14 @@ Errors are relative, so that 1 is the first iterate and 0 the converged step:
     energy     (E(u) - E(u*)) / (E(u_0) - E(u*))    of the objective of the step
     residual   |grad E(u)| / |grad E(h v)|          what contacts balance left out, as in `Info.residual`
 
-The converged step has no friction: where vertices stick, every position inside the cone of friction is a solution.
+The converged step of `exact_steps` has no friction, which has no energy to go down; `settled_steps` has it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -34,7 +34,16 @@ from .targets import Targets
 if TYPE_CHECKING:
     from .simulator import Simulator
 
-__all__ = ["Errors", "ExactStep", "exact_steps", "frictionless", "problem_of", "scene_without_friction", "select_state"]
+__all__ = [
+    "Errors",
+    "ExactStep",
+    "exact_steps",
+    "frictionless",
+    "problem_of",
+    "scene_without_friction",
+    "select_state",
+    "settled_steps",
+]
 
 Array = NDArray[np.float64]
 
@@ -47,6 +56,8 @@ _PATIENCE = 3  # looks in which no residual halves, one where all are nearly sol
 _SURE = 1e-8  # uncertainty of a converged step that ends the search for a better one
 # and that Newton's method is spared for: what rounding of the precision hides
 _FINE = {torch.float32: 1e-8, torch.float64: 1e-14}
+# of steps with friction: iterations of Multilevel, and of Chebyshev one run after another
+_LEADING, _SETTLING = 64, (256, 512, 1024, 2048, 4096, 8192)
 # of the positions: what rounding them already moves a body that only falls, and what a stiff one scatters by
 ROUNDINGS = 10.0
 
@@ -224,6 +235,51 @@ def exact_steps(
             if search.sure:
                 break
     return [step for step in search.found if step is not None]
+
+
+@torch.no_grad()
+def settled_steps(
+    sim: Simulator, state: State, *, forces: Tensor | None = None, enough: float = _SURE
+) -> list[ExactStep]:
+    """The step of every environment with its friction, where iterations from "velocity" come to rest.
+
+    There is no energy that Newton's method could go down, so `Multilevel` in float64 on the CPU is followed by longer
+    and longer runs of Chebyshev, and `ExactStep.uncertainty` is what the last two of them have still moved. It stays
+    large where they go round in circles, as between sticking and slipping. `ExactStep.judge` knows no friction.
+
+    Args:
+        sim: scene, time step and material; its solver and device do not matter.
+        state: where the steps start, [B, V, 3].
+        forces: [B, V, 3] N.
+        enough: uncertainty at which to stop.
+    """
+    with torch.device("cpu"):
+        twin = plain_copy(sim)
+        twin.solver, twin.tolerance = Chebyshev(), 0.0
+        twin = twin.to("cpu", torch.float64)
+        wide, pushed = State(_wide(state[0]), _wide(state[1])), None if forces is None else _wide(forces)
+
+        def run(solver: Solver, iterations: int, start: str | Tensor = "velocity") -> State:
+            twin.solver, twin.iterations = solver, iterations
+            return cast(State, twin(wide, pushed, start=start))
+
+        # not the difference of positions, which has lost digits
+        first = run(Chebyshev(), 0).velocities * twin.time_step
+        after, moves = run(Multilevel(), _LEADING), [torch.inf * torch.ones(len(first), dtype=torch.float64)]
+        for iterations in _SETTLING:
+            before, after = after, run(Chebyshev(), iterations, after.positions)
+            moves.append((after.velocities - before.velocities).flatten(1).norm(dim=1) * twin.time_step)
+            scale = (first - after.velocities * twin.time_step).flatten(1).norm(dim=1)
+            rounding = ROUNDINGS * torch.finfo(torch.float64).eps * wide.positions.flatten(1).norm(dim=1)
+            left = torch.maximum(moves[-2], moves[-1])
+            if bool((left <= torch.maximum(enough * scale, rounding)).all()):
+                break
+    shares = left / scale.clamp(min=torch.finfo(torch.float64).tiny)
+    found = zip(first.numpy(), (after.velocities * twin.time_step).numpy(), shares.tolist(), strict=True)
+    return [
+        ExactStep(problem_of(sim, state, item, forces=forces), start, solution, share)
+        for item, (start, solution, share) in enumerate(found)
+    ]
 
 
 class _Search:

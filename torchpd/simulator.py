@@ -253,7 +253,9 @@ class Simulator(Model):
         `attained=False`, and a `TuningWarning`. Files do not keep it: times are of the machine that measured them.
 
         Takes about a second for a thousand vertices, 2 to 8 s for 3 thousand and 20 s for 10 thousand on one core of a
-        CPU: nine steps of each studied environment are solved to convergence in float64, on the CPU.
+        CPU: nine steps of each studied environment are solved to convergence in float64, on the CPU. With friction up
+        to three times as long; where steps come to no end there, as of stiff bodies that stick and slip, the target
+        counts as out of reach.
 
         Args:
             state: where typical motions start [B, V, 3], the rest state by default, once for each environment of the
@@ -264,7 +266,7 @@ class Simulator(Model):
             forces: on the vertices during these steps [B, V, 3] [N].
             targets: where pins and spheres are during them, as in `forward`; by default where the scene has them.
             candidates: solvers to choose from, not "auto"; by default those that cannot diverge, and no `Multilevel`
-                where there is friction, which the study leaves out.
+                where there is friction, which may lead it astray in steps that the study has not seen.
             most: iterations of a step, at most.
             progress: show a bar.
 

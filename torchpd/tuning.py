@@ -1,9 +1,9 @@
 """Choose solver and iterations for an error or a time, from a short study on the user's own scene: `Simulator.tune`.
 
-The study takes a few states of the motion, solves each to convergence in float64 (`accuracy.exact_steps`), and runs
-every candidate at doubling iteration counts from the same states. What it promises is kept as a `Promise`, whose
-`holds(info)` watches a run by the residual: error and residual of one scene fall together, and the study measures by
-how much.
+The study takes a few states of the motion, solves each to convergence in float64 (`accuracy.exact_steps`, with friction
+`settled_steps`), and runs every candidate at doubling iteration counts from the same states. What it promises is kept
+as a `Promise`, whose `holds(info)` watches a run by the residual: error and residual of one scene fall together, and
+the study measures by how much.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .accuracy import ExactStep, exact_steps, frictionless
+from .accuracy import ExactStep, exact_steps, settled_steps
 from .automatic import runs
 from .checks import check_has_values, check_scalar, check_whole
 from .contenders import safe_solvers
@@ -55,6 +55,8 @@ _NEAR = 1.1  # a safer candidate wins although it takes this much longer
 _HOPELESS = 1.5  # a candidate that takes this much longer than another one is given up
 # iterations for the states that are studied: of Multilevel, and of Chebyshev where a GPU's kernel runs no other
 _MOVING, _MOVING_PLAINLY = 64, 512
+# uncertainty of steps with friction, at most if they settle at all: a share of the error that is asked for, or of this
+_SETTLED, _COARSE = 1e-2, 1e-2
 _KNOWN = 0.1  # uncertainty of the converged steps, at most, where a time is asked for and no error
 
 
@@ -62,7 +64,7 @@ _KNOWN = 0.1  # uncertainty of the converged steps, at most, where a time is ask
 class _Study:
     """What every trial needs."""
 
-    sim: Simulator  # frictionless, its batch the studied states
+    sim: Simulator  # its batch the studied states
     state: State
     forces: Tensor | None
     exact: list[ExactStep]
@@ -120,8 +122,10 @@ def tune(
             raise TypeError(f"tune: candidates must be solvers, such as Chebyshev() and Multilevel(), got {solver!r}")
     start = sim.rest_state(environments_of_material(sim)) if state is None else state
     check_start(sim, start, forces)
-    study = _prepare(_with_targets(sim, targets, len(start[0])), start, forces)
-    check_known(study.exact, _KNOWN if error is None else error / SAFETY)
+    study = _prepare(_with_targets(sim, targets, len(start[0])), start, forces, error)
+    # with friction steps may come to no end, which counts as error: then a target is not attained
+    if not has_friction(sim):
+        check_known(study.exact, _KNOWN if error is None else error / SAFETY)
     named: Mapping[str, Solver] = (
         _usual(sim, safe_solvers(study.sim, study.state))
         if candidates is None
@@ -153,7 +157,7 @@ def tune(
 
 
 def _usual(sim: Simulator, solvers: Mapping[str, Solver]) -> dict[str, Solver]:
-    """Those that are studied if no others are named: friction, which the study leaves out, may cost Multilevel much."""
+    """Those that are studied if no others are named: friction may lead Multilevel astray in steps that are not."""
     smooth = not has_friction(sim)
     return {name: solver for name, solver in solvers.items() if smooth or not isinstance(solver, Multilevel)}
 
@@ -172,16 +176,20 @@ def _with_targets(sim: Simulator, targets: Targets | None, batch: int) -> Simula
 
 
 @torch.no_grad()
-def _prepare(sim: Simulator, start: State, forces: Tensor | None) -> _Study:
+def _prepare(sim: Simulator, start: State, forces: Tensor | None, error: float | None) -> _Study:
     """States of the motion from `start`, with their converged steps; those that only fall are left out."""
     items = _environments(sim, len(start[0]))
-    smooth = _of_environments(frictionless(sim), items, len(start[0]))
+    some = _of_environments(sim, items, len(start[0]))
+    some.tolerance = 0.0
     given = None if forces is None else forces.detach()[items]
-    states = _motion(smooth, State(start[0][items], start[1][items]), given)
-    everyone = _of_environments(smooth, list(range(len(items))) * len(states), len(items))
+    states = _motion(some, State(start[0][items], start[1][items]), given)
+    everyone = _of_environments(some, list(range(len(items))) * len(states), len(items))
     state = State(*(torch.cat(parts) for parts in zip(*states, strict=True)))
     repeated = None if given is None else given.repeat(len(states), 1, 1)
-    exact = exact_steps(everyone, state, forces=repeated)
+    if has_friction(sim):
+        exact = settled_steps(everyone, state, forces=repeated, enough=_SETTLED * (error or _COARSE))
+    else:
+        exact = exact_steps(everyone, state, forces=repeated)
     moving = [number for number, step in enumerate(exact) if step.moves(sim.dtype)]
     if not moving:
         raise ValueError(
@@ -211,7 +219,7 @@ def _motion(sim: Simulator, start: State, forces: Tensor | None) -> list[State]:
     is not convex, which are few, and which all solvers leave slowly.
     """
     mover = copy.copy(sim)
-    if runs(Multilevel(), mover):
+    if runs(Multilevel(), mover) and not has_friction(mover):
         mover.solver, mover.iterations = Multilevel(), _MOVING
     else:
         mover.solver, mover.iterations = Chebyshev(), _MOVING_PLAINLY
