@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
 
 import torchpd as pd
-from torchpd.fill import LEAST_FILL
+from torchpd.fill import LEAST_FILL, parts_of
 from torchpd.quality import shape_gradients
 
 Array = NDArray[np.float64]
@@ -119,10 +119,53 @@ def test_winding_and_shared_vertices_do_not_matter() -> None:
     np.testing.assert_allclose(fill_of(one), fill_of(other), atol=1e-5)
 
 
-def test_cracks_do_not_empty_a_body() -> None:
+@pytest.mark.parametrize(("noise", "cells"), [(1e-3, 20), (8e-3, 20), (8e-3, 40), (1e-5, 10)])
+def test_cracks_do_not_empty_a_body(noise: float, cells: int) -> None:
     surface = ball()
-    cracked = soup(surface, noise=1e-3)  # a hundredth of a cell
-    assert filled(pd.tetrahedralize(cracked, cells=20)) == pytest.approx(surface.volume(), rel=0.02)
+    cracked = soup(surface, noise)  # a fortieth of a cell for each 1e-3 at 20 cells; edges are 0.15 long
+    assert filled(pd.tetrahedralize(cracked, cells=cells)) == pytest.approx(surface.volume(), rel=0.01)
+
+
+def test_seams_are_closed_by_distance_not_by_rounding() -> None:
+    # Two halves, 1e-6 cells apart where a grid of the tolerance has its boundary.
+    whole = block(1.0, 1.0, 1.0)
+    right, left = whole.translated((0.5, 0.0, 0.0)), whole.translated((-0.5, 0.0, 0.0))
+    for gap in (1e-6, 0.1):
+        tolerance = 0.25
+        open_right = right.triangles[(right.vertices[right.triangles][:, :, 0] > 0.1).any(axis=1)]
+        open_left = left.triangles[(left.vertices[left.triangles][:, :, 0] < -0.1).any(axis=1)]
+        vertices = np.concatenate([right.vertices + [gap / 2, 0, 0], left.vertices - [gap / 2, 0, 0]])
+        shift = [0.5 * tolerance, 0.0, 0.0]
+        both = pd.TriMesh(vertices + shift, np.concatenate([open_right, open_left + len(right.vertices)]))
+        parts = parts_of(both, tolerance, fill_holes=True)
+        assert len(parts.caps) == 0
+        assert len(np.unique(parts.part)) == 1
+        closed = parts.triangles - shift
+        # The strips between the halves are wound anyhow: count volumes by where faces look from the middle.
+        volumes = np.linalg.det(closed)
+        assert np.abs(volumes).sum() / 6.0 == pytest.approx(2.0 + gap, rel=1e-9)
+
+
+def test_the_corners_of_a_fine_rim_stay_apart() -> None:
+    whole = ball(4)
+    upper = whole.vertices[whole.triangles].mean(axis=1)[:, 2] > 0.0
+    used, numbers = np.unique(whole.triangles[upper], return_inverse=True)
+    bowl = pd.TriMesh(whole.vertices[used], numbers.reshape(-1, 3))
+    parts = parts_of(bowl, 0.5, fill_holes=True)  # edges are 0.07
+    rim = np.unique(parts.caps[:, :2].reshape(-1, 3), axis=0)
+    assert len(parts.caps) == len(rim) == 96
+    assert not len(parts.sheets)
+
+
+def test_what_is_torn_to_pieces_is_a_sheet_and_reported() -> None:
+    whole = ball()
+    corners = whole.vertices[whole.triangles]
+    middle = corners.mean(axis=1, keepdims=True)
+    shreds = soup(pd.TriMesh((middle + 0.7 * (corners - middle)).reshape(-1, 3), np.arange(3840).reshape(-1, 3)))
+    with pytest.warns(pd.MeshWarning, match=r"1280 of 1280 triangles .* less than 0\.02\d+ m and half an edge apart"):
+        mesh = pd.tetrahedralize(shreds, cells=20)
+    assert np.all(fill_of(mesh) == 1.0)
+    assert whole.volume() < filled(mesh) < 1.2 * whole.volume()  # a layer of half a cell, 1/20 of the radius
 
 
 def test_parts_that_overlap_count_once_and_cavities_are_filled() -> None:

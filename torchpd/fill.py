@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from .lattice import Lattice, candidates, split_long
 from .mesh import TriMesh
+from .mesh_checks import warn
 
 __all__ = ["LEAST_FILL", "Parts", "inside_share", "parts_of"]
 
@@ -32,6 +34,10 @@ LEAST_FILL = 0.05
 _SAMPLES = 6
 # A part that is thinner than this, in cubes on average, encloses nothing: a surface and its own way back.
 _THIN = 1e-3
+# The nearest vertices that may count as one with a vertex: the others are reached through these.
+_COPIES = 7
+# A sheet of fewer triangles may be meant.
+_FEW = 100
 # Rounding of a covered length.
 _TIE = 1e-3
 # Samples in work at a time, and small triangles, to bound memory.
@@ -60,11 +66,12 @@ class _Edges(NamedTuple):
 def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     """Take a surface apart, and close what is open by a cone over each connected piece of its open edges.
 
-    Parts that are closed as they are stay exact. In the others, vertices closer than `tolerance` count as one: files
-    repeat vertices along seams, not always to the bit.
+    Parts that are closed as they are stay exact. In the others, vertices at open edges that are closer than `tolerance`
+    count as one, since files repeat vertices along seams, not always to the bit: strips of triangles close the seams.
+    Pieces of which most edges are still open then are sheets.
     """
-    triangles = surface.triangles
     same = _numbered(surface.vertices)
+    triangles = surface.triangles
     part = _connected(triangles, same)
     edges = _edges(triangles, same)
     closed, oriented = (np.ones(int(part.max()) + 1, dtype=bool) for _ in range(2))
@@ -75,21 +82,74 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     none = np.empty((0, 3, 3))
     if not rest.any():
         return Parts(corners, part, oriented, none, none)
-    near = _numbered(np.floor(surface.vertices / tolerance + 0.5))
-    edges = _edges(triangles[rest], near)
-    own = _connected(triangles[rest], near)
-    caps, cap_of = _cones(surface.vertices, near, edges, own) if fill_holes else (none, own[:0])
-    whole = np.ones(int(own.max()) + 1, dtype=bool)
-    if not fill_holes:
-        whole[own[edges.triangle[edges.open]]] = False
-    whole = whole[own]
+    places, near = _welded(surface.vertices, same, _edges(triangles[rest], same), tolerance)
+    loose = triangles[rest]
+    own, edges = _connected(loose, near), _edges(loose, near)
+    count = int(own.max()) + 1
+    gaps = np.bincount(own[edges.triangle[edges.open]], minlength=count)
+    torn = 2 * gaps > np.bincount(own[edges.triangle], minlength=count)
+    if fill_holes:
+        _report_torn(int(torn[own].sum()), len(surface.triangles), tolerance)
+    whole = ~torn if fill_holes else gaps == 0
+    strips, strip_of = _strips(surface.vertices, places, _edges(loose, same), own)
+    cones, cone_of = _cones(places, near, edges, own)
+    strips, strip_of = strips[whole[strip_of]], strip_of[whole[strip_of]]
+    cones, cone_of = cones[whole[cone_of]], cone_of[whole[cone_of]]
+    corners, inner = surface.vertices[loose], whole[own]
+    new = np.concatenate([own[inner], strip_of, cone_of])
     return Parts(
-        triangles=np.concatenate([corners[~rest], corners[rest][whole], caps]),
-        part=np.concatenate([part[~rest], len(oriented) + own[whole], len(oriented) + cap_of]),
-        oriented=np.append(oriented, np.zeros(int(own.max()) + 1, dtype=bool)),
-        sheets=corners[rest][~whole],
-        caps=caps,
+        triangles=np.concatenate([surface.vertices[triangles[~rest]], corners[inner], strips, cones]),
+        part=np.concatenate([part[~rest], len(oriented) + new]),
+        oriented=np.append(oriented, np.zeros(count, dtype=bool)),
+        sheets=corners[~inner],
+        caps=cones,
     )
+
+
+def _report_torn(count: int, total: int, tolerance: float) -> None:
+    if count > _FEW:
+        warn(
+            f"tetrahedralize: {count} of {total} triangles hang together in pieces of which most edges are open, which "
+            "do not tell inside from outside: the mesh is full where they pass, which is too heavy, and may be hollow. "
+            f"Corners less than {tolerance:.3g} m and half an edge apart count as one: repair the surface where they "
+            "are farther apart, or use fewer cells"
+        )
+
+
+def _welded(vertices: Array, same: Index, edges: _Edges, tolerance: float) -> tuple[Array, Index]:
+    """A place and a number for every vertex: those of several that count as one are alike.
+
+    Such are the ends of open edges that are closer than `tolerance`, and than half of all edges there: the neighbours
+    along a fine rim stay apart.
+    """
+    shortest = np.full(len(vertices), np.inf)
+    lengths = np.linalg.norm(vertices[edges.ends[:, 0]] - vertices[edges.ends[:, 1]], axis=1)
+    for end in (0, 1):
+        np.minimum.at(shortest, same[edges.ends[:, end]], lengths)
+    numbers, first = np.unique(same[edges.ends[edges.open]], return_index=True)
+    points = vertices[edges.ends[edges.open].reshape(-1)[first]]
+    reach = np.minimum(tolerance, 0.5 * shortest[numbers])
+    distance, other = cKDTree(points).query(points, k=range(2, 2 + _COPIES), distance_upper_bound=float(reach.max()))
+    near = distance <= np.minimum(reach[:, None], np.append(reach, 0.0)[other])
+    one, other = np.nonzero(near)[0], other[near]
+    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=2 * (len(points),))
+    cluster = connected_components(graph, directed=False)[1]
+    sums = np.stack([np.bincount(cluster, weights=points[:, k]) for k in range(3)], axis=1)
+    renumbered = np.arange(len(vertices))
+    renumbered[numbers] = numbers[np.unique(cluster, return_index=True)[1]][cluster]
+    moved = np.full((len(vertices), 3), np.nan)
+    moved[numbers] = (sums / np.bincount(cluster)[:, None])[cluster]
+    places = moved[same]
+    return np.where(np.isnan(places), vertices, places), renumbered[same]
+
+
+def _strips(vertices: Array, places: Array, edges: _Edges, part: Index) -> tuple[Array, Index]:
+    """Triangles [C, 3, 3] between the open edges and where the places of their ends are, and the part of each."""
+    ends, of = edges.ends[edges.open], part[edges.triangle[edges.open]]
+    (a, b), (c, d) = vertices[ends.T], places[ends.T]
+    strips = np.concatenate([np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)])
+    wide = np.concatenate([(b != d).any(axis=1), (a != c).any(axis=1)])
+    return strips[wide], np.tile(of, 2)[wide]
 
 
 def _numbered(rows: Array) -> Index:

@@ -25,7 +25,7 @@ __all__ = ["tetrahedralize"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Vertices closer than this many cells count as one where the surface is searched for holes.
+# Vertices at open edges closer than this many cells count as one.
 _SEAM = 0.25
 # A share that may be rounding of none.
 _HOLLOW = 1e-4
@@ -44,7 +44,10 @@ def tetrahedralize(
     "lattice" takes any triangles: open, in pieces, self-intersecting, with either winding. It keeps the tets of a
     body-centred cubic lattice that the surface reaches into or encloses. All tets are alike and well shaped; the mesh
     reaches beyond the surface by up to one cell, and parts less than about a cell apart grow together. Cavities are
-    filled. Parts of the mesh that would hang together by an edge or a vertex alone are separated there.
+    filled. Corners at open edges that are less than a quarter of a cell apart, and less than half of their edges, count
+    as one; holes are closed by cones. What is torn beyond that tells no
+    inside: a `MeshWarning` reports it. Parts of the mesh that would hang together by an edge or a vertex alone are
+    separated there.
 
     Of its volume, `mesh.fill` says which share of each tet lies inside of the surface. `Solid` multiplies density and
     Young's modulus by it, so that a body weighs what the surface encloses (to 2 % and less; 3 % where it is about one
@@ -97,7 +100,8 @@ def _fill_lattice(surface: TriMesh, lattice: Lattice, *, progress: bool, fill_ho
     def report(kinds: Iterable[int]) -> Iterable[int]:
         return tqdm(kinds, desc="tetrahedralize", disable=not progress, leave=False)
 
-    walls = lattice.touched(surface.vertices[surface.triangles], report)
+    corners = surface.vertices[surface.triangles]
+    walls = lattice.touched(corners, report)
     parts = parts_of(surface, _SEAM * lattice.spacing, fill_holes=fill_holes)
     if len(parts.caps):
         walls |= lattice.touched(parts.caps)
@@ -108,7 +112,7 @@ def _fill_lattice(surface: TriMesh, lattice: Lattice, *, progress: bool, fill_ho
     share[whole] = 1.0
     # Walls that the surface touches from within, in a face, an edge or a vertex, would be one more layer outside.
     hollow = walls & (share < _HOLLOW)
-    kept = (walls | inner) & (~hollow | lattice.entered(parts.triangles, hollow))
+    kept = (walls | inner) & (~hollow | lattice.entered(np.concatenate([corners, parts.caps]), hollow))
     numbers, weights = lattice.locate_among(surface.vertices, kept)
     kept.reshape(-1)[numbers] = True
     chosen = np.flatnonzero(kept)
