@@ -157,6 +157,28 @@ def test_the_corners_of_a_fine_rim_stay_apart() -> None:
     assert not len(parts.sheets)
 
 
+@pytest.mark.parametrize("cells", [10, 20])
+@pytest.mark.parametrize("noise", [0.0, 5e-3])
+def test_a_surface_of_two_sides_is_filled_as_one_of_one(cells: int, noise: float) -> None:
+    surface = ball()
+    if noise:
+        surface = soup(surface, noise)
+    both = joined(surface, pd.TriMesh(surface.vertices, surface.triangles[:, ::-1]))
+    one, other = (pd.tetrahedralize(s, cells=cells) for s in (surface, both))
+    np.testing.assert_allclose(fill_of(one), fill_of(other), atol=1e-5)
+    assert filled(other) == pytest.approx(ball().volume(), rel=0.01)
+
+
+def test_walls_between_cells_that_come_twice_are_kept() -> None:
+    cube = block(1.0, 1.0, 1.0)
+    right = cube.translated((0.5, 0.0, 0.0))
+    two = joined(right, right.transformed(np.diag([-1.0, 1.0, 1.0])))
+    parts = parts_of(two, 1e-3, fill_holes=True)
+    assert len(parts.triangles) == 24
+    assert not len(parts.caps)
+    assert filled(pd.tetrahedralize(two, cells=8)) == pytest.approx(2.0, rel=1e-3)
+
+
 def test_what_is_torn_to_pieces_is_a_sheet_and_reported() -> None:
     whole = ball()
     corners = whole.vertices[whole.triangles]

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from .lattice import Lattice, candidates, split_long
 from .mesh import TriMesh
-from .mesh_checks import warn
+from .mesh_checks import find_repeated, warn
 
 __all__ = ["LEAST_FILL", "Parts", "inside_share", "parts_of"]
 
@@ -68,10 +68,10 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
 
     Parts that are closed as they are stay exact. In the others, vertices at open edges that are closer than `tolerance`
     count as one, since files repeat vertices along seams, not always to the bit: strips of triangles close the seams.
-    Pieces of which most edges are still open then are sheets.
+    Pieces of which most edges are still open then are sheets. Of triangles that come on both sides one counts.
     """
     same = _numbered(surface.vertices)
-    triangles = surface.triangles
+    triangles = surface.triangles[_single(surface.triangles, same)]
     part = _connected(triangles, same)
     edges = _edges(triangles, same)
     closed, oriented = (np.ones(int(part.max()) + 1, dtype=bool) for _ in range(2))
@@ -83,7 +83,7 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     if not rest.any():
         return Parts(corners, part, oriented, none, none)
     places, near = _welded(surface.vertices, same, _edges(triangles[rest], same), tolerance)
-    loose = triangles[rest]
+    loose = triangles[rest][_single(triangles[rest], near)]
     own, edges = _connected(loose, near), _edges(loose, near)
     count = int(own.max()) + 1
     gaps = np.bincount(own[edges.triangle[edges.open]], minlength=count)
@@ -114,6 +114,21 @@ def _report_torn(count: int, total: int, tolerance: float) -> None:
             f"Corners less than {tolerance:.3g} m and half an edge apart count as one: repair the surface where they "
             "are farther apart, or use fewer cells"
         )
+
+
+def _single(triangles: Index, same: Index) -> Mask:
+    """Which triangles count: of those that come again the first, in parts which that closes or that come again whole.
+
+    Many models have every triangle twice, once from either side: by windings, or by turns, they would enclose nothing.
+    """
+    again = find_repeated(same[triangles])[0]
+    if again.any():
+        part = _connected(triangles, same)
+        edges = _edges(triangles[~again], same)
+        good = np.ones(int(part.max()) + 1, dtype=bool)
+        good[part[~again][edges.triangle[edges.open]]] = False
+        again &= good[part] | (np.bincount(part, again) == np.bincount(part, ~again))[part]
+    return ~again
 
 
 def _welded(vertices: Array, same: Index, edges: _Edges, tolerance: float) -> tuple[Array, Index]:

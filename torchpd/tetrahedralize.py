@@ -45,7 +45,7 @@ def tetrahedralize(
     body-centred cubic lattice that the surface reaches into or encloses. All tets are alike and well shaped; the mesh
     reaches beyond the surface by up to one cell, and parts less than about a cell apart grow together. Cavities are
     filled. Corners at open edges that are less than a quarter of a cell apart, and less than half of their edges, count
-    as one; holes are closed by cones. What is torn beyond that tells no
+    as one; triangles that come from both sides count once; holes are closed by cones. What is torn beyond that tells no
     inside: a `MeshWarning` reports it. Parts of the mesh that would hang together by an edge or a vertex alone are
     separated there.
 
