@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from pathlib import Path
 
@@ -121,7 +122,9 @@ def test_a_file_says_what_it_leaves_out(tmp_path: Path) -> None:
         partly.to_file(tmp_path / "b.vtu")
 
 
-@pytest.mark.parametrize("name", ["tets.xyz", "tets", "tets.stl", "tets.obj", "tets.svg"])
+@pytest.mark.parametrize(
+    "name", ["tets.xyz", "tets", "tets.stl", "tets.obj", "tets.svg", "tets.ply", "tets.wkt", "tets.ugrid"]
+)
 def test_files_that_cannot_hold_tets_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match=rf"cannot write .*{name}.*must end in \.mesh, \.msh, \.vtk or \.vtu"):
         shapes.single_tet().to_file(tmp_path / name)
@@ -169,6 +172,47 @@ def test_regions_survive_a_file(tmp_path: Path, suffix: str) -> None:
     youngs = np.where(mesh.regions == 2, 1e6, 1e5)
     assert Solid(mesh, youngs).youngs[1] == 1e6
     assert box.regions is None
+
+
+@pytest.mark.parametrize(
+    "name", ["a.avs", "a.bdf", "a.dato", "a.f3grid", "a.inp", "a.mdpa", "a.nas", "a.node", "a.xml"]
+)
+def test_formats_without_regions_say_so_and_keep_the_tets(tmp_path: Path, name: str) -> None:
+    box = shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
+    mesh = TetMesh(box.vertices, box.tets, regions=np.arange(len(box.tets)) % 3 + 1)
+    with pytest.warns(MeshWarning, match=rf"{name} is without the regions; \.mesh, .* keep them"):
+        mesh.to_file(tmp_path / name)
+    again = TetMesh.from_file(tmp_path / name)
+    np.testing.assert_array_equal(again.tets, mesh.tets)
+    assert again.regions is None
+
+
+def test_numbers_that_do_not_fit_a_format_are_refused(tmp_path: Path) -> None:
+    mesh = TetMesh([[-1.23456789012e-3, 0.0, 0.0], *CORNERS[1:]], TET)  # a column of .nas is 16 characters wide
+    with pytest.raises(ValueError, match=r"cannot write .*a\.nas through meshio: its numbers do not fit the format"):
+        mesh.to_file(tmp_path / "a.nas")
+
+
+@pytest.mark.parametrize("suffix", [".dat", ".meshb", ".tec"])
+def test_other_formats_that_keep_regions_do_not_warn(tmp_path: Path, suffix: str) -> None:
+    mesh = TetMesh(CORNERS, TET, regions=[5])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mesh.to_file(tmp_path / f"a{suffix}")
+    assert np.array_equal(TetMesh.from_file(tmp_path / f"a{suffix}").regions, [5])
+
+
+@pytest.mark.parametrize(("name", "package"), [("a.xdmf", "h5py"), ("a.med", "h5py"), ("a.e", "netCDF4")])
+def test_packages_that_a_format_needs_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ModuleNotFoundError, match=rf"to_file cannot write .*{name}: .* pip install {package}"):
+        shapes.single_tet().to_file(tmp_path / name)
+    if name != "a.xdmf":  # of which the head tells whether
+        (tmp_path / name).touch()
+        with pytest.raises(ModuleNotFoundError, match=rf"from_file cannot read {name}: .* pip install {package}"):
+            TetMesh.from_file(tmp_path / name)
 
 
 def test_physical_groups_of_gmsh_become_regions(tmp_path: Path) -> None:

@@ -223,6 +223,9 @@ class TetMesh:
     Tets that come with the opposite winding are turned (their last two corners change places), which is reported by a
     `MeshWarning` and counted in `flipped`.
 
+    Arrays are NumPy's and read-only: `torch.tensor(mesh.vertices)` copies them without a warning, where
+    `torch.from_numpy` gives one.
+
     Args:
         vertices: positions [V, 3] in m.
         tets: vertex numbers [E, 4].
@@ -326,9 +329,10 @@ class TetMesh:
     def to_file(self, path: PathLike) -> None:
         """Write in the format of the file's suffix (.mesh, .msh, .vtk, .vtu, ...) through meshio.
 
-        Vertices, tets and regions; that an embedded surface and the fill are left out a `MeshWarning` says.
+        Vertices and tets, and regions where the format has room for them, as those four do. What is left out a
+        `MeshWarning` says: regions elsewhere, an embedded surface and the fill.
         """
-        file = write_tets(path, self.vertices, self.tets, self.regions)
+        file, with_regions = write_tets(path, self.vertices, self.tets, self.regions)
         parts = {"the embedded surface": self.embedding, "the fill": self.fill}
         lost = [name for name, part in parts.items() if part is not None]
         if lost:
@@ -336,6 +340,8 @@ class TetMesh:
                 f"TetMesh.to_file: {file.name} is without {' and '.join(lost)}, for which mesh files have no place; "
                 "Simulator.save keeps them, and mesh.embedding.surface.to_file(...) writes a surface"
             )
+        if self.regions is not None and not with_regions:
+            warn(f"TetMesh.to_file: {file.name} is without the regions; .mesh, .msh, .vtk and .vtu keep them")
 
     @property
     def bounds(self) -> Array:

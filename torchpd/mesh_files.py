@@ -33,7 +33,10 @@ MESHIO_SUFFIXES = {".mesh", ".msh", ".vtk", ".vtu"}
 _ENDINGS = "the file's name must end in .mesh, .msh, .vtk or .vtu, or as another format of meshio"
 _REGIONS = ("gmsh:physical", "medit:ref")  # what meshio calls the regions of a .msh and of a .mesh
 _VOLUMES = ("tetra", "hexahedron", "wedge", "pyramid")
-SURFACE_SUFFIXES = {".glb", ".gltf", ".obj", ".off", ".stl"}  # formats without tetrahedra; not all that meshio reads
+# Formats without tetrahedra; not all that meshio reads.
+SURFACE_SUFFIXES = {".glb", ".gltf", ".obj", ".off", ".ply", ".stl", ".wkt"}
+# Formats that bring regions back; others write them nowhere, or wrong.
+_WITH_REGIONS = {".dat", ".hmf", ".med", ".mesh", ".meshb", ".msh", ".tec", ".vtk", ".vtu", ".xdmf", ".xmf"}
 
 
 def existing(path: PathLike) -> Path:
@@ -54,6 +57,8 @@ def read_content(owner: str, file: Path) -> Any:
         # meshio prints what is wrong with a file, sums it up on stderr, and exits the process
         with redirect_stdout(said), redirect_stderr(warned):
             content = meshio.read(file)
+    except ModuleNotFoundError as error:
+        raise _missing(f"{owner} cannot read {file.name}", error) from error
     except (meshio.ReadError, ValueError, SystemExit) as error:
         words = " ".join((said.getvalue().strip() or warned.getvalue()).split()).removeprefix("Error: ")
         raise ValueError(f"{owner} cannot read {file.name} through meshio: {words or error}") from error
@@ -77,6 +82,11 @@ def regions_of(content: Any) -> NDArray[Any] | None:
     return None
 
 
+def _missing(failure: str, error: ModuleNotFoundError) -> ModuleNotFoundError:
+    fix = f"pip install {error.name}; .mesh, .msh, .vtk and .vtu need nothing"
+    return ModuleNotFoundError(f"{failure}: meshio needs the package {error.name} for it; {fix}", name=error.name)
+
+
 def without_tets(file: Path, came: Collection[str]) -> ValueError:
     fix = "turn a surface into tetrahedra with torchpd.tetrahedralize(path, cells=...)"
     if any(kind.startswith(_VOLUMES) for kind in came):
@@ -87,21 +97,27 @@ def without_tets(file: Path, came: Collection[str]) -> ValueError:
     )
 
 
-def write_tets(path: PathLike, points: NDArray[np.float64], tets: Index, regions: Index | None) -> Path:
-    """Write tets in the format of the file's suffix; the file."""
+def write_tets(path: PathLike, points: NDArray[np.float64], tets: Index, regions: Index | None) -> tuple[Path, bool]:
+    """Write tets in the format of the file's suffix: the file, and whether it holds the regions."""
     import meshio
 
     file = check_target_file(path, "TetMesh.to_file")
     suffix = file.suffix.lower()
-    if suffix not in meshio.extension_to_filetypes or suffix in SURFACE_SUFFIXES:
+    plain = file.suffixes[-2:] == [".ugrid"]  # of which meshio cannot read what it writes: it wants .b8.ugrid, say
+    if suffix not in meshio.extension_to_filetypes or suffix in SURFACE_SUFFIXES or plain:
         raise ValueError(f"TetMesh.to_file cannot write tetrahedra to {file}: {_ENDINGS}")
     data, kind = {}, None
-    if regions is not None:
+    kept = suffix in _WITH_REGIONS
+    if regions is not None and kept:
         data[_REGIONS[suffix == ".mesh"]] = [regions]
         if suffix == ".msh":  # version 2.2 has room for both numbers of a tet, and wants both
             data["gmsh:geometrical"], kind = [regions], "gmsh22"
     try:
         meshio.Mesh(points, [("tetra", tets)], cell_data=data).write(file, file_format=kind)
-    except (meshio.ReadError, meshio.WriteError, KeyError) as error:  # ReadError, of formats that are only read
-        raise ValueError(f"TetMesh.to_file cannot write {file} through meshio: {error}; {_ENDINGS}") from error
-    return file
+    except ModuleNotFoundError as error:
+        raise _missing(f"TetMesh.to_file cannot write {file}", error) from error
+    # ReadError, of formats that are only read; AssertionError, of numbers that do not fit the columns of a .nas
+    except (meshio.ReadError, meshio.WriteError, KeyError, AssertionError) as error:
+        words = str(error) or "its numbers do not fit the format"
+        raise ValueError(f"TetMesh.to_file cannot write {file} through meshio: {words}; {_ENDINGS}") from error
+    return file, kept
