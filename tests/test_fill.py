@@ -329,3 +329,14 @@ def test_a_beam_of_a_lattice_sags_about_as_far_as_it_should() -> None:
     assert sag(lattice) == pytest.approx(sag(box), rel=0.05)
     finer = pd.tetrahedralize(block(length, height, height), cells=40)
     assert 0.94 < sag(finer) / exact < 1.0
+
+
+@pytest.mark.parametrize(
+    ("cells", "part"),
+    [((20, 1, 4), 0.09), ((20, 2, 4), 0.11), ((20, 4, 4), 0.11), ((40, 2, 8), 0.28), ((80, 2, 16), 0.49)],
+)
+def test_flat_cells_sag_as_little_as_the_limits_say(cells: tuple[int, int, int], part: float) -> None:
+    length, height = 1.0, 0.02
+    exact = 1000.0 * 9.81 * length**4 / (8.0 * 1e7 * height**2 / 12.0)
+    plate = pd.shapes.box((length, height, 0.2), cells).translated((-0.5, 0.0, 0.0))
+    assert sag(plate) / exact == pytest.approx(part, abs=0.005)
