@@ -133,7 +133,7 @@ def test_the_reaction_of_a_contact() -> None:
 def test_a_pin_is_let_go_by_a_tiny_spring() -> None:
     """Of one environment: stiffness 0 is refused. The body falls freely, given a converged step."""
     solid = pd.Solid(MESH, youngs=1e5, density=1000.0)
-    scene = pd.Scene(solid, pd.Pin(solid, [0, 1, 2]), pd.Gravity())
+    scene = pd.Scene(solid, pd.Pin(solid, [0, 1, 5]), pd.Gravity())
     springs = torch.tensor([[torch.inf] * 3, [1e-9] * 3])
     free_fall = -9.81 / 2 * 30 * 31 / 60**2
     for options, least, most in (

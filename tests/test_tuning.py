@@ -545,7 +545,7 @@ def errors_of_a_slide(sim: pd.Simulator, state: pd.State, steps: int = 25) -> li
     errors = []
     for _ in range(steps):
         after, (exact,) = sim(state), settled_steps(sim, state)
-        if exact.moves(sim.dtype):
+        if exact.scale > 1e-9:  # else it lies, to rounding
             assert exact.uncertainty < 1e-4
             errors.append(exact.position_error(after.velocities[0].numpy() * sim.time_step))
         state = after

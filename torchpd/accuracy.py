@@ -1,6 +1,7 @@
 """How wrong a step is: the converged step in float64, and the distance of any other answer from it.
 
-Errors are relative, so that 1 is the first iterate and 0 the converged step:
+Errors are relative, so that 1 is where all would fly to, u_0 = h v on the pins and out of the contacts, and 0 the
+converged step:
 
     position   |u - u*| / |u_0 - u*|                over all vertices, u = x_{t+1} - x_t
     energy     (E(u) - E(u*)) / (E(u_0) - E(u*))    of the objective of the step
@@ -76,7 +77,7 @@ class ExactStep:
     """A step in float64 with its converged answer."""
 
     problem: StepProblem
-    first: Array  # [V, 3] m: u_0
+    first: Array  # [V, 3] m: u_0, where nothing has been solved
     solution: Array  # [V, 3] m: u*
     uncertainty: float  # bound on the error of u* itself, relative as the errors are
 
@@ -90,8 +91,9 @@ class ExactStep:
         return roundings * torch.finfo(dtype).eps * float(np.linalg.norm(self.problem.positions))
 
     def moves(self, dtype: torch.dtype) -> bool:
-        """Whether solving this step changes more than rounding does."""
-        return self.scale > self.rounding(dtype)
+        """Whether solving this step changes more than rounding does, from where bodies move as rigid ones."""
+        way = min(self.scale, float(np.linalg.norm(self.problem.first_iterate() - self.solution)))
+        return way > self.rounding(dtype)
 
     def error_beyond_rounding(self, displacement: Array, dtype: torch.dtype, roundings: float = ROUNDINGS) -> float:
         """The least e >= 0 with |u - u*| <= e |u_0 - u*| + `rounding`."""
@@ -223,7 +225,7 @@ def exact_steps(
         state: where the steps start, [B, V, 3].
         forces: [B, V, 3] N.
         targets: of pins and spheres, as in `Simulator.forward`.
-        start: of the first iterate u_0, "velocity" or "inertial".
+        start: of the u_0 that errors are relative to: "velocity", h v, or the "inertial" first iterate.
         iterations: of each solver, at most.
     """
     # whatever torch's default device
@@ -263,11 +265,12 @@ def settled_steps(
             twin.solver, twin.iterations = solver, iterations
             return cast(State, twin(wide, pushed, start=start))
 
-        # not the difference of positions, which has lost digits
-        first = run(Chebyshev(), 0).velocities * twin.time_step
+        problems = [problem_of(sim, state, item, forces=forces) for item in range(len(wide.positions))]
+        first = torch.from_numpy(np.stack([problem.course() for problem in problems]))
         after, moves = run(Multilevel(), _LEADING), [torch.inf * torch.ones(len(first), dtype=torch.float64)]
         for iterations in _SETTLING:
             before, after = after, run(Chebyshev(), iterations, after.positions)
+            # not the difference of positions, which has lost digits
             moves.append((after.velocities - before.velocities).flatten(1).norm(dim=1) * twin.time_step)
             scale = (first - after.velocities * twin.time_step).flatten(1).norm(dim=1)
             rounding = ROUNDINGS * torch.finfo(torch.float64).eps * wide.positions.flatten(1).norm(dim=1)
@@ -277,8 +280,8 @@ def settled_steps(
     shares = left / scale.clamp(min=torch.finfo(torch.float64).tiny)
     found = zip(first.numpy(), (after.velocities * twin.time_step).numpy(), shares.tolist(), strict=True)
     return [
-        ExactStep(problem_of(sim, state, item, forces=forces), start, solution, share)
-        for item, (start, solution, share) in enumerate(found)
+        ExactStep(problem, start, solution, share)
+        for problem, (start, solution, share) in zip(problems, found, strict=True)
     ]
 
 
@@ -296,8 +299,11 @@ class _Search:
         self.forces = None if forces is None else _wide(forces)
         self.targets = _wide(targets) if isinstance(targets, Tensor) else _widened(targets)
         self.problems = [problem_of(sim, state, item, forces=forces, targets=targets) for item in range(len(state[0]))]
-        self.firsts = [problem.first_iterate(start) for problem in self.problems]
-        self.best: Tensor = torch.from_numpy(np.array(self.firsts))  # displacements [B, V, 3] m
+        self.firsts = [
+            problem.course() if start == "velocity" else problem.first_iterate(start) for problem in self.problems
+        ]
+        near = [problem.first_iterate(start) for problem in self.problems]
+        self.best: Tensor = torch.from_numpy(np.array(near))  # displacements [B, V, 3] m
         self.lowest = torch.full((len(self.problems),), torch.inf, dtype=torch.float64)
         self.found: list[ExactStep | None] = [None] * len(self.problems)
 

@@ -35,8 +35,8 @@ class Trial(NamedTuple):
 class Promise:
     """What `Simulator.tune` chose and what may be expected of it, for motions like the studied one of that material.
 
-    |x - x*| <= error |x_0 - x*| + 10 eps |x|: x* the converged step, with its friction, x_0 the first iterate, eps of
-    the precision. The last term matters to steps that hardly change anything, as of a body that comes to rest.
+    |x - x*| <= error |x_0 - x*| + 10 eps |x|: x* the converged step, with its friction, x_0 = x + h v, eps of the
+    precision. The last term matters to steps that hardly change anything, as of a body that comes to rest.
     """
 
     asked_error: float | None

@@ -282,7 +282,7 @@ class StepProblem:
             return u
         touched = [bool((turned @ plane[:3] <= plane[3]).any()) for plane in self.values.planes[:8]]
         if not any(touched):
-            return u + turned - y
+            return np.asarray(u + turned - y)
         if pinned.any():
             return u
         planes = self.values.planes[:8][touched]

@@ -260,7 +260,7 @@ class Simulator(Model):
         Args:
             state: where typical motions start [B, V, 3], the rest state by default, once for each environment of the
                 material; up to four environments are studied over 30 steps. Times are for its batch.
-            error: of a step, |x - x*| / |x_0 - x*|, x* converged and x_0 the first iterate; in (0, 1).
+            error: of a step, |x - x*| / |x_0 - x*|, x* converged and x_0 = x + h v; in (0, 1).
             milliseconds: of `sim(state)` on this machine; the error is then as low as that allows, with no more
                 iterations than it takes to get below rounding.
             forces: on the vertices during these steps [B, V, 3] [N].

@@ -28,7 +28,7 @@ def check_request(error: float | None, milliseconds: float | None) -> None:
             "for example sim.tune(error=1e-2)"
         )
     if error is not None and not 0.0 < error < 1.0:
-        raise ValueError(f"tune: error must lie in (0, 1), 1 being the first iterate; got {error}")
+        raise ValueError(f"tune: error must lie in (0, 1), 1 being x + h v; got {error}")
     if milliseconds is not None and not 0.0 < milliseconds < math.inf:
         raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
 
