@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from .forecast import LANDING_ROOTS, Forecast, Spectrum, forecast, has_contacts, has_friction, spectrum_of
+from .forecast import LANDING_ROOTS, Forecast, Spectrum, forecast, has_contacts, held_up_by, spectrum_of
 from .gpu import H100
 from .kernel_costs import iteration_microseconds
 from .multilevel import MOST_DIRECT
@@ -99,9 +99,9 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     Args:
         sim: scene, time step, material, device, and the batch to choose for.
         iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error, but
-            Chebyshev with friction. None sets as many as are expected to reach an error of `AIM`, times `MARGIN`, and
-            with a tolerance `PATIENCE`. With smooth contacts those of Multilevel are for the hardest step of any mesh;
-            with a tolerance, and unless you give them, it is compared by what landing takes on even meshes.
+            Chebyshev with friction and balls. None sets as many as are expected to reach an error of `AIM`, times
+            `MARGIN`, and with a tolerance `PATIENCE`. On smooth planes those of Multilevel are for the hardest step of
+            any mesh; with a tolerance, and unless you give them, it is compared by what landing takes on even meshes.
     """
 
     def chosen(enough: int, why: str) -> Choice:
@@ -112,9 +112,9 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
     if spectrum is None:
         return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
-    if has_friction(sim):
+    if cause := held_up_by(sim):
         plain = _known(forecast(sim, chebyshev, spectrum))
-        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and friction may keep Multilevel from working"
+        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and {cause} may keep Multilevel from working"
         return chebyshev, chosen(_enough(plain), why)
     plain, lasting, short = (_known(forecast(sim, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
     # the others know nothing of contacts

@@ -74,7 +74,8 @@ def measure_convergence(
     solution = start.positions + torch.from_numpy(exact.solution).to(start.positions.device)
     scale = exact.scale
     # rounded positions strain a body a little, even one that only falls
-    if float((after(Chebyshev(), 0) - solution).norm()) <= 10.0 * torch.finfo(state.positions.dtype).eps * float(start.positions.norm()):
+    rounding = 10.0 * torch.finfo(state.positions.dtype).eps * float(start.positions.norm())
+    if float((after(Chebyshev(), 0) - solution).norm()) <= rounding:
         raise SolvedAlreadyError("measure_convergence: the first iterate solves this step already (free fall, or rest)")
     curves = {}
     with tqdm(total=len(solvers) * len(counts), desc="convergence", disable=not progress, leave=False) as bar:

@@ -8,8 +8,8 @@ without contacts nine of ten needed 0.3 to 1.5 times the forecast, meshes with s
 Chebyshev 0.6 to 1.9 times (`benchmarks/forecast.py`).
 
 With contacts the forecast of `Multilevel` is that of the step in which a stiff body of slivers lands on a face: a
-seventh of what Chebyshev needs, but two square roots of it at least, which even meshes need. With friction, and
-without its small problem, it is a bound: what Chebyshev needs. Nine of ten of those 65 scenes, most of which do not
+seventh of what Chebyshev needs, but two square roots of it at least, which even meshes need. With friction or balls,
+and without its small problem, it is a bound: what Chebyshev needs. Nine of ten of those 65 scenes, most of which do not
 land in the step that is measured, needed 0.1 to 1.15 of it, half of them 0.5. `Simulator.tune` measures instead.
 
 Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
@@ -36,6 +36,7 @@ __all__ = [
     "forecast",
     "has_contacts",
     "has_friction",
+    "held_up_by",
     "is_bound",
     "spectrum_of",
     "warn_of_few_iterations",
@@ -143,7 +144,7 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0
     left = max(_decay(slowest, limit), _decay(middle, limit), 1e-3)
     rate = -math.log(min(left, 1.0 - 1e-15))
-    lands = isinstance(solver, Multilevel) and solver.outer == "corotated" and not has_friction(sim)
+    lands = isinstance(solver, Multilevel) and solver.outer == "corotated" and not held_up_by(sim)
     if lands:
         plain = math.log(1e3) / rate
         rate = math.log(1e3) / max(_LANDING_SHARE * plain, LANDING_ROOTS * math.sqrt(plain))
@@ -163,6 +164,13 @@ def has_contacts(sim: Model) -> bool:
 def has_friction(sim: Model) -> bool:
     """Whether any contact may hold a vertex by friction."""
     return any(bool((getattr(sim, name)[..., 4] > 0.0).any()) for name in ("planes", "spheres"))
+
+
+def held_up_by(sim: Model) -> str:
+    """What may keep `Multilevel` from working: "friction", "a ball" (thin sheets buckle over it), or ""."""
+    if has_friction(sim):
+        return "friction"
+    return "a ball" if sim.spheres.shape[-2] else ""
 
 
 def warn_of_few_iterations(sim: Model, changed: str | None = None, enough: float = FAR_TOO_FEW) -> bool:
