@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from cases import Case, box, contact_block
+from cases import Case, box, contact_block, slope
 from numpy.typing import NDArray
 from runs import arguments_of, simulator, state_of
 
 import torchpd as pd
+from torchpd.reference import StepProblem, step_problem
+from torchpd.reference_solvers import guarded_chebyshev
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -106,8 +110,8 @@ def test_a_plate_slides_as_coulomb_says(
         state = sim(state, push if step < 10 else None)
         speed = max(speed + H * ((6.0 if step < 10 else 0.0) - 0.3 * 9.81), 0.0)
         mean = float((sim.masses * state.velocities[0, :, 0]).sum() / sim.masses.sum())
-        # bending sets some vertices down before others, at first
-        assert abs(mean - speed) <= 0.05 * (speed + 0.05), step
+        # of a soft plate vertices set down, and stop, one after another
+        assert abs(mean - speed) <= 0.05 * (speed + 0.1), step
     assert speed == 0.0
 
 
@@ -181,3 +185,78 @@ def test_energy_falls_along_rigid_motions() -> None:
     scale = np.abs(gradient).sum()
     assert np.abs(gradient.sum(axis=0)).max() <= 1e-12 * scale
     assert np.abs(np.cross(arms, gradient).sum(axis=0)).max() <= 1e-12 * scale
+
+
+class Still(StepProblem):
+    """Without rigid motions."""
+
+    def align(self, displacement: Array) -> Array:
+        return displacement
+
+
+def pressed_corner() -> Case:
+    """A plate that yaws about the corner where it is pressed down: its friction acts there, and its slips differ."""
+    vertices, tets = box((0.4, 0.05, 0.4), (4, 1, 4))
+    scene = pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e5), pd.Gravity(), pd.Ground(0.0, friction=0.5))
+    forces = np.zeros_like(vertices)
+    forces[np.abs(vertices - [0.0, 0.05, 0.0]).sum(axis=1).argmin(), 1] = -20.0
+    return Case(scene, vertices, np.cross([0.0, 1.0, 0.0], vertices), H, extras={"forces": forces})
+
+
+def spinning_plate(spin: float, speed: float) -> Case:
+    vertices, tets = box((0.4, 0.05, 0.4), (4, 1, 4))
+    scene = pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e5), pd.Gravity(), pd.Ground(0.0, friction=0.3))
+    turning = np.cross([0.0, spin, 0.0], vertices - vertices.mean(axis=0))
+    return Case(scene, vertices, turning + [speed, 0.0, 0.0], H)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        spinning_plate(0.0, 0.5), spinning_plate(5.0, 0.04), spinning_plate(1.0, 0.04), spinning_plate(5.0, 0.5),
+        spinning_plate(0.0, 0.01), pressed_corner(), slope(0.3, 0.6), slope(0.5, 0.3), slope(0.5, 0.0),
+        contact_block(pd.Ground(0.0, friction=0.4), velocity=(1.0, -1.0, 0.0)),
+        contact_block(pd.Ground(0.0), pd.Ground(0.0, normal=(1.0, 0.0, 0.0)), velocity=(-1.0, -1.0, 0.5)),
+        rod(1e5, pd.Gravity(), spin=20.0),
+    ],
+    ids=[
+        "slides", "spins and stops", "spins slowly", "spins and slides", "sticks", "pressed at a corner", "holds",
+        "slides down", "smooth", "lands", "edge", "flies",
+    ],
+)  # fmt: skip
+def test_nothing_moves_once_iterations_have_converged(case: Case) -> None:
+    """Solved without rigid motions a step is where rigid motions leave it; then errors of a sum show."""
+    problem, x, v = case.problem(), case.positions, case.velocities
+    for _ in range(3):
+        problem = step_problem(case.scene.values(), x, v, H, **case.extras)
+        still = Still(**{name.name: getattr(problem, name.name) for name in fields(problem)})
+        solved = guarded_chebyshev(still, still.course(), iterations=3000).displacement
+        assert np.linalg.norm(problem.residual(solved)) <= 1e-7 * np.linalg.norm(problem.residual(problem.course()))
+        assert np.abs(problem.align(solved) - solved).max() <= 1e-10
+        x, v = x + solved, solved / H
+
+
+def after_steps(case: Case, offset: float, steps: int, **options: Any) -> Array:
+    """Velocities."""
+    vertices, tets = case.positions + offset, case.scene.values().tets
+    body = pd.Solid(pd.TetMesh(vertices, tets), 1e6)
+    pin = [pd.Pin(body, [0], stiffness=options["spring"])] if options else []
+    sim = pd.Simulator(pd.Scene(body, pd.Gravity(), *pin), H, 32, dtype=torch.float64, progress=False)
+    track = sim.rollout(pd.State(torch.tensor(vertices)[None], torch.tensor(case.velocities)[None]), steps)
+    return np.asarray(track.velocities[-1, 0])
+
+
+@pytest.mark.parametrize("offset", [1e2, 1e4, 1e6])
+def test_far_from_the_origin_it_is_the_same(offset: float) -> None:
+    """To the rounding of positions there: sums about the origin lose all digits of a body of 10 cm at 1e6 m."""
+    case = rod(1e6, spin=5.0)
+    near, far = after_steps(case, 0.0, 5), after_steps(case, offset, 5)
+    assert np.abs(far - near).max() <= 2e3 * ULP[torch.float64] * offset / H
+
+
+@pytest.mark.parametrize("spring", [1e6, 1e9, 1e12])
+def test_a_spring_that_outweighs_all_is_a_pivot(spring: float) -> None:
+    """Its share of sums about the origin would drown those of the body."""
+    case = rod(1e6)
+    near, far = after_steps(case, 0.0, 5, spring=spring), after_steps(case, 10.0, 5, spring=spring)
+    assert np.abs(far - near).max() <= 1e-4 * np.abs(near).max()

@@ -135,9 +135,6 @@ def among_planes() -> Case:
 
 
 RESTARTS = pd.Chebyshev(rho=0.9999)
-
-
-RESTARTS = pd.Chebyshev(rho=0.9999)
 CASES: dict[str, Callable[[], Case]] = {
     "pins, velocity start": lambda: pinned("velocity"),
     "pins, inertial start": lambda: pinned("inertial"),

@@ -225,7 +225,7 @@ class StepProblem:
         return csr_array(diags_array(np.repeat(self.weight, 3)) + wide.T @ (inner @ wide))
 
     def first_iterate(self, start: str | Array = "velocity") -> Array:
-        """u_0: "velocity" h v, "inertial" s, or positions [V, 3]; pins at their targets, contact, then momentum."""
+        """u_0: "velocity" h v, "inertial" s, or positions [V, 3]; pins at their targets, contact, rigid motions."""
         if isinstance(start, str):
             guesses = {"velocity": self.time_step * self.velocities, "inertial": self.target}
             if start not in guesses:
@@ -308,14 +308,15 @@ class StepProblem:
         if len(planes) > 1 or not lies.any():
             return np.zeros(3)
         slips = u[lies] - np.outer(u[lies] @ normals[0], normals[0])
-        free, rub = slips.mean(axis=0) + along, -friction[0] * across
-        left = np.linalg.norm(free) - rub
-        if left <= 0.0:  # friction stops it, unless it holds a vertex already
-            slides = 4.0 * (slips**2).sum(axis=1).min() > (slips.mean(axis=0) ** 2).sum()
-            return np.asarray(-slips.mean(axis=0) if slides else np.zeros(3))
-        way = left * free / np.linalg.norm(free) - slips.mean(axis=0)
+        mean = slips.mean(axis=0)
         # slips that differ leave a doubt about where friction acts: what is within it is left to the iterations
-        doubt = rub * min(2.0, np.sqrt(slips.var(axis=0).sum()) / left)
+        apart = 2.0 * np.linalg.norm(slips.max(axis=0) - slips.min(axis=0))
+        free, rub, slip = mean + along, -friction[0] * across, np.linalg.norm(mean)
+        left = np.linalg.norm(free) - rub
+        if left <= 0.0:
+            return np.asarray(-mean if slip > max(apart, apart * rub / max(slip, 1e-300)) else np.zeros(3))
+        way = left * free / np.linalg.norm(free) - mean
+        doubt = rub * min(2.0, apart / left)
         return np.asarray(max(0.0, 1.0 - doubt / max(np.linalg.norm(way), 1e-300)) * way)
 
     def smallest_gap(self, displacement: Array) -> Array:

@@ -4,6 +4,12 @@
 
 namespace pd::inline PD_TARGET {
 
+inline void set_lane(double& a, int, double number) { a = number; }
+template <int W>
+void set_lane(Pack<double, W>& a, int lane, double number) {
+  a.v[lane] = number;
+}
+
 template <class Lanes, class Visit>
 void each_in_a_piece(const Plan<typename Lanes::Scalar>& plan, const Visit& visit) {
   for (int i = 0; i < plan.vertices; ++i) {
@@ -13,17 +19,33 @@ void each_in_a_piece(const Plan<typename Lanes::Scalar>& plan, const Visit& visi
 
 template <class Lanes>
 void sum_pieces(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w) {
-  using Real = typename Lanes::Real;
-  const auto widen = [](const Vec3<Real>& a) {
-    return Vec3{Lanes::widen(a.x), Lanes::widen(a.y), Lanes::widen(a.z)};
+  using Wide = typename Lanes::Wide;
+  using S = RigidSums;
+  const auto widen = [](const Vec3<typename Lanes::Real>& a) {
+    return Vec3<Wide>{Lanes::widen(a.x), Lanes::widen(a.y), Lanes::widen(a.z)};
   };
+  const auto at = [&](int i) { return widen(Lanes::vec3(w.x[i])) + widen(Lanes::vec3(w.u[i])); };
   for (int g = 0; g < plan.groups; ++g) w.group_sums[g] = {};
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
-    const auto lag = widen(Lanes::vec3(w.target[i] - w.u[i]));
-    const auto y = widen(Lanes::vec3(w.x[i])) + widen(Lanes::vec3(w.u[i]));
-    const auto a = Lanes::widen(w.inertia[i]);
-    add_rigid(w.group_sums[g].rigid, a, y, lag);
-    if (plan.pins > 0) add_pin(w.group_sums[g].rigid, RigidSums::pins, a, y);
+    add_mean(w.group_sums[g].rigid + S::weight, Lanes::widen(w.inertia[i]), at(i));
+  });
+  for (int g = 0; g < plan.groups; ++g) {
+    GroupSums<Wide>& sums = w.group_sums[g];
+    for (int lane = 0; lane < Lanes::environments; ++lane) {
+      double first[S::lag];
+      for (int n = 0; n < S::lag; ++n) first[n] = Lanes::lane(sums.rigid[n], lane);
+      const Vec3<double> center = center_of(first);
+      set_lane(sums.center.x, lane, center.x);
+      set_lane(sums.center.y, lane, center.y);
+      set_lane(sums.center.z, lane, center.z);
+    }
+  }
+  each_in_a_piece<Lanes>(plan, [&](int i, int g) {
+    GroupSums<Wide>& sums = w.group_sums[g];
+    const Wide a = Lanes::widen(w.inertia[i]);
+    const Vec3<Wide> arm = at(i) - sums.center;
+    add_moments(sums.rigid + S::lag, a, arm, widen(Lanes::vec3(w.target[i] - w.u[i])));
+    if (plan.pins > 0) add_pin(sums.rigid + S::pins, a, arm);
   });
 }
 
@@ -73,7 +95,7 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
     GroupSums<Wide>& sums = w.group_sums[g];
     for (Wide& least : sums.gaps) least = Wide(HUGE_VAL);
     for (Wide& sum : sums.slips) sum = Wide(0.0);
-    sums.slowest = Wide(HUGE_VAL);
+    for (Wide& least : sums.bounds) least = Wide(HUGE_VAL);
   }
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
     GroupSums<Wide>& sums = w.group_sums[g];
@@ -81,7 +103,7 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
       sums.gaps[k] = lesser(sums.gaps[k], Lanes::widen(gap));
     };
     const Vec3<Real> u = Lanes::vec3(w.u[i]);
-    add_touch(sums.slips, sums.slowest, contacts, at(i), u, w.motion[g], near);
+    add_touch(sums.slips, sums.bounds, contacts, at(i), u, w.motion[g], near);
   });
   for (int g = 0; g < plan.groups; ++g) {
     for (int lane = 0; lane < Lanes::environments; ++lane) {
@@ -92,17 +114,16 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
         touched |= touches ? 1u << k : 0u;
         if (k < Touch::planes) Lanes::set_lane(w.touched[g][k], lane, T(touches));
       }
-      double slips[Touch::slips];
+      double slips[Touch::slips], bounds[Touch::bounds];
       read_lane<Touch::slips, Lanes>(sums.slips, lane, slips);
+      read_lane<Touch::bounds, Lanes>(sums.bounds, lane, bounds);
       const auto plane = [&](int k) {
         const Plane<Real>& p = contacts.planes[k];
         const auto number = [&](const Real& a) { return Lanes::lane(Lanes::widen(a), lane); };
         const Vec3<double> normal = {number(p.normal.x), number(p.normal.y), number(p.normal.z)};
         return Plane<double>{normal, number(p.height), number(p.friction)};
       };
-      const double slowest = Lanes::lane(sums.slowest, lane);
-      set_motion(w, g, lane,
-                 motion_on_contacts(fit_of(w, g, lane), touched, slips, slowest, plane));
+      set_motion(w, g, lane, motion_on_contacts(fit_of(w, g, lane), touched, slips, bounds, plane));
     }
   }
   if (!contacts.has_several()) return;

@@ -20,11 +20,12 @@ inline Storage allocate_zeroed(std::size_t bytes) {
   return Storage(new (std::align_val_t{64}) std::byte[bytes]());
 }
 
-// of a piece that no pin holds, see solver/rigid.h
+// of a loose piece, see solver/rigid.h
 template <class Wide>
 struct GroupSums {
   Wide rigid[RigidSums::count];
-  Wide gaps[Touch::planes + 1], slips[Touch::slips], slowest;
+  Vec3<Wide> center;
+  Wide gaps[Touch::planes + 1], slips[Touch::slips], bounds[Touch::bounds];
 };
 
 constexpr int shared_chunk = 256;  // shared vertices that one sum covers

@@ -114,6 +114,7 @@ class FusedRunner {
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || given_first) return;
+    move_pieces<Rigid::mean>();
     move_pieces<Rigid::free>();
     if constexpr (Touching) {
       move_pieces<Rigid::touching>();

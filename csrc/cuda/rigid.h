@@ -6,22 +6,25 @@
 
 namespace pd::inline PD_TARGET {
 
-// Three rounds: the motion of a free piece, what contacts leave of it, and nothing where that leads into further contacts.
-enum class Rigid { free, touching, beside };
+// Four rounds: where a piece is, its motion if it touches nothing, what contacts leave of that, and nothing where that leads into
+// further contacts.
+enum class Rigid { mean, free, touching, beside };
 
-// The numbers of a part, see RigidSums and Touch; the last round has its least gap in place of `touched`.
+// The numbers of a part, see RigidSums and Touch, and the least gap of the last round.
 struct PartSums {
-  static constexpr int rigid = 0, touched = RigidSums::count, slowest = touched + 1;
-  static constexpr int slips = slowest + 1, count = slips + Touch::slips;
+  static constexpr int rigid = 0, touched = RigidSums::count, least_gap = touched + 1;
+  static constexpr int slips = least_gap + 1, bounds = slips + Touch::slips;
+  static constexpr int count = bounds + Touch::bounds;
 };
 
 template <class T>
 struct Piece {
+  Vec3<double> center;
   RigidMotion<T> motion;
   unsigned touched;  // a bit for each of the first planes
 };
 
-// Adds `visit` of vertices index(begin) ... index(end - 1) up, and writes it.
+// visit(i, x + u, u) of vertices i = index(begin) ... index(end - 1), each by one lane.
 template <class T, bool Touching, class Index, class Visit>
 PD_DEVICE void each_of_part(const Vertices<T, Touching>& v, int begin, int end, const Index& index,
                             const Visit& visit) {
@@ -60,37 +63,41 @@ PD_DEVICE void write_shares(const double (&value)[Count], Op op, double* to) {
 template <Rigid What, class T, bool Touching, class Index>
 PD_DEVICE void sum_part(const Vertices<T, Touching>& v, const Contacts<T>& contacts, bool pins,
                         int begin, int end, const Index& index, const Piece<T>& piece, double* to) {
-  if constexpr (What == Rigid::free) {
-    const auto wide = [](const Vec3<T>& a) {
-      return Vec3<double>{double(a.x), double(a.y), double(a.z)};
-    };
-    const auto at = [&](int i) { return wide(vec3(v.x[i])) + wide(vec3(v.u[i])); };
-    double sum[RigidSums::pins] = {};
-    each_of_part(v, begin, end, index, [&](int i, const Vec3<T>&, const Vec3<T>& u) {
-      add_rigid(sum, double(v.inertia(i)), at(i), wide(vec3(v.target[i]) - u));
+  using S = RigidSums;
+  const auto wide = [](const Vec3<T>& a) {
+    return Vec3<double>{double(a.x), double(a.y), double(a.z)};
+  };
+  const auto at = [&](int i) { return wide(vec3(v.x[i])) + wide(vec3(v.u[i])); };
+  if constexpr (What == Rigid::mean) {
+    double sum[S::lag] = {};
+    each_of_part(v, begin, end, index, [&](int i, const Vec3<T>&, const Vec3<T>&) {
+      add_mean(sum, double(v.inertia(i)), at(i));
     });
     write_shares(sum, Add{}, to + PartSums::rigid);
-    double held[RigidSums::count - RigidSums::pins] = {};
+  } else if constexpr (What == Rigid::free) {
+    double sum[S::pins - S::lag] = {}, held[S::count - S::pins] = {};
+    each_of_part(v, begin, end, index, [&](int i, const Vec3<T>&, const Vec3<T>& u) {
+      add_moments(sum, double(v.inertia(i)), at(i) - piece.center, wide(vec3(v.target[i]) - u));
+    });
+    write_shares(sum, Add{}, to + PartSums::rigid + S::lag);
     if (pins) {
       each_of_part(v, begin, end, index, [&](int i, const Vec3<T>&, const Vec3<T>&) {
-        add_pin(held, 0, double(v.inertia(i)), at(i));
+        add_pin(held, double(v.inertia(i)), at(i) - piece.center);
       });
     }
-    write_shares(held, Add{}, to + PartSums::rigid + RigidSums::pins);
+    write_shares(held, Add{}, to + PartSums::rigid + S::pins);
   } else if constexpr (What == Rigid::touching) {
-    double slips[Touch::slips] = {}, slowest = HUGE_VAL;
+    double slips[Touch::slips] = {}, bounds[Touch::bounds];
+    for (double& least : bounds) least = HUGE_VAL;
     unsigned touched = 0;
     const auto near = [&](int k, T gap) { touched |= gap > T(0) ? 0u : 1u << k; };
     each_of_part(v, begin, end, index, [&](int, const Vec3<T>& y, const Vec3<T>& u) {
-      add_touch(slips, slowest, contacts, y, u, piece.motion, near);
+      add_touch(slips, bounds, contacts, y, u, piece.motion, near);
     });
     touched = __reduce_or_sync(whole_warp, touched);
-    slowest = across_warp(slowest, Least{});
-    if (threadIdx.x % warp_size == 0) {
-      to[PartSums::touched] = double(touched);
-      to[PartSums::slowest] = slowest;
-    }
+    if (threadIdx.x % warp_size == 0) to[PartSums::touched] = double(touched);
     write_shares(slips, Add{}, to + PartSums::slips);
+    write_shares(bounds, Least{}, to + PartSums::bounds);
   } else {
     double least = HUGE_VAL;
     const auto touches = [&](int k) { return bool(piece.touched >> k & 1); };
@@ -99,7 +106,7 @@ PD_DEVICE void sum_part(const Vertices<T, Touching>& v, const Contacts<T>& conta
       least = Least{}(least, double(beside));
     });
     least = across_warp(least, Least{});
-    if (threadIdx.x % warp_size == 0) to[PartSums::touched] = least;
+    if (threadIdx.x % warp_size == 0) to[PartSums::least_gap] = least;
   }
 }
 
@@ -140,29 +147,33 @@ template <Rigid What, class T, class Read>
 PD_DEVICE void move_piece(const DevicePlan<T>& plan, int piece, const Contacts<T>& contacts,
                           const Read& read, Piece<T>& to) {
   const bool leader = threadIdx.x % warp_size == 0;
-  double one[1];
-  if constexpr (What == Rigid::beside) {
-    over_parts(plan, piece, Least{}, PartSums::touched, read, one);
-    if (leader && !(one[0] > 0)) to.motion.turn = {}, to.motion.shift = {};
+  if constexpr (What == Rigid::mean) {
+    double sum[RigidSums::lag];
+    over_parts(plan, piece, Add{}, PartSums::rigid, read, sum);
+    if (leader) to.center = center_of(sum);
+  } else if constexpr (What == Rigid::beside) {
+    double least[1];
+    over_parts(plan, piece, Least{}, PartSums::least_gap, read, least);
+    if (leader && !(least[0] > 0)) to.motion.turn = {}, to.motion.shift = {};
   } else {
     double sum[RigidSums::count];
     over_parts(plan, piece, Add{}, PartSums::rigid, read, sum);
     if constexpr (What == Rigid::free) {
       if (leader) to.motion = motion_in<T>(RigidFit(sum).free());
     } else {
-      over_parts(plan, piece, Or{}, PartSums::touched, read, one);
-      const unsigned touched = unsigned(one[0]);
-      over_parts(plan, piece, Least{}, PartSums::slowest, read, one);
-      double slips[Touch::slips];
+      double bits[1], slips[Touch::slips], bounds[Touch::bounds];
+      over_parts(plan, piece, Or{}, PartSums::touched, read, bits);
       over_parts(plan, piece, Add{}, PartSums::slips, read, slips);
+      over_parts(plan, piece, Least{}, PartSums::bounds, read, bounds);
       if (!leader) return;
+      const unsigned touched = unsigned(bits[0]);
       to.touched = touched;
       if (touched == 0) return;
       const auto plane = [&](int k) {
         const Plane<T>& p = contacts.planes[k];
         return Plane<double>{vector_in<double>(p.normal), double(p.height), double(p.friction)};
       };
-      to.motion = motion_in<T>(motion_on_contacts(RigidFit(sum), touched, slips, one[0], plane));
+      to.motion = motion_in<T>(motion_on_contacts(RigidFit(sum), touched, slips, bounds, plane));
     }
   }
 }

@@ -102,6 +102,7 @@ class SeveralRunner {
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || given_first) return;
+    move_pieces<Rigid::mean>();
     move_pieces<Rigid::free>();
     if constexpr (Touching) {
       move_pieces<Rigid::touching>();

@@ -15,40 +15,56 @@
 
 namespace pd::inline PD_TARGET {
 
-// Sums over the vertices of a piece, in double.
+// Sums over the vertices of a piece, in double. First those that give the mean of y; then the others, about that mean, so that far
+// from the origin, or where a stiff spring outweighs all other vertices, nothing cancels.
 struct RigidSums {
   static constexpr int weight = 0, position = 1, lag = 4, spread = 7, turn = 13;
   static constexpr int pins = 22, pin_position = 23, pin_spread = 26, count = 32;
 };
 
-// Adds a vertex of weight a at y, from which its target is `lag` away, to sums over a; y; z - y; y y^T; (z - y) y^T.
-template <class W, int Count>
-PD_HD void add_rigid(W (&sum)[Count], const W& a, const Vec3<W>& y, const Vec3<W>& lag) {
-  using S = RigidSums;
-  const W at[3] = {y.x, y.y, y.z}, way[3] = {a * lag.x, a * lag.y, a * lag.z};
-  sum[S::weight] = sum[S::weight] + a;
-  int n = S::spread;
+// Adds a vertex of weight a at y to the sums from `weight` on, over a and a y.
+template <class W>
+PD_HD void add_mean(W* sum, const W& a, const Vec3<W>& y) {
+  sum[0] = sum[0] + a;
+  sum[1] = multiply_add(a, y.x, sum[1]);
+  sum[2] = multiply_add(a, y.y, sum[2]);
+  sum[3] = multiply_add(a, y.z, sum[3]);
+}
+
+// Adds a vertex at `arm` from the mean, from which its target is `lag` away, to the sums from `lag` on, over a (z - y); a arm arm^T;
+// a (z - y) arm^T.
+template <class W>
+PD_HD void add_moments(W* sum, const W& a, const Vec3<W>& arm, const Vec3<W>& lag) {
+  constexpr int spread = RigidSums::spread - RigidSums::lag,
+                turn = RigidSums::turn - RigidSums::lag;
+  const W at[3] = {arm.x, arm.y, arm.z}, way[3] = {a * lag.x, a * lag.y, a * lag.z};
+  int n = spread;
   for (int r = 0; r < 3; ++r) {
     const W moment = a * at[r];
-    sum[S::position + r] = sum[S::position + r] + moment;
-    sum[S::lag + r] = sum[S::lag + r] + way[r];
+    sum[r] = sum[r] + way[r];
     for (int c = r; c < 3; ++c, ++n) sum[n] = multiply_add(moment, at[c], sum[n]);
     for (int c = 0; c < 3; ++c)
-      sum[S::turn + 3 * r + c] = multiply_add(way[r], at[c], sum[S::turn + 3 * r + c]);
+      sum[turn + 3 * r + c] = multiply_add(way[r], at[c], sum[turn + 3 * r + c]);
   }
 }
 
-// Adds a vertex that a pin holds on its target, where a is 0, to sums over 1; y; y y^T from sum[first] on.
-template <class W, int Count>
-PD_HD void add_pin(W (&sum)[Count], int first, const W& a, const Vec3<W>& y) {
-  const W at[3] = {y.x, y.y, y.z}, pinned = select(a > W(0.0), W(0.0), W(1.0));
-  sum[first] = sum[first] + pinned;
-  int n = first + RigidSums::pin_spread - RigidSums::pins;
+// Adds a vertex that a pin holds on its target, where a is 0, to the sums from `pins` on, over 1; arm; arm arm^T.
+template <class W>
+PD_HD void add_pin(W* sum, const W& a, const Vec3<W>& arm) {
+  const W at[3] = {arm.x, arm.y, arm.z}, pinned = select(a > W(0.0), W(0.0), W(1.0));
+  sum[0] = sum[0] + pinned;
+  int n = RigidSums::pin_spread - RigidSums::pins;
   for (int r = 0; r < 3; ++r) {
     const W held = pinned * at[r];
-    sum[first + 1 + r] = sum[first + 1 + r] + held;
+    sum[1 + r] = sum[1 + r] + held;
     for (int c = r; c < 3; ++c, ++n) sum[n] = multiply_add(held, at[c], sum[n]);
   }
+}
+
+// The mean of y, from the first sums.
+PD_HD Vec3<double> center_of(const double* sum) {
+  const double share = sum[0] > 0 ? 1.0 / sum[0] : 0.0;
+  return {share * sum[1], share * sum[2], share * sum[3]};
 }
 
 // y += turn (y - center) + shift
@@ -75,26 +91,16 @@ struct RigidFit {
   Vec3<double> center, shift, axis = {0, 0, 0};
   Mat3<double> covariance;
 
-  PD_HD explicit RigidFit(const double (&sum)[RigidSums::count]) {
+  PD_HD explicit RigidFit(const double (&sum)[RigidSums::count]) : center(center_of(sum)) {
     using S = RigidSums;
     const double share = sum[S::weight] > 0 ? 1.0 / sum[S::weight] : 0.0;
-    double middle[3], way[3], h[3][3];
-    for (int r = 0; r < 3; ++r) {
-      middle[r] = share * sum[S::position + r];
-      way[r] = share * sum[S::lag + r];
-    }
-    int n = S::spread;
-    for (int r = 0; r < 3; ++r) {
-      for (int c = r; c < 3; ++c, ++n)
-        h[r][c] = h[c][r] = sum[n] - sum[S::position + r] * middle[c];
-    }
-    const double square = share * (h[0][0] + h[1][1] + h[2][2]);
-    for (int r = 0; r < 3; ++r) {
-      for (int c = 0; c < 3; ++c) h[r][c] += sum[S::turn + 3 * r + c] - sum[S::lag + r] * middle[c];
-      covariance.row[r] = {h[r][0], h[r][1], h[r][2]};
-    }
-    center = {middle[0], middle[1], middle[2]};
-    shift = {way[0], way[1], way[2]};
+    shift = {share * sum[S::lag], share * sum[S::lag + 1], share * sum[S::lag + 2]};
+    const Mat3<double> spread = symmetric(sum + S::spread);
+    const double* turn = sum + S::turn;
+    for (int r = 0; r < 3; ++r)
+      covariance.row[r] =
+          spread.row[r] + Vec3<double>{turn[3 * r], turn[3 * r + 1], turn[3 * r + 2]};
+    const double square = share * (spread.row[0].x + spread.row[1].y + spread.row[2].z);
     if (sum[S::pins] > 0) turn_about_pins(sum, pins_apart * pins_apart * square);
   }
 
@@ -105,13 +111,8 @@ struct RigidFit {
     if (hold == Hold::all) return still();
     if (hold == Hold::line) return {turn_about(axis), center, shift};
     const double size = square_root(frobenius(covariance, covariance));
-    Mat3<double> turn = nearest_rotation((1.0 / (size > 0 ? size : 1.0)) * covariance);
-    turn.row[0].x -= 1.0;
-    turn.row[1].y -= 1.0;
-    turn.row[2].z -= 1.0;
-    // less is rounding, which would keep what drifts from coming to rest
-    if (frobenius(turn, turn) < least_turn * least_turn) turn = {};
-    return {turn, center, shift};
+    const Mat3<double> r = nearest_rotation((1.0 / (size > 0 ? size : 1.0)) * covariance);
+    return {beyond_rounding(less_identity(r, 1.0)), center, shift};
   }
 
   // The turn about a normal alone: R - I = sin [n]x + (1 - cos) (n n^T - I).
@@ -126,55 +127,66 @@ struct RigidFit {
     Mat3<double> turn = sine * cross_matrix(n);
     const double axis[3] = {n.x, n.y, n.z};
     for (int r = 0; r < 3; ++r) turn.row[r] = multiply_add(lift * axis[r], n, turn.row[r]);
-    turn.row[0].x -= lift;
-    turn.row[1].y -= lift;
-    turn.row[2].z -= lift;
-    return turn;
+    return beyond_rounding(less_identity(turn, lift));
   }
 
  private:
+  PD_HD static Mat3<double> symmetric(const double* s) {
+    return {{{s[0], s[1], s[2]}, {s[1], s[3], s[4]}, {s[2], s[4], s[5]}}};
+  }
+
+  PD_HD static Mat3<double> less_identity(Mat3<double> a, double share) {
+    a.row[0].x -= share;
+    a.row[1].y -= share;
+    a.row[2].z -= share;
+    return a;
+  }
+
+  // Less is rounding, which would keep what drifts from coming to rest.
+  PD_HD static Mat3<double> beyond_rounding(const Mat3<double>& turn) {
+    return frobenius(turn, turn) < least_turn * least_turn ? Mat3<double>{} : turn;
+  }
+
   // The middle of the pins becomes the center; `apart`: square of how far from a point or a line they may be.
   PD_HD void turn_about_pins(const double (&sum)[RigidSums::count], double apart) {
     using S = RigidSums;
     const double share = 1.0 / sum[S::pins];
-    const Vec3<double> pivot = share * Vec3<double>{sum[S::pin_position], sum[S::pin_position + 1],
-                                                    sum[S::pin_position + 2]};
-    const double middle[3] = {pivot.x, pivot.y, pivot.z};
-    double p[3][3];
-    int n = S::pin_spread;
-    for (int r = 0; r < 3; ++r) {
-      for (int c = r; c < 3; ++c, ++n) p[r][c] = p[c][r] = share * sum[n] - middle[r] * middle[c];
-    }
-    const SignedSvd<double> svd = signed_svd(Mat3<double>{
-        {{p[0][0], p[0][1], p[0][2]}, {p[1][0], p[1][1], p[1][2]}, {p[2][0], p[2][1], p[2][2]}}});
+    const double* at = sum + S::pin_position;
+    const double middle[3] = {share * at[0], share * at[1], share * at[2]};
+    const Vec3<double> pivot = {middle[0], middle[1], middle[2]};  // from the mean
+    Mat3<double> spread = share * symmetric(sum + S::pin_spread);
+    for (int r = 0; r < 3; ++r) spread.row[r] = subtract_product(spread.row[r], middle[r], pivot);
+    const SignedSvd<double> svd = signed_svd(spread);
     hold = svd.s[1] > apart ? Hold::all : svd.s[0] > apart ? Hold::line : Hold::point;
     axis = {svd.u.row[0].x, svd.u.row[1].x, svd.u.row[2].x};
-    const Vec3<double> arm = center - pivot, reach = sum[S::weight] * (arm + shift);
+    const Vec3<double> reach = sum[S::weight] * (shift - pivot);
     const double out[3] = {reach.x, reach.y, reach.z};
-    for (int r = 0; r < 3; ++r) covariance.row[r] = multiply_add(out[r], arm, covariance.row[r]);
-    center = pivot;
+    for (int r = 0; r < 3; ++r)
+      covariance.row[r] = subtract_product(covariance.row[r], out[r], pivot);
+    center = center + pivot;
     shift = {0, 0, 0};
   }
 };
 
 // What a piece would touch if it moved freely: a bit for each of the first planes, and one for all other contacts together. And how
-// vertices slip that lie on those planes that have friction: sums of the slips, of their squares and of 1.
+// vertices slip that lie on those planes that have friction: sums of the slips and of 1, and the least of the slips and of their
+// negatives, axis by axis.
 struct Touch {
   static constexpr int planes = 8;
   static constexpr unsigned others = 1u << planes;
-  static constexpr int slip = 0, square = 3, vertices = 4, slips = 5;
+  static constexpr int slip = 0, vertices = 3, slips = 4, bounds = 6;
 };
 
 // A vertex lies on a plane when it is no further off than this share of the way that the plane stops.
 constexpr double lying = 0.01;
 
-// Adds a vertex at y = x + u, whose piece would move by `motion`, to the slips and the least of them, squared; `near(k, gap)` learns
-// how far from the first planes it would come, and at last from the other contacts.
+// Adds a vertex at y = x + u, whose piece would move by `motion`, to the slips and their bounds; `near(k, gap)` learns how far from
+// the first planes it would come, and at last from the other contacts.
 template <class W, class R, class Near>
-PD_HD void add_touch(W (&slips)[Touch::slips], W& slowest, const Contacts<R>& contacts,
-                     const Vec3<R>& y, const Vec3<R>& u, const RigidMotion<R>& motion,
-                     const Near& near) {
-  const R none(0), one(1);
+PD_HD void add_touch(W (&slips)[Touch::slips], W (&bounds)[Touch::bounds],
+                     const Contacts<R>& contacts, const Vec3<R>& y, const Vec3<R>& u,
+                     const RigidMotion<R>& motion, const Near& near) {
+  const R none(0), one(1), far(HUGE_VAL);
   const Vec3<R> moved = y + motion.of(y);
   const int told = contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
   for (int k = 0; k < told; ++k) {
@@ -184,10 +196,13 @@ PD_HD void add_touch(W (&slips)[Touch::slips], W& slowest, const Contacts<R>& co
     const R lies = select(gap(plane, y) < reach, one, none);
     const R rubs = select(plane.friction > none, lies, none);
     const Vec3<R> slip = rubs * tangential(u, plane.normal);
-    const R square = dot(slip, slip);
-    const R add[Touch::slips] = {slip.x, slip.y, slip.z, square, rubs};
+    const R add[Touch::slips] = {slip.x, slip.y, slip.z, rubs};
     for (int n = 0; n < Touch::slips; ++n) slips[n] = slips[n] + convert<double>(add[n]);
-    slowest = lesser(slowest, convert<double>(select(rubs > none, square, R(HUGE_VAL))));
+    for (int n = 0; n < 3; ++n) {
+      const R least = select(rubs > none, add[n], far), most = select(rubs > none, -add[n], far);
+      bounds[n] = lesser(bounds[n], convert<double>(least));
+      bounds[3 + n] = lesser(bounds[3 + n], convert<double>(most));
+    }
   }
   near(Touch::planes, contacts.least_gap(moved, told));
 }
@@ -204,23 +219,26 @@ PD_HD R least_gap_beside(const Contacts<R>& contacts, const Vec3<R>& moved,
   return least;
 }
 
-// Along a rough plane with normal n, that vertices slide on by `slips`, none of them by less than `slowest`, squared. Nothing moves
-// once iterations have converged: friction that could stop the whole piece does so unless it holds a vertex already, and where
-// slips differ it does not act along their mean alone, and what is within that doubt is left as it is.
+// Along a rough plane with normal n, that vertices slide on by `slips`. Where these differ by up to d, friction acts along none of
+// them alone: of its force a share of up to 2 d / |slip| is in doubt, and what is within that is left to the iterations, so that
+// nothing moves once they have converged. So it is where friction could stop the whole piece, which it then does.
 PD_HD Vec3<double> slide(const Vec3<double>& shift, const Vec3<double>& n, double friction,
-                         const double (&slips)[Touch::slips], double slowest) {
+                         const double (&slips)[Touch::slips],
+                         const double (&bounds)[Touch::bounds]) {
   if (!(slips[Touch::vertices] > 0)) return {};
   const double share = 1.0 / slips[Touch::vertices], across = dot(shift, n);
   const Vec3<double> mean =
       share * Vec3<double>{slips[Touch::slip], slips[Touch::slip + 1], slips[Touch::slip + 2]};
+  double square = 0;
+  for (int a = 0; a < 3; ++a) square += (bounds[a] + bounds[3 + a]) * (bounds[a] + bounds[3 + a]);
+  const double apart = 2.0 * square_root(square), rub = -friction * across;
   const Vec3<double> free = mean + subtract_product(shift, across, n);
-  const double length = square_root(dot(free, free)), rub = -friction * across;
-  const double left = length - rub;
-  if (!(left > 0)) return 4 * slowest > dot(mean, mean) ? -mean : Vec3<double>{};
+  const double length = square_root(dot(free, free)), left = length - rub;
+  const double slip = square_root(dot(mean, mean));
+  if (!(left > 0)) return slip > apart && slip * slip > apart * rub ? -mean : Vec3<double>{};
   const Vec3<double> way = (left / length) * free - mean;
-  const double spread = share * slips[Touch::square] - dot(mean, mean);  // of the slips, squared
-  const double uneven = spread > 0 ? square_root(spread) / left : 0.0;
-  const double doubt = rub * (uneven < 2.0 ? uneven : 2.0), size = square_root(dot(way, way));
+  const double doubt = apart < 2.0 * left ? rub * apart / left : 2.0 * rub;
+  const double size = square_root(dot(way, way));
   if (!(size > doubt)) return {};
   return (1.0 - doubt / size) * way;
 }
@@ -228,7 +246,8 @@ PD_HD Vec3<double> slide(const Vec3<double>& shift, const Vec3<double>& n, doubl
 // The motion that contacts leave to a piece that touches some of them; `plane(k)` are the first of them.
 template <class PlaneAt>
 PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touched,
-                                             const double (&slips)[Touch::slips], double slowest,
+                                             const double (&slips)[Touch::slips],
+                                             const double (&bounds)[Touch::bounds],
                                              const PlaneAt& plane) {
   constexpr double parallel = 1e-12;  // square of what a normal adds to others
   if (touched == 0) return fit.free();
@@ -249,7 +268,7 @@ PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touch
   }
   if (count == 3 || (friction > 0 && touches > 1)) return motion;
   if (friction > 0) {
-    motion.shift = slide(fit.shift, normals[0], friction, slips, slowest);
+    motion.shift = slide(fit.shift, normals[0], friction, slips, bounds);
     return motion;
   }
   motion.shift = fit.shift;
