@@ -557,8 +557,8 @@ def test_friction_is_part_of_the_promise() -> None:
     sim, state = sliding(1e6)
     promise = sim.tune(state, error=1e-2)
     assert promise.attained
-    # of another motion
-    state.velocities[..., 0], state.velocities[..., 2] = -0.7, 0.5
+    # another way, at the same speed
+    state.velocities[..., 0], state.velocities[..., 2] = 0.8, 0.6
     assert max(errors_of_a_slide(sim, state)) <= 1e-2
     sim.iterations //= 3
     assert max(errors_of_a_slide(sim, state)) > 1e-2
