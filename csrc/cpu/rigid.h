@@ -4,12 +4,6 @@
 
 namespace pd::inline PD_TARGET {
 
-inline void set_lane(double& a, int, double number) { a = number; }
-template <int W>
-void set_lane(Pack<double, W>& a, int lane, double number) {
-  a.v[lane] = number;
-}
-
 template <class Lanes, class Visit>
 void each_in_a_piece(const Plan<typename Lanes::Scalar>& plan, const Visit& visit) {
   for (int i = 0; i < plan.vertices; ++i) {
@@ -31,14 +25,10 @@ void sum_pieces(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w) {
   });
   for (int g = 0; g < plan.groups; ++g) {
     GroupSums<Wide>& sums = w.group_sums[g];
-    for (int lane = 0; lane < Lanes::environments; ++lane) {
-      double first[S::lag];
-      for (int n = 0; n < S::lag; ++n) first[n] = Lanes::lane(sums.rigid[n], lane);
-      const Vec3<double> center = center_of(first);
-      set_lane(sums.center.x, lane, center.x);
-      set_lane(sums.center.y, lane, center.y);
-      set_lane(sums.center.z, lane, center.z);
-    }
+    const Wide weight = sums.rigid[S::weight], none(0.0), one(1.0);
+    const Wide share = one / select(weight > none, weight, one);
+    const Wide* sum = sums.rigid + S::position;
+    sums.center = {share * sum[0], share * sum[1], share * sum[2]};
   }
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
     GroupSums<Wide>& sums = w.group_sums[g];
