@@ -30,8 +30,9 @@ setup: $(VENV)/extension.stamp $(VENV)/package.stamp
 demo: setup
 	$(BIN)/python -m torchpd demo $(DEMO_ARGS)
 
+# A process for each core, up to where they would wait for memory and not for each other.
 test: setup
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses=auto --maxprocesses=8 $(PYTEST_ARGS)
 
 coverage: setup
 	$(BIN)/python -m pytest --cov --cov-report=term $(PYTEST_ARGS)

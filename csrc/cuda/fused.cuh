@@ -33,11 +33,11 @@ template <class T>
 constexpr int resident_threads = sizeof(T) == 4 ? 640 : 256;
 constexpr std::size_t reserved_shared_bytes = 1024;
 
-template <class T, bool Touching, Blocks Kind, bool Near, int Threads>
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near, int Threads>
 __global__ void __launch_bounds__(Threads, 1)
     fused_step(const __grid_constant__ FusedCall<T> call) {
   extern __shared__ __align__(16) std::byte shared[];
-  FusedRunner<T, Touching, Kind, Near> runner(call, shared);
+  FusedRunner<T, Touching, Loose, Kind, Near> runner(call, shared);
   const int team = Kind != Blocks::one ? int(blockIdx.x) / call.step.plan.patches : int(blockIdx.x);
   for (std::int64_t e = team; e < call.step.batch; e += call.teams) runner.roll(e);
   // nobody leaves while others may still write to its shared memory
@@ -47,31 +47,31 @@ __global__ void __launch_bounds__(Threads, 1)
 template <class T>
 using FusedKernel = void (*)(FusedCall<T>);
 
-template <class T, bool Touching>
+template <class T, bool Touching, bool Loose>
 FusedKernel<T> fused_kernel_for(Blocks kind, bool near, int threads) {
   constexpr int most = most_grid_threads<T>;
   if (kind == Blocks::cluster) {
     constexpr int few = most * 5 / 8;  // have more registers each
     if (threads <= few) {
-      if (near) return fused_step<T, Touching, Blocks::cluster, true, few>;
-      return fused_step<T, Touching, Blocks::cluster, false, few>;
+      if (near) return fused_step<T, Touching, Loose, Blocks::cluster, true, few>;
+      return fused_step<T, Touching, Loose, Blocks::cluster, false, few>;
     }
-    if (near) return fused_step<T, Touching, Blocks::cluster, true, most>;
-    return fused_step<T, Touching, Blocks::cluster, false, most>;
+    if (near) return fused_step<T, Touching, Loose, Blocks::cluster, true, most>;
+    return fused_step<T, Touching, Loose, Blocks::cluster, false, most>;
   }
   if (kind == Blocks::grid) {
-    if (near) return fused_step<T, Touching, Blocks::grid, true, most>;
-    return fused_step<T, Touching, Blocks::grid, false, far_threads<T>>;
+    if (near) return fused_step<T, Touching, Loose, Blocks::grid, true, most>;
+    return fused_step<T, Touching, Loose, Blocks::grid, false, far_threads<T>>;
   }
-  if (near) return fused_step<T, Touching, Blocks::one, true, resident_threads<T>>;
-  return fused_step<T, Touching, Blocks::one, false, resident_threads<T>>;
+  if (near) return fused_step<T, Touching, Loose, Blocks::one, true, resident_threads<T>>;
+  return fused_step<T, Touching, Loose, Blocks::one, false, resident_threads<T>>;
 }
 
 template <class T>
 FusedKernel<T> fused_kernel(const DeviceStep<T>& step, Blocks kind, bool near, int threads) {
-  const bool touching = step.material.planes_count + step.material.spheres_count > 0;
-  return touching ? fused_kernel_for<T, true>(kind, near, threads)
-                  : fused_kernel_for<T, false>(kind, near, threads);
+  if (touches(step)) return fused_kernel_for<T, true, true>(kind, near, threads);
+  return has_loose(step) ? fused_kernel_for<T, false, true>(kind, near, threads)
+                         : fused_kernel_for<T, false, false>(kind, near, threads);
 }
 
 // How a call is launched.
@@ -224,8 +224,8 @@ void FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
 template <class T>
 int largest_cluster_with() {
   constexpr int threads = most_grid_threads<T>;
-  const auto* kernel =
-      reinterpret_cast<const void*>(fused_kernel_for<T, true>(Blocks::cluster, true, threads));
+  const auto* kernel = reinterpret_cast<const void*>(
+      fused_kernel_for<T, true, true>(Blocks::cluster, true, threads));
   const std::size_t shared = shared_memory_per_block();
   if (resident_blocks(kernel, threads, shared) == 0) return 1;
   int blocks = int(most_cluster_blocks);

@@ -15,10 +15,11 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: the scene has contacts. `Near`: of one patch, whose vertex arrays fit shared memory, as far as iterations ask for
+// `Touching`: the scene has contacts. `Loose`: pieces that pins leave to move, in scenes without which their sums and motions would
+// only take registers from the iterations. `Near`: of one patch, whose vertex arrays fit shared memory, as far as iterations ask for
 // them; of several, which are so small that theirs fit and that no thread has more than one slot, nor in float32 more than one
 // tetrahedron; of a cluster, where all are as small, with so few own vertices that each has eight lanes and not four.
-template <class T, bool Touching, Blocks Kind, bool Near>
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 class FusedRunner {
   static constexpr bool Many = Kind != Blocks::one;  // patches an environment
   static constexpr bool Clustered = Kind == Blocks::cluster;
@@ -110,25 +111,7 @@ class FusedRunner {
   PD_DEVICE void align() {
     if constexpr (Clustered) release();
     settle();
-    const bool given_first = set_.start == StartKind::given && !started_;
-    const bool first = !started_;
-    started_ = true;
-    if (plan_.pieces == 0 || given_first) return;
-    move_pieces<Rigid::mean>();
-    move_pieces<Rigid::free>();
-    if constexpr (Touching) {
-      move_pieces<Rigid::touching>();
-      if (contacts_.has_several()) move_pieces<Rigid::beside>();
-    }
-    each_slot([&](int s) {
-      const int number = plan_.slot_piece[patch_.first_slot + s];
-      if (number < 0 || !(v_.u[s].w > 0)) return;  // of no piece, or pinned
-      const Vec3<T> u = vec3(v_.u[s]) + piece(number).motion.of(vec3(v_.x[s]) + vec3(v_.u[s]));
-      move(s, u);
-      if (first) v_.set_before(s, u);
-    });
-    moved_ = true;
-    __syncthreads();
+    if constexpr (Loose) align_pieces();
   }
 
   // When the sums of an iteration are sent and concluded: with one block, or where they may stop it, in the next one before
@@ -445,15 +428,13 @@ class FusedRunner {
   PD_DEVICE void weigh();
   PD_DEVICE void weigh_with(const T* stiffness, bool bounded);
   PD_DEVICE T weigh_own(const T* stiffness, bool bounded);
+  PD_DEVICE void read_own();
 
   // ---- rigid motions: cuda/fused_rigid.h
 
+  PD_DEVICE void align_pieces();
   template <Rigid What>
-  PD_DEVICE void move_pieces();
-  template <class Visit>
-  PD_DEVICE void each_part(const Visit& visit) const;
-  template <class Visit>
-  PD_DEVICE void each_piece(const Visit& visit) const;
+  PD_DEVICE void find_motions();
 
   // ---- results
 

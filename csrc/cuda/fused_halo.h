@@ -5,20 +5,20 @@
 namespace pd::inline PD_TARGET {
 
 // Of the patches that work out a tetrahedron one counts its energy.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE bool FusedRunner<T, Touching, Kind, Near>::counts(int number, T met) const {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE bool FusedRunner<T, Touching, Loose, Kind, Near>::counts(int number, T met) const {
   if (Once || number == int(threadIdx.x)) return counts_;
   return !(met == T(0)) && counts_energy(number);
 }
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE bool FusedRunner<T, Touching, Kind, Near>::counts_energy(int number) const {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE bool FusedRunner<T, Touching, Loose, Kind, Near>::counts_energy(int number) const {
   const PairPlace place = place_of(patch_, min(number / 2, patch_.pairs - 1));
   return plan_.pair_tet[place.in(2) + number % 2 * pair_lanes] >= 0;
 }
 
 // What positions are relative to: for all patches of a cluster the same, since they tell each other their own.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE Vec3<T> FusedRunner<T, Touching, Kind, Near>::anchor_of_step() {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE Vec3<T> FusedRunner<T, Touching, Loose, Kind, Near>::anchor_of_step() {
   if constexpr (!Clustered) return vec3(v_.x[0]);
   if (loaded_) {
     loaded_ = false;
@@ -32,15 +32,15 @@ PD_DEVICE Vec3<T> FusedRunner<T, Touching, Kind, Near>::anchor_of_step() {
   return read3(anchor);
 }
 
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::await_positions() {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::await_positions() {
   if (awaited_ != round_) halo_.wait(round_);
   awaited_ = round_;
 }
 
 // What iterations go by and change: in registers from the first to the last.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::hold() {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::hold() {
   const int own = OwnHalo::vertex();
   if (own >= patch_.interior) return;
   seen_ = v_.see(own);
@@ -48,8 +48,8 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::hold() {
   held_ = true;
 }
 
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::release() {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::release() {
   if (held_ && is_first()) {
     v_.set(at_.slot, seen_.u);
     v_.set_before(at_.slot, seen_.before);
@@ -58,8 +58,8 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::release() {
 }
 
 // Own vertices that were moved by something else than an iteration.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::send_positions() {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::send_positions() {
   __syncthreads();
   await_positions();
   ++round_;
@@ -72,9 +72,9 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::send_positions() {
 
 // As iterate(). Nobody waits at its end but for the positions, with which the next begins: what warps write before its barrier
 // and read after it has two places, for even and for odd iterations.
-template <class T, bool Touching, Blocks Kind, bool Near>
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 template <bool Stops>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::iterate_own(int k) {
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::iterate_own(int k) {
   const bool guard = set_.schedule == ScheduleKind::guarded && k % guard_period == 0;
   if (moved_) {
     send_positions();
@@ -136,10 +136,10 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::iterate_own(int k) {
 }
 
 // As pass(), of which nobody moves anything.
-template <class T, bool Touching, Blocks Kind, bool Near>
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 template <class Element, class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::pass_own(const Element& element,
-                                                              const Visit& visit) {
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::pass_own(const Element& element,
+                                                                     const Visit& visit) {
   if (moved_) send_positions();
   await_positions();
   energy_ = double(each_element(element));

@@ -5,42 +5,47 @@
 
 namespace pd::inline PD_TARGET {
 
-// a warp for each
-template <class T, bool Touching, Blocks Kind, bool Near>
-template <class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::each_part(const Visit& visit) const {
-  const int warps = blockDim.x / warp_size;
-  for (int part = plan_.patch_part[index_] + int(threadIdx.x) / warp_size;
-       part < plan_.patch_part[index_ + 1]; part += warps)
-    visit(part, plan_.part_start[part], plan_.part_start[part + 1]);
-}
-
-template <class T, bool Touching, Blocks Kind, bool Near>
-template <class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::each_piece(const Visit& visit) const {
-  const int warps = blockDim.x / warp_size;
-  for (int piece = int(threadIdx.x) / warp_size; piece < plan_.pieces; piece += warps) visit(piece);
-}
-
-template <class T, bool Touching, Blocks Kind, bool Near>
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 template <Rigid What>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::move_pieces() {
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::find_motions() {
   if constexpr (Many) sums_.meet();  // everyone has read the sums of the last time
-  each_part([&](int part, int begin, int end) {
-    const auto index = [&](int at) { return plan_.part_slot[at] - patch_.first_slot; };
-    const Piece<T>& piece = this->piece(plan_.slot_piece[plan_.part_slot[begin]]);
-    double* sums = part_sums() + PartSums::count * part;
-    sum_part<What>(v_, contacts_, plan_.pins > 0, begin, end, index, piece, sums);
-  });
+  const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
+  double* sums = part_sums();
+  const int end = plan_.patch_part[index_ + 1];
+  for (int n = plan_.patch_part[index_] + warp; n < end; n += warps) {
+    const Part part(plan_, n, nullptr, -patch_.first_slot);
+    const Piece<T>& piece = this->piece(part.piece(plan_));
+    sum_part<What>(v_, contacts_, plan_.pins > 0, part, piece, sums + PartSums::count * n);
+  }
   sums_.meet();
-  each_piece([&](int piece) {
-    // past the first level of cache, which does not see what other blocks wrote
-    const auto read = [&](int part, int n) {
-      return __ldcg(part_sums() + PartSums::count * part + n);
-    };
-    move_piece<What>(plan_, piece, contacts_, read, this->piece(piece));
-  });
+  for (int n = warp; n < plan_.pieces; n += warps)
+    move_piece<What>(plan_, n, contacts_, sums, this->piece(n));
   __syncthreads();
+}
+
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::align_pieces() {
+  const bool given_first = set_.start == StartKind::given && !started_;
+  const bool first = !started_;
+  started_ = true;
+  if (plan_.pieces == 0 || given_first) return;
+  find_motions<Rigid::mean>();
+  find_motions<Rigid::free>();
+  if constexpr (Touching) {
+    find_motions<Rigid::touching>();
+    if (contacts_.has_several()) find_motions<Rigid::beside>();
+  }
+  each_slot([&](int s) {
+    const int number = plan_.slot_piece[patch_.first_slot + s];
+    if (number < 0 || !(v_.u[s].w > 0)) return;  // of no piece, or pinned
+    const Vec3<T> u = vec3(v_.u[s]) + piece(number).motion.of(vec3(v_.x[s]) + vec3(v_.u[s]));
+    move(s, u);
+    if (first) v_.set_before(s, u);
+  });
+  moved_ = true;
+  __syncthreads();
+  // again, since registers that live across calls would be spilled in the iterations too
+  if constexpr (Many) read_own();
 }
 
 }  // namespace pd::inline PD_TARGET

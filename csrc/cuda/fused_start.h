@@ -5,9 +5,9 @@
 namespace pd::inline PD_TARGET {
 
 // Where everything lies in the memory of the block, and what does not fit there.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::lay_out(const FusedCall<T>& call,
-                                                             std::byte* shared) {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::lay_out(const FusedCall<T>& call,
+                                                                    std::byte* shared) {
   std::byte* slots = shared + fused_control_bytes;
   if constexpr (Clustered) {
     energies_ = reinterpret_cast<double*>(shared + cluster_energy_begin);
@@ -41,8 +41,8 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::lay_out(const FusedCall<T>&
 }
 
 // What a thread knows of its patch.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::open(std::byte* shared) {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::open(std::byte* shared) {
   if constexpr (!Near) {
     const int threads = blockDim.x;
     soon_ = min((2 * patch_.outer + threads - 1) / threads * threads, soon_);
@@ -57,8 +57,8 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::open(std::byte* shared) {
   }
 }
 
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::load() {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::load() {
   if (threadIdx.x == 0) in_.read_contacts(planes_, balls_);
   contacts_ = {planes_, balls_, call_.material.planes_count, call_.material.spheres_count};
   each_slot([&](int s) {
@@ -79,8 +79,8 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::load() {
   __syncthreads();
 }
 
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::move_balls() {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::move_balls() {
   if constexpr (!Touching) return;
   __syncthreads();
   for (int b = threadIdx.x; b < contacts_.ball_count; b += blockDim.x)
@@ -89,8 +89,8 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::move_balls() {
 }
 
 // a and 1 / D of every vertex, w V of every element, and the smallest a / D
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::weigh() {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::weigh() {
   const T* stiffness = call_.material.stiffness.of(in_.environment);
   constexpr bool own = Clustered && Once;
   T plain = T(0);
@@ -118,13 +118,26 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::weigh() {
   __syncthreads();
 }
 
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::weigh_with(const T* stiffness, bool bounded) {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::weigh_with(const T* stiffness,
+                                                                       bool bounded) {
   weigh_pairs(patch_, rest_of<Many>(patch_), stiffness, bounded, weights());
   __syncthreads();  // one lane has left the weights of two
   if constexpr (!Many) return;
-  half_ = read_half(patch_, weights(), threadIdx.x);
   per_unit_ = T(1) / rest_of<true>(patch_).unit;
+  read_own();
+}
+
+// What a thread keeps of its first tetrahedron.
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::read_own() {
+  if constexpr (Clustered && Once) {
+    const T weight = half_.weight;
+    half_ = read_half<false, T>(patch_, nullptr, threadIdx.x);
+    half_.weight = weight;
+  } else {
+    half_ = read_half(patch_, weights(), threadIdx.x);
+  }
   if constexpr (Clustered) {
     rest_ = half_rest(half_, per_unit_, rest_of<true>(patch_).position);
     counts_ = counts_energy(threadIdx.x);
@@ -136,8 +149,9 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::weigh_with(const T* stiffne
 }
 
 // The same without memory where no thread has more than one tetrahedron. Returns its weight without the bound.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE T FusedRunner<T, Touching, Kind, Near>::weigh_own(const T* stiffness, bool bounded) {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE T FusedRunner<T, Touching, Loose, Kind, Near>::weigh_own(const T* stiffness,
+                                                                   bool bounded) {
   const ComputedRest<T> rest = rest_of<true>(patch_);
   const PairPlace place = place_of(patch_, min(int(threadIdx.x) / 2, patch_.pairs - 1));
   const int which = int(threadIdx.x) % 2, tet = tet_of(plan_, place, which);
@@ -147,8 +161,7 @@ PD_DEVICE T FusedRunner<T, Touching, Kind, Near>::weigh_own(const T* stiffness, 
       tet < 0 ? T(0) : tet_weight(patch_weight(rest.unit, stiffness[tet]), half_.factor);
   half_.weight = bound * plain;
   per_unit_ = T(1) / rest.unit;
-  rest_ = half_rest(half_, per_unit_, rest.position);
-  counts_ = counts_energy(threadIdx.x);
+  read_own();
   return plain;
 }
 

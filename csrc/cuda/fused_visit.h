@@ -5,34 +5,34 @@
 namespace pd::inline PD_TARGET {
 
 // Shared slots have the first seats.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE int FusedRunner<T, Touching, Kind, Near>::slot_of_seat(int seat) const {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE int FusedRunner<T, Touching, Loose, Kind, Near>::slot_of_seat(int seat) const {
   const int shared = patch_.shared();
   return seat < shared ? patch_.interior + seat : seat - shared;
 }
 
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE int FusedRunner<T, Touching, Kind, Near>::row_of_seat(int seat) const {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE int FusedRunner<T, Touching, Loose, Kind, Near>::row_of_seat(int seat) const {
   return seat == int(threadIdx.x) ? row_ : patch_.row(slot_of_seat(seat));
 }
 
 // rounds of this warp's threads for so many seats
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE int FusedRunner<T, Touching, Kind, Near>::rounds(int seats) const {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE int FusedRunner<T, Touching, Loose, Kind, Near>::rounds(int seats) const {
   const int threads = blockDim.x;
   return max(0, (seats - (int(threadIdx.x) - lane()) + threads - 1) / threads);
 }
 
 // In a visit the rounds without shared seats come first: letters are on the way meanwhile.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE int FusedRunner<T, Touching, Kind, Near>::seat_of_visit(int visit) const {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE int FusedRunner<T, Touching, Loose, Kind, Near>::seat_of_visit(int visit) const {
   const int waiting = rounds(patch_.shared()), all = rounds(patch_.slots);
   const int round = visit + waiting < all ? visit + waiting : visit + waiting - all;
   return int(threadIdx.x) + round * int(blockDim.x);
 }
 
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::see(int seat) {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::see(int seat) {
   if (seat >= patch_.slots) return;
   const int slot = slot_of_seat(seat);
   seen_ = v_.see(slot);
@@ -40,44 +40,45 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::see(int seat) {
 }
 
 // Of a grid: the force on a shared vertex goes to the other patches.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::post(int seat, const Vec3<T>& force) const {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::post(int seat,
+                                                                 const Vec3<T>& force) const {
   const std::int64_t slot = patch_.first_slot + slot_of_seat(seat);
   Letter::post(letter_box() + slot * Letter::words, force, round_);
 }
 
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::post_shared() {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::post_shared() {
   ++round_;
   for (int seat = threadIdx.x; seat < patch_.shared(); seat += blockDim.x)
     post(seat, sum_entries_soon<T>(entries_, row_of_seat(seat)));
   __syncwarp();
 }
 
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE Vec3<T> FusedRunner<T, Touching, Kind, Near>::read(int seat) const {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE Vec3<T> FusedRunner<T, Touching, Loose, Kind, Near>::read(int seat) const {
   const auto* senders = reinterpret_cast<const Senders*>(plan_.slot_sender);
   return read_letters<T>(letter_box(), senders, earlier_shared() + seat, seat < patch_.shared(),
                          round_);
 }
 
 // Of a far grid: what the first visited vertex knows of itself, asked for before the barrier, as the next one's before a visit.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::see_first() {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::see_first() {
   see(seat_of_visit(0));
 }
 
 // What the guard wants to know of this iterate, before it is moved.
-template <class T, bool Touching, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::leave_energy(bool owned) {
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::leave_energy(bool owned) {
   if (owned) energy_ += seen_.energy();
   sums_.leave_early({energy_, 0, 0}, 1, Add{});
 }
 
 // A warp's rounds of seats without shared ones, then those whose letters have come meanwhile.
-template <class T, bool Touching, Blocks Kind, bool Near>
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 template <bool MayStop, class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_patch(const Visit& visit) {
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::visit_patch(const Visit& visit) {
   if (soon_ == 2 * patch_.pairs) post_shared();
   heed_late<MayStop>();
   if (finished_) return;
@@ -100,9 +101,10 @@ PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_patch(const Visit& vi
 }
 
 // The same where each thread has the one seat of its number. Warps wait as one, else lanes would go on one after another.
-template <class T, bool Touching, Blocks Kind, bool Near>
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 template <bool MayStop, class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Kind, Near>::visit_seat(bool early, const Visit& visit) {
+PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::visit_seat(bool early,
+                                                                       const Visit& visit) {
   ++round_;
   const int seat = threadIdx.x, shared = patch_.shared();
   // of the warp: any slots, any shared ones

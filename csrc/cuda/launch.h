@@ -17,6 +17,16 @@ enum class DeviceKernel : int {
 
 using Stream = void*;  // cudaStream_t
 
+// What a scene asks of the kernels beside elements and vertices: contacts; pieces that pins leave to move.
+template <class T>
+bool touches(const DeviceStep<T>& call) {
+  return call.material.planes_count + call.material.spheres_count > 0;
+}
+template <class T>
+bool has_loose(const DeviceStep<T>& call) {
+  return call.plan.pieces > 0;
+}
+
 // Bytes of device memory that a run wants, aligned to 256. Fused: kernels block, cluster and grid.
 template <class T>
 std::int64_t fused_bytes(const DeviceStep<T>& call);

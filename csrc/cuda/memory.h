@@ -2,8 +2,10 @@
 #pragma once
 #include "math/vec.h"
 
-// Everything in a kernel: what is called out of line wants its objects in memory, not in registers.
+// Nearly everything in a kernel: what is called out of line wants its objects in memory, not in registers.
 #define PD_DEVICE __device__ __forceinline__
+// What a kernel seldom does, of values or of what lies in memory anyway: inlined, it would take registers from its iterations.
+#define PD_DEVICE_COLD __device__ __noinline__
 
 namespace pd::inline PD_TARGET {
 

@@ -131,15 +131,11 @@ struct OuterLaunch {
 
   static OuterKernel<T> kernel_of(const DeviceStep<T>& step) {
     const auto of = [&]<int Threads>() {
-      return touching(step) ? outer_iterations<T, true, Threads>
-                            : outer_iterations<T, false, Threads>;
+      return touches(step) ? outer_iterations<T, true, Threads>
+                           : outer_iterations<T, false, Threads>;
     };
     return is_small(step) ? of.template operator()<small_outer_threads>()
                           : of.template operator()<outer_threads>();
-  }
-
-  static bool touching(const DeviceStep<T>& step) {
-    return step.material.planes_count + step.material.spheres_count > 0;
   }
 
   OuterCall<T> call(const StreamCall<T>& stream) const {
@@ -158,7 +154,7 @@ OuterMemory<T> arrange(Arena& arena, const OuterCall<T>& call) {
   const std::int64_t teams = call.teams, n = step.plan.vertices;
   const std::int64_t pairs = step.settings.learns() ? history * n : 0;
   const std::int64_t small = step.settings.schedule == ScheduleKind::corotated ? teams : 0;
-  const std::int64_t held = OuterLaunch<T>::touching(step) ? n : 0;
+  const std::int64_t held = touches(step) ? n : 0;
   OuterMemory<T> m;
   // what must start as zero comes first
   arena.place(m.counter, teams);

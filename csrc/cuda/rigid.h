@@ -24,15 +24,31 @@ struct Piece {
   unsigned touched;  // a bit for each of the first planes
 };
 
-// visit(i, x + u, u) of vertices i = index(begin) ... index(end - 1), each by one lane.
-template <class T, bool Touching, class Index, class Visit>
-PD_DEVICE void each_of_part(const Vertices<T, Touching>& v, int begin, int end, const Index& index,
-                            const Visit& visit) {
-  for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size) {
-    const int i = index(at);
-    visit(i, vec3(v.x[i]) + vec3(v.u[i]), vec3(v.u[i]));
+// Slots of a part, and where the arrays have the vertex of one: at the slot itself, or where `vertex` says, from `first` on.
+struct Part {
+  const int *slot, *vertex;
+  int begin, end, first;
+
+  template <class T>
+  PD_DEVICE Part(const DevicePlan<T>& plan, int part, const int* vertex, int first)
+      : slot(plan.part_slot),
+        vertex(vertex),
+        begin(plan.part_start[part]),
+        end(plan.part_start[part + 1]),
+        first(first) {}
+
+  template <class T>
+  PD_DEVICE int piece(const DevicePlan<T>& plan) const {
+    return plan.slot_piece[slot[begin]];
   }
-}
+
+  // visit(i), each by one lane
+  template <class Visit>
+  PD_DEVICE void each(const Visit& visit) const {
+    for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size)
+      visit(first + (vertex ? vertex[slot[at]] : slot[at]));
+  }
+};
 
 // Lane n gets value n of all lanes together. Each exchange halves how many values a lane is left with.
 template <int Count, class Op>
@@ -60,9 +76,10 @@ PD_DEVICE void write_shares(const double (&value)[Count], Op op, double* to) {
   if (int(threadIdx.x) % warp_size < Count) to[int(threadIdx.x) % warp_size] = own;
 }
 
-template <Rigid What, class T, bool Touching, class Index>
-PD_DEVICE void sum_part(const Vertices<T, Touching>& v, const Contacts<T>& contacts, bool pins,
-                        int begin, int end, const Index& index, const Piece<T>& piece, double* to) {
+// `to`: PartSums
+template <Rigid What, class T, bool Touching>
+PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool pins, Part part,
+                             const Piece<T>& piece, double* to) {
   using S = RigidSums;
   const auto wide = [](const Vec3<T>& a) {
     return Vec3<double>{double(a.x), double(a.y), double(a.z)};
@@ -70,20 +87,17 @@ PD_DEVICE void sum_part(const Vertices<T, Touching>& v, const Contacts<T>& conta
   const auto at = [&](int i) { return wide(vec3(v.x[i])) + wide(vec3(v.u[i])); };
   if constexpr (What == Rigid::mean) {
     double sum[S::lag] = {};
-    each_of_part(v, begin, end, index, [&](int i, const Vec3<T>&, const Vec3<T>&) {
-      add_mean(sum, double(v.inertia(i)), at(i));
-    });
+    part.each([&](int i) { add_mean(sum, double(v.inertia(i)), at(i)); });
     write_shares(sum, Add{}, to + PartSums::rigid);
   } else if constexpr (What == Rigid::free) {
     double sum[S::pins - S::lag] = {}, held[S::count - S::pins] = {};
-    each_of_part(v, begin, end, index, [&](int i, const Vec3<T>&, const Vec3<T>& u) {
-      add_moments(sum, double(v.inertia(i)), at(i) - piece.center, wide(vec3(v.target[i]) - u));
+    part.each([&](int i) {
+      const Vec3<T> lag = vec3(v.target[i]) - vec3(v.u[i]);
+      add_moments(sum, double(v.inertia(i)), at(i) - piece.center, wide(lag));
     });
     write_shares(sum, Add{}, to + PartSums::rigid + S::lag);
     if (pins) {
-      each_of_part(v, begin, end, index, [&](int i, const Vec3<T>&, const Vec3<T>&) {
-        add_pin(held, double(v.inertia(i)), at(i) - piece.center);
-      });
+      part.each([&](int i) { add_pin(held, double(v.inertia(i)), at(i) - piece.center); });
     }
     write_shares(held, Add{}, to + PartSums::rigid + S::pins);
   } else if constexpr (What == Rigid::touching) {
@@ -91,8 +105,9 @@ PD_DEVICE void sum_part(const Vertices<T, Touching>& v, const Contacts<T>& conta
     for (double& least : bounds) least = HUGE_VAL;
     unsigned touched = 0;
     const auto near = [&](int k, T gap) { touched |= gap > T(0) ? 0u : 1u << k; };
-    each_of_part(v, begin, end, index, [&](int, const Vec3<T>& y, const Vec3<T>& u) {
-      add_touch(slips, bounds, contacts, y, u, piece.motion, near);
+    part.each([&](int i) {
+      const Vec3<T> u = vec3(v.u[i]);
+      add_touch(slips, bounds, contacts, vec3(v.x[i]) + u, u, piece.motion, near);
     });
     touched = __reduce_or_sync(whole_warp, touched);
     if (threadIdx.x % warp_size == 0) to[PartSums::touched] = double(touched);
@@ -101,7 +116,8 @@ PD_DEVICE void sum_part(const Vertices<T, Touching>& v, const Contacts<T>& conta
   } else {
     double least = HUGE_VAL;
     const auto touches = [&](int k) { return bool(piece.touched >> k & 1); };
-    each_of_part(v, begin, end, index, [&](int, const Vec3<T>& y, const Vec3<T>&) {
+    part.each([&](int i) {
+      const Vec3<T> y = vec3(v.x[i]) + vec3(v.u[i]);
       const T beside = least_gap_beside(contacts, y + piece.motion.of(y), touches);
       least = Least{}(least, double(beside));
     });
@@ -110,14 +126,16 @@ PD_DEVICE void sum_part(const Vertices<T, Touching>& v, const Contacts<T>& conta
   }
 }
 
-// Combines what `read(part, first + n)` gives for the parts of a piece, in all lanes.
-template <int Count, class T, class Op, class Read>
-PD_DEVICE void over_parts(const DevicePlan<T>& plan, int piece, Op op, int first, const Read& read,
-                          double (&sum)[Count]) {
+// Combines numbers `first`, ... of the parts of a piece, in all lanes.
+template <int Count, class T, class Op>
+PD_DEVICE void over_parts(const DevicePlan<T>& plan, int piece, const double* part_sum, Op op,
+                          int first, double (&sum)[Count]) {
   for (int n = 0; n < Count; ++n) sum[n] = Op::none;
   for (int at = plan.piece_start[piece] + int(threadIdx.x) % warp_size;
        at < plan.piece_start[piece + 1]; at += warp_size) {
-    for (int n = 0; n < Count; ++n) sum[n] = op(sum[n], read(plan.piece_part[at], first + n));
+    const double* part = part_sum + PartSums::count * plan.piece_part[at] + first;
+    // past the first level of cache, which does not see what other blocks wrote
+    for (int n = 0; n < Count; ++n) sum[n] = op(sum[n], __ldcg(part + n));
   }
   const double own = share_out(sum, op);
   for (int n = 0; n < Count; ++n) sum[n] = __shfl_sync(whole_warp, own, n);
@@ -143,28 +161,29 @@ struct Or {
   }
 };
 
-template <Rigid What, class T, class Read>
-PD_DEVICE void move_piece(const DevicePlan<T>& plan, int piece, const Contacts<T>& contacts,
-                          const Read& read, Piece<T>& to) {
+// `part_sum`: [parts, PartSums::count]
+template <Rigid What, class T>
+PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T> contacts,
+                               const double* part_sum, Piece<T>& to) {
   const bool leader = threadIdx.x % warp_size == 0;
   if constexpr (What == Rigid::mean) {
     double sum[RigidSums::lag];
-    over_parts(plan, piece, Add{}, PartSums::rigid, read, sum);
+    over_parts(plan, piece, part_sum, Add{}, PartSums::rigid, sum);
     if (leader) to.center = center_of(sum);
   } else if constexpr (What == Rigid::beside) {
     double least[1];
-    over_parts(plan, piece, Least{}, PartSums::least_gap, read, least);
+    over_parts(plan, piece, part_sum, Least{}, PartSums::least_gap, least);
     if (leader && !(least[0] > 0)) to.motion.turn = {}, to.motion.shift = {};
   } else {
     double sum[RigidSums::count];
-    over_parts(plan, piece, Add{}, PartSums::rigid, read, sum);
+    over_parts(plan, piece, part_sum, Add{}, PartSums::rigid, sum);
     if constexpr (What == Rigid::free) {
       if (leader) to.motion = motion_in<T>(RigidFit(sum).free());
     } else {
       double bits[1], slips[Touch::slips], bounds[Touch::bounds];
-      over_parts(plan, piece, Or{}, PartSums::touched, read, bits);
-      over_parts(plan, piece, Add{}, PartSums::slips, read, slips);
-      over_parts(plan, piece, Least{}, PartSums::bounds, read, bounds);
+      over_parts(plan, piece, part_sum, Or{}, PartSums::touched, bits);
+      over_parts(plan, piece, part_sum, Add{}, PartSums::slips, slips);
+      over_parts(plan, piece, part_sum, Least{}, PartSums::bounds, bounds);
       if (!leader) return;
       const unsigned touched = unsigned(bits[0]);
       to.touched = touched;

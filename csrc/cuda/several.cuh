@@ -10,11 +10,11 @@
 
 namespace pd {
 
-template <class T, bool Touching, bool Once, bool Lean>
+template <class T, bool Touching, bool Loose, bool Once, bool Lean>
 __global__ void __launch_bounds__(Lean ? lean_threads : several_threads, 1)
     several_step(const __grid_constant__ SeveralCall<T> call) {
   extern __shared__ __align__(16) std::byte shared[];
-  SeveralRunner<T, Touching, Once, Lean> runner(call, shared);
+  SeveralRunner<T, Touching, Loose, Once, Lean> runner(call, shared);
   const auto begin = [&](std::int64_t block, std::int64_t each, std::int64_t before) {
     return min(before + block * each, call.step.batch);
   };
@@ -45,8 +45,9 @@ struct SeveralLaunch {
     const auto bytes = [&](int together) { return SeveralLayout<T>(step, together).bytes; };
     shape = several_shape(mesh, step.batch, room, bytes);
     shared = bytes(shape.together);
-    const bool touching = step.material.planes_count + step.material.spheres_count > 0;
-    kernel = touching ? kernel_for<true>(mesh) : kernel_for<false>(mesh);
+    kernel = touches(step)     ? kernel_for<true, true>(mesh)
+             : has_loose(step) ? kernel_for<false, true>(mesh)
+                               : kernel_for<false, false>(mesh);
     const int resident = resident_blocks(function(), shape.threads, shared);
     if (resident == 0) refuse_shared_memory(shared);
     const std::int64_t most = most_at_work(mesh, room, bytes), together = shape.together;
@@ -67,11 +68,11 @@ struct SeveralLaunch {
   }
 
  private:
-  template <bool Touching>
+  template <bool Touching, bool Loose>
   auto kernel_for(const SmallMesh& mesh) const {
-    if (!shape.once(mesh)) return several_step<T, Touching, false, false>;
-    return shape.lean ? several_step<T, Touching, true, true>
-                      : several_step<T, Touching, true, false>;
+    if (!shape.once(mesh)) return several_step<T, Touching, Loose, false, false>;
+    return shape.lean ? several_step<T, Touching, Loose, true, true>
+                      : several_step<T, Touching, Loose, true, false>;
   }
 };
 

@@ -13,9 +13,9 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Once`: no thread has a second pair, so that each keeps what the plan says of its own. `Lean`: there are too few registers to
+// `Loose`: see cuda/fused.h. `Once`: no thread has a second pair, so that each keeps what the plan says of its own. `Lean`: there are too few registers to
 // ask for all forces on a vertex at once.
-template <class T, bool Touching, bool Once, bool Lean>
+template <class T, bool Touching, bool Loose, bool Once, bool Lean>
 class SeveralRunner {
   using Seen = typename Vertices<T, Touching>::Seen;
 
@@ -27,7 +27,9 @@ class SeveralRunner {
  public:
   // `shared`: SeveralLayout::bytes
   PD_DEVICE SeveralRunner(const SeveralCall<T>& call, std::byte* shared)
-      : call_(call.step),
+      : whole_(call),
+        shared_(shared),
+        call_(call.step),
         plan_(call.step.plan),
         set_(call.step.settings),
         memory_(call.scratch),
@@ -98,25 +100,7 @@ class SeveralRunner {
   // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
   PD_DEVICE void align() {
     settle();
-    const bool given_first = set_.start == StartKind::given && !started_;
-    const bool first = !started_;
-    started_ = true;
-    if (plan_.pieces == 0 || given_first) return;
-    move_pieces<Rigid::mean>();
-    move_pieces<Rigid::free>();
-    if constexpr (Touching) {
-      move_pieces<Rigid::touching>();
-      if (contacts(0).has_several()) move_pieces<Rigid::beside>();
-    }
-    each_slot([&](const Seat& seat, int i) {
-      const int number = plan_.slot_piece[seat.at];
-      if (number < 0 || !(v_.u[i].w > 0)) return;  // of no piece, or pinned
-      const RigidMotion<T>& motion = piece(seat.environment, number).motion;
-      const Vec3<T> u = vec3(v_.u[i]) + motion.of(vec3(v_.x[i]) + vec3(v_.u[i]));
-      move(i, u);
-      if (first) v_.set_before(i, u);
-    });
-    __syncthreads();
+    if constexpr (Loose) align_pieces();
   }
 
   PD_DEVICE void iterate(int k) {
@@ -188,9 +172,9 @@ class SeveralRunner {
   PD_DEVICE Piece<T>& piece(int environment, int piece) const {
     return memory_.pieces[std::int64_t(first_of_block_ + environment) * plan_.pieces + piece];
   }
-  PD_DEVICE double* part_sum(int environment, int part) const {
+  PD_DEVICE double* part_sums(int environment) const {
     return memory_.part_sum +
-           (std::int64_t(first_of_block_ + environment) * plan_.parts + part) * PartSums::count;
+           std::int64_t(first_of_block_ + environment) * plan_.parts * PartSums::count;
   }
 
   // ---- who works on what
@@ -215,22 +199,6 @@ class SeveralRunner {
   PD_DEVICE void each_environment(const Visit& visit) {
     const int warps = blockDim.x / warp_size;
     for (int e = warps - 1 - int(threadIdx.x) / warp_size; e < here_; e += warps) visit(e);
-  }
-  template <class Visit>
-  PD_DEVICE void each_part(const Visit& visit) const {
-    const int warps = blockDim.x / warp_size;
-    for (int n = int(threadIdx.x) / warp_size; n < here_ * plan_.parts; n += warps) {
-      const Seat part = seat_of(n, plan_.parts);
-      visit(part.environment, part.at, plan_.part_start[part.at], plan_.part_start[part.at + 1]);
-    }
-  }
-  template <class Visit>
-  PD_DEVICE void each_piece(const Visit& visit) const {
-    const int warps = blockDim.x / warp_size;
-    for (int n = int(threadIdx.x) / warp_size; n < here_ * plan_.pieces; n += warps) {
-      const Seat piece = seat_of(n, plan_.pieces);
-      visit(piece.environment, piece.at);
-    }
   }
 
   // ---- elements and vertices
@@ -422,18 +390,60 @@ class SeveralRunner {
 
   // ---- rigid motions: cuda/rigid.h
 
-  template <Rigid What>
-  PD_DEVICE void move_pieces() {
-    each_part([&](int e, int part, int begin, int end) {
-      const auto index = [&](int at) { return e * slots() + plan_.part_slot[at]; };
-      const Piece<T>& piece = this->piece(e, plan_.slot_piece[plan_.part_slot[begin]]);
-      sum_part<What>(v_, contacts(e), plan_.pins > 0, begin, end, index, piece, part_sum(e, part));
+  PD_DEVICE void align_pieces() {
+    const bool given_first = set_.start == StartKind::given && !started_;
+    const bool first = !started_;
+    started_ = true;
+    if (plan_.pieces == 0 || given_first) return;
+    align_out_of_line(whole_, shared_, first_, here_, first);
+    // again, since what lives in registers across a call would be spilled in the iterations too
+    read_ahead(first_pair_);
+  }
+
+  // By a runner of its own, so that this one stays in registers. `first`: there is no iterate before this one.
+  PD_DEVICE_COLD static void align_out_of_line(const SeveralCall<T>& call, std::byte* shared,
+                                               std::int64_t first_environment, int here,
+                                               bool first) {
+    SeveralRunner run(call, shared);
+    run.first_ = first_environment;
+    run.here_ = here;
+    run.move_pieces(first);
+  }
+
+  PD_DEVICE void move_pieces(bool first) {
+    find_motions<Rigid::mean>();
+    find_motions<Rigid::free>();
+    if constexpr (Touching) {
+      find_motions<Rigid::touching>();
+      if (contacts(0).has_several()) find_motions<Rigid::beside>();
+    }
+    each_slot([&](const Seat& seat, int i) {
+      const int number = plan_.slot_piece[seat.at];
+      if (number < 0 || !(v_.u[i].w > 0)) return;  // of no piece, or pinned
+      const RigidMotion<T>& motion = piece(seat.environment, number).motion;
+      const Vec3<T> u = vec3(v_.u[i]) + motion.of(vec3(v_.x[i]) + vec3(v_.u[i]));
+      move(i, u);
+      if (first) v_.set_before(i, u);
     });
     __syncthreads();
-    each_piece([&](int e, int piece) {
-      const auto read = [&](int part, int n) { return part_sum(e, part)[n]; };
-      move_piece<What>(plan_, piece, contacts(e), read, this->piece(e, piece));
-    });
+  }
+
+  template <Rigid What>
+  PD_DEVICE void find_motions() {
+    const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
+    for (int n = warp; n < here_ * plan_.parts; n += warps) {
+      const Seat at = seat_of(n, plan_.parts);
+      const Part part(plan_, at.at, nullptr, at.environment * slots());
+      const Piece<T>& piece = this->piece(at.environment, part.piece(plan_));
+      sum_part<What>(v_, contacts(at.environment), plan_.pins > 0, part, piece,
+                     part_sums(at.environment) + PartSums::count * at.at);
+    }
+    __syncthreads();
+    for (int n = warp; n < here_ * plan_.pieces; n += warps) {
+      const Seat at = seat_of(n, plan_.pieces);
+      move_piece<What>(plan_, at.at, contacts(at.environment), part_sums(at.environment),
+                       this->piece(at.environment, at.at));
+    }
     __syncthreads();
   }
 
@@ -447,6 +457,8 @@ class SeveralRunner {
       inputs(e).write_info(record, course_[e].progress);
   }
 
+  const SeveralCall<T>& whole_;
+  std::byte* shared_;
   const DeviceStep<T>& call_;
   const DevicePlan<T>& plan_;
   const Settings& set_;

@@ -290,7 +290,7 @@ void run_stream(const DeviceStep<T>& step, void* memory, Stream to) {
   Arena arena(memory);
   call.memory = arrange(arena, call);
   void* outer = static_cast<std::byte*>(memory) + arena.size();
-  if (step.material.planes_count + step.material.spheres_count > 0) {
+  if (touches(step)) {
     run_stream_with<T, true>(call, outer, stream);
   } else {
     run_stream_with<T, false>(call, outer, stream);

@@ -100,8 +100,8 @@ struct StreamWork {
   PD_DEVICE Piece<T>& piece(int piece) const {
     return call.memory.pieces[environment * plan.pieces + piece];
   }
-  PD_DEVICE double* part_sum(int part) const {
-    return call.memory.part_sum + (environment * plan.parts + part) * PartSums::count;
+  PD_DEVICE double* part_sums() const {
+    return call.memory.part_sum + environment * plan.parts * PartSums::count;
   }
 };
 
@@ -386,11 +386,11 @@ __global__ void __launch_bounds__(vertex_threads)
   const std::int64_t warp = thread_number() / warp_size;
   if (warp >= call.step.batch * parts) return;
   const StreamWork<T, true> w(call, warp / parts);
-  const int part = int(warp % parts);
-  const int begin = w.plan.part_start[part], end = w.plan.part_start[part + 1];
-  const auto index = [&](int at) { return w.plan.slot_vertex[w.plan.part_slot[at]]; };
-  const Piece<T>& piece = w.piece(w.plan.slot_piece[w.plan.part_slot[begin]]);
-  sum_part<What>(w.v, w.contacts, w.plan.pins > 0, begin, end, index, piece, w.part_sum(part));
+  const int n = int(warp % parts);
+  const Part part(w.plan, n, w.plan.slot_vertex, 0);
+  const Piece<T>& piece = w.piece(part.piece(w.plan));
+  sum_part<What>(w.v, w.contacts, w.plan.pins > 0, part, piece,
+                 w.part_sums() + PartSums::count * n);
 }
 
 template <Rigid What, class T>
@@ -401,8 +401,7 @@ __global__ void __launch_bounds__(vertex_threads)
   if (warp >= call.step.batch * pieces) return;
   const StreamWork<T, true> w(call, warp / pieces);
   const int piece = int(warp % pieces);
-  const auto read = [&](int part, int n) { return w.part_sum(part)[n]; };
-  move_piece<What>(w.plan, piece, w.contacts, read, w.piece(piece));
+  move_piece<What>(w.plan, piece, w.contacts, w.part_sums(), w.piece(piece));
 }
 
 // `first`: before any iteration, which has no iterate before it
