@@ -30,7 +30,7 @@ setup: $(VENV)/extension.stamp $(VENV)/package.stamp
 demo: setup
 	$(BIN)/python -m torchpd demo $(DEMO_ARGS)
 
-# A process for each core, up to where they would wait for memory and not for each other.
+# A process for each core, of which more than eight would want much memory and speed up little.
 test: setup
 	$(BIN)/python -m pytest --numprocesses=auto --maxprocesses=8 $(PYTEST_ARGS)
 

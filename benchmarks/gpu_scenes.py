@@ -116,7 +116,7 @@ def _suffix(mesh: str) -> str:
 
 @dataclass(frozen=True)
 class GpuScene:
-    """Copies of a bar that is held at one end, swings, and bends by its weight."""
+    """Copies of a bar that is held at one end, swings, and bends by its weight, or that is loose."""
 
     name: str
     cells: tuple[int, int, int]
@@ -127,12 +127,18 @@ class GpuScene:
     aims: tuple[Aim, ...] = ()
     heavy: bool = False  # minutes to prepare: only when asked for
     effects: bool = False  # all that a solid may meet: it rests on a ball, over ground, both rough, and is damped
+    loose: bool = False  # held by nothing
+    ground: bool = False  # lies on a smooth plane
 
     def build(self) -> pd.Scene:
         """The scene of one environment."""
         mesh = MESHES[self.mesh](self.cells)
         bar = pd.Solid(mesh, youngs=YOUNGS, density=DENSITY)
-        parts = [bar, pd.Pin(bar, mesh.vertices[:, 0] < 1e-9), pd.Gravity((0.0, -9.81, 0.0))]
+        parts = [bar, pd.Gravity((0.0, -9.81, 0.0))]
+        if not self.loose:
+            parts.append(pd.Pin(bar, mesh.vertices[:, 0] < 1e-9))
+        if self.ground:
+            parts.append(pd.Ground())
         if self.effects:
             ball = pd.Sphere((0.7 * SIZE[0], -0.1, 0.5 * SIZE[2]), 0.1, friction=0.3)
             parts += [ball, pd.Ground(height=-0.2, friction=0.3), pd.Damping(1.0)]
@@ -166,6 +172,14 @@ def _iteration(must: float, stretch: float | None = None) -> Aim:
     return Aim("marginal_iteration_microseconds", must, stretch)
 
 
+def _loose(name: str, cells: tuple[int, int, int], batch: int = 1, kernel: str = "auto") -> list[GpuScene]:
+    """The same, free and on the ground."""
+    return [
+        GpuScene(f"{name}-{suffix}", cells, batch, kernel, loose=True, ground=suffix == "ground")
+        for suffix in ("free", "ground")
+    ]
+
+
 GPU_SCENES = (
     *(
         GpuScene(
@@ -182,6 +196,11 @@ GPU_SCENES = (
     *_pair("one-100k", (99, 31, 31), "auto", _iteration(14.0, 11.0)),
     *_pair("one-1M", (255, 63, 63), "stream", _iteration(130.0, 105.0)),
     GpuScene("one-1M-effects", (255, 63, 63), kernel="stream", effects=True, aims=(_iteration(360.0),)),
+    *_loose("64x8192", SMALL[64], 8192),
+    *_loose("256x8192", SMALL[256], 8192),
+    *_loose("1000x1024", SMALL[1000], 1024),
+    *_loose("one-10k", (39, 15, 15), kernel="grid"),
+    *_loose("one-1M", (255, 63, 63), kernel="stream"),
     *_pair("one-4M", (1023, 63, 63), "stream", _iteration(480.0, 400.0), heavy=True),
 )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -186,7 +187,9 @@ def test_scenes_of_the_gpu_are_what_their_names_say() -> None:
     for scene in scenes.GPU_SCENES:
         vertices = np.prod(np.add(scene.cells, 1))
         assert scene.name.endswith("-effects") == scene.effects
-        size = scene.name.removesuffix("-effects").removesuffix(f"-{scene.mesh}").removeprefix("one-")
+        assert scene.name.endswith(("-free", "-ground")) == scene.loose
+        assert scene.name.endswith("-ground") == scene.ground
+        size = re.sub(f"^one-|-({scene.mesh}|effects|free|ground)$", "", scene.name)
         if "x" in size:
             assert size == f"{vertices}x{scene.batch}"
         elif size == "1200-tets":

@@ -46,8 +46,8 @@ def test_names_keep_their_template_arguments(tool: dict[str, Any]) -> None:
     for signature, name in (
         ("void pd::rotate<double>(pd::RotationCall<double>)", "pd::rotate<double>"),
         (
-            "void pd::fused_step<float, true, (pd::generic::Blocks)1, true, 512>(pd::generic::FusedCall<float>)",
-            "pd::fused_step<float, true, (pd::generic::Blocks)1, true, 512>",
+            "void pd::fused_step<float, true, true, (pd::generic::Blocks)1, true, 512>(pd::generic::FusedCall<float>)",
+            "pd::fused_step<float, true, true, (pd::generic::Blocks)1, true, 512>",
         ),
         (
             "void pd::stream_decide<(pd::Decision)0, double>(pd::Call<double>, int)",

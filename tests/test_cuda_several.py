@@ -53,7 +53,7 @@ def touching() -> tuple[pd.scene.Part, ...]:
 
 @pytest.mark.usefixtures("poisoned")
 @pytest.mark.parametrize(("iterations", "tolerance"), [(15, 0.0), (200, 0.1)])
-@pytest.mark.parametrize(("pinned", "contacts"), [(True, True), (False, True), (False, False)])
+@pytest.mark.parametrize(("pinned", "contacts"), [(True, True), (False, True), (False, False), (True, False)])
 @pytest.mark.parametrize("cells", [(1, 1, 1), (2, 2, 2), (3, 3, 3), (4, 4, 4)])
 def test_how_many_share_a_block_does_not_matter(
     cells: tuple[int, int, int], pinned: bool, contacts: bool, iterations: int, tolerance: float, tmp_path: Path

@@ -168,6 +168,30 @@ def test_one_wrong_number_is_enough(
     assert not bool(info.converged.any())
 
 
+@pytest.mark.parametrize(
+    ("name", "column"), [("planes", 1), ("planes", 3), ("planes", 4), ("spheres", 0), ("spheres", 3), ("spheres", 4)]
+)
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["chebyshev", "levels"])
+def test_contact_that_is_no_number_shows(
+    dtype: torch.dtype, device: torch.device, solver: pd.Solver, name: str, column: int
+) -> None:
+    """Normal, height, centre or radius of one that nothing touches, or friction of one that a body lies on."""
+    body = pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2)), youngs=1e4)
+    ball = pd.Sphere((0.1, -0.3 if (name, column) == ("spheres", 4) else -2.0, 0.1), 0.3, friction=0.5)
+    ground = pd.Ground(height=0.0 if column == 4 and name == "planes" else -1.0, friction=0.5)
+    scene = pd.Scene(body, pd.Gravity(), ground, ball)
+    sim = pd.Simulator(scene, 1 / 60, 20, solver=solver, dtype=dtype, progress=False).to(device)
+    state = sim.rest_state(9)
+    _, expected = sim(state, return_info=True)
+    assert bool(expected.residual.isfinite().all())
+    sim.set_material(**{name: getattr(sim, name).expand(9, -1, -1).clone()})
+    getattr(sim, name)[4, 0, column] = torch.nan
+    _, info = sim(state, return_info=True)
+    assert info.residual.isnan().nonzero().tolist() == [[4]]
+    others = [e for e in range(9) if e != 4]
+    assert torch.equal(info.residual[others], expected.residual[others])
+
+
 def test_what_overflows_is_not_still(device: torch.device) -> None:
     """|u - s|^2 beyond the numbers says nothing of a change."""
     sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), youngs=1e4)), 1.0, 20, dtype=torch.float64)

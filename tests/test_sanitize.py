@@ -77,7 +77,7 @@ def test_kernels_that_did_not_run_are_named(tool: dict[str, Any], capsys: pytest
     assert len(expected) > 200
     assert all(name.startswith("pd::") for name in expected)
     signatures = (
-        "void pd::fused_step<float, true, (pd::generic::Blocks)1, true, 512>(pd::FusedCall<float>)",
+        "void pd::fused_step<float, true, true, (pd::generic::Blocks)1, true, 512>(pd::FusedCall<float>)",
         "void pd::freeform::freeform_items<pd::freeform::CellBoxes<double>>(pd::freeform::CellBoxes<double>, long)",
     )
     assert {tool["plain"](signature) for signature in signatures} < expected
@@ -90,8 +90,8 @@ def test_kernels_that_did_not_run_are_named(tool: dict[str, Any], capsys: pytest
 
 
 def test_without_clusters_none_of_their_kernels_is_expected(tool: dict[str, Any]) -> None:
-    """Two precisions, with and without contacts, near and far, few threads and many."""
-    assert len(tool["expected_kernels"](clusters=True) - tool["expected_kernels"](clusters=False)) == 16
+    """Two precisions; held, loose and touching bodies; near and far, few threads and many."""
+    assert len(tool["expected_kernels"](clusters=True) - tool["expected_kernels"](clusters=False)) == 24
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,13 @@
 """Counts the instructions of the loops of kernels, compiled for sm_90. No GPU is needed.
 
-python tools/instructions.py fused_float "fused_step<float, false, .*Blocks.0, true"
+python tools/instructions.py fused_float "fused_step<float, false, false, .*Blocks.0, true"
 
 compiles csrc/cuda/fused_float.cu as a build does and prints, of each kernel whose name the pattern is found in, the
 loops: where they begin, how many instructions they have, and how many the shortest pass runs. Left out are functions
 that a loop calls, what stands behind its end, and what a warp does whose lanes have parted. This one is the kernel
-"block" in float32 without contacts: its loop over pairs of tetrahedra that adds up no energy has 487, and runs 403
-where no rotation wants more than its closed form, 202 a tetrahedron: INSTRUCTIONS of benchmarks/gpu_timing.py.
+"block" in float32 of held bodies without contacts: its loop over pairs of tetrahedra that adds up no energy has 487,
+and runs 403 where no rotation wants more than its closed form, 202 a tetrahedron: INSTRUCTIONS of
+benchmarks/gpu_timing.py.
 """
 
 from __future__ import annotations

@@ -63,6 +63,7 @@ struct Pack {
   PD_HD friend Pack operator/(Pack a, Pack b) { return a.v / b.v; }
   PD_HD friend Pack operator-(Pack a) { return -a.v; }
   PD_HD friend Mask<T, W> operator>(Pack a, Pack b) { return {a.v > b.v}; }
+  PD_HD friend Mask<T, W> operator<=(Pack a, Pack b) { return {a.v <= b.v}; }
   PD_HD friend Mask<T, W> operator<(Pack a, Pack b) { return {a.v < b.v}; }
 };
 

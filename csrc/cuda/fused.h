@@ -15,8 +15,8 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: the scene has contacts. `Loose`: pieces that pins leave to move, in scenes without which their sums and motions would
-// only take registers from the iterations. `Near`: of one patch, whose vertex arrays fit shared memory, as far as iterations ask for
+// `Touching`: the scene has contacts. `Loose`: it may have pieces that pins leave to move, always so with contacts; elsewhere their
+// sums and motions would only take registers from the iterations. `Near`: of one patch, whose vertex arrays fit shared memory, as far as iterations ask for
 // them; of several, which are so small that theirs fit and that no thread has more than one slot, nor in float32 more than one
 // tetrahedron; of a cluster, where all are as small, with so few own vertices that each has eight lanes and not four.
 template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>

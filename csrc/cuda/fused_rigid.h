@@ -15,7 +15,8 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::find_motions() {
   for (int n = plan_.patch_part[index_] + warp; n < end; n += warps) {
     const Part part(plan_, n, nullptr, -patch_.first_slot);
     const Piece<T>& piece = this->piece(part.piece(plan_));
-    sum_part<What>(v_, contacts_, plan_.pins > 0, part, piece, sums + PartSums::count * n);
+    sum_part<What>(v_, contacts_, plan_.pins > 0, parts_are_pieces(plan_), part, piece,
+                   sums + PartSums::count * n);
   }
   sums_.meet();
   for (int n = warp; n < plan_.pieces; n += warps)
@@ -25,11 +26,10 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::find_motions() {
 
 template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::align_pieces() {
-  const bool given_first = set_.start == StartKind::given && !started_;
   const bool first = !started_;
   started_ = true;
-  if (plan_.pieces == 0 || given_first) return;
-  find_motions<Rigid::mean>();
+  if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
+  if (!parts_are_pieces(plan_)) find_motions<Rigid::mean>();
   find_motions<Rigid::free>();
   if constexpr (Touching) {
     find_motions<Rigid::touching>();

@@ -155,10 +155,9 @@ PD_DEVICE T FusedRunner<T, Touching, Loose, Kind, Near>::weigh_own(const T* stif
   const ComputedRest<T> rest = rest_of<true>(patch_);
   const PairPlace place = place_of(patch_, min(int(threadIdx.x) / 2, patch_.pairs - 1));
   const int which = int(threadIdx.x) % 2, tet = tet_of(plan_, place, which);
-  half_ = read_half<false, T>(patch_, nullptr, threadIdx.x);
+  const T factor = read_half<false, T>(patch_, nullptr, threadIdx.x).factor;
   const T bound = bounded ? plan_.pair_bound[place.in(2) + which * pair_lanes] : T(1);
-  const T plain =
-      tet < 0 ? T(0) : tet_weight(patch_weight(rest.unit, stiffness[tet]), half_.factor);
+  const T plain = tet < 0 ? T(0) : tet_weight(patch_weight(rest.unit, stiffness[tet]), factor);
   half_.weight = bound * plain;
   per_unit_ = T(1) / rest.unit;
   read_own();

@@ -6,7 +6,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// Four rounds: where a piece is, its motion if it touches nothing, what contacts leave of that, and nothing where that leads into
+// Up to four rounds: where a piece is, its motion if it touches nothing, what contacts leave of that, and nothing where that leads into
 // further contacts.
 enum class Rigid { mean, free, touching, beside };
 
@@ -70,35 +70,54 @@ PD_DEVICE double share_out(const double (&value)[Count], Op op) {
   return left[0];
 }
 
+// Returns what share_out does.
 template <int Count, class Op>
-PD_DEVICE void write_shares(const double (&value)[Count], Op op, double* to) {
+PD_DEVICE double write_shares(const double (&value)[Count], Op op, double* to) {
   const double own = share_out(value, op);
   if (int(threadIdx.x) % warp_size < Count) to[int(threadIdx.x) % warp_size] = own;
+  return own;
+}
+
+// Every part is a whole piece, whose mean needs no round of its own.
+template <class T>
+PD_HD bool parts_are_pieces(const DevicePlan<T>& plan) {
+  return plan.parts == plan.pieces;
 }
 
 // `to`: PartSums
 template <Rigid What, class T, bool Touching>
-PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool pins, Part part,
-                             const Piece<T>& piece, double* to) {
+PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool pins, bool whole,
+                             Part part, const Piece<T>& piece, double* to) {
   using S = RigidSums;
   const auto wide = [](const Vec3<T>& a) {
     return Vec3<double>{double(a.x), double(a.y), double(a.z)};
   };
   const auto at = [&](int i) { return wide(vec3(v.x[i])) + wide(vec3(v.u[i])); };
-  if constexpr (What == Rigid::mean) {
+  const auto sum_mean = [&] {
     double sum[S::lag] = {};
     part.each([&](int i) { add_mean(sum, double(v.inertia(i)), at(i)); });
-    write_shares(sum, Add{}, to + PartSums::rigid);
+    return write_shares(sum, Add{}, to + PartSums::rigid);
+  };
+  if constexpr (What == Rigid::mean) {
+    sum_mean();
   } else if constexpr (What == Rigid::free) {
+    Vec3<double> center;
+    if (whole) {
+      const double own = sum_mean();
+      double sum[S::lag];
+      for (int n = 0; n < S::lag; ++n) sum[n] = __shfl_sync(whole_warp, own, n);
+      center = center_of(sum);
+    } else {
+      center = piece.center;
+    }
     double sum[S::pins - S::lag] = {}, held[S::count - S::pins] = {};
     part.each([&](int i) {
       const Vec3<T> lag = vec3(v.target[i]) - vec3(v.u[i]);
-      add_moments(sum, double(v.inertia(i)), at(i) - piece.center, wide(lag));
+      add_moments(sum, double(v.inertia(i)), at(i) - center, wide(lag));
     });
     write_shares(sum, Add{}, to + PartSums::rigid + S::lag);
-    if (pins) {
-      part.each([&](int i) { add_pin(held, double(v.inertia(i)), at(i) - piece.center); });
-    }
+    if (!pins) return;
+    part.each([&](int i) { add_pin(held, double(v.inertia(i)), at(i) - center); });
     write_shares(held, Add{}, to + PartSums::rigid + S::pins);
   } else if constexpr (What == Rigid::touching) {
     double slips[Touch::slips] = {}, bounds[Touch::bounds];
@@ -126,19 +145,43 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool
   }
 }
 
-// Combines numbers `first`, ... of the parts of a piece, in all lanes.
-template <int Count, class T, class Op>
+// Combines Count numbers, from the `first` on, of the parts of a piece, and gives them to all lanes. With few parts a lane adds up
+// one number of all of them; with many it adds up all numbers of every 32nd part.
+template <int Count, class T, class Op, int All>
 PD_DEVICE void over_parts(const DevicePlan<T>& plan, int piece, const double* part_sum, Op op,
-                          int first, double (&sum)[Count]) {
-  for (int n = 0; n < Count; ++n) sum[n] = Op::none;
-  for (int at = plan.piece_start[piece] + int(threadIdx.x) % warp_size;
-       at < plan.piece_start[piece + 1]; at += warp_size) {
-    const double* part = part_sum + PartSums::count * plan.piece_part[at] + first;
-    // past the first level of cache, which does not see what other blocks wrote
-    for (int n = 0; n < Count; ++n) sum[n] = op(sum[n], __ldcg(part + n));
+                          int first, double (&sum)[All]) {
+  constexpr int few = 16;
+  const int lane = int(threadIdx.x) % warp_size;
+  const int begin = plan.piece_start[piece], end = plan.piece_start[piece + 1];
+  // past the first level of cache, which does not see what other blocks wrote
+  const auto read = [&](int at, int n) {
+    return __ldcg(part_sum + PartSums::count * plan.piece_part[at] + first + n);
+  };
+  double own = Op::none;
+  if (end - begin <= few) {
+    for (int at = begin; at < end && lane < Count; ++at) own = op(own, read(at, lane));
+  } else {
+    double part[Count];
+    for (int n = 0; n < Count; ++n) part[n] = Op::none;
+    for (int at = begin + lane; at < end; at += warp_size) {
+      for (int n = 0; n < Count; ++n) part[n] = op(part[n], read(at, n));
+    }
+    own = share_out(part, op);
   }
-  const double own = share_out(sum, op);
+  __syncwarp();
   for (int n = 0; n < Count; ++n) sum[n] = __shfl_sync(whole_warp, own, n);
+}
+
+// RigidSums of a piece.
+template <class T>
+PD_DEVICE void rigid_sums(const DevicePlan<T>& plan, int piece, const double* part_sum,
+                          double (&sum)[RigidSums::count]) {
+  if (plan.pins > 0) {
+    over_parts<RigidSums::count>(plan, piece, part_sum, Add{}, PartSums::rigid, sum);
+    return;
+  }
+  for (int n = RigidSums::pins; n < RigidSums::count; ++n) sum[n] = 0;
+  over_parts<RigidSums::pins>(plan, piece, part_sum, Add{}, PartSums::rigid, sum);
 }
 
 template <class To, class From>
@@ -168,26 +211,27 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
   const bool leader = threadIdx.x % warp_size == 0;
   if constexpr (What == Rigid::mean) {
     double sum[RigidSums::lag];
-    over_parts(plan, piece, part_sum, Add{}, PartSums::rigid, sum);
+    over_parts<RigidSums::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, sum);
     if (leader) to.center = center_of(sum);
   } else if constexpr (What == Rigid::beside) {
     double least[1];
-    over_parts(plan, piece, part_sum, Least{}, PartSums::least_gap, least);
+    over_parts<1>(plan, piece, part_sum, Least{}, PartSums::least_gap, least);
     if (leader && !(least[0] > 0)) to.motion.turn = {}, to.motion.shift = {};
   } else {
     double sum[RigidSums::count];
-    over_parts(plan, piece, part_sum, Add{}, PartSums::rigid, sum);
     if constexpr (What == Rigid::free) {
+      rigid_sums(plan, piece, part_sum, sum);
       if (leader) to.motion = motion_in<T>(RigidFit(sum).free());
     } else {
       double bits[1], slips[Touch::slips], bounds[Touch::bounds];
-      over_parts(plan, piece, part_sum, Or{}, PartSums::touched, bits);
-      over_parts(plan, piece, part_sum, Add{}, PartSums::slips, slips);
-      over_parts(plan, piece, part_sum, Least{}, PartSums::bounds, bounds);
-      if (!leader) return;
+      over_parts<1>(plan, piece, part_sum, Or{}, PartSums::touched, bits);
       const unsigned touched = unsigned(bits[0]);
-      to.touched = touched;
+      if (leader) to.touched = touched;
       if (touched == 0) return;
+      rigid_sums(plan, piece, part_sum, sum);
+      over_parts<Touch::slips>(plan, piece, part_sum, Add{}, PartSums::slips, slips);
+      over_parts<Touch::bounds>(plan, piece, part_sum, Least{}, PartSums::bounds, bounds);
+      if (!leader) return;
       const auto plane = [&](int k) {
         const Plane<T>& p = contacts.planes[k];
         return Plane<double>{vector_in<double>(p.normal), double(p.height), double(p.friction)};

@@ -13,8 +13,8 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Loose`: see cuda/fused.h. `Once`: no thread has a second pair, so that each keeps what the plan says of its own. `Lean`: there are too few registers to
-// ask for all forces on a vertex at once.
+// `Touching`, `Loose`: see cuda/fused.h. `Once`: no thread has a second pair, so that each keeps what the plan says of its own.
+// `Lean`: there are too few registers to ask for all forces on a vertex at once.
 template <class T, bool Touching, bool Loose, bool Once, bool Lean>
 class SeveralRunner {
   using Seen = typename Vertices<T, Touching>::Seen;
@@ -391,10 +391,9 @@ class SeveralRunner {
   // ---- rigid motions: cuda/rigid.h
 
   PD_DEVICE void align_pieces() {
-    const bool given_first = set_.start == StartKind::given && !started_;
     const bool first = !started_;
     started_ = true;
-    if (plan_.pieces == 0 || given_first) return;
+    if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
     align_out_of_line(whole_, shared_, first_, here_, first);
     // again, since what lives in registers across a call would be spilled in the iterations too
     read_ahead(first_pair_);
@@ -411,7 +410,7 @@ class SeveralRunner {
   }
 
   PD_DEVICE void move_pieces(bool first) {
-    find_motions<Rigid::mean>();
+    if (!parts_are_pieces(plan_)) find_motions<Rigid::mean>();
     find_motions<Rigid::free>();
     if constexpr (Touching) {
       find_motions<Rigid::touching>();
@@ -435,8 +434,8 @@ class SeveralRunner {
       const Seat at = seat_of(n, plan_.parts);
       const Part part(plan_, at.at, nullptr, at.environment * slots());
       const Piece<T>& piece = this->piece(at.environment, part.piece(plan_));
-      sum_part<What>(v_, contacts(at.environment), plan_.pins > 0, part, piece,
-                     part_sums(at.environment) + PartSums::count * at.at);
+      sum_part<What>(v_, contacts(at.environment), plan_.pins > 0, parts_are_pieces(plan_), part,
+                     piece, part_sums(at.environment) + PartSums::count * at.at);
     }
     __syncthreads();
     for (int n = warp; n < here_ * plan_.pieces; n += warps) {

@@ -122,7 +122,7 @@ class StreamRunner {
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
-    move_pieces<Rigid::mean>();
+    if (!parts_are_pieces(plan_)) move_pieces<Rigid::mean>();
     move_pieces<Rigid::free>();
     if constexpr (Touching) {
       move_pieces<Rigid::touching>();

@@ -389,7 +389,7 @@ __global__ void __launch_bounds__(vertex_threads)
   const int n = int(warp % parts);
   const Part part(w.plan, n, w.plan.slot_vertex, 0);
   const Piece<T>& piece = w.piece(part.piece(w.plan));
-  sum_part<What>(w.v, w.contacts, w.plan.pins > 0, part, piece,
+  sum_part<What>(w.v, w.contacts, w.plan.pins > 0, parts_are_pieces(w.plan), part, piece,
                  w.part_sums() + PartSums::count * n);
 }
 

@@ -36,9 +36,11 @@ PD_HD R gap(const Ball<R>& ball, const Vec3<R>& x) {
   return square_root(dot(d, d)) - ball.radius;
 }
 
+// How far inside; what is no number stays so, and shows.
 template <class R>
 PD_HD R penetration(const R& distance) {
-  return select(distance < R(0), -distance, R(0));
+  const R none(0);
+  return select(distance < none, -distance, select(distance > none, none, distance));
 }
 
 // Away from the ball; upwards for a vertex at its very centre.
@@ -56,15 +58,22 @@ PD_HD Vec3<R> tangential(const Vec3<R>& slip, const Vec3<R>& normal) {
   return subtract_product(slip, dot(normal, slip), normal);
 }
 
-// Pushes the displacement `u` out by `depth` along `normal`, then takes back slip against the surface.
+// Pushes the displacement `u` out by `depth` along `normal`, then takes back slip against the surface. Most vertices touch nothing,
+// and what is smooth takes nothing back: lane by lane the same, whether others do or not.
 template <class R>
 PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, const R& friction,
                        const Vec3<R>& motion) {
-  const Vec3<R> pushed = multiply_add(depth, normal, u);
+  const R none(0);
+  const auto touches = !(depth <= none);
+  if (!any(touches)) return u;
+  const Vec3<R> pushed = select(touches, multiply_add(depth, normal, u), u);
+  const R rub = friction * depth;
+  const auto rubs = touches && !(rub <= none);
+  if (!any(rubs)) return pushed;
   const Vec3<R> slip = tangential(pushed - motion, normal);
   const R length = square_root(dot(slip, slip));
-  const R grip = lesser(R(1), friction * depth / select(length > R(0), length, R(1)));
-  return subtract_product(pushed, grip, slip);
+  const R grip = lesser(rub / select(length > none, length, R(1)), R(1));
+  return select(rubs, subtract_product(pushed, grip, slip), pushed);
 }
 
 // Of a normal, squared: what earlier ones leave of one that they span but for a thousandth.
@@ -118,8 +127,7 @@ struct Push {
     const R along_row[3] = {kept * along.x, kept * along.y, kept * along.z};
     for (int a = 0; a < 3; ++a) {
       const Vec3<R> row = left.free.row[a], line = along_row[a] * along;
-      left.free.row[a] = {select(resists, line.x, row.x), select(resists, line.y, row.y),
-                          select(resists, line.z, row.z)};
+      left.free.row[a] = select(resists, line, row);
     }
   }
 
@@ -203,19 +211,21 @@ struct Contacts {
   }
 
  private:
-  // What visit(contact, u) makes of u, contact after contact.
+  // What visit(contact, u) makes of u, contact after contact. Of one that pushes nothing out it would change the sign of a 0 at most.
   template <class Visit>
   PD_HD Vec3<R> each(const Vec3<R>& x, Vec3<R> u, const Vec3<R>& around, const Visit& visit) const {
+    const R none(0);
+    const auto meet = [&](const Push<R>& push) {
+      if (any(!(push.depth <= none))) u = visit(push, u);
+    };
     for (int i = 0; i < plane_count; ++i) {
       const Plane<R>& p = planes[i];
-      const R none(0);
-      u = visit(Push<R>{p.normal, penetration(gap(p, x + u)), p.friction, {none, none, none}}, u);
+      meet({p.normal, penetration(gap(p, x + u)), p.friction, {none, none, none}});
     }
     for (int i = 0; i < ball_count; ++i) {
       const Ball<R>& b = balls[i];
       const Vec3<R> normal = outward(b, x + around);
-      const R depth = penetration(dot(normal, (x + u) - b.center) - b.radius);
-      u = visit(Push<R>{normal, depth, b.friction, b.motion}, u);
+      meet({normal, penetration(dot(normal, (x + u) - b.center) - b.radius), b.friction, b.motion});
     }
     return u;
   }

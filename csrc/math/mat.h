@@ -51,13 +51,14 @@ PD_HD R frobenius(const Mat3<R>& a, const Mat3<R>& b) {
 }
 
 template <class Mask, class R>
+PD_HD Vec3<R> select(const Mask& take, const Vec3<R>& a, const Vec3<R>& b) {
+  return {select(take, a.x, b.x), select(take, a.y, b.y), select(take, a.z, b.z)};
+}
+
+template <class Mask, class R>
 PD_HD Mat3<R> select(const Mask& take, const Mat3<R>& a, const Mat3<R>& b) {
-  Mat3<R> chosen;
-  for (int r = 0; r < 3; ++r) {
-    chosen.row[r] = {select(take, a.row[r].x, b.row[r].x), select(take, a.row[r].y, b.row[r].y),
-                     select(take, a.row[r].z, b.row[r].z)};
-  }
-  return chosen;
+  return {{select(take, a.row[0], b.row[0]), select(take, a.row[1], b.row[1]),
+           select(take, a.row[2], b.row[2])}};
 }
 
 template <class R>
