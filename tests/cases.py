@@ -152,6 +152,38 @@ def contact_block(
     return Case(scene, vertices, np.tile(velocity, (len(vertices), 1)), 1.0 / 60.0)
 
 
+def rotation(*degrees: float) -> Array:
+    """About x, then y, then z."""
+    matrix = np.eye(3)
+    for axis, angle in enumerate(np.radians(degrees)):
+        turn = np.eye(3)
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        turn[i, i] = turn[j, j] = np.cos(angle)
+        turn[j, i], turn[i, j] = np.sin(angle), -np.sin(angle)
+        matrix = turn @ matrix
+    return matrix
+
+
+def leaning(
+    friction: float,
+    *parts: Part,
+    turn: tuple[float, float, float] = (0.0, 20.0, 20.0),
+    size: tuple[float, float, float] = (0.05, 0.5, 0.05),
+    cells: tuple[int, int, int] = (1, 10, 1),
+    gravity: tuple[float, float, float] = (0.0, -9.8, 0.0),
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    youngs: float = 1e7,
+    height: float = 0.0,
+) -> Case:
+    """A bar on its lowest corner, edge or face, on y = 0, or that far above it."""
+    vertices, tets = box(size, cells)
+    vertices = (vertices - vertices.mean(axis=0)) @ rotation(*turn).T
+    vertices[:, 1] += height - vertices[:, 1].min()
+    ground = Ground(0.0, friction=friction)
+    scene = Scene(Solid(TetMesh(vertices, tets), youngs), Gravity(gravity), ground, *parts)
+    return Case(scene, vertices, np.tile(velocity, (len(vertices), 1)), 1.0 / 60.0)
+
+
 def slope(angle: float, friction: float) -> Case:
     """A cube at rest on a slope [rad]: gravity is tilted instead of the plane, downhill is +x."""
     pull = (9.8 * float(np.sin(angle)), -9.8 * float(np.cos(angle)), 0.0)

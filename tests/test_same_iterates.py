@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from cases import Case, box, contact_block, sliver_mesh
+from cases import Case, box, contact_block, leaning, sliver_mesh
 from runs import arguments_of, displacement, reference_run, rounded_problem, simulator, state_of
 
 import torchpd as pd
@@ -121,6 +122,38 @@ def hung(*held: int, stiffness: float | None = None, ground: float = -9.0) -> Ca
     return stirred(Case(scene, vertices, 0.0 * vertices, 1.0 / 60.0, extras=extras), size=1e-4)
 
 
+def tipping(friction: float, *, spin: float = 0.0, **options: Any) -> Case:
+    """A stiff bar or block that tips, and spins about its lowest vertex; much gravity, as float32 rounds its 0.5 m."""
+    case = leaning(friction, **{"youngs": 1e6, "gravity": (0.0, -98.0, 0.0), **options})
+    arms = case.positions - case.positions[case.positions[:, 1].argmin()]
+    turning = np.cross([0.0, 0.0, spin], arms)
+    return stirred(Case(case.scene, case.positions, case.velocities + turning, case.time_step), size=1e-5)
+
+
+def several_tip() -> Case:
+    """Bars on a corner and on an edge, a block that lands, one that rests and a bar that flies."""
+    bodies, gravity, *_ = zip(
+        *(
+            leaning(0.7, youngs=1e6, gravity=(0.0, -98.0, 0.0), **shape).scene.parts
+            for shape in (
+                {},
+                {"turn": (0.0, 0.0, 25.0)},
+                {"turn": (5.0, 10.0, 15.0), "size": (0.2, 0.2, 0.2), "cells": (2, 2, 2), "height": 0.005},
+                {"turn": (0.0, 0.0, 0.0), "size": (0.2, 0.2, 0.2), "cells": (2, 2, 2)},
+                {"height": 0.5},
+            )
+        ),
+        strict=True,
+    )
+    placed = [
+        pd.Solid(body.mesh.translated((0.0, 0.0, 0.2 * k)), body.youngs, body.density) for k, body in enumerate(bodies)
+    ]
+    planes = [pd.Ground(-9.0, normal=(1.0, 0.0, 0.0)), pd.Ground(0.0, friction=0.7)]
+    scene = pd.Scene(*placed, gravity[0], *planes)
+    x = scene.values().rest_positions
+    return stirred(Case(scene, x, 0.0 * x, 1.0 / 60.0), size=1e-5)
+
+
 def among_planes() -> Case:
     """Three hard blocks among eleven planes: one touches the tenth, one a wall that it slides to, one nothing."""
     vertices, tets = box((0.3, 0.2, 0.2), (3, 2, 2))
@@ -150,6 +183,19 @@ CASES: dict[str, Callable[[], Case]] = {
     "sliding against friction": lambda: sliding(pd.Ground(0.0, friction=0.3)),
     "sliding, turning, friction": lambda: sliding(pd.Ground(0.0, friction=0.3), spin=3.0),
     "sliding along an edge": lambda: sliding(pd.Ground(0.0), pd.Ground(-0.3, normal=(-1.0, 0.1, 0.0)), spin=3.0),
+    "tipping about a corner": lambda: tipping(0.8),
+    "tipping on smooth ground": lambda: tipping(0.0),
+    "tipping and sliding": lambda: tipping(0.1, velocity=(1.0, 0.0, 0.5)),
+    "tipping over an edge": lambda: tipping(
+        1.0, turn=(0.0, 33.0, 0.0), size=(0.1, 0.4, 0.1), cells=(2, 8, 2), gravity=(50.0, -98.0, -32.0)
+    ),
+    "tipping on to a face": lambda: tipping(
+        0.7, turn=(0.0, 10.0, 1.0), size=(0.2, 0.2, 0.2), cells=(2, 2, 2), spin=-2.0
+    ),
+    "landing on a corner": lambda: tipping(
+        0.6, turn=(5.0, 10.0, 15.0), size=(0.2, 0.2, 0.2), cells=(2, 2, 2), velocity=(0.5, -1.0, 0.0), height=0.005
+    ),
+    "several that tip": several_tip,
     "among many planes": among_planes,
     "hung from a point": lambda: hung(0),
     "hung from an edge": lambda: hung(0, 1),

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array, diags_array, kron
 
+from .reference_rigid import align, gaps_of
 from .scene import SceneValues
 
 __all__ = [
@@ -244,85 +245,13 @@ class StepProblem:
         return np.where(self.free[:, None], displacement, self.target)
 
     def align(self, displacement: Array) -> Array:
-        """Move every component as a rigid body to where E is least, as far as pins and contacts leave it to go there.
-
-        E is then sum a / 2 |x + u - (x + s)|^2, so that it is a weighted fit of two sets of points (Kabsch 1976). Hard
-        pins at a point or along a line leave turns about that; smooth planes the turn about their normal and the way
-        along all of them; a plane with friction the way along it, shortened as by Coulomb; other contacts nothing.
-        """
-        moved = displacement.copy()
-        for piece in range(int(self.values.component.max()) + 1):
-            of = self.values.component == piece
-            moved[of] = self._aligned(displacement, of)
-        return np.where(self.free[:, None], moved, displacement)
-
-    def _aligned(self, displacement: Array, of: Mask) -> Array:
-        """Of one component, [n, 3]."""
-        u, weight = displacement[of], self.weight[of, None] / self.weight[of].sum()
-        y, z = self.positions[of] + u, self.positions[of] + self.target[of]
-        middle, lag = (weight * y).sum(axis=0), (weight * (z - y)).sum(axis=0)
-        covariance = (weight * (z - middle - lag)).T @ (y - middle)
-        pinned = ~self.free[of]
-        turn = nearest_rotation(covariance)
-        if pinned.any():
-            at_rest = self.values.rest_positions[of][pinned]
-            if np.linalg.matrix_rank(at_rest - at_rest.mean(axis=0), tol=1e-6) > 1:
-                return u
-            pivot = y[pinned].mean(axis=0)
-            _, sizes, directions = np.linalg.svd(y[pinned] - pivot, full_matrices=True)
-            apart = 1e-4 * np.sqrt((weight * (y - middle) ** 2).sum() * pinned.sum())
-            if (sizes[1:] > apart).any():
-                return u
-            covariance = (weight * (z - pivot)).T @ (y - pivot)
-            turn = _turn_about(directions[0], covariance) if sizes[0] > apart else nearest_rotation(covariance)
-            middle, lag = pivot, np.zeros(3)
-        turned = (y - middle) @ turn.T + middle + lag
-        far = self.values.planes[8:]
-        if _least_gap(turned, far, self.sphere_centers, self.values.spheres) <= 0.0:
-            return u
-        touched = [bool((turned @ plane[:3] <= plane[3]).any()) for plane in self.values.planes[:8]]
-        if not any(touched):
-            return np.asarray(u + turned - y)
-        if pinned.any():
-            return u
-        planes = self.values.planes[:8][touched]
-        turn, shift = np.eye(3), self._way_on(planes, y, u, lag)
-        if np.linalg.matrix_rank(planes[:, :3], tol=1e-6) == 1 and not planes[:, 4].any():
-            turn = _turn_about(planes[0, :3], covariance)
-        on = y + (y - middle) @ (turn - np.eye(3)).T + shift
-        others = np.concatenate([self.values.planes[:8][~np.array(touched)], far])
-        fits = _least_gap(on, others, self.sphere_centers, self.values.spheres) > 0.0
-        return np.asarray(u + on - y if fits else u)
-
-    @staticmethod
-    def _way_on(planes: Array, y: Array, u: Array, lag: Array) -> Array:
-        """How far a component at y that touches planes goes along all of them of the way `lag` to its targets [3]."""
-        normals, friction = planes[:, :3], planes[:, 4]
-        _, sizes, directions = np.linalg.svd(normals)
-        span = directions[: int((sizes > 1e-6).sum())]
-        along = lag - span.T @ (span @ lag)
-        if not friction.any():
-            return along if len(span) < 3 else np.zeros(3)
-        across = float(lag @ normals[0])
-        lies = y @ normals[0] - planes[0, 3] < -0.01 * across
-        if len(planes) > 1 or not lies.any():
-            return np.zeros(3)
-        slips = u[lies] - np.outer(u[lies] @ normals[0], normals[0])
-        mean = slips.mean(axis=0)
-        # slips that differ leave a doubt about where friction acts: what is within it is left to the iterations
-        apart = 2.0 * np.linalg.norm(slips.max(axis=0) - slips.min(axis=0))
-        free, rub, slip = mean + along, -friction[0] * across, np.linalg.norm(mean)
-        left = np.linalg.norm(free) - rub
-        if left <= 0.0:
-            return np.asarray(-mean if slip > max(apart, apart * rub / max(slip, 1e-300)) else np.zeros(3))
-        way = left * free / np.linalg.norm(free) - mean
-        doubt = rub * min(2.0, apart / left)
-        return np.asarray(max(0.0, 1.0 - doubt / max(np.linalg.norm(way), 1e-300)) * way)
+        """Move every component as a rigid body to where E is least, as far as pins and contacts let it."""
+        return align(self, displacement, nearest_rotation)
 
     def smallest_gap(self, displacement: Array) -> Array:
         """Distance of every vertex to the nearest contact surface, negative inside [V]; inf without contacts."""
         positions = self.positions + displacement
-        return _gaps(positions, self.values.planes, self.sphere_centers, self.values.spheres)
+        return gaps_of(positions, self.values.planes, self.sphere_centers, self.values.spheres)
 
     def project(self, displacement: Array, around: Array | None = None) -> Array:
         """P(u): out of the planes one after another, then out of the spheres; hard pins stay.
@@ -349,31 +278,6 @@ class StepProblem:
         scale = (self.weighted_diagonal if diagonal is None else diagonal)[:, None]
         stepped = displacement - self.gradient(displacement) / scale
         return np.asarray(scale * (displacement - self.project(stepped, displacement)))
-
-
-def _gaps(positions: Array, planes: Array, centers: Array, spheres: Array) -> Array:
-    """Distance of every position to the nearest of planes and spheres [n]; inf without any."""
-    gaps = np.full(len(positions), np.inf)
-    for plane in planes:
-        gaps = np.minimum(gaps, positions @ plane[:3] - plane[3])
-    for center, sphere in zip(centers, spheres, strict=True):
-        gaps = np.minimum(gaps, np.linalg.norm(positions - center, axis=1) - sphere[3])
-    return gaps
-
-
-def _least_gap(positions: Array, planes: Array, centers: Array, spheres: Array) -> float:
-    return float(_gaps(positions, planes, centers, spheres).min())
-
-
-def _turn_about(normal: Array, covariance: Array) -> Array:
-    """The rotation R about a normal that maximises tr(R^T covariance), by its angle."""
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    first /= np.linalg.norm(first)
-    frame = np.stack([first, np.cross(normal, first)])
-    flat = frame @ covariance @ frame.T
-    angle = np.arctan2(flat[1, 0] - flat[0, 1], flat[0, 0] + flat[1, 1])
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return np.asarray(np.outer(normal, normal) + frame.T @ turn @ frame)
 
 
 def _push_out(displacement: Array, normals: Array, gaps: Array, motion: Array, friction: float) -> Array:

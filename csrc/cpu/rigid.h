@@ -74,17 +74,25 @@ void free_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w)
   }
 }
 
+// One of the first planes, of one environment.
 template <class Lanes>
-void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
-                   const Contacts<typename Lanes::Real>& contacts) {
-  using T = typename Lanes::Scalar;
+Plane<double> plane_of(const Contacts<typename Lanes::Real>& contacts, int k, int lane) {
+  const auto& p = contacts.planes[k];
+  const auto number = [&](const auto& a) { return Lanes::lane(Lanes::widen(a), lane); };
+  return {{number(p.normal.x), number(p.normal.y), number(p.normal.z)},
+          number(p.height),
+          number(p.friction)};
+}
+
+template <class Lanes>
+void find_touched(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
+                  const Contacts<typename Lanes::Real>& contacts) {
   using Real = typename Lanes::Real;
   using Wide = typename Lanes::Wide;
-  const auto at = [&](int i) { return Lanes::vec3(w.x[i] + w.u[i]); };
   for (int g = 0; g < plan.groups; ++g) {
     GroupSums<Wide>& sums = w.group_sums[g];
     for (Wide& least : sums.gaps) least = Wide(HUGE_VAL);
-    for (Wide& sum : sums.slips) sum = Wide(0.0);
+    for (Wide& sum : sums.touch) sum = Wide(0.0);
     for (Wide& least : sums.bounds) least = Wide(HUGE_VAL);
   }
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
@@ -93,41 +101,143 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
       sums.gaps[k] = lesser(sums.gaps[k], Lanes::widen(gap));
     };
     const Vec3<Real> u = Lanes::vec3(w.u[i]);
-    add_touch(sums.slips, sums.bounds, contacts, at(i), u, w.motion[g], near);
+    add_touch(sums.touch, sums.bounds, contacts, Lanes::vec3(w.x[i] + w.u[i]), u, w.motion[g],
+              near);
+  });
+}
+
+// A bit for each contact that a piece would touch if it moved freely, see Touch.
+template <class Lanes>
+unsigned touched_by(const Workspace<Lanes>& w, int g, int lane) {
+  unsigned touched = 0;
+  for (int k = 0; k <= Touch::planes; ++k) {
+    if (!(Lanes::lane(w.group_sums[g].gaps[k], lane) > 0)) touched |= 1u << k;
+  }
+  return touched;
+}
+
+// What is left to a piece that does not tip.
+template <class Lanes>
+void set_motion_on_contacts(Workspace<Lanes>& w, const Contacts<typename Lanes::Real>& contacts,
+                            int g, int lane) {
+  const auto& sums = w.group_sums[g];
+  double touch[Touch::sums], bounds[Touch::bounds];
+  read_lane<Touch::sums, Lanes>(sums.touch, lane, touch);
+  read_lane<Touch::bounds, Lanes>(sums.bounds, lane, bounds);
+  const auto plane = [&](int k) { return plane_of<Lanes>(contacts, k, lane); };
+  set_motion(w, g, lane,
+             motion_on_contacts(fit_of(w, g, lane), touched_by(w, g, lane), touch, bounds, plane));
+}
+
+template <class Lanes>
+void set_search(Workspace<Lanes>& w, const Contacts<typename Lanes::Real>& contacts, int g,
+                int lane) {
+  using T = typename Lanes::Scalar;
+  const Tipping& tipping = w.tipping[g * Lanes::environments + lane];
+  if (!tipping.goes_on()) return;
+  const TippingSearch<double> one = tipping.search(plane_of<Lanes>(contacts, tipping.number, lane));
+  TippingSearch<typename Lanes::Real>& to = w.search[g];
+  const auto set = [&](Vec3<typename Lanes::Real>& v, const Vec3<double>& a) {
+    Lanes::set_lane(v.x, lane, T(a.x));
+    Lanes::set_lane(v.y, lane, T(a.y));
+    Lanes::set_lane(v.z, lane, T(a.z));
+  };
+  set(to.normal, one.normal);
+  set(to.away, one.away);
+  Lanes::set_lane(to.height, lane, T(one.height));
+  Lanes::set_lane(to.reach, lane, T(one.reach));
+  Lanes::set_lane(to.seeks, lane, T(one.seeks));
+}
+
+// Motions of pieces that tip: solver/tipping.h. Returns whether there are any.
+template <class Lanes>
+bool tip_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
+                 const Contacts<typename Lanes::Real>& contacts) {
+  using Real = typename Lanes::Real;
+  using Wide = typename Lanes::Wide;
+  constexpr int lanes = Lanes::environments;
+  bool some = false;
+  for (int g = 0; g < plan.groups; ++g) {
+    bool& tips = w.group_sums[g].tips;
+    tips = false;
+    for (int lane = 0; lane < lanes; ++lane) tips = tips || w.tipping[g * lanes + lane].goes_on();
+    some = some || tips;
+  }
+  if (!some) return false;
+  const auto widen = [](const Vec3<Real>& a) {
+    return Vec3<Wide>{Lanes::widen(a.x), Lanes::widen(a.y), Lanes::widen(a.z)};
+  };
+  for (int g = 0; g < plan.groups; ++g) {
+    for (Wide& number : w.group_sums[g].found) number = Wide(HUGE_VAL);
+  }
+  each_in_a_piece<Lanes>(plan, [&](int i, int g) {
+    if (!w.group_sums[g].tips) return;
+    const Vec3<Real> u = Lanes::vec3(w.u[i]), y = Lanes::vec3(w.x[i] + w.u[i]);
+    Real depth, before;
+    w.search[g].look(contacts, w.motion[g], y, depth, before);
+    keep_found(w.group_sums[g].found, Lanes::widen(depth), Lanes::widen(before), widen(y),
+               widen(u));
   });
   for (int g = 0; g < plan.groups; ++g) {
-    for (int lane = 0; lane < Lanes::environments; ++lane) {
-      const GroupSums<Wide>& sums = w.group_sums[g];
-      unsigned touched = 0;
-      for (int k = 0; k <= Touch::planes; ++k) {
-        const bool touches = !(Lanes::lane(sums.gaps[k], lane) > 0);
-        touched |= touches ? 1u << k : 0u;
-        if (k < Touch::planes) Lanes::set_lane(w.touched[g][k], lane, T(touches));
+    for (int lane = 0; lane < lanes; ++lane) {
+      Tipping& tipping = w.tipping[g * lanes + lane];
+      if (!tipping.goes_on()) continue;
+      double found[Found::count];
+      read_lane<Found::count, Lanes>(w.group_sums[g].found, lane, found);
+      RigidMotion<double> motion;
+      if (tipping.next(fit_of(w, g, lane), plane_of<Lanes>(contacts, tipping.number, lane), found,
+                       motion)) {
+        set_motion(w, g, lane, motion);
+        set_search(w, contacts, g, lane);
+      } else {
+        set_motion_on_contacts(w, contacts, g, lane);
       }
-      double slips[Touch::slips], bounds[Touch::bounds];
-      read_lane<Touch::slips, Lanes>(sums.slips, lane, slips);
-      read_lane<Touch::bounds, Lanes>(sums.bounds, lane, bounds);
-      const auto plane = [&](int k) {
-        const Plane<Real>& p = contacts.planes[k];
-        const auto number = [&](const Real& a) { return Lanes::lane(Lanes::widen(a), lane); };
-        const Vec3<double> normal = {number(p.normal.x), number(p.normal.y), number(p.normal.z)};
-        return Plane<double>{normal, number(p.height), number(p.friction)};
-      };
-      set_motion(w, g, lane, motion_on_contacts(fit_of(w, g, lane), touched, slips, bounds, plane));
     }
+  }
+  return true;
+}
+
+template <class Lanes>
+void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
+                   const Contacts<typename Lanes::Real>& contacts) {
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Wide = typename Lanes::Wide;
+  constexpr int lanes = Lanes::environments;
+  find_touched(plan, w, contacts);
+  for (int g = 0; g < plan.groups; ++g) {
+    for (int lane = 0; lane < lanes; ++lane) {
+      const unsigned touched = touched_by(w, g, lane);
+      for (int k = 0; k < Touch::planes; ++k)
+        Lanes::set_lane(w.touched[g][k], lane, T(touched >> k & 1));
+      bool tips = false;
+      if (contacts.plane_count > 0) {
+        double touch[Touch::sums];
+        read_lane<Touch::sums, Lanes>(w.group_sums[g].touch, lane, touch);
+        Tipping& tipping = w.tipping[g * lanes + lane];
+        begin_tipping(tipping, fit_of(w, g, lane), touched, touch,
+                      [&](int k) { return plane_of<Lanes>(contacts, k, lane); });
+        set_search(w, contacts, g, lane);
+        tips = tipping.goes_on();
+      }
+      if (!tips) set_motion_on_contacts(w, contacts, g, lane);
+    }
+  }
+  while (contacts.plane_count > 0 && tip_motions(plan, w, contacts)) {
   }
   if (!contacts.has_several()) return;
   // what is left must not lead into other contacts
   for (int g = 0; g < plan.groups; ++g) w.group_sums[g].gaps[0] = Wide(HUGE_VAL);
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
     const auto touches = [&](int k) { return w.touched[g][k] > Real(T(0)); };
-    const Vec3<Real> y = at(i);
+    const Vec3<Real> y = Lanes::vec3(w.x[i] + w.u[i]);
     const Real least = least_gap_beside(contacts, y + w.motion[g].of(y), touches);
     w.group_sums[g].gaps[0] = lesser(w.group_sums[g].gaps[0], Lanes::widen(least));
   });
   for (int g = 0; g < plan.groups; ++g) {
-    for (int lane = 0; lane < Lanes::environments; ++lane) {
-      if (!(Lanes::lane(w.group_sums[g].gaps[0], lane) > 0))
+    for (int lane = 0; lane < lanes; ++lane) {
+      const bool tips = contacts.plane_count > 0 && w.tipping[g * lanes + lane].tips;
+      if (!tips && !(Lanes::lane(w.group_sums[g].gaps[0], lane) > 0))
         set_motion(w, g, lane, fit_of(w, g, lane).still());
     }
   }

@@ -2,7 +2,7 @@
 #pragma once
 #include "cpu/lanes.h"
 #include "effects/contact.h"
-#include "solver/rigid.h"
+#include "solver/tipping.h"
 
 #include <cstdint>
 #include <memory>
@@ -25,7 +25,9 @@ template <class Wide>
 struct GroupSums {
   Wide rigid[RigidSums::count];
   Vec3<Wide> center;
-  Wide gaps[Touch::planes + 1], slips[Touch::slips], bounds[Touch::bounds];
+  Wide gaps[Touch::planes + 1], touch[Touch::sums], bounds[Touch::bounds];
+  Wide found[Found::count];
+  bool tips;  // in some environment
 };
 
 constexpr int shared_chunk = 256;  // shared vertices that one sum covers
@@ -50,6 +52,8 @@ struct Workspace {
   GroupSums<Wide>* group_sums;  // [groups]
   RigidMotion<Real>* motion;    // [groups]
   Real (*touched)[Touch::planes];  // [groups] 1 for each of the first planes that it touches
+  Tipping* tipping;                // [groups, environments]
+  TippingSearch<Real>* search;     // [groups]
   Plane<Real>* planes;
   Ball<Real>* balls;
   T* weight;  // [elements], or [elements, W] when stiffness differs between environments
@@ -92,6 +96,9 @@ struct Workspace {
     place(group_sums, plan.groups, base);
     place(motion, plan.groups, base);
     place(touched, plan.groups, base);
+    const int tipping_groups = material.planes_count > 0 ? plan.groups : 0;
+    place(tipping, tipping_groups * Lanes::environments, base);
+    place(search, tipping_groups, base);
     place(planes, material.planes_count, base);
     place(balls, material.spheres_count, base);
     place(weight,

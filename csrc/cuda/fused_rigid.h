@@ -24,6 +24,15 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::find_motions() {
   __syncthreads();
 }
 
+// The same in every block of the team, since all of them work out all motions.
+template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+PD_DEVICE bool FusedRunner<T, Touching, Loose, Kind, Near>::some_tip() {
+  bool some = false;
+  for (int n = threadIdx.x; n < plan_.pieces; n += blockDim.x)
+    some = some || piece(n).tipping.goes_on();
+  return __syncthreads_or(some);
+}
+
 template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::align_pieces() {
   const bool first = !started_;
@@ -33,6 +42,7 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::align_pieces() {
   find_motions<Rigid::free>();
   if constexpr (Touching) {
     find_motions<Rigid::touching>();
+    while (some_tip()) find_motions<Rigid::tipping>();
     if (contacts_.has_several()) find_motions<Rigid::beside>();
   }
   each_slot([&](int s) {

@@ -2,26 +2,30 @@
 #pragma once
 #include "cuda/collect.h"
 #include "cuda/vertices.h"
-#include "solver/rigid.h"
+#include "solver/tipping.h"
 
 namespace pd::inline PD_TARGET {
 
-// Up to four rounds: where a piece is, its motion if it touches nothing, what contacts leave of that, and nothing where that leads into
-// further contacts.
-enum class Rigid { mean, free, touching, beside };
+// Rounds: where a piece is, its motion if it touches nothing, what contacts leave of that, several where it tips, and nothing where
+// that leads into further contacts.
+enum class Rigid { mean, free, touching, tipping, beside };
 
-// The numbers of a part, see RigidSums and Touch, and the least gap of the last round.
+// The numbers of a part, see RigidSums and Touch, and the least gap of the last round. What a search finds comes where those of Touch
+// were.
 struct PartSums {
-  static constexpr int rigid = 0, touched = RigidSums::count, least_gap = touched + 1;
-  static constexpr int slips = least_gap + 1, bounds = slips + Touch::slips;
-  static constexpr int count = bounds + Touch::bounds;
+  static constexpr int rigid = 0, touch = RigidSums::count, bounds = touch + Touch::sums;
+  static constexpr int touched = bounds + Touch::bounds, least_gap = touched + 1;
+  static constexpr int count = least_gap + 1, found = touch;
+  static_assert(Found::count <= Touch::sums);
 };
 
 template <class T>
 struct Piece {
+  double sum[RigidSums::count], touch[Touch::sums], bounds[Touch::bounds];  // of all its parts
+  double touched, least_gap;  // a bit for each of the first planes; see PartSums
   Vec3<double> center;
   RigidMotion<T> motion;
-  unsigned touched;  // a bit for each of the first planes
+  Tipping tipping;
 };
 
 // Slots of a part, and where the arrays have the vertex of one: at the slot itself, or where `vertex` says, from `first` on.
@@ -84,6 +88,23 @@ PD_HD bool parts_are_pieces(const DevicePlan<T>& plan) {
   return plan.parts == plan.pieces;
 }
 
+// The lane of a warp that has the least number, the first of them.
+PD_DEVICE int lane_of_least(double number) {
+  const double least = across_warp(number, Least{});
+  const unsigned have = __ballot_sync(whole_warp, number == least);
+  return have ? __ffs(int(have)) - 1 : 0;
+}
+
+template <class To, class From>
+PD_HD Vec3<To> vector_in(const Vec3<From>& a) {
+  return {To(a.x), To(a.y), To(a.z)};
+}
+
+template <class To, class From>
+PD_HD Plane<To> plane_in(const Plane<From>& p) {
+  return {vector_in<To>(p.normal), To(p.height), To(p.friction)};
+}
+
 // `to`: PartSums
 template <Rigid What, class T, bool Touching>
 PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool pins, bool whole,
@@ -120,21 +141,38 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool
     part.each([&](int i) { add_pin(held, double(v.inertia(i)), at(i) - center); });
     write_shares(held, Add{}, to + PartSums::rigid + S::pins);
   } else if constexpr (What == Rigid::touching) {
-    double slips[Touch::slips] = {}, bounds[Touch::bounds];
+    double sums[Touch::sums] = {}, bounds[Touch::bounds];
     for (double& least : bounds) least = HUGE_VAL;
     unsigned touched = 0;
     const auto near = [&](int k, T gap) { touched |= gap > T(0) ? 0u : 1u << k; };
     part.each([&](int i) {
       const Vec3<T> u = vec3(v.u[i]);
-      add_touch(slips, bounds, contacts, vec3(v.x[i]) + u, u, piece.motion, near);
+      add_touch(sums, bounds, contacts, vec3(v.x[i]) + u, u, piece.motion, near);
     });
     touched = __reduce_or_sync(whole_warp, touched);
     if (threadIdx.x % warp_size == 0) to[PartSums::touched] = double(touched);
-    write_shares(slips, Add{}, to + PartSums::slips);
+    write_shares(sums, Add{}, to + PartSums::touch);
     write_shares(bounds, Least{}, to + PartSums::bounds);
+  } else if constexpr (What == Rigid::tipping) {
+    if (!piece.tipping.goes_on()) return;
+    const TippingSearch<double> s =
+        piece.tipping.search(plane_in<double>(contacts.planes[piece.tipping.number]));
+    const TippingSearch<T> search = {vector_in<T>(s.normal), vector_in<T>(s.away), T(s.height),
+                                     T(s.reach), T(s.seeks)};
+    double found[Found::count];
+    for (double& number : found) number = HUGE_VAL;
+    part.each([&](int i) {
+      const Vec3<T> u = vec3(v.u[i]), y = vec3(v.x[i]) + u;
+      T depth, before;
+      search.look(contacts, piece.motion, y, depth, before);
+      keep_found(found, double(depth), double(before), wide(y), wide(u));
+    });
+    if (int(threadIdx.x) % warp_size != lane_of_least(found[Found::depth])) return;
+    for (int n = 0; n < Found::count; ++n) to[PartSums::found + n] = found[n];
   } else {
     double least = HUGE_VAL;
-    const auto touches = [&](int k) { return bool(piece.touched >> k & 1); };
+    const unsigned touched = unsigned(piece.touched);
+    const auto touches = [&](int k) { return bool(touched >> k & 1); };
     part.each([&](int i) {
       const Vec3<T> y = vec3(v.x[i]) + vec3(v.u[i]);
       const T beside = least_gap_beside(contacts, y + piece.motion.of(y), touches);
@@ -145,48 +183,42 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool
   }
 }
 
-// Combines Count numbers, from the `first` on, of the parts of a piece, and gives them to all lanes. With few parts a lane adds up
-// one number of all of them; with many it adds up all numbers of every 32nd part.
-template <int Count, class T, class Op, int All>
+// Number n of `from`, [parts, PartSums::count], of a part, past the first level of cache, which does not see what other blocks wrote.
+template <class T>
+PD_DEVICE double read_part(const DevicePlan<T>& plan, const double* from, int at, int n) {
+  return __ldcg(from + PartSums::count * plan.piece_part[at] + n);
+}
+
+// Lane n gets number n of many parts together: a lane adds up all numbers of every 32nd of them.
+template <int Count, class T, class Op>
+PD_DEVICE_COLD double over_many_parts(const DevicePlan<T>& plan, int begin, int end,
+                                      const double* from, Op op) {
+  double part[Count];
+  for (int n = 0; n < Count; ++n) part[n] = Op::none;
+  for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size) {
+    for (int n = 0; n < Count; ++n) part[n] = op(part[n], read_part(plan, from, at, n));
+  }
+  return share_out(part, op);
+}
+
+// Combines Count numbers, from the `first` on, of the parts of a piece, in memory that all lanes can read then: to broadcast them one by
+// one takes longer. With few parts a lane adds up one number of all of them.
+template <int Count, class T, class Op>
 PD_DEVICE void over_parts(const DevicePlan<T>& plan, int piece, const double* part_sum, Op op,
-                          int first, double (&sum)[All]) {
+                          int first, double* total) {
   constexpr int few = 16;
   const int lane = int(threadIdx.x) % warp_size;
   const int begin = plan.piece_start[piece], end = plan.piece_start[piece + 1];
-  // past the first level of cache, which does not see what other blocks wrote
-  const auto read = [&](int at, int n) {
-    return __ldcg(part_sum + PartSums::count * plan.piece_part[at] + first + n);
-  };
+  const double* from = part_sum + first;
   double own = Op::none;
   if (end - begin <= few) {
-    for (int at = begin; at < end && lane < Count; ++at) own = op(own, read(at, lane));
+    for (int at = begin; at < end && lane < Count; ++at)
+      own = op(own, read_part(plan, from, at, lane));
   } else {
-    double part[Count];
-    for (int n = 0; n < Count; ++n) part[n] = Op::none;
-    for (int at = begin + lane; at < end; at += warp_size) {
-      for (int n = 0; n < Count; ++n) part[n] = op(part[n], read(at, n));
-    }
-    own = share_out(part, op);
+    own = over_many_parts<Count>(plan, begin, end, from, op);
   }
+  if (lane < Count) total[lane] = own;
   __syncwarp();
-  for (int n = 0; n < Count; ++n) sum[n] = __shfl_sync(whole_warp, own, n);
-}
-
-// RigidSums of a piece.
-template <class T>
-PD_DEVICE void rigid_sums(const DevicePlan<T>& plan, int piece, const double* part_sum,
-                          double (&sum)[RigidSums::count]) {
-  if (plan.pins > 0) {
-    over_parts<RigidSums::count>(plan, piece, part_sum, Add{}, PartSums::rigid, sum);
-    return;
-  }
-  for (int n = RigidSums::pins; n < RigidSums::count; ++n) sum[n] = 0;
-  over_parts<RigidSums::pins>(plan, piece, part_sum, Add{}, PartSums::rigid, sum);
-}
-
-template <class To, class From>
-PD_HD Vec3<To> vector_in(const Vec3<From>& a) {
-  return {To(a.x), To(a.y), To(a.z)};
 }
 
 template <class T>
@@ -204,40 +236,74 @@ struct Or {
   }
 };
 
+// What the parts of a piece have found, for all lanes.
+template <class T>
+PD_DEVICE void find_over_parts(const DevicePlan<T>& plan, int piece, const double* part_sum,
+                               double (&found)[Found::count]) {
+  const int lane = int(threadIdx.x) % warp_size;
+  const double* from = part_sum + PartSums::found;
+  int best = plan.piece_start[piece];
+  double least = HUGE_VAL;
+  for (int at = best + lane; at < plan.piece_start[piece + 1]; at += warp_size) {
+    const double depth = read_part(plan, from, at, Found::depth);
+    if (depth < least) best = at, least = depth;
+  }
+  best = __shfl_sync(whole_warp, best, lane_of_least(least));
+  for (int n = 0; n < Found::count; ++n) found[n] = read_part(plan, from, best, n);
+}
+
+// What contacts leave to a piece that does not tip, by one lane.
+template <class T>
+PD_DEVICE_COLD void move_on_contacts(const Contacts<T>& contacts, Piece<T>& to) {
+  const auto plane = [&](int k) { return plane_in<double>(contacts.planes[k]); };
+  to.motion = motion_in<T>(
+      motion_on_contacts(RigidFit(to.sum), unsigned(to.touched), to.touch, to.bounds, plane));
+}
+
 // `part_sum`: [parts, PartSums::count]
 template <Rigid What, class T>
 PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T> contacts,
                                const double* part_sum, Piece<T>& to) {
   const bool leader = threadIdx.x % warp_size == 0;
+  const auto plane = [&](int k) { return plane_in<double>(contacts.planes[k]); };
   if constexpr (What == Rigid::mean) {
-    double sum[RigidSums::lag];
-    over_parts<RigidSums::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, sum);
-    if (leader) to.center = center_of(sum);
-  } else if constexpr (What == Rigid::beside) {
-    double least[1];
-    over_parts<1>(plan, piece, part_sum, Least{}, PartSums::least_gap, least);
-    if (leader && !(least[0] > 0)) to.motion.turn = {}, to.motion.shift = {};
-  } else {
-    double sum[RigidSums::count];
-    if constexpr (What == Rigid::free) {
-      rigid_sums(plan, piece, part_sum, sum);
-      if (leader) to.motion = motion_in<T>(RigidFit(sum).free());
+    over_parts<RigidSums::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+    if (leader) to.center = center_of(to.sum);
+  } else if constexpr (What == Rigid::free) {
+    if (plan.pins > 0) {
+      over_parts<RigidSums::count>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
     } else {
-      double bits[1], slips[Touch::slips], bounds[Touch::bounds];
-      over_parts<1>(plan, piece, part_sum, Or{}, PartSums::touched, bits);
-      const unsigned touched = unsigned(bits[0]);
-      if (leader) to.touched = touched;
-      if (touched == 0) return;
-      rigid_sums(plan, piece, part_sum, sum);
-      over_parts<Touch::slips>(plan, piece, part_sum, Add{}, PartSums::slips, slips);
-      over_parts<Touch::bounds>(plan, piece, part_sum, Least{}, PartSums::bounds, bounds);
-      if (!leader) return;
-      const auto plane = [&](int k) {
-        const Plane<T>& p = contacts.planes[k];
-        return Plane<double>{vector_in<double>(p.normal), double(p.height), double(p.friction)};
-      };
-      to.motion = motion_in<T>(motion_on_contacts(RigidFit(sum), touched, slips, bounds, plane));
+      over_parts<RigidSums::pins>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
     }
+    if (!leader) return;
+    if (plan.pins == 0) {
+      for (int n = RigidSums::pins; n < RigidSums::count; ++n) to.sum[n] = 0;
+    }
+    to.motion = motion_in<T>(RigidFit(to.sum).free());
+  } else if constexpr (What == Rigid::touching) {
+    over_parts<1>(plan, piece, part_sum, Or{}, PartSums::touched, &to.touched);
+    if (leader) to.tipping.end();
+    if (to.touched == 0) return;
+    over_parts<Touch::sums>(plan, piece, part_sum, Add{}, PartSums::touch, to.touch);
+    over_parts<Touch::bounds>(plan, piece, part_sum, Least{}, PartSums::bounds, to.bounds);
+    if (!leader) return;
+    begin_tipping(to.tipping, RigidFit(to.sum), unsigned(to.touched), to.touch, plane);
+    if (!to.tipping.goes_on()) move_on_contacts(contacts, to);
+  } else if constexpr (What == Rigid::tipping) {
+    if (!to.tipping.goes_on()) return;
+    double found[Found::count];
+    find_over_parts(plan, piece, part_sum, found);
+    if (!leader) return;
+    RigidMotion<double> motion;
+    if (to.tipping.next(RigidFit(to.sum), plane(to.tipping.number), found, motion)) {
+      to.motion = motion_in<T>(motion);
+    } else {
+      move_on_contacts(contacts, to);
+    }
+  } else {
+    over_parts<1>(plan, piece, part_sum, Least{}, PartSums::least_gap, &to.least_gap);
+    if (leader && !to.tipping.tips && !(to.least_gap > 0))
+      to.motion.turn = {}, to.motion.shift = {};
   }
 }
 

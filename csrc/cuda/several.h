@@ -414,6 +414,7 @@ class SeveralRunner {
     find_motions<Rigid::free>();
     if constexpr (Touching) {
       find_motions<Rigid::touching>();
+      while (some_tip()) find_motions<Rigid::tipping>();
       if (contacts(0).has_several()) find_motions<Rigid::beside>();
     }
     each_slot([&](const Seat& seat, int i) {
@@ -425,6 +426,15 @@ class SeveralRunner {
       if (first) v_.set_before(i, u);
     });
     __syncthreads();
+  }
+
+  PD_DEVICE bool some_tip() {
+    bool some = false;
+    for (int n = threadIdx.x; n < here_ * plan_.pieces; n += blockDim.x) {
+      const Seat at = seat_of(n, plan_.pieces);
+      some = some || piece(at.environment, at.at).tipping.goes_on();
+    }
+    return __syncthreads_or(some);
   }
 
   template <Rigid What>

@@ -127,6 +127,7 @@ class StreamRunner {
     if constexpr (Touching) {
       move_pieces<Rigid::touching>();
       const Material<T>& material = call_.step.material;
+      if (material.planes_count > 0) tip();
       if (material.planes_count + material.spheres_count > 1) move_pieces<Rigid::beside>();
     }
     launcher_.run(stream_align<T>, patches_, vertex_threads, 0, call_, first);
@@ -239,6 +240,14 @@ class StreamRunner {
                   vertex_threads, 0, call_);
     launcher_.run(stream_pieces<What, T>, blocks_for(batch * plan_.pieces * warp_size),
                   vertex_threads, 0, call_);
+  }
+
+  void tip() {
+    if (plan_.parts <= tipping_parts) {
+      launcher_.run(stream_tipping<T>, call_.step.batch, tipping_threads, 0, call_);
+    } else {
+      for (int n = 0; n < tipping_rounds; ++n) move_pieces<Rigid::tipping>();
+    }
   }
 
   static std::int64_t blocks_for(std::int64_t threads) {

@@ -379,6 +379,10 @@ PD_DEVICE std::int64_t thread_number() {
 
 // ---- rigid motions: cuda/rigid.h
 
+constexpr int tipping_threads = 512;
+constexpr int tipping_parts =
+    2048;  // of an environment; more are searched by all blocks, launch by launch
+
 template <Rigid What, class T>
 __global__ void __launch_bounds__(vertex_threads)
     stream_parts(const __grid_constant__ StreamCall<T> call) {
@@ -402,6 +406,29 @@ __global__ void __launch_bounds__(vertex_threads)
   const StreamWork<T, true> w(call, warp / pieces);
   const int piece = int(warp % pieces);
   move_piece<What>(w.plan, piece, w.contacts, w.part_sums(), w.piece(piece));
+}
+
+// All searches for pieces that tip, one block for all of an environment: most often there is nothing to do.
+template <class T>
+__global__ void __launch_bounds__(tipping_threads)
+    stream_tipping(const __grid_constant__ StreamCall<T> call) {
+  const StreamWork<T, true> w(call, blockIdx.x);
+  const int warp = int(threadIdx.x) / warp_size, warps = int(blockDim.x) / warp_size;
+  while (true) {
+    bool some = false;
+    for (int n = threadIdx.x; n < w.plan.pieces; n += blockDim.x)
+      some = some || w.piece(n).tipping.goes_on();
+    if (!__syncthreads_or(some)) return;
+    for (int n = warp; n < w.plan.parts; n += warps) {
+      const Part part(w.plan, n, w.plan.slot_vertex, 0);
+      sum_part<Rigid::tipping>(w.v, w.contacts, w.plan.pins > 0, parts_are_pieces(w.plan), part,
+                               w.piece(part.piece(w.plan)), w.part_sums() + PartSums::count * n);
+    }
+    __syncthreads();
+    for (int n = warp; n < w.plan.pieces; n += warps)
+      move_piece<Rigid::tipping>(w.plan, n, w.contacts, w.part_sums(), w.piece(n));
+    __syncthreads();
+  }
 }
 
 // `first`: before any iteration, which has no iterate before it

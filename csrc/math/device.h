@@ -5,8 +5,10 @@
 #define PD_HD __host__ __device__ __forceinline__
 #define PD_COLD __host__ __device__ __noinline__  // seldom called: keeps its registers to itself
 #define PD_UNROLL _Pragma("unroll")
+#define PD_ROLLED _Pragma("unroll 1")
 #else
 #define PD_HD [[gnu::always_inline]] inline
 #define PD_COLD [[gnu::noinline, gnu::cold]]
 #define PD_UNROLL _Pragma("GCC unroll 8")
+#define PD_ROLLED _Pragma("GCC unroll 1")
 #endif

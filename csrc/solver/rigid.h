@@ -6,9 +6,9 @@
 // a piece at one point p leave it the turn about p, with p in place of both means; pins along a line the turn about that.
 //
 // What a piece touches balances part of its momentum. A plane leaves it the turn about the normal and the way along the plane;
-// planes that meet leave the way along their edge. Neither moves any vertex towards a plane. With friction the way along a
-// plane is shortened by friction times the way that the plane stops, which is Coulomb's law for the sum of all forces where all
-// vertices slide the same way; turns are left to the iterations.
+// planes that meet leave the way along their edge. Neither moves any vertex towards a plane; solver/tipping.h has what may. With
+// friction the way along a plane is shortened by friction times the way that the plane stops, which is Coulomb's law for the sum of all
+// forces where all vertices slide the same way; turns are left to the iterations.
 #pragma once
 #include "effects/contact.h"
 #include "math/rotation.h"
@@ -85,22 +85,62 @@ constexpr double least_turn = 4e-15;
 // What pins leave to a piece.
 enum class Hold { none, point, line, all };
 
-// What the sums say about a piece: where it turns, its shift, H, and the line along which pins hold it.
+PD_HD Mat3<double> symmetric(const double* s) {
+  return {{{s[0], s[1], s[2]}, {s[1], s[3], s[4]}, {s[2], s[4], s[5]}}};
+}
+
+PD_HD Mat3<double> less_identity(Mat3<double> a, double share) {
+  a.row[0].x -= share;
+  a.row[1].y -= share;
+  a.row[2].z -= share;
+  return a;
+}
+
+// Less is rounding, which would keep what drifts from coming to rest.
+PD_HD Mat3<double> beyond_rounding(const Mat3<double>& turn) {
+  return frobenius(turn, turn) < least_turn * least_turn ? Mat3<double>{} : turn;
+}
+
+// R - I of the rotation R that makes tr(R^T H) largest.
+PD_COLD inline Mat3<double> best_turn(const Mat3<double>& covariance) {
+  const double size = square_root(frobenius(covariance, covariance));
+  const Mat3<double> r = nearest_rotation((1.0 / (size > 0 ? size : 1.0)) * covariance);
+  return beyond_rounding(less_identity(r, 1.0));
+}
+
+// The same of rotations about n alone: R - I = sin [n]x + (1 - cos) (n n^T - I).
+PD_COLD inline Mat3<double> best_turn_about(const Mat3<double>& covariance, const Vec3<double>& n) {
+  const Vec3<double> image = covariance * n;
+  const double along =
+      covariance.row[0].x + covariance.row[1].y + covariance.row[2].z - dot(n, image);
+  const double across = dot(n, axis_of(covariance));
+  const double size = square_root(along * along + across * across);
+  if (!(size > 0)) return {};
+  const double sine = across / size, lift = 1.0 - along / size;
+  Mat3<double> turn = sine * cross_matrix(n);
+  const double axis[3] = {n.x, n.y, n.z};
+  for (int r = 0; r < 3; ++r) turn.row[r] = multiply_add(lift * axis[r], n, turn.row[r]);
+  return beyond_rounding(less_identity(turn, lift));
+}
+
+// What the sums say about a piece: where it turns, its shift, H, the square of its size, and the line along which pins hold it.
 struct RigidFit {
   Hold hold = Hold::none;
+  double weight, square;
   Vec3<double> center, shift, axis = {0, 0, 0};
   Mat3<double> covariance;
 
-  PD_HD explicit RigidFit(const double (&sum)[RigidSums::count]) : center(center_of(sum)) {
+  PD_HD explicit RigidFit(const double (&sum)[RigidSums::count])
+      : weight(sum[RigidSums::weight]), center(center_of(sum)) {
     using S = RigidSums;
-    const double share = sum[S::weight] > 0 ? 1.0 / sum[S::weight] : 0.0;
+    const double share = weight > 0 ? 1.0 / weight : 0.0;
     shift = {share * sum[S::lag], share * sum[S::lag + 1], share * sum[S::lag + 2]};
     const Mat3<double> spread = symmetric(sum + S::spread);
     const double* turn = sum + S::turn;
     for (int r = 0; r < 3; ++r)
       covariance.row[r] =
           spread.row[r] + Vec3<double>{turn[3 * r], turn[3 * r + 1], turn[3 * r + 2]};
-    const double square = share * (spread.row[0].x + spread.row[1].y + spread.row[2].z);
+    square = share * (spread.row[0].x + spread.row[1].y + spread.row[2].z);
     if (sum[S::pins] > 0) turn_about_pins(sum, pins_apart * pins_apart * square);
   }
 
@@ -109,46 +149,13 @@ struct RigidFit {
   // Of a piece that touches nothing.
   PD_HD RigidMotion<double> free() const {
     if (hold == Hold::all) return still();
-    if (hold == Hold::line) return {turn_about(axis), center, shift};
-    const double size = square_root(frobenius(covariance, covariance));
-    const Mat3<double> r = nearest_rotation((1.0 / (size > 0 ? size : 1.0)) * covariance);
-    return {beyond_rounding(less_identity(r, 1.0)), center, shift};
-  }
-
-  // The turn about a normal alone: R - I = sin [n]x + (1 - cos) (n n^T - I).
-  PD_HD Mat3<double> turn_about(const Vec3<double>& n) const {
-    const Vec3<double> image = covariance * n;
-    const double along =
-        covariance.row[0].x + covariance.row[1].y + covariance.row[2].z - dot(n, image);
-    const double across = dot(n, axis_of(covariance));
-    const double size = square_root(along * along + across * across);
-    if (!(size > 0)) return {};
-    const double sine = across / size, lift = 1.0 - along / size;
-    Mat3<double> turn = sine * cross_matrix(n);
-    const double axis[3] = {n.x, n.y, n.z};
-    for (int r = 0; r < 3; ++r) turn.row[r] = multiply_add(lift * axis[r], n, turn.row[r]);
-    return beyond_rounding(less_identity(turn, lift));
+    if (hold == Hold::line) return {best_turn_about(covariance, axis), center, shift};
+    return {best_turn(covariance), center, shift};
   }
 
  private:
-  PD_HD static Mat3<double> symmetric(const double* s) {
-    return {{{s[0], s[1], s[2]}, {s[1], s[3], s[4]}, {s[2], s[4], s[5]}}};
-  }
-
-  PD_HD static Mat3<double> less_identity(Mat3<double> a, double share) {
-    a.row[0].x -= share;
-    a.row[1].y -= share;
-    a.row[2].z -= share;
-    return a;
-  }
-
-  // Less is rounding, which would keep what drifts from coming to rest.
-  PD_HD static Mat3<double> beyond_rounding(const Mat3<double>& turn) {
-    return frobenius(turn, turn) < least_turn * least_turn ? Mat3<double>{} : turn;
-  }
-
   // The middle of the pins becomes the center; `apart`: square of how far from a point or a line they may be.
-  PD_HD void turn_about_pins(const double (&sum)[RigidSums::count], double apart) {
+  PD_COLD void turn_about_pins(const double (&sum)[RigidSums::count], double apart) {
     using S = RigidSums;
     const double share = 1.0 / sum[S::pins];
     const double* at = sum + S::pin_position;
@@ -168,38 +175,57 @@ struct RigidFit {
   }
 };
 
-// What a piece would touch if it moved freely: a bit for each of the first planes, and one for all other contacts together. And how
-// vertices slip that lie on those planes that have friction: sums of the slips and of 1, and the least of the slips and of their
-// negatives, axis by axis.
+// What a piece would touch if it moved freely: a bit for each of the first planes, and one for all other contacts together. Sums over
+// the vertices that lie on those planes: of the slips and of 1 where there is friction; of 1, of their arms from the middle of the
+// piece, and of products of these. And the least of the slips and of their negatives, axis by axis.
 struct Touch {
   static constexpr int planes = 8;
   static constexpr unsigned others = 1u << planes;
-  static constexpr int slip = 0, vertices = 3, slips = 4, bounds = 6;
+  static constexpr int slip = 0, rubbing = 3, lying = 4, arm = 5, spread = 8, sums = 14;
+  static constexpr int bounds = 6;
 };
 
 // A vertex lies on a plane when it is no further off than this share of the way that the plane stops.
-constexpr double lying = 0.01;
+constexpr double lies_within = 0.01;
 
-// Adds a vertex at y = x + u, whose piece would move by `motion`, to the slips and their bounds; `near(k, gap)` learns how far from
-// the first planes it would come, and at last from the other contacts.
+// Adds a vertex at y = x + u, whose piece would move by `motion`, to these; `near(k, gap)` learns how far from the first planes it
+// would come, and at last from the other contacts.
 template <class W, class R, class Near>
-PD_HD void add_touch(W (&slips)[Touch::slips], W (&bounds)[Touch::bounds],
+PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
                      const Contacts<R>& contacts, const Vec3<R>& y, const Vec3<R>& u,
                      const RigidMotion<R>& motion, const Near& near) {
   const R none(0), one(1), far(HUGE_VAL);
-  const Vec3<R> moved = y + motion.of(y);
+  const Vec3<R> moved = y + motion.of(y), arm = y - motion.center;
+  // in double, since their spread is a difference
+  const Vec3<W> wide_arm = {convert<double>(arm.x), convert<double>(arm.y), convert<double>(arm.z)};
   const int told = contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
   for (int k = 0; k < told; ++k) {
     const Plane<R>& plane = contacts.planes[k];
     near(k, gap(plane, moved));
-    const R reach = -R(scalar_of<R>(lying)) * dot(motion.shift, plane.normal);
+    const R reach = -R(scalar_of<R>(lies_within)) * dot(motion.shift, plane.normal);
     const R lies = select(gap(plane, y) < reach, one, none);
     const R rubs = select(plane.friction > none, lies, none);
     const Vec3<R> slip = rubs * tangential(u, plane.normal);
-    const R add[Touch::slips] = {slip.x, slip.y, slip.z, rubs};
-    for (int n = 0; n < Touch::slips; ++n) slips[n] = slips[n] + convert<double>(add[n]);
+    const W there = convert<double>(lies);
+    const Vec3<W> at = there * wide_arm;
+    const W add[Touch::sums] = {convert<double>(slip.x),
+                                convert<double>(slip.y),
+                                convert<double>(slip.z),
+                                convert<double>(rubs),
+                                there,
+                                at.x,
+                                at.y,
+                                at.z,
+                                at.x * wide_arm.x,
+                                at.x * wide_arm.y,
+                                at.x * wide_arm.z,
+                                at.y * wide_arm.y,
+                                at.y * wide_arm.z,
+                                at.z * wide_arm.z};
+    for (int n = 0; n < Touch::sums; ++n) sums[n] = sums[n] + add[n];
+    const R way[3] = {slip.x, slip.y, slip.z};
     for (int n = 0; n < 3; ++n) {
-      const R least = select(rubs > none, add[n], far), most = select(rubs > none, -add[n], far);
+      const R least = select(rubs > none, way[n], far), most = select(rubs > none, -way[n], far);
       bounds[n] = lesser(bounds[n], convert<double>(least));
       bounds[3 + n] = lesser(bounds[3 + n], convert<double>(most));
     }
@@ -222,13 +248,13 @@ PD_HD R least_gap_beside(const Contacts<R>& contacts, const Vec3<R>& moved,
 // Along a rough plane with normal n, that vertices slide on by `slips`. Where these differ by up to d, friction acts along none of
 // them alone: of its force a share of up to 2 d / |slip| is in doubt, and what is within that is left to the iterations, so that
 // nothing moves once they have converged. So it is where friction could stop the whole piece, which it then does.
-PD_HD Vec3<double> slide(const Vec3<double>& shift, const Vec3<double>& n, double friction,
-                         const double (&slips)[Touch::slips],
-                         const double (&bounds)[Touch::bounds]) {
-  if (!(slips[Touch::vertices] > 0)) return {};
-  const double share = 1.0 / slips[Touch::vertices], across = dot(shift, n);
+PD_COLD inline Vec3<double> slide(const Vec3<double>& shift, const Vec3<double>& n, double friction,
+                                  const double (&sums)[Touch::sums],
+                                  const double (&bounds)[Touch::bounds]) {
+  if (!(sums[Touch::rubbing] > 0)) return {};
+  const double share = 1.0 / sums[Touch::rubbing], across = dot(shift, n);
   const Vec3<double> mean =
-      share * Vec3<double>{slips[Touch::slip], slips[Touch::slip + 1], slips[Touch::slip + 2]};
+      share * Vec3<double>{sums[Touch::slip], sums[Touch::slip + 1], sums[Touch::slip + 2]};
   double square = 0;
   for (int a = 0; a < 3; ++a) square += (bounds[a] + bounds[3 + a]) * (bounds[a] + bounds[3 + a]);
   const double apart = 2.0 * square_root(square), rub = -friction * across;
@@ -246,7 +272,7 @@ PD_HD Vec3<double> slide(const Vec3<double>& shift, const Vec3<double>& n, doubl
 // The motion that contacts leave to a piece that touches some of them; `plane(k)` are the first of them.
 template <class PlaneAt>
 PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touched,
-                                             const double (&slips)[Touch::slips],
+                                             const double (&sums)[Touch::sums],
                                              const double (&bounds)[Touch::bounds],
                                              const PlaneAt& plane) {
   constexpr double parallel = 1e-12;  // square of what a normal adds to others
@@ -256,6 +282,7 @@ PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touch
   Vec3<double> normals[3];
   int count = 0, touches = 0;
   double friction = 0;
+  PD_ROLLED
   for (int k = 0; k < Touch::planes; ++k) {
     if (!(touched >> k & 1)) continue;
     const Plane<double> p = plane(k);
@@ -268,13 +295,13 @@ PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touch
   }
   if (count == 3 || (friction > 0 && touches > 1)) return motion;
   if (friction > 0) {
-    motion.shift = slide(fit.shift, normals[0], friction, slips, bounds);
+    motion.shift = slide(fit.shift, normals[0], friction, sums, bounds);
     return motion;
   }
   motion.shift = fit.shift;
   for (int j = 0; j < count; ++j)
     motion.shift = subtract_product(motion.shift, dot(motion.shift, normals[j]), normals[j]);
-  if (count == 1) motion.turn = fit.turn_about(normals[0]);
+  if (count == 1) motion.turn = best_turn_about(fit.covariance, normals[0]);
   return motion;
 }
 

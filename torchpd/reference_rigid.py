@@ -1,0 +1,356 @@
+"""Rigid motions of the oracle: components go as far as pins and contacts leave them to where their energy is least.
+
+Along them E is sum a / 2 |x + u - (x + s)|^2, a weighted fit of two sets of points (Kabsch 1976). Hard pins at a point
+or along a line leave turns about that; smooth planes the turn about their normal and the way along all of them; a plane
+with friction the way along it, shortened as by Coulomb. On one plane a component may tip besides (`_Tipping`). Other
+contacts leave it nothing.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from .reference import StepProblem
+
+__all__ = ["align", "gaps_of"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TOLD = 8  # planes that are told apart
+LYING = 0.01  # of the way that a plane stops: a vertex lies on it that is no further off
+TOUCHING = 1e-3  # of that: vertices may go so deep, and are lifted out again
+ROUNDED = 0.1  # the same of those that it turns about
+RESTING = 0.5  # square of how far off pressure is, by the spread of what lies on the plane
+ROUNDS = 5  # searches for the vertices that it tips about
+ALIKE = 0.02  # directions of slips that count as one: their distance
+NEWTON = 8  # steps to a balance of torques
+ONWARD = 0.9  # least cosine between a slip before and after
+
+
+class NearestRotation(Protocol):
+    def __call__(self, matrices: Array) -> Array: ...
+
+
+def gaps_of(positions: Array, planes: Array, centers: Array, spheres: Array) -> Array:
+    """Distance of every position to the nearest of planes and spheres [n]; inf without any."""
+    gaps = np.full(len(positions), np.inf)
+    for plane in planes:
+        gaps = np.minimum(gaps, positions @ plane[:3] - plane[3])
+    for center, sphere in zip(centers, spheres, strict=True):
+        gaps = np.minimum(gaps, np.linalg.norm(positions - center, axis=1) - sphere[3])
+    return gaps
+
+
+def align(problem: StepProblem, displacement: Array, nearest_rotation: NearestRotation) -> Array:
+    """Displacements [V, 3] after the rigid motion of every component."""
+    values, moved = problem.values, displacement.copy()
+    for number in range(int(values.component.max()) + 1):
+        of = values.component == number
+        moved[of] += _Piece(problem, displacement, of, nearest_rotation).motion()
+    return np.where(problem.free[:, None], moved, displacement)
+
+
+class _Piece:
+    """One component, its n vertices at y = x + u, their targets z = x + s."""
+
+    def __init__(self, problem: StepProblem, displacement: Array, of: Mask, nearest_rotation: NearestRotation) -> None:
+        self.problem, self.nearest_rotation = problem, nearest_rotation
+        self.planes = problem.values.planes
+        self.u, self.weight = displacement[of], problem.weight[of, None]
+        self.y, self.z = problem.positions[of] + self.u, problem.positions[of] + problem.target[of]
+        share = self.weight / self.weight.sum()
+        self.middle, self.lag = (share * self.y).sum(axis=0), (share * (self.z - self.y)).sum(axis=0)
+        self.square = float((share * (self.y - self.middle) ** 2).sum())  # of its radius of gyration
+        self.covariance = self.about(self.middle + self.lag, self.middle)
+        self.pinned = ~problem.free[of]
+        self.rest = problem.values.rest_positions[of]
+
+    def about(self, goal: Array, pivot: Array) -> Array:
+        """Sum of a (z - goal) (y - pivot)^T."""
+        return np.asarray((self.weight * (self.z - goal)).T @ (self.y - pivot))
+
+    def gaps(self, positions: Array, planes: Array) -> Array:
+        return gaps_of(positions, planes, self.problem.sphere_centers, self.problem.values.spheres)
+
+    def deepest(self, moved: Array) -> tuple[int, float, float]:
+        """The vertex that goes deepest into a contact, how deep beyond where it was, and how far it was before."""
+        none = self.planes[:0]
+        each = [(self.y @ plane[:3] - plane[3], moved @ plane[:3] - plane[3]) for plane in self.planes]
+        each.append((self.gaps(self.y, none), self.gaps(moved, none)))
+        before, after = (np.stack(part) for part in zip(*each, strict=True))
+        depths = after - np.minimum(before, 0.0)
+        contact, worst = np.unravel_index(int(depths.argmin()), depths.shape)
+        return int(worst), float(depths[contact, worst]), float(before[contact, worst])
+
+    def motion(self) -> Array:
+        """What every vertex is to be moved by [n, 3]."""
+        turn, pivot, shift = self.nearest_rotation(self.covariance), self.middle, self.lag
+        still = np.zeros_like(self.u)
+        if self.pinned.any():
+            at_rest, at = self.rest[self.pinned], self.y[self.pinned]
+            if np.linalg.matrix_rank(at_rest - at_rest.mean(axis=0), tol=1e-6) > 1:
+                return still
+            pivot, shift = at.mean(axis=0), np.zeros(3)
+            _, sizes, directions = np.linalg.svd(at - pivot, full_matrices=True)
+            apart = 1e-4 * np.sqrt(self.square * self.pinned.sum())
+            if (sizes[1:] > apart).any():
+                return still
+            covariance = self.about(pivot, pivot)
+            turn = _turn_about(directions[0], covariance) if sizes[0] > apart else self.nearest_rotation(covariance)
+        free = (self.y - pivot) @ turn.T + pivot + shift
+        if self.gaps(free, self.planes[TOLD:]).min() <= 0.0:
+            return still
+        touched = np.array([bool((free @ plane[:3] <= plane[3]).any()) for plane in self.planes[:TOLD]], dtype=bool)
+        if not touched.any():
+            return np.asarray(free - self.y)
+        if self.pinned.any():
+            return still
+        planes = self.planes[:TOLD][touched]
+        if len(planes) == 1:
+            tipped = _Tipping(self, planes[0]).motion(free)
+            if tipped is not None:
+                return tipped
+        turn, shift = np.eye(3), self.way_on(planes)
+        if np.linalg.matrix_rank(planes[:, :3], tol=1e-6) == 1 and not planes[:, 4].any():
+            turn = _turn_about(planes[0, :3], self.covariance)
+        along = (self.y - self.middle) @ (turn - np.eye(3)).T + shift
+        others = np.concatenate([self.planes[:TOLD][~touched], self.planes[TOLD:]])
+        return np.asarray(along if self.gaps(self.y + along, others).min() > 0.0 else still)
+
+    def slips(self, normal: Array) -> Array:
+        return np.asarray(self.u - np.outer(self.u @ normal, normal))
+
+    def way_on(self, planes: Array) -> Array:
+        """How far it goes along all planes that it touches [3]."""
+        normals, friction = planes[:, :3], planes[:, 4]
+        _, sizes, directions = np.linalg.svd(normals)
+        span = directions[: int((sizes > 1e-6).sum())]
+        along = self.lag - span.T @ (span @ self.lag)
+        if not friction.any():
+            return along if len(span) < 3 else np.zeros(3)
+        across = float(self.lag @ normals[0])
+        lies = self.y @ normals[0] - planes[0, 3] < -LYING * across
+        if len(planes) > 1 or not lies.any():
+            return np.zeros(3)
+        slips = self.slips(normals[0])[lies]
+        mean = slips.mean(axis=0)
+        # slips that differ leave a doubt about where friction acts: what is within it is left to the iterations
+        apart = 2.0 * np.linalg.norm(slips.max(axis=0) - slips.min(axis=0))
+        free, rub, slip = mean + along, -friction[0] * across, np.linalg.norm(mean)
+        left = np.linalg.norm(free) - rub
+        if left <= 0.0:
+            return np.asarray(-mean if slip > max(apart, apart * rub / max(slip, 1e-300)) else np.zeros(3))
+        way = left * free / np.linalg.norm(free) - mean
+        doubt = rub * min(2.0, apart / left)
+        return np.asarray(max(0.0, 1.0 - doubt / max(np.linalg.norm(way), 1e-300)) * way)
+
+
+class _Tipping:
+    """A component that tips or rolls on one plane, about one vertex or the line through two.
+
+    They stick, or slide the way that they slid, and what pushes them must be a force that contacts have: outward,
+    within friction's cone, and between the two. Which they are is found by turns: the vertex that would go deepest
+    comes next; of three the two remain beyond whose line the pressure has its centre.
+    """
+
+    def __init__(self, piece: _Piece, plane: Array) -> None:
+        self.piece, self.normal, self.friction = piece, plane[:3], float(plane[4])
+        self.height = float(plane[3])
+        self.gap = piece.y @ self.normal - self.height
+        self.reach = -LYING * float(piece.lag @ self.normal)
+        self.lies, self.slips = self.gap < self.reach, piece.slips(self.normal)
+
+    def motion(self, free: Array) -> Array | None:
+        """What every vertex is to be moved by [n, 3], `free` without contacts; None where it does not tip."""
+        piece, n = self.piece, self.normal
+        if not self.reach > 0.0:
+            return None
+        if self.lies.any():
+            lying = piece.y[self.lies]
+            middle = lying.mean(axis=0)
+            away = self.centre_of_pressure(piece.y, middle)
+            spread = (lying - middle).T @ (lying - middle) / len(lying)
+            least = 1e-8 * piece.square
+            line = np.linalg.eigvalsh(spread)[1] <= least
+            if not (line or away @ np.linalg.solve(spread + least * np.eye(3), away) > RESTING):
+                return None
+            on = [int(np.where(self.lies, piece.y @ away, -np.inf).argmax())]
+        else:
+            middle = piece.middle - (piece.middle @ n - self.height) * n
+            away = self.centre_of_pressure(piece.y, middle)
+            on = [piece.deepest(free)[0]]
+        pressure = middle + away
+        share = 1.0
+        for _ in range(ROUNDS - 1):
+            moved, holds = self.about(on, share)
+            worst, depth, before = piece.deepest(moved)
+            if depth >= -(ROUNDED if worst in on else TOUCHING) * self.reach:
+                return np.asarray(moved - piece.y + max(0.0, -depth) * n) if holds else None
+            left = before - self.drop(on)
+            if left >= self.reach:
+                share *= left / (left - depth)
+            elif not self.gap[worst] - self.drop(on) < self.reach or share < 1.0 or worst in on:
+                return None
+            elif len(on) == 1:
+                on.append(worst)
+            else:
+                pair = self.pair_of([*on, worst], pressure)
+                if pair is None or set(pair) == set(on):
+                    return None
+                on = pair
+        return None
+
+    def drop(self, on: list[int]) -> float:
+        """How far above the plane they are."""
+        return float(self.gap[on].min())
+
+    def centre_of_pressure(self, moved: Array, about: Array) -> Array:
+        """From a point of the plane [3]: where contact would have to push for the component to be at `moved`."""
+        force = self.piece.weight * (moved - self.piece.z)
+        torque = np.cross(moved - about, force).sum(axis=0)
+        return np.asarray(np.cross(self.normal, torque) / (force.sum(axis=0) @ self.normal))
+
+    def pair_of(self, three: list[int], pressure: Array) -> list[int] | None:
+        """Two of three vertices: those beyond whose line the pressure has its centre, the third being on this side."""
+        best, pair = 0.0, None
+        for i in range(3):
+            a, b, c = (self.piece.y[three[(i + j) % 3]] for j in range(3))
+            outward = np.cross(self.normal, b - a)
+            outward *= -np.sign((c - a) @ outward) / np.linalg.norm(outward)
+            beyond = float((pressure - a) @ outward)
+            if beyond > best:
+                best, pair = beyond, [three[i], three[(i + 1) % 3]]
+        return pair
+
+    def about(self, on: list[int], share: float) -> tuple[Array, bool]:
+        """Where it goes if it turns about these vertices [n, 3], or that share of the way; whether it does."""
+        sticking = self.sticking(on, share) if self.friction > 0.0 else None
+        if sticking is not None and sticking[1]:
+            return sticking
+        sliding = self.sliding(on, share)
+        if sliding is not None and (sliding[1] or sticking is None):
+            return sliding
+        return sticking if sticking is not None else (self.piece.y, False)
+
+    def sticking(self, on: list[int], share: float) -> tuple[Array, bool]:
+        """Friction takes back how far they slid, within its cone."""
+        piece, n = self.piece, self.normal
+        first, way, axis = self.line(on)
+        slips = self.slips[on]
+        goal = first - slips[0] - self.drop(on) * n
+        covariance = piece.about(goal, first)
+        turn = piece.nearest_rotation(covariance) if axis is None else _turn_about(axis, covariance)
+        moved = (piece.y - first) @ _part(turn, share).T + goal
+        force = (piece.weight * (moved - piece.z)).sum(axis=0)
+        push = float(force @ n)
+        holds = bool(push > 0.0 and np.linalg.norm(force - push * n) <= self.friction * push)
+        holds = holds and bool(np.linalg.norm(slips[0] - slips[-1]) <= self.reach)
+        holds = holds and self.between((piece.y - first) @ turn.T + goal, goal, axis, way, push)
+        return moved, holds
+
+    def sliding(self, on: list[int], share: float) -> tuple[Array, bool] | None:
+        """Friction acts against how they slid, and they go on that way; None where that is not known."""
+        piece, n = self.piece, self.normal
+        first, way, axis = self.line(on)
+        slips, direction = self.slips[on], np.zeros(3)
+        if self.friction > 0.0:
+            lengths = np.linalg.norm(slips, axis=1)
+            if not (lengths > self.reach).all():
+                return None
+            directions = slips / lengths[:, None]
+            if np.linalg.norm(directions[0] - directions[-1]) > ALIKE:
+                return None
+            direction = directions[0]
+        arm = first - piece.middle
+        drop = self.drop(on)
+        turn = self.sliding_turn(arm, axis, n - self.friction * direction, drop)
+        if turn is None:
+            return None
+        moved = self.slid(turn, arm, direction, drop)
+        push = float((piece.weight * (moved - piece.z)).sum(axis=0) @ n)
+        holds = push > 0.0 and self.between(moved, moved[on[0]], axis, way, push)
+        if self.friction > 0.0:
+            after = slips[0] + moved[on[0]] - first
+            after -= (after @ n) * n
+            holds = holds and after @ direction > ONWARD * np.linalg.norm(after)
+        return (moved if share == 1.0 else self.slid(_part(turn, share), arm, direction, drop)), bool(holds)
+
+    def line(self, on: list[int]) -> tuple[Array, Array, Array | None]:
+        """A point, the way to the other, and its direction if there is one."""
+        first = self.piece.y[on[0]]
+        way = np.asarray(self.piece.y[on[-1]] - first)
+        return first, way, way / np.linalg.norm(way) if len(on) == 2 else None
+
+    def between(self, moved: Array, at: Array, axis: Array | None, way: Array, push: float) -> bool:
+        """Whether that push at `moved` has its centre between the two vertices of a line."""
+        if axis is None:
+            return True
+        torque = np.cross(moved - at, self.piece.weight * (moved - self.piece.z)).sum(axis=0)
+        along, length = float(np.cross(self.normal, torque) @ axis) / push, float(np.linalg.norm(way))
+        return -1e-6 * length <= along <= (1.0 + 1e-6) * length
+
+    def slid(self, turn: Array, arm: Array, direction: Array, drop: float) -> Array:
+        """The component turned; the vertex at `arm` from its middle goes down by `drop`, against friction."""
+        piece = self.piece
+        lift = float(self.normal @ (arm - turn @ arm - piece.lag)) - drop
+        shift = piece.lag + lift * (self.normal - self.friction * direction)
+        return np.asarray((piece.y - piece.middle) @ turn.T + piece.middle + shift)
+
+    def sliding_turn(self, arm: Array, axis: Array | None, force: Array, drop: float) -> Array | None:
+        """The turn that balances torques when contact pushes a vertex along `force`, by Newton's method."""
+        piece, n, turn = self.piece, self.normal, np.eye(3)
+        weight = float(piece.weight.sum())
+        for _ in range(NEWTON):
+            at = turn @ arm
+            product = piece.covariance @ turn.T
+            lift = weight * (float(n @ (arm - at - piece.lag)) - drop)
+            torque = _axis(product) + lift * np.cross(at, force)
+            slope = np.trace(product) * np.eye(3) - product.T
+            slope += weight * np.outer(np.cross(at, force), np.cross(at, n))
+            slope += lift * ((at @ force) * np.eye(3) - np.outer(at, force))
+            if axis is None:
+                step = np.linalg.solve(slope, torque)
+                turn = _rotation(step) @ turn
+                size = float(np.linalg.norm(step))
+            else:
+                line = turn @ axis
+                basis = np.stack([line, n], axis=1)
+                roll, yaw = np.linalg.solve(basis.T @ slope @ basis, basis.T @ torque)
+                turn = _rotation(yaw * n) @ _rotation(roll * line) @ turn
+                size = float(np.hypot(roll, yaw))
+            if size < 1e-14:
+                break
+        return turn if size < 1e-9 else None
+
+
+def _axis(matrix: Array) -> Array:
+    """Twice the axis of the skew part."""
+    return np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+
+
+def _rotation(half: Array) -> Array:
+    """By Cayley's formula, about an axis by 2 atan(|v| / 2)."""
+    v = 0.5 * half
+    skew = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    return np.asarray(np.eye(3) + 2.0 / (1.0 + v @ v) * (skew + skew @ skew))
+
+
+def _part(turn: Array, share: float) -> Array:
+    """About that share of a turn: Cayley's vector of it times `share`."""
+    return turn if share == 1.0 else _rotation(share * 2.0 / (1.0 + np.trace(turn)) * _axis(turn))
+
+
+def _turn_about(normal: Array, covariance: Array) -> Array:
+    """The rotation R about a normal that maximises tr(R^T covariance), by its angle."""
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first /= np.linalg.norm(first)
+    frame = np.stack([first, np.cross(normal, first)])
+    flat = frame @ covariance @ frame.T
+    angle = np.arctan2(flat[1, 0] - flat[0, 1], flat[0, 0] + flat[1, 1])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.asarray(np.outer(normal, normal) + frame.T @ turn @ frame)
