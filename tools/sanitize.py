@@ -103,7 +103,10 @@ WAYS = {
     ),
     "grid": (Way(BAR, {"_GRID_TETS": 8}),),
     "far": (Way(bar(99, 1, 1), {"_GRID_TETS": 594}),),
-    "stream": (Way(BAR, {"_STREAM_TETS": SMALL}),),
+    "stream": (
+        Way(BAR, {"_STREAM_TETS": SMALL}),
+        Way(crumbs(129), {"_STREAM_TETS": SMALL}),  # more pieces than one block searches for those that tip
+    ),
     "large": (Way(bar(19, 20, 1), {"_STREAM_TETS": LARGE}), Way(crumbs(129), {"_STREAM_TETS": LARGE})),
 }
 KERNELS = tuple(WAYS)
@@ -118,8 +121,10 @@ def compiled_for(kernel: str, way: Way) -> Iterator[str]:
 
 
 def scene(mesh: pd.TetMesh, *, contacts: bool, pieces: bool, pins: bool) -> pd.Scene:
-    """Two bodies, the second of which is free where pieces are wanted."""
-    bodies = [pd.Solid(pd.TetMesh(mesh.vertices + [0.0, y, 0.0], mesh.tets), 1e5) for y in (0.0, 0.5)]
+    """Two bodies, the second of which is free where pieces are wanted, and tips on the ground."""
+    tilt = np.array([[0.96, 0.28, 0.0], [-0.28, 0.96, 0.0], [0.0, 0.0, 1.0]])
+    places = (mesh.vertices, mesh.vertices @ tilt + [0.0, 0.0, 1.5])
+    bodies = [pd.Solid(pd.TetMesh(vertices, mesh.tets), 1e5) for vertices in places]
     held = bodies[:1] if pieces else bodies
     parts: list[pd.scene.Part] = [*bodies, pd.Gravity(), pd.Damping(0.5)]
     if pins:

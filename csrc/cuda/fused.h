@@ -433,9 +433,6 @@ class FusedRunner {
   // ---- rigid motions: cuda/fused_rigid.h
 
   PD_DEVICE void align_pieces();
-  PD_DEVICE bool some_tip();
-  template <Rigid What>
-  PD_DEVICE void find_motions();
 
   // ---- results
 

@@ -5,32 +5,57 @@
 
 namespace pd::inline PD_TARGET {
 
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-template <Rigid What>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::find_motions() {
-  if constexpr (Many) sums_.meet();  // everyone has read the sums of the last time
-  const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
-  double* sums = part_sums();
-  const int end = plan_.patch_part[index_ + 1];
-  for (int n = plan_.patch_part[index_] + warp; n < end; n += warps) {
-    const Part part(plan_, n, nullptr, -patch_.first_slot);
-    const Piece<T>& piece = this->piece(part.piece(plan_));
-    sum_part<What>(v_, contacts_, plan_.pins > 0, parts_are_pieces(plan_), part, piece,
-                   sums + PartSums::count * n);
-  }
-  sums_.meet();
-  for (int n = warp; n < plan_.pieces; n += warps)
-    move_piece<What>(plan_, n, contacts_, sums, this->piece(n));
-  __syncthreads();
-}
+// What finds the motions: by itself, so that what lives across its calls is spilled here, and not in the iterations.
+template <class T, bool Touching, Blocks Kind>
+struct MotionFinder {
+  const DevicePlan<T>& plan;
+  Vertices<T, Touching> v;
+  Contacts<T> contacts;
+  Piece<T>* pieces;  // of this block
+  double* part_sums;
+  int first_part, end_part, first_slot;  // of its patch
+  TeamSums<Kind> sums;
 
-// The same in every block of the team, since all of them work out all motions.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE bool FusedRunner<T, Touching, Loose, Kind, Near>::some_tip() {
-  bool some = false;
-  for (int n = threadIdx.x; n < plan_.pieces; n += blockDim.x)
-    some = some || piece(n).tipping.goes_on();
-  return __syncthreads_or(some);
+  PD_DEVICE void run() {
+    if (!parts_are_pieces(plan)) find<Rigid::mean>();
+    find<Rigid::free>();
+    if constexpr (Touching) {
+      find<Rigid::touching>();
+      while (some_tip()) find<Rigid::tipping>();
+      if (contacts.has_several()) find<Rigid::beside>();
+    }
+  }
+
+ private:
+  template <Rigid What>
+  PD_DEVICE void find() {
+    if constexpr (Kind != Blocks::one) sums.meet();  // everyone has read the sums of the last time
+    const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
+    for (int n = first_part + warp; n < end_part; n += warps) {
+      const Part part(plan, n, nullptr, -first_slot);
+      sum_part<What>(v, contacts, plan.pins > 0, parts_are_pieces(plan), part,
+                     pieces[part.piece(plan)], part_sums + PartSums::count * n);
+    }
+    sums.meet();
+    for (int n = warp; n < plan.pieces; n += warps)
+      move_piece<What>(plan, n, contacts, part_sums, pieces[n]);
+    __syncthreads();
+  }
+
+  // The same in every block of the team, since all of them work out all motions.
+  PD_DEVICE bool some_tip() const {
+    bool some = false;
+    for (int n = threadIdx.x; n < plan.pieces; n += blockDim.x)
+      some = some || pieces[n].tipping.goes_on();
+    return __syncthreads_or(some);
+  }
+};
+
+// Returns where the team stands.
+template <class T, bool Touching, Blocks Kind>
+PD_DEVICE_COLD TeamSums<Kind> find_motions(MotionFinder<T, Touching, Kind> finder) {
+  finder.run();
+  return finder.sums;
 }
 
 template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
@@ -38,13 +63,9 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::align_pieces() {
   const bool first = !started_;
   started_ = true;
   if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
-  if (!parts_are_pieces(plan_)) find_motions<Rigid::mean>();
-  find_motions<Rigid::free>();
-  if constexpr (Touching) {
-    find_motions<Rigid::touching>();
-    while (some_tip()) find_motions<Rigid::tipping>();
-    if (contacts_.has_several()) find_motions<Rigid::beside>();
-  }
+  sums_ = find_motions<T, Touching, Kind>({plan_, v_, contacts_, &piece(0), part_sums(),
+                                           plan_.patch_part[index_], plan_.patch_part[index_ + 1],
+                                           patch_.first_slot, sums_});
   each_slot([&](int s) {
     const int number = plan_.slot_piece[patch_.first_slot + s];
     if (number < 0 || !(v_.u[s].w > 0)) return;  // of no piece, or pinned

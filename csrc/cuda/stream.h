@@ -380,8 +380,8 @@ PD_DEVICE std::int64_t thread_number() {
 // ---- rigid motions: cuda/rigid.h
 
 constexpr int tipping_threads = 512;
-constexpr int tipping_parts =
-    2048;  // of an environment; more are searched by all blocks, launch by launch
+// Parts of an environment: more are searched by all blocks, launch by launch.
+constexpr int tipping_parts = 128;
 
 template <Rigid What, class T>
 __global__ void __launch_bounds__(vertex_threads)

@@ -28,9 +28,9 @@ class TeamSums {
  public:
   // `box` [2, patches, sums_count], of a grid, starts with tags of zero; `cluster`: of a cluster
   PD_DEVICE TeamSums(TeamTotals& totals, Word* box, ClusterSums cluster, int patch, int patches)
-      : totals_(totals), box_(box), cluster_(cluster), patch_(patch), patches_(patches) {}
+      : totals_(&totals), box_(box), cluster_(cluster), patch_(patch), patches_(patches) {}
 
-  PD_DEVICE double total(int n) const { return totals_.total[n]; }
+  PD_DEVICE double total(int n) const { return totals_->total[n]; }
 
   // Every thread, before a barrier: its first `wanted` values.
   template <class Op>
@@ -41,7 +41,7 @@ class TeamSums {
     for (int n = 0; n < sums_count; ++n) {
       if (n >= wanted) break;
       const double sum = across_warp(value[n], op);
-      if (lane() == 0) totals_.warp_sum[n][threadIdx.x / warp_size] = sum;
+      if (lane() == 0) totals_->warp_sum[n][threadIdx.x / warp_size] = sum;
     }
   }
 
@@ -58,7 +58,7 @@ class TeamSums {
   PD_DEVICE void gather(const double* values, Op op) {
     double sum = Op::none;
     for (int i = lane(); i < int(blockDim.x); i += warp_size) sum = op(sum, values[i]);
-    totals_.warp_sum[0][lane()] = sum;
+    totals_->warp_sum[0][lane()] = sum;
     wanted_ = 1;
     left_ = warp_size;
     __syncwarp();
@@ -75,7 +75,7 @@ class TeamSums {
     ++round_;
 #pragma unroll 1
     for (int n = 0; n < wanted_; ++n) {
-      const double sum = across_warp(lane() < left_ ? totals_.warp_sum[n][lane()] : Op::none, op);
+      const double sum = across_warp(lane() < left_ ? totals_->warp_sum[n][lane()] : Op::none, op);
       if constexpr (Kind == Blocks::cluster) {
         if (n == 0 && lane() == 0) cluster_.expect(round_, wanted_ * patches_);
         if (lane() < patches_) cluster_.send(lane(), patch_, n, sum, round_);
@@ -84,7 +84,7 @@ class TeamSums {
       if constexpr (Kind == Blocks::grid) {
         post(box(patch_, n), {std::uint64_t(__double_as_longlong(sum)), round_});
       } else if constexpr (Kind == Blocks::one) {
-        totals_.total[n] = sum;
+        totals_->total[n] = sum;
       }
     }
     __syncwarp();
@@ -104,7 +104,7 @@ class TeamSums {
         }
         __syncwarp();
         const double sum = across_warp(mine, op);
-        if (lane() == 0) totals_.total[n] = sum;
+        if (lane() == 0) totals_->total[n] = sum;
       }
     }
     __syncwarp();
@@ -138,7 +138,7 @@ class TeamSums {
     return box_ + ((round_ & 1) * patches_ + patch) * sums_count + n;
   }
 
-  TeamTotals& totals_;
+  TeamTotals* totals_;
   Word* box_;
   ClusterSums cluster_;
   int patch_, patches_;
