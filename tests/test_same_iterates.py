@@ -189,6 +189,10 @@ CASES: dict[str, Callable[[], Case]] = {
     "tipping over an edge": lambda: tipping(
         1.0, turn=(0.0, 33.0, 0.0), size=(0.1, 0.4, 0.1), cells=(2, 8, 2), gravity=(50.0, -98.0, -32.0)
     ),
+    # the far end of the edge is found by way of a third vertex
+    "tipping over an edge askew": lambda: tipping(
+        1.0, turn=(0.0, 33.0, 0.0), size=(0.2, 0.4, 0.1), cells=(4, 8, 2), gravity=(40.0, -98.0, 40.0)
+    ),
     "tipping on to a face": lambda: tipping(
         0.7, turn=(0.0, 10.0, 1.0), size=(0.2, 0.2, 0.2), cells=(2, 2, 2), spin=-2.0
     ),
