@@ -64,6 +64,11 @@ def rounded_problem(case: Case, dtype: torch.dtype) -> StepProblem:
     return step_problem(case.scene.values(), x, v, case.time_step, **case.extras)
 
 
+def first_of(problem: StepProblem, case: Case, solver: pd.Jacobi | pd.Chebyshev) -> Array:
+    """The iterate that `solver` begins with, in the reference."""
+    return problem.first_iterate(case.start, weighted=solver.numbers()["weighted"])
+
+
 def reference_run(problem: StepProblem, first: Array, solver: pd.Jacobi | pd.Chebyshev, iterations: int) -> Iterates:
     """The iterations of `solver` in the reference."""
     numbers = solver.numbers()

@@ -16,7 +16,18 @@ from device_plans import delaunay_mesh
 from devices import require_gpu
 from numpy.typing import NDArray
 from on_gpu import DTYPES, GPU, KERNELS, bar, crowd, full_on_gpu, moved, on_gpu, relative
-from runs import ULP, arguments_of, displacement, moving, reference_run, rounded_problem, simulate, simulator, state_of
+from runs import (
+    ULP,
+    arguments_of,
+    displacement,
+    first_of,
+    moving,
+    reference_run,
+    rounded_problem,
+    simulate,
+    simulator,
+    state_of,
+)
 from test_determinism import different_environments
 from test_determinism import scene as scene_of_all_effects
 from test_same_iterates import CASES as SAME_CASES
@@ -138,16 +149,21 @@ ALL_SOLVERS: dict[str, pd.Jacobi | pd.Chebyshev] = {**SOLVERS, "restarting": RES
 
 
 @cache
-def problem_of(name: str, dtype: torch.dtype) -> tuple[Case, StepProblem, Array]:
+def problem_of(name: str, dtype: torch.dtype) -> tuple[Case, StepProblem]:
     case = {**CASES, **RESTARTING}[name]()
-    problem = rounded_problem(case, dtype)
-    return case, problem, problem.first_iterate(case.start)
+    return case, rounded_problem(case, dtype)
+
+
+@cache
+def first_iterate(name: str, dtype: torch.dtype, solver: str) -> Array:
+    case, problem = problem_of(name, dtype)
+    return first_of(problem, case, ALL_SOLVERS[solver])
 
 
 @cache
 def reference(name: str, dtype: torch.dtype, solver: str, iterations: int) -> Iterates:
-    _, problem, first = problem_of(name, dtype)
-    return reference_run(problem, first, ALL_SOLVERS[solver], iterations)
+    _, problem = problem_of(name, dtype)
+    return reference_run(problem, first_iterate(name, dtype, solver), ALL_SOLVERS[solver], iterations)
 
 
 @dataclass(frozen=True)
@@ -178,7 +194,7 @@ class Rounded(StepProblem):
 @cache
 def rounded_ways(name: str) -> list[Rounded]:
     """With three vertices and orders."""
-    _, problem, _ = problem_of(name, torch.float32)
+    _, problem = problem_of(name, torch.float32)
     rng = np.random.default_rng(0)
     own = {field.name: getattr(problem, field.name) for field in fields(problem)}
     vertices, tets = len(problem.positions), len(problem.values.tets)
@@ -191,7 +207,7 @@ def tolerance_of(name: str, dtype: torch.dtype, solver: str, iterations: int) ->
     if TOLERANCE[dtype] == MOST[dtype]:
         return TOLERANCE[dtype]
     expected = reference(name, dtype, solver, iterations).displacement
-    _, _, first = problem_of(name, dtype)
+    first = first_iterate(name, dtype, solver)
     found = [reference_run(way, first, ALL_SOLVERS[solver], iterations).displacement for way in rounded_ways(name)]
     rounded = 2.0 * float(np.abs(np.subtract(found, expected)).max() / np.abs(expected).max())
     return min(max(TOLERANCE[dtype], rounded), MOST[dtype])
@@ -209,7 +225,7 @@ class Errors(NamedTuple):
 
 def errors_of(sim: pd.Simulator, name: str, solver: str, batch: int) -> Errors:
     """The last of some equal environments."""
-    case, problem, _ = problem_of(name, sim.dtype)
+    case, problem = problem_of(name, sim.dtype)
     expected = reference(name, sim.dtype, solver, sim.iterations)
     after, info = sim(state_of(case, sim, batch), **arguments_of(case, sim, batch), return_info=True)
     u, item = displacement(sim, after, batch - 1), batch - 1
@@ -257,7 +273,7 @@ def why_not(name: str, kernel: str, precision: str) -> str:
 def test_iterates_are_those_of_the_reference(name: str, kernel: str, precision: str) -> None:
     if reason := why_not(name, kernel, precision):
         pytest.skip(reason)
-    case, _, _ = problem_of(name, DTYPES[precision])
+    case, _ = problem_of(name, DTYPES[precision])
     sim = on_gpu(case, DTYPES[precision], kernel)
     assert sim.plan.size("most_slots") > 1024 or (name, kernel, precision) != ("strip", "stream", "float32")
     assert sim.plan.patches > 1 or not name.startswith("several patches")
@@ -273,7 +289,7 @@ def test_iterates_of_large_patches(name: str, solver: str, precision: str) -> No
     """A thread has several of their elements; forces that others wait for go out before the last of them."""
     if reason := why_not(name, "far", precision):
         pytest.skip(reason)
-    case, _, _ = problem_of(name, DTYPES[precision])
+    case, _ = problem_of(name, DTYPES[precision])
     sim = on_gpu(case, DTYPES[precision], "far", solver=SOLVERS[solver])
     assert (sim.plan.patch_pairs > 512).all()
     if name != "cones":
@@ -322,7 +338,7 @@ def test_blocks_with_room_for_none_all_or_some_of_their_arrays(
 @pytest.mark.parametrize("solver", sorted(set(SOLVERS) - {"guarded"}))
 @pytest.mark.parametrize("name", ["pins, inertial start", "given start", "corner"])
 def test_every_schedule_and_start(name: str, solver: str, kernel: str, precision: str) -> None:
-    case, _, _ = problem_of(name, DTYPES[precision])
+    case, _ = problem_of(name, DTYPES[precision])
     check(on_gpu(case, DTYPES[precision], kernel, solver=SOLVERS[solver]), name, solver)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from cases import Case, box, contact_block, leaning, sliver_mesh
-from runs import arguments_of, displacement, reference_run, rounded_problem, simulator, state_of
+from runs import arguments_of, displacement, first_of, reference_run, rounded_problem, simulator, state_of
 
 import torchpd as pd
 from torchpd.reference import StepProblem
@@ -154,6 +154,26 @@ def several_tip() -> Case:
     return stirred(Case(scene, x, 0.0 * x, 1.0 / 60.0), size=1e-5)
 
 
+def landing_on_a_leash() -> Case:
+    """A hard block with a pin at one of its upper corners."""
+    vertices, tets = box((0.3, 0.2, 0.2), (3, 2, 2))
+    body = pd.Solid(pd.TetMesh(vertices + [0.0, 0.002, 0.0], tets), 1e6)
+    corner = int((vertices @ [1.0, 1.0, 1.0]).argmax())
+    scene = pd.Scene(body, pd.Pin(body, [corner]), pd.Gravity(), pd.Ground(0.0))
+    x = scene.values().rest_positions
+    return stirred(Case(scene, x, np.tile([0.0, -1.0, 0.0], (len(x), 1)), 1.0 / 60.0), size=1e-5)
+
+
+def landing_far_and_near() -> Case:
+    """A hard block and a soft one that land in a corner at once, and a hard one that has not come to it."""
+    vertices, tets = box((0.3, 0.2, 0.2), (3, 2, 2))
+    near = [pd.Solid(pd.TetMesh(vertices + [0.001, 0.001, z], tets), youngs) for z, youngs in ((0.0, 1e6), (0.3, 1e3))]
+    far = pd.Solid(pd.TetMesh(vertices + [0.02, 0.01, 0.6], tets), 1e6)
+    scene = pd.Scene(*near, far, pd.Gravity(), pd.Ground(0.0), pd.Ground(0.0, normal=(1.0, 0.0, 0.0)))
+    x = scene.values().rest_positions
+    return stirred(Case(scene, x, np.tile([-0.2, -1.0, 0.5], (len(x), 1)), 1.0 / 60.0), size=1e-5)
+
+
 def among_planes() -> Case:
     """Three hard blocks among eleven planes: one touches the tenth, one a wall that it slides to, one nothing."""
     vertices, tets = box((0.3, 0.2, 0.2), (3, 2, 2))
@@ -199,6 +219,21 @@ CASES: dict[str, Callable[[], Case]] = {
     "landing on a corner": lambda: tipping(
         0.6, turn=(5.0, 10.0, 15.0), size=(0.2, 0.2, 0.2), cells=(2, 2, 2), velocity=(0.5, -1.0, 0.0), height=0.005
     ),
+    # they start from where they are, above the ground
+    "landing and sliding": lambda: tipping(
+        0.3, turn=(2.0, 0.0, 1.0), size=(0.6, 0.15, 0.15), cells=(8, 2, 2), velocity=(3.0, -1.0, 0.0), height=0.002
+    ),
+    "landing on three corners": lambda: tipping(
+        0.3,
+        turn=(2.0, 0.0, 1.0),
+        size=(0.6, 0.15, 0.15),
+        cells=(8, 2, 2),
+        velocity=(1.0, -1.0, 0.3),
+        height=0.01,
+        spin=-2.0,
+    ),
+    "landing, held at a corner": landing_on_a_leash,
+    "landing far and near": landing_far_and_near,
     "several that tip": several_tip,
     "among many planes": among_planes,
     "hung from a point": lambda: hung(0),
@@ -219,7 +254,7 @@ def test_iterates_are_those_of_the_reference(
 ) -> None:
     scene = case()
     problem = rounded_problem(scene, dtype)
-    first = problem.first_iterate(scene.start)
+    first = first_of(problem, scene, solver)
     sim = simulator(scene, dtype, device, solver=solver)
     for sim.iterations in COUNTS:
         expected = reference_run(problem, first, solver, sim.iterations)

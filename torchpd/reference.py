@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array, diags_array, kron
 
-from .reference_rigid import align, gaps_of
+from .reference_rigid import align, begin, gaps_of
 from .scene import SceneValues
 
 __all__ = [
@@ -225,14 +225,18 @@ class StepProblem:
         wide = csr_array(kron(self.operator, np.eye(3)))
         return csr_array(diags_array(np.repeat(self.weight, 3)) + wide.T @ (inner @ wide))
 
-    def first_iterate(self, start: str | Array = "velocity") -> Array:
-        """u_0: "velocity" h v, "inertial" s, or positions [V, 3]; pins at their targets, contact, rigid motions."""
+    def first_iterate(self, start: str | Array = "velocity", *, weighted: bool = True) -> Array:
+        """u_0: "velocity" h v, "inertial" s, or positions [V, 3]; pins at their targets, contact, rigid motions.
+
+        What planes would squeeze by more than it gains starts from where it is: `weighted` as the iterations are.
+        """
         if isinstance(start, str):
             guesses = {"velocity": self.time_step * self.velocities, "inertial": self.target}
             if start not in guesses:
                 raise ValueError(f'start must be "velocity", "inertial" or positions [V, 3], got "{start}"')
             guess = self._hold(guesses[start])
-            return self.align(self.project(guess, guess))
+            begun = begin(self, guess, self.weighted_diagonal if weighted else self.plain_diagonal)
+            return self.align(begun, first=True)
         guess = self._hold(np.asarray(start, dtype=np.float64) - self.positions)
         return self.project(guess, guess)
 
@@ -244,9 +248,9 @@ class StepProblem:
     def _hold(self, displacement: Array) -> Array:
         return np.where(self.free[:, None], displacement, self.target)
 
-    def align(self, displacement: Array) -> Array:
+    def align(self, displacement: Array, *, first: bool = False) -> Array:
         """Move every component as a rigid body to where E is least, as far as pins and contacts let it."""
-        return align(self, displacement, nearest_rotation)
+        return align(self, displacement, nearest_rotation, first=first)
 
     def smallest_gap(self, displacement: Array) -> Array:
         """Distance of every vertex to the nearest contact surface, negative inside [V]; inf without contacts."""

@@ -2,8 +2,8 @@
 
 Along them E is sum a / 2 |x + u - (x + s)|^2, a weighted fit of two sets of points (Kabsch 1976). Hard pins at a point
 or along a line leave turns about that; smooth planes the turn about their normal and the way along all of them; a plane
-with friction the way along it, shortened as by Coulomb. On one plane a component may tip besides (`_Tipping`). Other
-contacts leave it nothing.
+with friction the way along it, shortened as by Coulomb. On one plane a component may tip besides (`_Tipping`); one that
+hovers goes as far as the first plane. Other contacts leave it nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from .reference import StepProblem
 
-__all__ = ["align", "gaps_of"]
+__all__ = ["align", "begin", "gaps_of"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -30,6 +30,8 @@ ROUNDS = 5  # searches for the vertices that it tips about
 ALIKE = 0.02  # directions of slips that count as one: their distance
 NEWTON = 8  # steps to a balance of torques
 ONWARD = 0.9  # least cosine between a slip before and after
+SQUEEZE = 0.5  # of the most that pushes of contacts may squeeze a component by
+WORTH = 0.01  # of what is left: less squeeze is no reason to give up the course
 
 
 class NearestRotation(Protocol):
@@ -46,20 +48,48 @@ def gaps_of(positions: Array, planes: Array, centers: Array, spheres: Array) -> 
     return gaps
 
 
-def align(problem: StepProblem, displacement: Array, nearest_rotation: NearestRotation) -> Array:
-    """Displacements [V, 3] after the rigid motion of every component."""
+def begin(problem: StepProblem, guess: Array, diagonal: Array) -> Array:
+    """The first iterate [V, 3], before rigid motions: `guess` out of the contacts, or components where they are.
+
+    Contacts push vertices out each for itself, by p, which squeezes a component by sum k / 2 |p - mean p|^2 at most,
+    k = D - a. One that starts from where it is has less energy left, half of that counted. It has no hard pins, and
+    forces would take it into no other contacts than the first planes.
+    """
+    planes, out = problem.values.planes, problem.project(guess, guess)
+    kept = problem._hold(np.zeros_like(guess))
+    still, begun, there = problem.project(kept, kept), out.copy(), problem.positions + problem.target
+    others = gaps_of(there, planes[TOLD:], problem.sphere_centers, problem.values.spheres) <= 0.0
+    for number in range(int(problem.values.component.max()) + 1):
+        of = problem.values.component == number
+        a, push = problem.weight[of, None], (out - guess)[of]
+        if (others | ~problem.free)[of].any():
+            continue
+        k = diagonal[of, None] - a
+        squeeze = SQUEEZE * float((k * (push - (k * push).sum(axis=0) / max(k.sum(), 1e-300)) ** 2).sum())
+        left, before = (float((a * (u - problem.target)[of] ** 2).sum()) for u in (out, still))
+        if left + squeeze > before and squeeze > WORTH * left:
+            begun[of] = still[of]
+    return begun
+
+
+def align(
+    problem: StepProblem, displacement: Array, nearest_rotation: NearestRotation, *, first: bool = False
+) -> Array:
+    """Displacements [V, 3] after the rigid motion of every component; `first`: before any iteration."""
     values, moved = problem.values, displacement.copy()
     for number in range(int(values.component.max()) + 1):
         of = values.component == number
-        moved[of] += _Piece(problem, displacement, of, nearest_rotation).motion()
+        moved[of] += _Piece(problem, displacement, of, nearest_rotation, first).motion()
     return np.where(problem.free[:, None], moved, displacement)
 
 
 class _Piece:
     """One component, its n vertices at y = x + u, their targets z = x + s."""
 
-    def __init__(self, problem: StepProblem, displacement: Array, of: Mask, nearest_rotation: NearestRotation) -> None:
-        self.problem, self.nearest_rotation = problem, nearest_rotation
+    def __init__(
+        self, problem: StepProblem, displacement: Array, of: Mask, nearest_rotation: NearestRotation, first: bool
+    ) -> None:
+        self.problem, self.nearest_rotation, self.first = problem, nearest_rotation, first
         self.planes = problem.values.planes
         self.u, self.weight = displacement[of], problem.weight[of, None]
         self.y, self.z = problem.positions[of] + self.u, problem.positions[of] + problem.target[of]
@@ -77,15 +107,31 @@ class _Piece:
     def gaps(self, positions: Array, planes: Array) -> Array:
         return gaps_of(positions, planes, self.problem.sphere_centers, self.problem.values.spheres)
 
-    def deepest(self, moved: Array) -> tuple[int, float, float]:
-        """The vertex that goes deepest into a contact, how deep beyond where it was, and how far it was before."""
+    def deepest(self, moved: Array, drop: Array, reach: float = 0.0) -> tuple[int, float, float]:
+        """The vertex that stops a motion first, how deep it goes beyond where it was, and how far off a drop leaves it.
+
+        Those that then lie on a contact, less than `reach` off, come first, the deepest; then those that come to it
+        after the least share of the motion. Without a reach the deepest.
+        """
         none = self.planes[:0]
         each = [(self.y @ plane[:3] - plane[3], moved @ plane[:3] - plane[3]) for plane in self.planes]
         each.append((self.gaps(self.y, none), self.gaps(moved, none)))
         before, after = (np.stack(part) for part in zip(*each, strict=True))
         depths = after - np.minimum(before, 0.0)
-        contact, worst = np.unravel_index(int(depths.argmin()), depths.shape)
-        return int(worst), float(depths[contact, worst]), float(before[contact, worst])
+        left = before + np.append(self.planes[:, :3] @ drop, 0.0)[:, None]
+        order = depths
+        if reach > 0.0:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                share = np.where(np.isfinite(left), left / (left - depths), 1.0)
+            order = depths / reach
+            order = np.where((left < reach) & (depths < -ROUNDED * reach), order - 3.0, order)
+            order = np.where((left >= reach) & (depths < -TOUCHING * reach), share - 2.0, order)
+        contact, worst = np.unravel_index(int(order.argmin()), depths.shape)
+        return int(worst), float(depths[contact, worst]), float(left[contact, worst])
+
+    def lowers(self, way: Array) -> bool:
+        """Whether there is less energy after a motion by that [n, 3]."""
+        return bool((self.weight * ((self.y + way - self.z) ** 2 - (self.y - self.z) ** 2)).sum() < 0.0)
 
     def motion(self) -> Array:
         """What every vertex is to be moved by [n, 3]."""
@@ -108,19 +154,29 @@ class _Piece:
         touched = np.array([bool((free @ plane[:3] <= plane[3]).any()) for plane in self.planes[:TOLD]], dtype=bool)
         if not touched.any():
             return np.asarray(free - self.y)
-        if self.pinned.any():
-            return still
         planes = self.planes[:TOLD][touched]
-        if len(planes) == 1:
+        if len(planes) == 1 and not self.pinned.any():
             tipped = _Tipping(self, planes[0]).motion(free)
             if tipped is not None:
                 return tipped
+        share = self.share_to(planes, free)
+        if share > LYING:
+            part = _part(turn, share) @ (self.y - pivot).T
+            return np.asarray(part.T + pivot + share * shift - self.y)
+        if self.pinned.any():
+            return still
         turn, shift = np.eye(3), self.way_on(planes)
         if np.linalg.matrix_rank(planes[:, :3], tol=1e-6) == 1 and not planes[:, 4].any():
             turn = _turn_about(planes[0, :3], self.covariance)
         along = (self.y - self.middle) @ (turn - np.eye(3)).T + shift
         others = np.concatenate([self.planes[:TOLD][~touched], self.planes[TOLD:]])
         return np.asarray(along if self.gaps(self.y + along, others).min() > 0.0 else still)
+
+    def share_to(self, planes: Array, free: Array) -> float:
+        """Of its free motion, that brings it to planes."""
+        before, after = (y @ planes[:, :3].T - planes[:, 3] for y in (self.y, free))
+        shares = np.where(before > 0.0, before / np.where(after > 0.0, 1.0, np.maximum(before - after, 1e-300)), 0.0)
+        return float(shares[after <= 0.0].min())
 
     def slips(self, normal: Array) -> Array:
         return np.asarray(self.u - np.outer(self.u @ normal, normal))
@@ -170,6 +226,8 @@ class _Tipping:
         piece, n = self.piece, self.normal
         if not self.reach > 0.0:
             return None
+        way = free - piece.y
+        self.free_slips = self.slips + way - np.outer(way @ n, n)
         if self.lies.any():
             lying = piece.y[self.lies]
             middle = lying.mean(axis=0)
@@ -183,20 +241,22 @@ class _Tipping:
         else:
             middle = piece.middle - (piece.middle @ n - self.height) * n
             away = self.centre_of_pressure(piece.y, middle)
-            on = [piece.deepest(free)[0]]
+            on = [piece.deepest(free, np.zeros(3))[0]]
         pressure = middle + away
         share = 1.0
         for _ in range(ROUNDS - 1):
             moved, holds = self.about(on, share)
-            worst, depth, before = piece.deepest(moved)
+            worst, depth, left = piece.deepest(moved, -self.drop(on) * n, self.reach)
             if depth >= -(ROUNDED if worst in on else TOUCHING) * self.reach:
-                return np.asarray(moved - piece.y + max(0.0, -depth) * n) if holds else None
-            left = before - self.drop(on)
+                way = np.asarray(moved - piece.y + max(0.0, -depth) * n)
+                # a first iterate may be out of balance
+                return way if holds or (piece.first and piece.lowers(way)) else None
             if left >= self.reach:
                 share *= left / (left - depth)
-            elif not self.gap[worst] - self.drop(on) < self.reach or share < 1.0 or worst in on:
+                continue
+            if not self.gap[worst] - self.drop(on) < self.reach or worst in on:
                 return None
-            elif len(on) == 1:
+            if len(on) == 1:
                 on.append(worst)
             else:
                 pair = self.pair_of([*on, worst], pressure)
@@ -254,10 +314,15 @@ class _Tipping:
         return moved, holds
 
     def sliding(self, on: list[int], share: float) -> tuple[Array, bool] | None:
-        """Friction acts against how they slid, and they go on that way; None where that is not known."""
+        """Friction acts against how they slid, and they go on that way; None where that is not known.
+
+        Before any iteration nothing has slid: it acts against how they would.
+        """
         piece, n = self.piece, self.normal
         first, way, axis = self.line(on)
         slips, direction = self.slips[on], np.zeros(3)
+        if piece.first and not (np.linalg.norm(slips, axis=1) > self.reach).all():
+            slips = self.free_slips[on]
         if self.friction > 0.0:
             lengths = np.linalg.norm(slips, axis=1)
             if not (lengths > self.reach).all():
@@ -275,7 +340,7 @@ class _Tipping:
         push = float((piece.weight * (moved - piece.z)).sum(axis=0) @ n)
         holds = push > 0.0 and self.between(moved, moved[on[0]], axis, way, push)
         if self.friction > 0.0:
-            after = slips[0] + moved[on[0]] - first
+            after = self.slips[on[0]] + moved[on[0]] - first
             after -= (after @ n) * n
             holds = holds and after @ direction > ONWARD * np.linalg.norm(after)
         return (moved if share == 1.0 else self.slid(_part(turn, share), arm, direction, drop)), bool(holds)

@@ -103,6 +103,8 @@ class Simulator(Model):
                 for all pins together. A sphere takes its centre [3] or [B, 3], and with its velocity [6] or [B, 6],
                 which friction then drags vertices along with.
             start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
+                The first two are moved out of contacts and along rigid motions; bodies that planes would squeeze there
+                by more than is gained start from x instead.
             return_info: also how the solve went; costs two more local steps, no synchronisation.
 
         Returns:

@@ -11,6 +11,53 @@ void each_in_a_piece(const Plan<typename Lanes::Scalar>& plan, const Visit& visi
   }
 }
 
+// Of one environment.
+template <int Count, class Lanes>
+void read_lane(const typename Lanes::Wide (&sum)[Count], int lane, double (&one)[Count]) {
+  for (int n = 0; n < Count; ++n) one[n] = Lanes::lane(sum[n], lane);
+}
+
+// Sets pieces to where they are that start from there. `vertex(i)`, `guess(i)`: what Stepper has of one.
+template <class Lanes, class VertexOf, class Guess>
+void begin_still(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
+                 const Contacts<typename Lanes::Real>& contacts, const VertexOf& vertex,
+                 const Guess& guess) {
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Wide = typename Lanes::Wide;
+  for (int g = 0; g < plan.groups; ++g) {
+    for (Wide& sum : w.group_sums[g].start) sum = Wide(0.0);
+  }
+  const Real none(T(0));
+  each_in_a_piece<Lanes>(plan, [&](int i, int g) {
+    const auto v = vertex(i);
+    const auto vec3 = [](const auto& a) { return Lanes::vec3(a); };
+    add_start(w.group_sums[g].start, contacts, vec3(v.x), vec3(v.target), v.inertia, v.inverse,
+              vec3(w.u[i]), vec3(v.still(contacts)), vec3(w.u[i] - guess(i)));
+  });
+  bool some = false;
+  for (int g = 0; g < plan.groups; ++g) {
+    GroupSums<Wide>& sums = w.group_sums[g];
+    sums.still = false;
+    for (int lane = 0; lane < Lanes::environments; ++lane) {
+      double sum[StartSums::count];
+      read_lane<StartSums::count, Lanes>(sums.start, lane, sum);
+      const bool still = starts_still(sum);
+      Lanes::set_lane(w.still[g], lane, T(still));
+      sums.still = sums.still || still;
+    }
+    some = some || sums.still;
+  }
+  if (!some) return;
+  each_in_a_piece<Lanes>(plan, [&](int i, int g) {
+    if (!w.group_sums[g].still) return;
+    const auto stays = w.still[g] > none;
+    const Vec3<Real> u = Lanes::vec3(w.u[i]), still = Lanes::vec3(vertex(i).still(contacts));
+    w.u[i] = Lanes::value(
+        {select(stays, still.x, u.x), select(stays, still.y, u.y), select(stays, still.z, u.z)});
+  });
+}
+
 template <class Lanes>
 void sum_pieces(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w) {
   using Wide = typename Lanes::Wide;
@@ -51,12 +98,6 @@ void set_motion(Workspace<Lanes>& w, int g, int lane, const RigidMotion<double>&
   for (int r = 0; r < 3; ++r) set(to.turn.row[r], motion.turn.row[r]);
   set(to.center, motion.center);
   set(to.shift, motion.shift);
-}
-
-// Of one environment.
-template <int Count, class Lanes>
-void read_lane(const typename Lanes::Wide (&sum)[Count], int lane, double (&one)[Count]) {
-  for (int n = 0; n < Count; ++n) one[n] = Lanes::lane(sum[n], lane);
 }
 
 template <class Lanes>
@@ -147,6 +188,7 @@ void set_search(Workspace<Lanes>& w, const Contacts<typename Lanes::Real>& conta
   Lanes::set_lane(to.height, lane, T(one.height));
   Lanes::set_lane(to.reach, lane, T(one.reach));
   Lanes::set_lane(to.seeks, lane, T(one.seeks));
+  Lanes::set_lane(to.down, lane, T(one.down));
 }
 
 // Motions of pieces that tip: solver/tipping.h. Returns whether there are any.
@@ -173,10 +215,10 @@ bool tip_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
     if (!w.group_sums[g].tips) return;
     const Vec3<Real> u = Lanes::vec3(w.u[i]), y = Lanes::vec3(w.x[i] + w.u[i]);
-    Real depth, before;
-    w.search[g].look(contacts, w.motion[g], y, depth, before);
-    keep_found(w.group_sums[g].found, Lanes::widen(depth), Lanes::widen(before), widen(y),
-               widen(u));
+    Real order, depth, left;
+    w.search[g].look(contacts, w.motion[g], y, order, depth, left);
+    keep_found(w.group_sums[g].found, Lanes::widen(order), Lanes::widen(depth), Lanes::widen(left),
+               widen(y), widen(u));
   });
   for (int g = 0; g < plan.groups; ++g) {
     for (int lane = 0; lane < lanes; ++lane) {
@@ -199,7 +241,7 @@ bool tip_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
 
 template <class Lanes>
 void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
-                   const Contacts<typename Lanes::Real>& contacts) {
+                   const Contacts<typename Lanes::Real>& contacts, bool first) {
   using T = typename Lanes::Scalar;
   using Real = typename Lanes::Real;
   using Wide = typename Lanes::Wide;
@@ -215,7 +257,7 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
         double touch[Touch::sums];
         read_lane<Touch::sums, Lanes>(w.group_sums[g].touch, lane, touch);
         Tipping& tipping = w.tipping[g * lanes + lane];
-        begin_tipping(tipping, fit_of(w, g, lane), touched, touch,
+        begin_tipping(tipping, first, fit_of(w, g, lane), touched, touch,
                       [&](int k) { return plane_of<Lanes>(contacts, k, lane); });
         set_search(w, contacts, g, lane);
         tips = tipping.goes_on();

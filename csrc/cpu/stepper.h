@@ -64,9 +64,7 @@ class Stepper {
 
   void start() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      Value guess = set_.start == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
-      if (set_.start == StartKind::given) guess = in_.at_vertex(call_.start, i) - w_.x[i];
-      w_.u[i] = w_.before[i] = vertex(i).first(contacts_, guess);
+      w_.u[i] = w_.before[i] = vertex(i).first(contacts_, guess(i));
     }
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
@@ -85,9 +83,15 @@ class Stepper {
     started_ = true;
     if (plan_.groups == 0 || (first && set_.start == StartKind::given)) return;
     if (team_.rank == 0) {
+      if constexpr (Touching) {
+        if (first)
+          begin_still(
+              plan_, w_, contacts_, [&](int i) { return vertex(i); },
+              [&](int i) { return guess(i); });
+      }
       sum_pieces(plan_, w_);
       free_motions(plan_, w_);
-      if constexpr (Touching) limit_motions(plan_, w_, contacts_);
+      if constexpr (Touching) limit_motions(plan_, w_, contacts_, first);
     }
     team_.barrier();
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
@@ -97,6 +101,12 @@ class Stepper {
       if (first) w_.before[i] = w_.u[i];
     }
     team_.barrier();
+  }
+
+  // What the first iterate is made of.
+  Value guess(std::int64_t i) const {
+    if (set_.start == StartKind::given) return in_.at_vertex(call_.start, i) - w_.x[i];
+    return set_.start == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
   }
 
   void iterate(int k) {

@@ -23,11 +23,12 @@ inline Storage allocate_zeroed(std::size_t bytes) {
 // of a loose piece, see solver/rigid.h
 template <class Wide>
 struct GroupSums {
+  Wide start[StartSums::count];
   Wide rigid[RigidSums::count];
   Vec3<Wide> center;
   Wide gaps[Touch::planes + 1], touch[Touch::sums], bounds[Touch::bounds];
   Wide found[Found::count];
-  bool tips;  // in some environment
+  bool tips, still;  // in some environment
 };
 
 constexpr int shared_chunk = 256;  // shared vertices that one sum covers
@@ -52,6 +53,7 @@ struct Workspace {
   GroupSums<Wide>* group_sums;  // [groups]
   RigidMotion<Real>* motion;    // [groups]
   Real (*touched)[Touch::planes];  // [groups] 1 for each of the first planes that it touches
+  Real* still;                     // [groups] 1 if it starts from where it is
   Tipping* tipping;                // [groups, environments]
   TippingSearch<Real>* search;     // [groups]
   Plane<Real>* planes;
@@ -96,6 +98,7 @@ struct Workspace {
     place(group_sums, plan.groups, base);
     place(motion, plan.groups, base);
     place(touched, plan.groups, base);
+    place(still, plan.groups, base);
     const int tipping_groups = material.planes_count > 0 ? plan.groups : 0;
     place(tipping, tipping_groups * Lanes::environments, base);
     place(search, tipping_groups, base);

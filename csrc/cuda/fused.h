@@ -223,10 +223,10 @@ class FusedRunner {
     return memory_.letters + (std::int64_t(team_) * 2 + (round_ & 1)) * plan_.slots * Letter::words;
   }
   // Of a cluster its own vertices.
+  PD_DEVICE int own_slots() const { return Clustered ? patch_.interior : patch_.slots; }
   template <class Visit>
   PD_DEVICE void each_slot(const Visit& visit) {
-    const int slots = Clustered ? patch_.interior : patch_.slots;
-    for (int s = threadIdx.x; s < slots; s += blockDim.x) visit(s);
+    for (int s = threadIdx.x; s < own_slots(); s += blockDim.x) visit(s);
   }
 
   // for elements to see; of a cluster that happens when it is sent

@@ -11,13 +11,23 @@ struct MotionFinder {
   const DevicePlan<T>& plan;
   Vertices<T, Touching> v;
   Contacts<T> contacts;
+  const Settings& settings;
+  Aligning how;
   Piece<T>* pieces;  // of this block
   double* part_sums;
-  int first_part, end_part, first_slot;  // of its patch
+  int first_part, end_part, first_slot, slots;  // of its patch
   TeamSums<Kind> sums;
 
   PD_DEVICE void run() {
-    if (!parts_are_pieces(plan)) find<Rigid::mean>();
+    bool starts = false;
+    if constexpr (Touching) {
+      starts = how.first;
+      if (starts) {
+        find<Rigid::start>();
+        begin_still();
+      }
+    }
+    if (!starts && !how.at_once) find<Rigid::mean>();
     find<Rigid::free>();
     if constexpr (Touching) {
       find<Rigid::touching>();
@@ -33,12 +43,21 @@ struct MotionFinder {
     const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
     for (int n = first_part + warp; n < end_part; n += warps) {
       const Part part(plan, n, nullptr, -first_slot);
-      sum_part<What>(v, contacts, plan.pins > 0, parts_are_pieces(plan), part,
-                     pieces[part.piece(plan)], part_sums + PartSums::count * n);
+      sum_part<What>(v, contacts, settings, how, part, pieces[part.piece(plan)],
+                     part_sums + PartSums::count * n);
     }
     sums.meet();
     for (int n = warp; n < plan.pieces; n += warps)
-      move_piece<What>(plan, n, contacts, part_sums, pieces[n]);
+      move_piece<What>(plan, n, contacts, how, part_sums, pieces[n]);
+    __syncthreads();
+  }
+
+  // In every patch that has the vertices, not only where their parts are.
+  PD_DEVICE void begin_still() {
+    for (int s = threadIdx.x; s < slots; s += blockDim.x) {
+      const int number = plan.slot_piece[first_slot + s];
+      if (number >= 0 && pieces[number].still) v.set(s, v.at(s).still(contacts));
+    }
     __syncthreads();
   }
 
@@ -63,9 +82,18 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::align_pieces() {
   const bool first = !started_;
   started_ = true;
   if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
-  sums_ = find_motions<T, Touching, Kind>({plan_, v_, contacts_, &piece(0), part_sums(),
-                                           plan_.patch_part[index_], plan_.patch_part[index_ + 1],
-                                           patch_.first_slot, sums_});
+  sums_ = find_motions<T, Touching, Kind>({plan_,
+                                           v_,
+                                           contacts_,
+                                           set_,
+                                           {plan_, Touching, first},
+                                           &piece(0),
+                                           part_sums(),
+                                           plan_.patch_part[index_],
+                                           plan_.patch_part[index_ + 1],
+                                           patch_.first_slot,
+                                           own_slots(),
+                                           sums_});
   each_slot([&](int s) {
     const int number = plan_.slot_piece[patch_.first_slot + s];
     if (number < 0 || !(v_.u[s].w > 0)) return;  // of no piece, or pinned

@@ -6,23 +6,27 @@
 
 namespace pd::inline PD_TARGET {
 
-// Rounds: where a piece is, its motion if it touches nothing, what contacts leave of that, several where it tips, and nothing where
-// that leads into further contacts.
-enum class Rigid { mean, free, touching, tipping, beside };
+// Rounds: where a piece is, and before any iteration on contacts whether it starts from where it was; its motion if it touches nothing,
+// what contacts leave of that, several where it tips, and nothing where that leads into further contacts.
+enum class Rigid { start, mean, free, touching, tipping, beside };
 
-// The numbers of a part, see RigidSums and Touch, and the least gap of the last round. What a search finds comes where those of Touch
-// were.
+// The numbers of a part, see RigidSums and Touch, and the least gap of the last round. What a search finds, and what the start goes by,
+// comes where those of Touch are in their round.
 struct PartSums {
   static constexpr int rigid = 0, touch = RigidSums::count, bounds = touch + Touch::sums;
   static constexpr int touched = bounds + Touch::bounds, least_gap = touched + 1;
-  static constexpr int count = least_gap + 1, found = touch;
-  static_assert(Found::count <= Touch::sums);
+  static constexpr int count = least_gap + 1, found = touch, start = touch;
+  // after those of StartSums: of a (v - u), by which the mean moves with a piece that stays
+  static constexpr int back = StartSums::count, starts = back + 3;
+  static_assert(Found::count <= Touch::sums && starts <= Touch::sums);
 };
 
 template <class T>
 struct Piece {
   double sum[RigidSums::count], touch[Touch::sums], bounds[Touch::bounds];  // of all its parts
+  double start[PartSums::starts];
   double touched, least_gap;  // a bit for each of the first planes; see PartSums
+  bool still;                 // starts from where it is
   Vec3<double> center;
   RigidMotion<T> motion;
   Tipping tipping;
@@ -82,11 +86,17 @@ PD_DEVICE double write_shares(const double (&value)[Count], Op op, double* to) {
   return own;
 }
 
-// Every part is a whole piece, whose mean needs no round of its own.
-template <class T>
-PD_HD bool parts_are_pieces(const DevicePlan<T>& plan) {
-  return plan.parts == plan.pieces;
-}
+// What all rounds go by: whether this is before any iteration, there are pins, and no piece needs a round for its mean, since every
+// part is a whole one.
+struct Aligning {
+  bool first, pins, at_once;
+
+  template <class T>
+  PD_HD Aligning(const DevicePlan<T>& plan, bool touching, bool first)
+      : first(first),
+        pins(plan.pins > 0),
+        at_once(plan.parts == plan.pieces && !(touching && first)) {}
+};
 
 // The lane of a warp that has the least number, the first of them.
 PD_DEVICE int lane_of_least(double number) {
@@ -107,8 +117,9 @@ PD_HD Plane<To> plane_in(const Plane<From>& p) {
 
 // `to`: PartSums
 template <Rigid What, class T, bool Touching>
-PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool pins, bool whole,
-                             Part part, const Piece<T>& piece, double* to) {
+PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts,
+                             const Settings& settings, Aligning how, Part part,
+                             const Piece<T>& piece, double* to) {
   using S = RigidSums;
   const auto wide = [](const Vec3<T>& a) {
     return Vec3<double>{double(a.x), double(a.y), double(a.z)};
@@ -119,11 +130,26 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool
     part.each([&](int i) { add_mean(sum, double(v.inertia(i)), at(i)); });
     return write_shares(sum, Add{}, to + PartSums::rigid);
   };
-  if constexpr (What == Rigid::mean) {
+  if constexpr (What == Rigid::start) {
+    sum_mean();
+    double sum[StartSums::count] = {}, back[3] = {};
+    part.each([&](int i) {
+      const auto vertex = v.at(i);
+      const Vec3<T> u = vec3(v.u[i]), still = vertex.still(contacts);
+      add_start(sum, contacts, vertex.x, vertex.target, vertex.inertia, vertex.inverse, u, still,
+                u - v.guess(i, settings));
+      const Vec3<double> way = double(vertex.inertia) * (wide(still) - wide(u));
+      back[0] += way.x;
+      back[1] += way.y;
+      back[2] += way.z;
+    });
+    write_shares(sum, Add{}, to + PartSums::start);
+    write_shares(back, Add{}, to + PartSums::start + PartSums::back);
+  } else if constexpr (What == Rigid::mean) {
     sum_mean();
   } else if constexpr (What == Rigid::free) {
     Vec3<double> center;
-    if (whole) {
+    if (how.at_once) {
       const double own = sum_mean();
       double sum[S::lag];
       for (int n = 0; n < S::lag; ++n) sum[n] = __shfl_sync(whole_warp, own, n);
@@ -137,7 +163,7 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool
       add_moments(sum, double(v.inertia(i)), at(i) - center, wide(lag));
     });
     write_shares(sum, Add{}, to + PartSums::rigid + S::lag);
-    if (!pins) return;
+    if (!how.pins) return;
     part.each([&](int i) { add_pin(held, double(v.inertia(i)), at(i) - center); });
     write_shares(held, Add{}, to + PartSums::rigid + S::pins);
   } else if constexpr (What == Rigid::touching) {
@@ -157,17 +183,21 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts, bool
     if (!piece.tipping.goes_on()) return;
     const TippingSearch<double> s =
         piece.tipping.search(plane_in<double>(contacts.planes[piece.tipping.number]));
-    const TippingSearch<T> search = {vector_in<T>(s.normal), vector_in<T>(s.away), T(s.height),
-                                     T(s.reach), T(s.seeks)};
+    const TippingSearch<T> search = {vector_in<T>(s.normal),
+                                     vector_in<T>(s.away),
+                                     T(s.height),
+                                     T(s.reach),
+                                     T(s.down),
+                                     T(s.seeks)};
     double found[Found::count];
     for (double& number : found) number = HUGE_VAL;
     part.each([&](int i) {
       const Vec3<T> u = vec3(v.u[i]), y = vec3(v.x[i]) + u;
-      T depth, before;
-      search.look(contacts, piece.motion, y, depth, before);
-      keep_found(found, double(depth), double(before), wide(y), wide(u));
+      T order, depth, left;
+      search.look(contacts, piece.motion, y, order, depth, left);
+      keep_found(found, double(order), double(depth), double(left), wide(y), wide(u));
     });
-    if (int(threadIdx.x) % warp_size != lane_of_least(found[Found::depth])) return;
+    if (int(threadIdx.x) % warp_size != lane_of_least(found[Found::order])) return;
     for (int n = 0; n < Found::count; ++n) to[PartSums::found + n] = found[n];
   } else {
     double least = HUGE_VAL;
@@ -245,8 +275,8 @@ PD_DEVICE void find_over_parts(const DevicePlan<T>& plan, int piece, const doubl
   int best = plan.piece_start[piece];
   double least = HUGE_VAL;
   for (int at = best + lane; at < plan.piece_start[piece + 1]; at += warp_size) {
-    const double depth = read_part(plan, from, at, Found::depth);
-    if (depth < least) best = at, least = depth;
+    const double order = read_part(plan, from, at, Found::order);
+    if (order < least) best = at, least = order;
   }
   best = __shfl_sync(whole_warp, best, lane_of_least(least));
   for (int n = 0; n < Found::count; ++n) found[n] = read_part(plan, from, best, n);
@@ -263,21 +293,32 @@ PD_DEVICE_COLD void move_on_contacts(const Contacts<T>& contacts, Piece<T>& to) 
 // `part_sum`: [parts, PartSums::count]
 template <Rigid What, class T>
 PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T> contacts,
-                               const double* part_sum, Piece<T>& to) {
+                               Aligning how, const double* part_sum, Piece<T>& to) {
   const bool leader = threadIdx.x % warp_size == 0;
   const auto plane = [&](int k) { return plane_in<double>(contacts.planes[k]); };
-  if constexpr (What == Rigid::mean) {
-    over_parts<RigidSums::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+  using S = RigidSums;
+  if constexpr (What == Rigid::start) {
+    over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+    over_parts<PartSums::starts>(plan, piece, part_sum, Add{}, PartSums::start, to.start);
+    if (!leader) return;
+    double sum[StartSums::count];
+    for (int n = 0; n < StartSums::count; ++n) sum[n] = to.start[n];
+    to.still = starts_still(sum);
+    for (int n = 0; n < 3 && to.still; ++n) to.sum[S::position + n] += to.start[PartSums::back + n];
+    to.center = center_of(to.sum);
+  } else if constexpr (What == Rigid::mean) {
+    over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
     if (leader) to.center = center_of(to.sum);
   } else if constexpr (What == Rigid::free) {
-    if (plan.pins > 0) {
-      over_parts<RigidSums::count>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
-    } else {
-      over_parts<RigidSums::pins>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
-    }
+    if (how.at_once) over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+    over_parts<S::pins - S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid + S::lag,
+                                 to.sum + S::lag);
+    if (how.pins)
+      over_parts<S::count - S::pins>(plan, piece, part_sum, Add{}, PartSums::rigid + S::pins,
+                                     to.sum + S::pins);
     if (!leader) return;
-    if (plan.pins == 0) {
-      for (int n = RigidSums::pins; n < RigidSums::count; ++n) to.sum[n] = 0;
+    if (!how.pins) {
+      for (int n = S::pins; n < S::count; ++n) to.sum[n] = 0;
     }
     to.motion = motion_in<T>(RigidFit(to.sum).free());
   } else if constexpr (What == Rigid::touching) {
@@ -287,7 +328,7 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
     over_parts<Touch::sums>(plan, piece, part_sum, Add{}, PartSums::touch, to.touch);
     over_parts<Touch::bounds>(plan, piece, part_sum, Least{}, PartSums::bounds, to.bounds);
     if (!leader) return;
-    begin_tipping(to.tipping, RigidFit(to.sum), unsigned(to.touched), to.touch, plane);
+    begin_tipping(to.tipping, how.first, RigidFit(to.sum), unsigned(to.touched), to.touch, plane);
     if (!to.tipping.goes_on()) move_on_contacts(contacts, to);
   } else if constexpr (What == Rigid::tipping) {
     if (!to.tipping.goes_on()) return;

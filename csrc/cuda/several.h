@@ -410,12 +410,21 @@ class SeveralRunner {
   }
 
   PD_DEVICE void move_pieces(bool first) {
-    if (!parts_are_pieces(plan_)) find_motions<Rigid::mean>();
-    find_motions<Rigid::free>();
+    const Aligning how(plan_, Touching, first);
+    bool starts = false;
     if constexpr (Touching) {
-      find_motions<Rigid::touching>();
-      while (some_tip()) find_motions<Rigid::tipping>();
-      if (contacts(0).has_several()) find_motions<Rigid::beside>();
+      starts = first;
+      if (starts) {
+        find_motions<Rigid::start>(how);
+        begin_still();
+      }
+    }
+    if (!starts && !how.at_once) find_motions<Rigid::mean>(how);
+    find_motions<Rigid::free>(how);
+    if constexpr (Touching) {
+      find_motions<Rigid::touching>(how);
+      while (some_tip()) find_motions<Rigid::tipping>(how);
+      if (contacts(0).has_several()) find_motions<Rigid::beside>(how);
     }
     each_slot([&](const Seat& seat, int i) {
       const int number = plan_.slot_piece[seat.at];
@@ -437,21 +446,30 @@ class SeveralRunner {
     return __syncthreads_or(some);
   }
 
+  PD_DEVICE void begin_still() {
+    each_slot([&](const Seat& seat, int i) {
+      const int number = plan_.slot_piece[seat.at];
+      if (number >= 0 && piece(seat.environment, number).still)
+        v_.set(i, v_.at(i).still(contacts(seat.environment)));
+    });
+    __syncthreads();
+  }
+
   template <Rigid What>
-  PD_DEVICE void find_motions() {
+  PD_DEVICE void find_motions(Aligning how) {
     const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
     for (int n = warp; n < here_ * plan_.parts; n += warps) {
       const Seat at = seat_of(n, plan_.parts);
       const Part part(plan_, at.at, nullptr, at.environment * slots());
       const Piece<T>& piece = this->piece(at.environment, part.piece(plan_));
-      sum_part<What>(v_, contacts(at.environment), plan_.pins > 0, parts_are_pieces(plan_), part,
-                     piece, part_sums(at.environment) + PartSums::count * at.at);
+      sum_part<What>(v_, contacts(at.environment), set_, how, part, piece,
+                     part_sums(at.environment) + PartSums::count * at.at);
     }
     __syncthreads();
     for (int n = warp; n < here_ * plan_.pieces; n += warps) {
       const Seat at = seat_of(n, plan_.pieces);
-      move_piece<What>(plan_, at.at, contacts(at.environment), part_sums(at.environment),
-                       this->piece(at.environment, at.at));
+      move_piece<What>(plan_, at.at, contacts(at.environment), how, part_sums(at.environment),
+                       piece(at.environment, at.at));
     }
     __syncthreads();
   }

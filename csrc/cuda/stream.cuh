@@ -122,13 +122,22 @@ class StreamRunner {
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
-    if (!parts_are_pieces(plan_)) move_pieces<Rigid::mean>();
-    move_pieces<Rigid::free>();
+    const Aligning how(plan_, Touching, first);
+    bool starts = false;
     if constexpr (Touching) {
-      move_pieces<Rigid::touching>();
+      starts = first;
+      if (starts) {
+        move_pieces<Rigid::start>(how);
+        launcher_.run(stream_still<T>, patches_, vertex_threads, 0, call_);
+      }
+    }
+    if (!starts && !how.at_once) move_pieces<Rigid::mean>(how);
+    move_pieces<Rigid::free>(how);
+    if constexpr (Touching) {
+      move_pieces<Rigid::touching>(how);
       const Material<T>& material = call_.step.material;
-      if (material.planes_count > 0) tip();
-      if (material.planes_count + material.spheres_count > 1) move_pieces<Rigid::beside>();
+      if (material.planes_count > 0) tip(how);
+      if (material.planes_count + material.spheres_count > 1) move_pieces<Rigid::beside>(how);
     }
     launcher_.run(stream_align<T>, patches_, vertex_threads, 0, call_, first);
   }
@@ -234,19 +243,19 @@ class StreamRunner {
   }
 
   template <Rigid What>
-  void move_pieces() {
+  void move_pieces(Aligning how) {
     const std::int64_t batch = call_.step.batch;
     launcher_.run(stream_parts<What, T>, blocks_for(batch * plan_.parts * warp_size),
-                  vertex_threads, 0, call_);
+                  vertex_threads, 0, call_, how);
     launcher_.run(stream_pieces<What, T>, blocks_for(batch * plan_.pieces * warp_size),
-                  vertex_threads, 0, call_);
+                  vertex_threads, 0, call_, how);
   }
 
-  void tip() {
+  void tip(Aligning how) {
     if (plan_.parts <= tipping_parts) {
-      launcher_.run(stream_tipping<T>, call_.step.batch, tipping_threads, 0, call_);
+      launcher_.run(stream_tipping<T>, call_.step.batch, tipping_threads, 0, call_, how);
     } else {
-      for (int n = 0; n < tipping_rounds; ++n) move_pieces<Rigid::tipping>();
+      for (int n = 0; n < tipping_rounds; ++n) move_pieces<Rigid::tipping>(how);
     }
   }
 

@@ -65,13 +65,18 @@ struct Vertices {
 
   PD_DEVICE Vec3<T> straight(int i, T h) const { return h * vec3(velocity[i]); }
 
+  // What the first iterate is made of, if it is not given.
+  PD_DEVICE Vec3<T> guess(int i, const Settings& settings) const {
+    if (settings.start == StartKind::inertial) return vec3(target[i]);
+    return straight(i, T(settings.time_step));
+  }
+
   PD_DEVICE Vec3<T> first(int i, const Inputs<T>& in, int vertex,
                           const Contacts<T>& contacts) const {
     const Settings& settings = in.call->settings;
-    Vec3<T> guess = straight(i, T(settings.time_step));
-    if (settings.start == StartKind::inertial) guess = vec3(target[i]);
-    if (settings.start == StartKind::given) guess = in.first_iterate(vertex) - vec3(x[i]);
-    return at(i).first(contacts, guess);
+    const bool given = settings.start == StartKind::given;
+    return at(i).first(contacts,
+                       given ? in.first_iterate(vertex) - vec3(x[i]) : guess(i, settings));
   }
 
   PD_DEVICE void set(int i, const Vec3<T>& value) const { u[i] = quad(value, u[i].w); }

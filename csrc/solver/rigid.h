@@ -5,6 +5,9 @@
 // Few iterations cannot turn or shift a stiff piece as a whole; after this its momentum is right, linear and angular. Pins that hold
 // a piece at one point p leave it the turn about p, with p in place of both means; pins along a line the turn about that.
 //
+// Contacts push the vertices of its straight course out each for itself, which squeezes a piece; few iterations do not undo that
+// where it is stiff. Such a piece starts from where it is instead, and its rigid motions take it on.
+//
 // What a piece touches balances part of its momentum. A plane leaves it the turn about the normal and the way along the plane;
 // planes that meet leave the way along their edge. Neither moves any vertex towards a plane; solver/tipping.h has what may. With
 // friction the way along a plane is shortened by friction times the way that the plane stops, which is Coulomb's law for the sum of all
@@ -123,6 +126,22 @@ PD_COLD inline Mat3<double> best_turn_about(const Mat3<double>& covariance, cons
   return beyond_rounding(less_identity(turn, lift));
 }
 
+// By Cayley's formula: about an axis by 2 atan(|v| / 2), less the identity.
+PD_HD Mat3<double> small_turn(const Vec3<double>& v) {
+  const Mat3<double> half = cross_matrix(0.5 * v), square = half * half;
+  const double share = 2.0 / (1.0 + 0.25 * dot(v, v));
+  Mat3<double> turn = share * half;
+  for (int r = 0; r < 3; ++r) turn.row[r] = multiply_add(share, square.row[r], turn.row[r]);
+  return turn;
+}
+
+// R - I of about that share of a turn.
+PD_HD Mat3<double> part_of_turn(const Mat3<double>& turn, double share) {
+  if (share == 1.0) return turn;
+  const double trace = turn.row[0].x + turn.row[1].y + turn.row[2].z;
+  return small_turn(2.0 * share / (4.0 + trace) * axis_of(turn));
+}
+
 // What the sums say about a piece: where it turns, its shift, H, the square of its size, and the line along which pins hold it.
 struct RigidFit {
   Hold hold = Hold::none;
@@ -177,13 +196,62 @@ struct RigidFit {
 
 // What a piece would touch if it moved freely: a bit for each of the first planes, and one for all other contacts together. Sums over
 // the vertices that lie on those planes: of the slips and of 1 where there is friction; of 1, of their arms from the middle of the
-// piece, and of products of these. And the least of the slips and of their negatives, axis by axis.
+// piece, and of products of these. The least of the slips and of their negatives, axis by axis; and of the shares of that motion after
+// which vertices come to those planes.
 struct Touch {
   static constexpr int planes = 8;
   static constexpr unsigned others = 1u << planes;
   static constexpr int slip = 0, rubbing = 3, lying = 4, arm = 5, spread = 8, sums = 14;
-  static constexpr int bounds = 6;
+  static constexpr int share = 6, bounds = 7;
 };
+
+// Sums over the vertices of a piece that say from where it starts: of a |u - s|^2 and a |v - s|^2, u being its course out of the
+// contacts, v where it is; of k = D - a, k p and k |p|^2, p being how far contacts have pushed; and how many vertices pins hold, or forces
+// would lead into other contacts than the first planes.
+struct StartSums {
+  static constexpr int left = 0, before = 1, stiffness = 2, push = 3, square = 6, beside = 7;
+  static constexpr int count = 8;
+};
+
+// Adds a vertex to these; `still`: v.
+template <class W, class R>
+PD_HD void add_start(W (&sum)[StartSums::count], const Contacts<R>& contacts, const Vec3<R>& x,
+                     const Vec3<R>& target, const R& inertia, const R& inverse, const Vec3<R>& u,
+                     const Vec3<R>& still, const Vec3<R>& push) {
+  using S = StartSums;
+  const auto wide = [](const Vec3<R>& a) {
+    return Vec3<W>{convert<double>(a.x), convert<double>(a.y), convert<double>(a.z)};
+  };
+  const R none(0), one(1);
+  const int told = contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
+  const R apart = select(contacts.least_gap(x + target, told) > none, none, one);
+  const R beside = select(inverse > none, apart, one);
+  const W a = convert<double>(inertia);
+  const W stiffness = W(1.0) / convert<double>(select(inverse > none, inverse, one)) - a;
+  const Vec3<W> left = wide(u) - wide(target), before = wide(still) - wide(target);
+  const Vec3<W> p = wide(push), pull = stiffness * p;
+  const W add[S::count] = {
+      a * dot(left, left), a * dot(before, before), stiffness, pull.x, pull.y, pull.z,
+      dot(pull, p),        convert<double>(beside)};
+  for (int n = 0; n < S::count; ++n) sum[n] = sum[n] + add[n];
+}
+
+// Of the most that pushes may squeeze a piece by.
+constexpr double likely_squeeze = 0.5;
+// Less of what is left is no reason to give up the course, be it rounding of what lies on a plane.
+constexpr double least_squeeze = 0.01;
+
+// Whether a piece starts from where it is, since on its course more energy would be left, as far as that is told beforehand: strain that
+// there is already is not counted, and the squeeze is estimated by what pushes p differ. For any c it is at most
+// sum k / 2 |p - c|^2, by A <= D of solver/step.h, where D is the weighted diagonal.
+PD_HD bool starts_still(const double (&sum)[StartSums::count]) {
+  using S = StartSums;
+  if (!(sum[S::stiffness] > 0) || sum[S::beside] > 0) return false;
+  const double* p = sum + S::push;
+  const double mean = (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) / sum[S::stiffness];
+  const double squeeze = likely_squeeze * (sum[S::square] - mean);
+  return sum[S::left] + squeeze > sum[S::before] && squeeze > least_squeeze * sum[S::left];
+}
 
 // A vertex lies on a plane when it is no further off than this share of the way that the plane stops.
 constexpr double lies_within = 0.01;
@@ -201,9 +269,15 @@ PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
   const int told = contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
   for (int k = 0; k < told; ++k) {
     const Plane<R>& plane = contacts.planes[k];
-    near(k, gap(plane, moved));
+    const R before = gap(plane, y), after = gap(plane, moved);
+    near(k, after);
+    const auto comes = before > none && !(after > none);
+    const R share = before / select(comes, before - after, one);
+    bounds[Touch::share] =
+        lesser(bounds[Touch::share],
+               convert<double>(select(after > none, far, select(comes, share, none))));
     const R reach = -R(scalar_of<R>(lies_within)) * dot(motion.shift, plane.normal);
-    const R lies = select(gap(plane, y) < reach, one, none);
+    const R lies = select(before < reach, one, none);
     const R rubs = select(plane.friction > none, lies, none);
     const Vec3<R> slip = rubs * tangential(u, plane.normal);
     const W there = convert<double>(lies);
@@ -269,7 +343,8 @@ PD_COLD inline Vec3<double> slide(const Vec3<double>& shift, const Vec3<double>&
   return (1.0 - doubt / size) * way;
 }
 
-// The motion that contacts leave to a piece that touches some of them; `plane(k)` are the first of them.
+// The motion that contacts leave to a piece that touches some of them; `plane(k)` are the first of them. From above all of these it
+// goes as far as the first.
 template <class PlaneAt>
 PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touched,
                                              const double (&sums)[Touch::sums],
@@ -278,7 +353,14 @@ PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touch
   constexpr double parallel = 1e-12;  // square of what a normal adds to others
   if (touched == 0) return fit.free();
   RigidMotion<double> motion = fit.still();
-  if (fit.hold != Hold::none || touched & Touch::others) return motion;
+  if (touched & Touch::others) return motion;
+  if (bounds[Touch::share] > lies_within) {
+    motion = fit.free();
+    motion.turn = part_of_turn(motion.turn, bounds[Touch::share]);
+    motion.shift = bounds[Touch::share] * motion.shift;
+    return motion;
+  }
+  if (fit.hold != Hold::none) return motion;
   Vec3<double> normals[3];
   int count = 0, touches = 0;
   double friction = 0;

@@ -6,8 +6,10 @@
 // such forces are what the iterations converge to as well, nothing moves once they have converged; that two vertices which stick may
 // not be able to share the force, where it twists, is left to the iterations. Which they are is found by turns, as in an active set
 // method: first the one that lies furthest to where pressure has its centre, then the one that the turn about it takes deepest; of
-// three the two remain beyond whose line that centre lies. A turn that takes other vertices into a contact goes as far as that one.
-// All that costs a search over the vertices each time, and nothing where a piece touches nothing or rests evenly.
+// three the two remain beyond whose line that centre lies. A turn that takes other vertices into a contact goes as far as the first of
+// them; but those which lie on one already stay there. Before any iteration nothing has slid, friction acts against the way that a
+// piece would slide, and what is out of balance will do if it lowers E. All that costs a search over the vertices each time, and
+// nothing where a piece touches nothing or rests evenly.
 #pragma once
 #include "solver/rigid.h"
 
@@ -26,68 +28,68 @@ constexpr double pressure_beyond = 1e-6;  // of a line, at its ends
 constexpr int balance_steps = 8;          // of Newton's method
 constexpr double balanced = 1e-9;         // its last step
 
-// What a search finds: how deep a vertex goes beyond where it is, negative, or how far it lies; its distance from that contact before;
-// where it is, and its displacement.
+// What a search finds: the vertex of the least order; how deep it goes beyond where it is, negative, or how far it lies; its distance
+// from that contact, before and once it has dropped; where it is, and its displacement.
 struct Found {
-  static constexpr int depth = 0, before = 1, at = 2, way = 5, count = 8;
+  static constexpr int order = 0, depth = 1, left = 2, at = 3, way = 6, count = 9;
 };
 
 // What vertices are searched for.
 template <class R>
 struct TippingSearch {
   Vec3<R> normal, away;
-  R height, reach;
-  R seeks;  // 1: the vertex on the plane that lies furthest `away`; 0: the one that the motion takes deepest into a contact
+  R height, reach, down;  // down: how far the vertices drop that it turns about
+  R seeks;  // 1: the vertex on the plane that lies furthest `away`; 0: the one that stops the motion first
 
-  // Less is more of that.
+  // Less is more of that. Of what stops a motion: first what lies on a contact and would leave it, the deepest; then what comes to one
+  // after the least share of the motion; with no reach the deepest.
+  PD_HD R order_of(const R& left, const R& beyond) const {
+    const R none(0), one(1), two(2), three(3), deep = -beyond;
+    const auto some = reach > none, lies = left < reach;
+    const R scaled = beyond / select(some, reach, one);
+    const auto sinks = lies && deep > R(scalar_of<R>(rounded_depth)) * reach;
+    const auto comes = !lies && deep > R(scalar_of<R>(touching_depth)) * reach;
+    const R share = left / select(comes, left + deep, one);
+    const R order = select(comes, share - two, select(sinks, scaled - three, scaled));
+    return select(some, order, beyond);
+  }
+
   PD_HD void look(const Contacts<R>& contacts, const RigidMotion<R>& motion, const Vec3<R>& y,
-                  R& depth, R& before) const {
+                  R& order, R& depth, R& left) const {
     const R none(0), far(HUGE_VAL);
     const Vec3<R> way = motion.of(y);
-    depth = before = far;
-    const auto deeper = [&](const R& gap, const R& after) {
-      const R beyond = after - lesser(gap, none);
-      const auto takes = beyond < depth;
-      before = select(takes, gap, before);
+    order = depth = left = far;
+    const auto meet = [&](const R& gap, const R& after, const R& dropped) {
+      const R beyond = after - lesser(gap, none), own = order_of(dropped, beyond);
+      const auto takes = own < order;
+      left = select(takes, dropped, left);
       depth = select(takes, beyond, depth);
+      order = select(takes, own, order);
     };
     for (int k = 0; k < contacts.plane_count; ++k) {
+      const Vec3<R> n = contacts.planes[k].normal;
       const R distance = gap(contacts.planes[k], y);
       // as a difference, so that what stays where it is keeps its distance to the last bit
-      deeper(distance, distance + dot(contacts.planes[k].normal, way));
+      meet(distance, distance + dot(n, way), subtract_product(distance, down, dot(n, normal)));
     }
-    if (contacts.ball_count > 0)
-      deeper(contacts.least_gap(y, contacts.plane_count),
-             contacts.least_gap(y + way, contacts.plane_count));
+    if (contacts.ball_count > 0) {
+      const R distance = contacts.least_gap(y, contacts.plane_count);
+      meet(distance, contacts.least_gap(y + way, contacts.plane_count), distance);
+    }
     const R lies = dot(normal, y) - height;
     const R furthest = select(lies < reach, -dot(away, y), far);
+    order = select(seeks > none, furthest, order);
     depth = select(seeks > none, furthest, depth);
   }
 };
 
 // Keeps a vertex if it is more of what is searched for.
 template <class W>
-PD_HD void keep_found(W (&found)[Found::count], const W& depth, const W& before, const Vec3<W>& y,
-                      const Vec3<W>& u) {
-  const auto takes = depth < found[Found::depth];
-  const W own[Found::count] = {depth, before, y.x, y.y, y.z, u.x, u.y, u.z};
+PD_HD void keep_found(W (&found)[Found::count], const W& order, const W& depth, const W& left,
+                      const Vec3<W>& y, const Vec3<W>& u) {
+  const auto takes = order < found[Found::order];
+  const W own[Found::count] = {order, depth, left, y.x, y.y, y.z, u.x, u.y, u.z};
   for (int n = 0; n < Found::count; ++n) found[n] = select(takes, own[n], found[n]);
-}
-
-// By Cayley's formula: about an axis by 2 atan(|v| / 2), less the identity.
-PD_HD Mat3<double> small_turn(const Vec3<double>& v) {
-  const Mat3<double> half = cross_matrix(0.5 * v), square = half * half;
-  const double share = 2.0 / (1.0 + 0.25 * dot(v, v));
-  Mat3<double> turn = share * half;
-  for (int r = 0; r < 3; ++r) turn.row[r] = multiply_add(share, square.row[r], turn.row[r]);
-  return turn;
-}
-
-// R - I of about that share of a turn.
-PD_HD Mat3<double> part_of_turn(const Mat3<double>& turn, double share) {
-  if (share == 1.0) return turn;
-  const double trace = turn.row[0].x + turn.row[1].y + turn.row[2].z;
-  return small_turn(2.0 * share / (4.0 + trace) * axis_of(turn));
 }
 
 // A turn followed by another, all of them R - I.
@@ -113,7 +115,7 @@ struct Tipping {
   };
 
   Stage stage;
-  bool tips;                 // its motion is one of these
+  bool tips, first;          // its motion is one of these; before any iteration
   int number, count, round;  // of the plane; of vertices that it turns about; of searches
   double reach, share;       // of the turn
   // where pressure has its centre if nothing moves, from the middle of what lies there, and in all
@@ -128,9 +130,10 @@ struct Tipping {
 
   // `sums`: of the vertices that lie on the plane, see Touch. With none the piece is to land: the first vertex is the one that
   // its free motion takes deepest, which is what a search finds with that.
-  PD_HD void begin(const RigidFit& fit, int plane_number, const Plane<double>& plane,
-                   const double (&sums)[Touch::sums]) {
+  PD_HD void begin(bool first_of_step, const RigidFit& fit, int plane_number,
+                   const Plane<double>& plane, const double (&sums)[Touch::sums]) {
     end();
+    first = first_of_step;
     const Vec3<double> n = plane.normal;
     reach = -lies_within * dot(fit.shift, n);
     if (fit.hold != Hold::none || !(reach > 0.0)) return;
@@ -161,7 +164,8 @@ struct Tipping {
   }
 
   PD_HD TippingSearch<double> search(const Plane<double>& plane) const {
-    return {plane.normal, away, plane.height, reach, stage == Stage::seek ? 1.0 : 0.0};
+    const double down = count > 0 ? drop(plane) : 0.0, seeks = stage == Stage::seek ? 1.0 : 0.0;
+    return {plane.normal, away, plane.height, count > 0 || seeks > 0 ? reach : 0.0, down, seeks};
   }
 
   // Goes on by what a search has found: `motion` is where the piece goes, if this is the end, or what to search with. False where
@@ -170,7 +174,7 @@ struct Tipping {
                   const double (&found)[Found::count], RigidMotion<double>& motion) {
     const bool seeks = stage == Stage::seek;
     stage = Stage::none;
-    const double depth = found[Found::depth], before = found[Found::before];
+    const double depth = found[Found::depth], left = found[Found::left];
     if (!(depth < HUGE_VAL)) return false;
     const Vec3<double> u = read(found + Found::way);
     const Vertex vertex = {read(found + Found::at), tangential(u, plane.normal)};
@@ -179,14 +183,11 @@ struct Tipping {
       const Trial trial = turn_about(fit, plane);
       motion = trial.motion;
       if (depth < 0.0) motion.shift = subtract_product(motion.shift, depth, plane.normal);
-      return tips = trial.holds;
+      return tips = trial.holds || (first && lowers(fit, motion));
     }
-    // how much further they are than what comes to lie on the plane
-    const double down = count > 0 ? drop(plane) : 0.0, left = before - down;
     if (count == 0 || left < reach) {
-      const bool lies = gap(plane, vertex.at) - down < reach;
-      if (((seeks || count > 0) && !lies) || share < 1.0 || !take(vertex, plane.normal))
-        return false;
+      const bool lies = gap(plane, vertex.at) - (count > 0 ? drop(plane) : 0.0) < reach;
+      if (((seeks || count > 0) && !lies) || !take(vertex, plane.normal)) return false;
     } else if (left > depth) {
       share *= left / (left - depth);
     } else {
@@ -245,10 +246,7 @@ struct Tipping {
     return true;
   }
 
-  PD_HD Vec3<double> line() const {
-    const Vec3<double> way = on[1].at - on[0].at;
-    return (1.0 / square_root(dot(way, way))) * way;
-  }
+  PD_HD Vec3<double> line() const { return direction_of(on[1].at - on[0].at); }
 
   // How far above the plane they are.
   PD_HD double drop(const Plane<double>& plane) const {
@@ -268,17 +266,30 @@ struct Tipping {
     const Trial stuck = sticking(fit, plane);
     if (stuck.holds) return stuck;
     // the way that they slide, if that is known
-    Vec3<double> way = {0, 0, 0};
-    for (int i = 0; i < count; ++i) {
-      const double length = square_root(dot(on[i].slip, on[i].slip));
-      if (!(length > reach)) return stuck;
-      const Vec3<double> own = (1.0 / length) * on[i].slip;
-      if (i == 0) way = own;
-      const Vec3<double> apart = own - way;
-      if (!(dot(apart, apart) <= slips_alike * slips_alike)) return stuck;
+    Vec3<double> slips[2] = {on[0].slip, on[count - 1].slip};
+    if (first && !(slides(slips[0]) && slides(slips[1]))) {
+      const RigidMotion<double> free = fit.free();
+      for (int i = 0; i < 2; ++i)
+        slips[i] = slips[i] + tangential(free.of(on[i < count ? i : 0].at), plane.normal);
     }
+    if (!slides(slips[0]) || !slides(slips[1])) return stuck;
+    const Vec3<double> way = direction_of(slips[0]), apart = direction_of(slips[1]) - way;
+    if (!(dot(apart, apart) <= slips_alike * slips_alike)) return stuck;
     const Trial slid = sliding(fit, plane, way);
     return slid.holds ? slid : stuck;
+  }
+
+  // Whether E is less after a motion.
+  PD_HD static bool lowers(const RigidFit& fit, const RigidMotion<double>& motion) {
+    const Vec3<double> left = motion.of(fit.center) - fit.shift;
+    const double shifted = 0.5 * fit.weight * (dot(left, left) - dot(fit.shift, fit.shift));
+    return shifted < frobenius(motion.turn, fit.covariance);
+  }
+
+  PD_HD bool slides(const Vec3<double>& slip) const { return dot(slip, slip) > reach * reach; }
+
+  PD_HD static Vec3<double> direction_of(const Vec3<double>& a) {
+    return (1.0 / square_root(dot(a, a))) * a;
   }
 
   // About where they were before they slid.
@@ -363,13 +374,13 @@ struct Tipping {
 
 // Begins where a piece touches one plane of the first, alone.
 template <class PlaneAt>
-PD_HD void begin_tipping(Tipping& tipping, const RigidFit& fit, unsigned touched,
+PD_HD void begin_tipping(Tipping& tipping, bool first, const RigidFit& fit, unsigned touched,
                          const double (&sums)[Touch::sums], const PlaneAt& plane) {
   tipping.end();
   if (touched == 0 || touched >= Touch::others || (touched & (touched - 1)) != 0) return;
   int number = 0;
   while (touched >> number > 1) ++number;
-  tipping.begin(fit, number, plane(number), sums);
+  tipping.begin(first, fit, number, plane(number), sums);
 }
 
 }  // namespace pd::inline PD_TARGET

@@ -85,6 +85,12 @@ struct Vertex {
     return project(contacts, u, u);
   }
 
+  // where it is
+  PD_HD Value still(const Contacts<Real>& contacts) const {
+    const Real none(T(0));
+    return first(contacts, Lanes::value({none, none, none}));
+  }
+
   // dE/du, `force` being that of the elements, dE_elastic/du
   PD_HD Value gradient(const Value& u, const Value& force) const {
     return multiply_add(inertia, u - target, force);

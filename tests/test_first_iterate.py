@@ -1,0 +1,150 @@
+"""Where a step starts: on its straight course, or where a body is that contacts would squeeze by more than it gains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cases import Case, box, contact_block, leaning, rotation
+from runs import displacement, rounded_problem, simulator, state_of
+
+import torchpd as pd
+from torchpd.reference import StepProblem
+
+pytestmark = pytest.mark.usefixtures("poisoned")
+
+H = 1 / 60
+STEPS = 240
+
+LANDINGS = {
+    "cube on a corner": leaning(0.8, turn=(3.0, 10.0, 2.0), size=(0.2, 0.2, 0.2), cells=(3, 3, 3), height=0.001),
+    "cube on an edge": leaning(0.8, turn=(0.0, 10.0, 45.0), size=(0.2, 0.2, 0.2), cells=(3, 3, 3), height=0.05),
+    "cube on smooth ground": leaning(0.0, turn=(3.0, 10.0, 20.0), size=(0.2, 0.2, 0.2), cells=(3, 3, 3), height=0.05),
+    "column": leaning(0.8, turn=(3.0, 10.0, 2.0), size=(0.1, 0.4, 0.1), cells=(2, 8, 2), height=0.001),
+}
+
+
+@pytest.mark.parametrize("iterations", [3, 6, 64])
+@pytest.mark.parametrize("name", LANDINGS)
+def test_what_lands_comes_to_rest_whatever_the_iterations(name: str, iterations: int) -> None:
+    """Of 10 MPa: from where contacts had squeezed them they went on to jump at 0.3 to 0.7 m/s with three and six."""
+    case = LANDINGS[name]
+    sim = simulator(case, torch.float64, iterations=iterations)
+    masses = torch.from_numpy(case.scene.values().masses)
+    state, late = state_of(case, sim), []
+    for step in range(STEPS):
+        state = sim(state)
+        if step >= STEPS - 60:
+            late.append(float((masses[:, None] * state.velocities[0] ** 2).sum() / masses.sum()))
+    assert np.sqrt(np.mean(late)) < 0.01
+    height = float((masses * state.positions[0, :, 1]).sum() / masses.sum())
+    assert height == pytest.approx(0.2 if name == "column" else 0.1, rel=0.01)
+
+
+@pytest.mark.parametrize("corner", [False, True])
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+@pytest.mark.parametrize("tilt", [0.0, 0.1, 1.0, 5.0, 90.0])
+def test_what_falls_comes_to_the_ground_at_once(
+    tilt: float, friction: float, corner: bool, dtype: torch.dtype, device: torch.device
+) -> None:
+    """From where it is to where contacts stop it, though three iterations could not take it there."""
+    rng = np.random.default_rng(0)
+    planes = [pd.Ground(friction=friction), *([pd.Ground(normal=(1.0, 0.0, 0.0), friction=friction)] * corner)]
+    for size, cells in (((0.2, 0.2, 0.2), (3, 3, 3)), ((0.4, 0.05, 0.4), (6, 1, 6)), ((0.6, 0.1, 0.1), (8, 2, 2))):
+        vertices, tets = box(size, cells)
+        x = (vertices - vertices.mean(axis=0)) @ rotation(*(tilt * rng.standard_normal(3))).T
+        height = rng.uniform(0.005, 0.06)
+        x += height - x.min(axis=0)
+        way = -rng.uniform(4.0, 6.0, 3) * [corner, 1.0, 0.0]
+        v = way + np.cross(2.0 * rng.standard_normal(3), x - x.mean(axis=0))
+        case = Case(pd.Scene(pd.Solid(pd.TetMesh(x, tets), 1e7), pd.Gravity(), *planes), x, v, H)
+        assert case.problem().smallest_gap(H * v).min() < 0.0
+        sim = simulator(case, dtype, device, iterations=3)
+        after = sim(state_of(case, sim)).positions[0].double().cpu().numpy()
+        assert case.problem().smallest_gap(after - x).min() <= 0.02 * height
+
+
+@pytest.mark.parametrize("iterations", [0, 2, 64])
+def test_a_plane_that_nothing_comes_near_changes_nothing(iterations: int, device: torch.device) -> None:
+    """A soft block about to fall, of more energy on its course than where it is, keeps what stretches it."""
+    moving = contact_block(pd.Ground(-5.0), youngs=2e4, velocity=(0.0, 9.8 * H, 0.0))
+    moving = replace(moving, velocities=moving.velocities + moving.positions * [0.2, 0.0, 0.0])
+    alone = replace(moving, scene=pd.Scene(*(part for part in moving.scene.parts if not isinstance(part, pd.Ground))))
+    sims = [simulator(case, torch.float64, device, iterations=iterations) for case in (moving, alone)]
+    near, far = (displacement(sim, sim(state_of(moving, sim))) for sim in sims)
+    assert np.abs(near - far).max() <= 1e-12 * np.abs(far).max()
+
+
+def sinking(youngs: float) -> Case:
+    """A single tetrahedron, one corner of which comes below the ground."""
+    corners = np.array([[0.0, 0.0, 0.0], [0.3, 0.2, 0.0], [0.0, 0.25, 0.2], [-0.2, 0.3, -0.1]])
+    mesh = pd.TetMesh(corners, np.array([[0, 1, 2, 3]]))
+    mesh = mesh if np.linalg.det(corners[1:] - corners[0]) > 0 else pd.TetMesh(corners, np.array([[0, 2, 1, 3]]))
+    scene = pd.Scene(pd.Solid(mesh, youngs), pd.Gravity(), pd.Ground(0.0))
+    return Case(scene, corners, np.tile([0.0, -0.6, 0.0], (4, 1)), H)
+
+
+def critical_stiffness(weighted: bool) -> float:
+    """Where the course is as good as no way, by hand: corner 0 is pushed out by d, all others sink by d.
+
+    sum a |u - s|^2 is left, a_0 (d + f)^2 + sum_j a_j f^2 with f the fall by gravity; k_0 (1 - k_0 / sum k) d^2 / 2 is
+    the squeeze; sum a (d + f)^2 if they stay.
+    """
+    problem = sinking(1.0).problem()
+    d, f = H * 0.6, 9.81 * H**2
+    a = problem.weight
+    k = (problem.weighted_diagonal if weighted else problem.plain_diagonal) - a  # of 1 Pa
+    gain = a.sum() * (d + f) ** 2 - a[0] * (d + f) ** 2 - a[1:].sum() * f**2
+    return float(gain / (0.5 * k[0] * (1.0 - k[0] / k.sum()) * d**2))
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_it_starts_where_it_is_from_that_stiffness_on(weighted: bool, dtype: torch.dtype, device: torch.device) -> None:
+    """On the course three corners go down; where it is, a rigid motion turns it about the lowest one."""
+    critical = critical_stiffness(weighted)
+    solver = pd.Jacobi(diagonal="weighted" if weighted else "plain")
+    for factor in (0.99, 1.01):
+        case = sinking(factor * critical)
+        problem = rounded_problem(case, dtype)
+        course = problem.align(problem.course(), first=True)
+        still = problem.align(np.zeros_like(course), first=True)
+        assert np.abs(course - still).max() > 1e-3
+        sim = simulator(case, dtype, device, solver=solver, iterations=0)
+        found = displacement(sim, sim(state_of(case, sim)))
+        expected = problem.align(course if factor < 1.0 else still)
+        assert np.abs(found - expected).max() <= 1e-5 * np.abs(expected).max()
+        assert np.array_equal(problem.first_iterate(weighted=weighted), course if factor < 1.0 else still)
+
+
+def test_environments_choose_for_themselves(device: torch.device) -> None:
+    """The same state in materials on both sides of that stiffness, beside each other and alone."""
+    case = sinking(critical_stiffness(True))
+    sim = simulator(case, torch.float64, device, iterations=0)
+    factors = torch.tensor([0.9, 1.1, 0.99, 1.01, 2.0, 0.5, 1.1, 0.9, 1.01], dtype=torch.float64, device=device)
+    sim.set_material(stiffness=sim.stiffness * factors[:, None])
+    after = sim(state_of(case, sim, len(factors)))
+    for n, factor in enumerate(factors.tolist()):
+        alone = simulator(sinking(factor * critical_stiffness(True)), torch.float64, device, iterations=0)
+        assert torch.equal(after.positions[n], alone(state_of(case, alone)).positions[0])
+    assert len({tuple(x) for x in after.positions[:, 1].tolist()}) == 2
+
+
+def on(*planes: pd.Part, **options: object) -> tuple[StepProblem, Case]:
+    case = contact_block(*planes, velocity=(0.0, -1.0, 0.0), youngs=1e7)
+    case = replace(case, velocities=case.velocities + 1e-3 * case.positions)
+    return case.problem(), case
+
+
+def test_balls_and_pins_leave_it_on_its_course() -> None:
+    """What rigid motions do not free from the squeeze keeps its momentum."""
+    lands, _ = on(pd.Ground(-0.001))
+    assert (lands.first_iterate() - lands.align(lands.course(), first=True)).any()
+    for part in (pd.Sphere((0.15, -0.2, 0.15), 0.199), None):
+        problem, case = on(pd.Ground(-0.001)) if part is None else on(part)
+        if part is None:
+            body = case.scene.solids[0]
+            pinned = pd.Scene(*case.scene.parts, pd.Pin(body, [0]))
+            problem = replace(case, scene=pinned).problem()
+        assert np.array_equal(problem.first_iterate(), problem.align(problem.course(), first=True))
