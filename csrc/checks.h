@@ -282,7 +282,8 @@ Values<T> values_view(const Tensor& t, std::int64_t rows, std::int64_t width, bo
   const bool own = sizes.size() == shape.size() + 1 && (sizes[0] == batch || sizes[0] == 1);
   TORCH_CHECK_VALUE((own ? sizes.slice(1) : sizes) == at::IntArrayRef(shape), "material.", name,
                     " must be ", at::IntArrayRef(shape), " or the same after a batch of ", batch,
-                    " (", meaning, "), got ", describe(t));
+                    ", as many environments as the positions have (", meaning, "), got ",
+                    describe(t));
   return {t.const_data_ptr<T>(), own && sizes[0] == batch ? rows * width : 0};
 }
 

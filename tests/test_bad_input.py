@@ -129,7 +129,7 @@ def test_steps_of_a_rollout_are_checked(steps: int, every: int, sim: pd.Simulato
 
 def test_material_is_checked(sim: pd.Simulator) -> None:
     wrong: list[tuple[str, Tensor, str]] = [
-        ("masses", sim.masses[:-1], r"material\.masses must be \[27\] or the same after a batch of 2"),
+        ("masses", sim.masses[:-1], r"material\.masses must be \[27\] or the same after a batch of 2, as many"),
         ("masses", sim.masses.repeat(3, 1), r"material\.masses must be \[27\] or the same after a batch of 2"),
         (
             "masses",

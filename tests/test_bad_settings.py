@@ -31,6 +31,7 @@ def test_settings_of_a_simulator_are_checked() -> None:
         ({"iterations": -1}, ValueError, r"iterations must be a whole number >= 0, got -1"),
         ({"iterations": 2.5}, ValueError, r"iterations must be a whole number >= 0, got 2\.5"),
         ({"time_step": "fast"}, ValueError, r"time_step must be positive and finite \[s\], got 'fast'"),
+        ({"time_step": "1"}, ValueError, r"time_step must be positive and finite \[s\], got '1'"),
         ({"time_step": None}, ValueError, r"time_step must be positive and finite \[s\], got None"),
         ({"iterations": "many"}, ValueError, r"iterations must be a whole number >= 0, got 'many'"),
         ({"iterations": math.nan}, ValueError, r"iterations must be a whole number >= 0, got nan"),
@@ -249,7 +250,8 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
     masses[4:6] = -0.5
     sparse, unreal = torch.ones(48).to_sparse(), torch.ones(48, device="meta")
     for arrays, kind, message in (
-        ({"youngs": 1e5}, TypeError, r"no array 'youngs'; there are stiffness, masses"),
+        ({"youngs": 1e5}, TypeError, r"no array 'youngs'; there are stiffness, masses.*; stiffness is Young's modulus"),
+        ({"friction": 0.5}, TypeError, r"no array 'friction'; .*; friction is planes\[\.\.\., 4\] and"),
         (
             {"stiffness": torch.ones(3)},
             ValueError,

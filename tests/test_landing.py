@@ -84,7 +84,8 @@ def test_environments_that_land_differently_do_not_know_of_each_other(
     starts = [(s.positions.to(dtype), f * s.velocities.to(dtype)) for f in factors for s in states[:STEPS]][:17]
     positions, velocities = (torch.cat(parts) for parts in zip(*starts, strict=True))
     together, info = sim(pd.State(positions, velocities), return_info=True)
-    assert len(set(info.restarts.tolist())) > 4
+    assert int(info.restarts.min()) <= 2
+    assert int(info.restarts.max()) >= 9
     assert (len(set(info.iterations.tolist())) > 1) == (tolerance > 0.0)
     for i, (x, v) in enumerate(starts):
         alone = sim(pd.State(x, v))

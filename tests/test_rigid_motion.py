@@ -211,6 +211,26 @@ def spinning_plate(spin: float, speed: float) -> Case:
     return Case(scene, vertices, turning + [speed, 0.0, 0.0], H)
 
 
+def gripped(gravity: float = 0.0) -> Case:
+    """A cube between two rough balls that squeeze it, and lift it in this step."""
+    vertices, tets = box((0.1, 0.1, 0.1), (2, 2, 2))
+    vertices = vertices - 0.05
+    balls = [pd.Sphere((side * 0.149, 0.0, 0.0), 0.1, friction=1.0) for side in (-1.0, 1.0)]
+    scene = pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e5), pd.Gravity((0.0, gravity, 0.0)), *balls)
+    starts = np.array([ball.center for ball in balls])
+    lifted = {"sphere_centers": starts + [0.0, 0.002, 0.0], "sphere_starts": starts}
+    return Case(scene, vertices, 0.0 * vertices, H, extras=lifted)
+
+
+def wedged(friction: float = 1.0) -> Case:
+    """A cube that rough walls squeeze, nearer to each other above it: it hangs, though nothing is below it."""
+    vertices, tets = box((0.1, 0.1, 0.1), (2, 2, 2))
+    vertices = vertices - 0.05
+    walls = [pd.Ground(-0.0495, normal=(side, -0.05, 0.0), friction=friction) for side in (-1.0, 1.0)]
+    scene = pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e5), pd.Gravity(), *walls)
+    return Case(scene, vertices, 0.0 * vertices, H)
+
+
 @pytest.mark.parametrize(
     "case",
     [
@@ -218,11 +238,11 @@ def spinning_plate(spin: float, speed: float) -> Case:
         spinning_plate(0.0, 0.01), pressed_corner(), slope(0.3, 0.6), slope(0.5, 0.3), slope(0.5, 0.0),
         contact_block(pd.Ground(0.0, friction=0.4), velocity=(1.0, -1.0, 0.0)),
         contact_block(pd.Ground(0.0), pd.Ground(0.0, normal=(1.0, 0.0, 0.0)), velocity=(-1.0, -1.0, 0.5)),
-        rod(1e5, pd.Gravity(), spin=20.0),
+        rod(1e5, pd.Gravity(), spin=20.0), gripped(), gripped(-9.8), wedged(),
     ],
     ids=[
         "slides", "spins and stops", "spins slowly", "spins and slides", "sticks", "pressed at a corner", "holds",
-        "slides down", "smooth", "lands", "edge", "flies",
+        "slides down", "smooth", "lands", "edge", "flies", "gripped", "gripped, heavy", "wedged",
     ],
 )  # fmt: skip
 def test_nothing_moves_once_iterations_have_converged(case: Case) -> None:

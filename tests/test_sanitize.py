@@ -19,7 +19,7 @@ TOOLS = Path(__file__).parent.parent / "tools"
 H100 = Properties(132, 232448, 16)
 FAR_THREADS = {torch.float32: 384, torch.float64: 192}  # far_threads of csrc/cuda/fused.cuh
 PIPELINE_SLOTS = 1024  # csrc/cuda/pipeline.h
-TIPPING_PARTS = 128  # csrc/cuda/stream.h: more than one block searches
+ROUNDS_WARPS = 4  # csrc/cuda/stream_rigid.h: with more parts a team has several blocks
 
 
 @pytest.fixture(name="tool", scope="module")
@@ -49,7 +49,7 @@ def test_patches_are_what_the_kernels_are_to_see(tool: dict[str, Any], dtype: to
         }
         for plan in (*plans["grid"], *plans["far"], plans["stream"][0]):
             assert len(plan.shared_start) > 1  # else nothing is exchanged
-        assert plans["stream"][1].size("parts") > TIPPING_PARTS
+        assert plans["stream"][1].size("parts") > ROUNDS_WARPS
         (far,) = plans["far"]
         assert min(far.size("most_slots"), 2 * far.size("most_pairs")) > FAR_THREADS[dtype]
         assert bool((far.patch_outer > 0).all())

@@ -259,7 +259,8 @@ def test_what_is_dropped_comes_to_rest(count: int, dtype: torch.dtype, device: t
     track = sim.rollout(state_of(case, sim), 150)
     assert float(track.velocities[-30:].abs().max()) <= 5e-3
     foot = track.positions[-1, 0, :, 1]
-    assert float(foot.min()) >= 0.0
+    # iterations push it out by the way of gravity in a step, to the rounding of that
+    assert float(foot.min()) >= -ULP[dtype] * 9.8 * H**2
     assert int((foot < 1e-5).sum()) == 16
 
 

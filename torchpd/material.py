@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MATERIAL_ROWS",
+    "PARTS_OF_ROWS",
     "check_array",
     "check_batches",
     "check_material",
@@ -27,6 +28,14 @@ __all__ = [
 ]
 
 MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
+# What users look for by the names of scenes.
+PARTS_OF_ROWS = {
+    "friction": "friction is planes[..., 4] and spheres[..., 4]",
+    "height": "the height of a ground is planes[..., 3]",
+    "radius": "the radius of a sphere is spheres[..., 3]",
+    "density": "masses are of vertices [kg], a density times their share of volume",
+    "youngs": "stiffness is Young's modulus of each tetrahedron [Pa]",
+}
 
 _UNIT_SLACK = 1e-4  # of the length of a plane's normal: float32 rounding and a training step's
 

@@ -14,7 +14,7 @@ from torch.nn.utils.parametrize import is_parametrized
 from .automatic import AIM, Choice, choose_solver
 from .checks import check_has_values, check_like, check_whole, of_each
 from .forecast import FAR_TOO_FEW, warn_of_few_iterations
-from .material import MATERIAL_ROWS, check_array, check_batches, material_of
+from .material import MATERIAL_ROWS, PARTS_OF_ROWS, check_array, check_batches, material_of
 from .multilevel import has_levels, has_strangers
 from .parametrized import invert, parametrization
 from .placing import check_wanted_device, move_plan, plan_anew, plan_for_solver, plan_on
@@ -290,7 +290,8 @@ class Model(nn.Module):
         check_has_values(owner, self.device)
         for name in arrays:
             if name not in MATERIAL_ROWS:
-                raise TypeError(f"{owner}: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}")
+                part_of = f"; {PARTS_OF_ROWS[name]}" if name in PARTS_OF_ROWS else ""
+                raise TypeError(f"{owner}: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}{part_of}")
         checked = {name: check_array(owner, name, value, getattr(self, name)) for name, value in arrays.items()}
         for name, value in arrays.items():
             if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
@@ -513,7 +514,7 @@ def _kind_of(value: object) -> str:
 
 def _number_or_nan(value: float) -> float:
     try:
-        return float(value)
+        return math.nan if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         return math.nan
 

@@ -3,7 +3,8 @@
 Along them E is sum a / 2 |x + u - (x + s)|^2, a weighted fit of two sets of points (Kabsch 1976). Hard pins at a point
 or along a line leave turns about that; smooth planes the turn about their normal and the way along all of them; a plane
 with friction the way along it, shortened as by Coulomb. On one plane a component may tip besides (`_Tipping`); one that
-hovers goes as far as the first plane. Other contacts leave it nothing.
+hovers goes as far as the first plane. Other contacts leave it nothing. Where a motion ends since the component comes to
+a contact, it goes on from there.
 """
 
 from __future__ import annotations
@@ -26,11 +27,15 @@ LYING = 0.01  # of the way that a plane stops: a vertex lies on it that is no fu
 TOUCHING = 1e-3  # of that: vertices may go so deep, and are lifted out again
 ROUNDED = 0.1  # the same of those that it turns about
 RESTING = 0.5  # square of how far off pressure is, by the spread of what lies on the plane
-ROUNDS = 5  # searches for the vertices that it tips about
+LEGS = 4  # parts of a motion that contacts end one after the other
+ROUNDS = 8  # searches for the vertices that it tips about
+IN_LINE = 1e-6  # of three vertices, by how far one is off
 ALIKE = 0.02  # directions of slips that count as one: their distance
 NEWTON = 8  # steps to a balance of torques
 ONWARD = 0.9  # least cosine between a slip before and after
+HALF_TURN = 1e-6  # 4 cos^2(angle / 2), at most, of what counts as half a turn
 SQUEEZE = 0.5  # of the most that pushes of contacts may squeeze a component by
+LIFT = 6.0  # of what it costs to shift it as a whole by that push
 WORTH = 0.01  # of what is left: less squeeze is no reason to give up the course
 
 
@@ -52,8 +57,9 @@ def begin(problem: StepProblem, guess: Array, diagonal: Array) -> Array:
     """The first iterate [V, 3], before rigid motions: `guess` out of the contacts, or components where they are.
 
     Contacts push vertices out each for itself, by p, which squeezes a component by sum k / 2 |p - mean p|^2 at most,
-    k = D - a. One that starts from where it is has less energy left, half of that counted. It has no hard pins, and
-    forces would take it into no other contacts than the first planes.
+    k = D - a. One that starts from where it is has less energy left, half of that counted, there or after rigid
+    motions: a shift by how far contacts push, d, costs sum a / 2 d^2. It has no hard pins, and forces would take it
+    into no other contacts than the first planes.
     """
     planes, out = problem.values.planes, problem.project(guess, guess)
     kept = problem._hold(np.zeros_like(guess))
@@ -67,7 +73,9 @@ def begin(problem: StepProblem, guess: Array, diagonal: Array) -> Array:
         k = diagonal[of, None] - a
         squeeze = SQUEEZE * float((k * (push - (k * push).sum(axis=0) / max(k.sum(), 1e-300)) ** 2).sum())
         left, before = (float((a * (u - problem.target)[of] ** 2).sum()) for u in (out, still))
-        if left + squeeze > before and squeeze > WORTH * left:
+        pushed = float(k[push.any(axis=1)].sum())
+        lift = LIFT * float(a.sum()) * float((k * push**2).sum()) / max(pushed, 1e-300)
+        if squeeze > min(before - left, lift) and squeeze > WORTH * left:
             begun[of] = still[of]
     return begun
 
@@ -79,8 +87,14 @@ def align(
     values, moved = problem.values, displacement.copy()
     for number in range(int(values.component.max()) + 1):
         of = values.component == number
-        moved[of] += _Piece(problem, displacement, of, nearest_rotation, first).motion()
-    return np.where(problem.free[:, None], moved, displacement)
+        for _ in range(LEGS):
+            piece = _Piece(problem, moved, of, nearest_rotation, first)
+            way = np.zeros_like(moved)
+            way[of] = piece.motion()
+            moved = np.where(problem.free[:, None], moved + way, moved)
+            if not piece.comes:
+                break
+    return moved
 
 
 class _Piece:
@@ -99,19 +113,49 @@ class _Piece:
         self.covariance = self.about(self.middle + self.lag, self.middle)
         self.pinned = ~problem.free[of]
         self.rest = problem.values.rest_positions[of]
+        self.comes = False  # its motion ends where it comes to a contact
 
     def about(self, goal: Array, pivot: Array) -> Array:
         """Sum of a (z - goal) (y - pivot)^T."""
         return np.asarray((self.weight * (self.z - goal)).T @ (self.y - pivot))
 
-    def gaps(self, positions: Array, planes: Array) -> Array:
-        return gaps_of(positions, planes, self.problem.sphere_centers, self.problem.values.spheres)
+    def gaps(self, positions: Array, planes: Array, *, balls: bool = True) -> Array:
+        spheres = self.problem.values.spheres if balls else np.zeros((0, 5))
+        return gaps_of(positions, planes, self.problem.sphere_centers[: len(spheres)], spheres)
 
-    def deepest(self, moved: Array, drop: Array, reach: float = 0.0) -> tuple[int, float, float]:
+    def left(self, moved: Array, planes: Array, *, balls: bool = True) -> Array:
+        """Gaps after a motion. After the iterations 0 or less too where a force could keep a vertex from that motion.
+
+        That is one within the cone of friction of a contact on which it lies: contacts that go round a component, or
+        are curved, may hold it with forces that no single one of them shows.
+        """
+        after, way = self.gaps(moved, planes, balls=balls), moved - self.y
+        if self.first:
+            return after
+        size = np.linalg.norm(way, axis=1)
+        contacts = [(np.broadcast_to(p[:3], way.shape), self.y @ p[:3] - p[3], p[4]) for p in planes]
+        if balls:
+            for center, sphere in zip(self.problem.sphere_centers, self.problem.values.spheres, strict=True):
+                arm = self.y - center
+                length = np.linalg.norm(arm, axis=1, keepdims=True)
+                outward = np.where(length > 0.0, arm / np.maximum(length, 1e-300), [0.0, 1.0, 0.0])
+                contacts.append((outward, length[:, 0] - sphere[3], sphere[4]))
+        for normals, before, friction in contacts:
+            across = (normals * way).sum(axis=1)
+            lift = across - friction * np.linalg.norm(way - across[:, None] * normals, axis=1)
+            after = np.where(before <= LYING * size, np.minimum(after, lift), after)
+        return after
+
+    def left_of(self, plane: Array, free: Array) -> Array:
+        """The same for one of the first planes; alone it shows what it holds."""
+        several = len(self.planes) + len(self.problem.values.spheres) > 1
+        return self.left(free, plane[None], balls=False) if several else np.asarray(free @ plane[:3] - plane[3])
+
+    def deepest(self, moved: Array, drop: Array, reach: float) -> tuple[int, float, float]:
         """The vertex that stops a motion first, how deep it goes beyond where it was, and how far off a drop leaves it.
 
         Those that then lie on a contact, less than `reach` off, come first, the deepest; then those that come to it
-        after the least share of the motion. Without a reach the deepest.
+        after the least share of the motion.
         """
         none = self.planes[:0]
         each = [(self.y @ plane[:3] - plane[3], moved @ plane[:3] - plane[3]) for plane in self.planes]
@@ -119,13 +163,11 @@ class _Piece:
         before, after = (np.stack(part) for part in zip(*each, strict=True))
         depths = after - np.minimum(before, 0.0)
         left = before + np.append(self.planes[:, :3] @ drop, 0.0)[:, None]
-        order = depths
-        if reach > 0.0:
-            with np.errstate(invalid="ignore", divide="ignore"):
-                share = np.where(np.isfinite(left), left / (left - depths), 1.0)
-            order = depths / reach
-            order = np.where((left < reach) & (depths < -ROUNDED * reach), order - 3.0, order)
-            order = np.where((left >= reach) & (depths < -TOUCHING * reach), share - 2.0, order)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = np.where(np.isfinite(left), left / (left - depths), 1.0)
+        order = depths / reach
+        order = np.where((left < reach) & (depths < -ROUNDED * reach), order - 3.0, order)
+        order = np.where((left >= reach) & (depths < -TOUCHING * reach), share - 2.0, order)
         contact, worst = np.unravel_index(int(order.argmin()), depths.shape)
         return int(worst), float(depths[contact, worst]), float(left[contact, worst])
 
@@ -149,9 +191,9 @@ class _Piece:
             covariance = self.about(pivot, pivot)
             turn = _turn_about(directions[0], covariance) if sizes[0] > apart else self.nearest_rotation(covariance)
         free = (self.y - pivot) @ turn.T + pivot + shift
-        if self.gaps(free, self.planes[TOLD:]).min() <= 0.0:
+        if self.left(free, self.planes[TOLD:]).min() <= 0.0:
             return still
-        touched = np.array([bool((free @ plane[:3] <= plane[3]).any()) for plane in self.planes[:TOLD]], dtype=bool)
+        touched = np.array([bool((self.left_of(plane, free) <= 0.0).any()) for plane in self.planes[:TOLD]], dtype=bool)
         if not touched.any():
             return np.asarray(free - self.y)
         planes = self.planes[:TOLD][touched]
@@ -161,6 +203,7 @@ class _Piece:
                 return tipped
         share = self.share_to(planes, free)
         if share > LYING:
+            self.comes = True
             part = _part(turn, share) @ (self.y - pivot).T
             return np.asarray(part.T + pivot + share * shift - self.y)
         if self.pinned.any():
@@ -169,14 +212,21 @@ class _Piece:
         if np.linalg.matrix_rank(planes[:, :3], tol=1e-6) == 1 and not planes[:, 4].any():
             turn = _turn_about(planes[0, :3], self.covariance)
         along = (self.y - self.middle) @ (turn - np.eye(3)).T + shift
-        others = np.concatenate([self.planes[:TOLD][~touched], self.planes[TOLD:]])
-        return np.asarray(along if self.gaps(self.y + along, others).min() > 0.0 else still)
+        beside = min(
+            self.gaps(self.y + along, self.planes[:TOLD][~touched], balls=False).min(),
+            self.left(self.y + along, self.planes[TOLD:]).min(),
+        )
+        return np.asarray(along if beside > 0.0 else still)
 
     def share_to(self, planes: Array, free: Array) -> float:
         """Of its free motion, that brings it to planes."""
-        before, after = (y @ planes[:, :3].T - planes[:, 3] for y in (self.y, free))
-        shares = np.where(before > 0.0, before / np.where(after > 0.0, 1.0, np.maximum(before - after, 1e-300)), 0.0)
-        return float(shares[after <= 0.0].min())
+        least = 1.0
+        for plane in planes:
+            before, after = (y @ plane[:3] - plane[3] for y in (self.y, free))
+            comes, touches = (before > 0.0) & (after <= 0.0), self.left_of(plane, free) <= 0.0
+            shares = np.where(comes, before / np.where(comes, np.maximum(before - after, 1e-300), 1.0), 0.0)
+            least = min(least, float(shares[touches].min(initial=1.0)))
+        return least
 
     def slips(self, normal: Array) -> Array:
         return np.asarray(self.u - np.outer(self.u @ normal, normal))
@@ -216,41 +266,38 @@ class _Tipping:
 
     def __init__(self, piece: _Piece, plane: Array) -> None:
         self.piece, self.normal, self.friction = piece, plane[:3], float(plane[4])
-        self.height = float(plane[3])
-        self.gap = piece.y @ self.normal - self.height
+        self.gap = piece.y @ self.normal - float(plane[3])
         self.reach = -LYING * float(piece.lag @ self.normal)
         self.lies, self.slips = self.gap < self.reach, piece.slips(self.normal)
 
     def motion(self, free: Array) -> Array | None:
         """What every vertex is to be moved by [n, 3], `free` without contacts; None where it does not tip."""
         piece, n = self.piece, self.normal
-        if not self.reach > 0.0:
+        if not (self.reach > 0.0 and self.lies.any()):
             return None
         way = free - piece.y
         self.free_slips = self.slips + way - np.outer(way @ n, n)
-        if self.lies.any():
-            lying = piece.y[self.lies]
-            middle = lying.mean(axis=0)
-            away = self.centre_of_pressure(piece.y, middle)
-            spread = (lying - middle).T @ (lying - middle) / len(lying)
-            least = 1e-8 * piece.square
-            line = np.linalg.eigvalsh(spread)[1] <= least
-            if not (line or away @ np.linalg.solve(spread + least * np.eye(3), away) > RESTING):
-                return None
-            on = [int(np.where(self.lies, piece.y @ away, -np.inf).argmax())]
-        else:
-            middle = piece.middle - (piece.middle @ n - self.height) * n
-            away = self.centre_of_pressure(piece.y, middle)
-            on = [piece.deepest(free, np.zeros(3))[0]]
+        lying = piece.y[self.lies]
+        middle = lying.mean(axis=0)
+        away = self.centre_of_pressure(piece.y, middle)
+        spread = (lying - middle).T @ (lying - middle) / len(lying)
+        least = 1e-8 * piece.square
+        line = np.linalg.eigvalsh(spread)[1] <= least
+        if not (line or away @ np.linalg.solve(spread + least * np.eye(3), away) > RESTING):
+            return None
+        on = [int(np.where(self.lies, piece.y @ away, -np.inf).argmax())]
         pressure = middle + away
         share = 1.0
         for _ in range(ROUNDS - 1):
-            moved, holds = self.about(on, share)
+            moved, pushes, holds = self.about(on, share)
             worst, depth, left = piece.deepest(moved, -self.drop(on) * n, self.reach)
             if depth >= -(ROUNDED if worst in on else TOUCHING) * self.reach:
                 way = np.asarray(moved - piece.y + max(0.0, -depth) * n)
                 # a first iterate may be out of balance
-                return way if holds or (piece.first and piece.lowers(way)) else None
+                if not holds and not (piece.first and pushes and piece.lowers(way)):
+                    return None
+                piece.comes = share < 1.0
+                return way
             if left >= self.reach:
                 share *= left / (left - depth)
                 continue
@@ -276,28 +323,36 @@ class _Tipping:
         return np.asarray(np.cross(self.normal, torque) / (force.sum(axis=0) @ self.normal))
 
     def pair_of(self, three: list[int], pressure: Array) -> list[int] | None:
-        """Two of three vertices: those beyond whose line the pressure has its centre, the third being on this side."""
+        """Two of three vertices: those beyond whose line the pressure has its centre, the third being on this side.
+
+        Of three in a line the ends.
+        """
         best, pair = 0.0, None
         for i in range(3):
             a, b, c = (self.piece.y[three[(i + j) % 3]] for j in range(3))
             outward = np.cross(self.normal, b - a)
-            outward *= -np.sign((c - a) @ outward) / np.linalg.norm(outward)
-            beyond = float((pressure - a) @ outward)
-            if beyond > best:
-                best, pair = beyond, [three[i], three[(i + 1) % 3]]
+            side, length = float((c - a) @ outward), float(np.linalg.norm(outward))
+            own = -np.sign(side) * float((pressure - a) @ outward) / length
+            if abs(side) <= IN_LINE * length**2:
+                own = length
+            if own > best:
+                best, pair = own, [three[i], three[(i + 1) % 3]]
         return pair
 
-    def about(self, on: list[int], share: float) -> tuple[Array, bool]:
-        """Where it goes if it turns about these vertices [n, 3], or that share of the way; whether it does."""
+    def about(self, on: list[int], share: float) -> tuple[Array, bool, bool]:
+        """Where it goes if it turns about these vertices [n, 3], or that share of the way.
+
+        And whether the contact pushes then; as contacts can.
+        """
         sticking = self.sticking(on, share) if self.friction > 0.0 else None
-        if sticking is not None and sticking[1]:
+        if sticking is not None and sticking[2]:
             return sticking
         sliding = self.sliding(on, share)
-        if sliding is not None and (sliding[1] or sticking is None):
+        if sliding is not None and (sliding[2] or sticking is None):
             return sliding
-        return sticking if sticking is not None else (self.piece.y, False)
+        return sticking if sticking is not None else (self.piece.y, False, False)
 
-    def sticking(self, on: list[int], share: float) -> tuple[Array, bool]:
+    def sticking(self, on: list[int], share: float) -> tuple[Array, bool, bool]:
         """Friction takes back how far they slid, within its cone."""
         piece, n = self.piece, self.normal
         first, way, axis = self.line(on)
@@ -311,9 +366,9 @@ class _Tipping:
         holds = bool(push > 0.0 and np.linalg.norm(force - push * n) <= self.friction * push)
         holds = holds and bool(np.linalg.norm(slips[0] - slips[-1]) <= self.reach)
         holds = holds and self.between((piece.y - first) @ turn.T + goal, goal, axis, way, push)
-        return moved, holds
+        return moved, push > 0.0, holds
 
-    def sliding(self, on: list[int], share: float) -> tuple[Array, bool] | None:
+    def sliding(self, on: list[int], share: float) -> tuple[Array, bool, bool] | None:
         """Friction acts against how they slid, and they go on that way; None where that is not known.
 
         Before any iteration nothing has slid: it acts against how they would.
@@ -343,7 +398,11 @@ class _Tipping:
             after = self.slips[on[0]] + moved[on[0]] - first
             after -= (after @ n) * n
             holds = holds and after @ direction > ONWARD * np.linalg.norm(after)
-        return (moved if share == 1.0 else self.slid(_part(turn, share), arm, direction, drop)), bool(holds)
+        if share < 1.0:
+            # of how it rolls and of how it turns about the normal: the line of two vertices stays level
+            yaw = np.eye(3) if axis is None else _turn_about(n, np.outer(turn @ axis, axis))
+            moved = self.slid(_part(yaw, share) @ _part(yaw.T @ turn, share), arm, direction, drop)
+        return moved, push > 0.0, bool(holds)
 
     def line(self, on: list[int]) -> tuple[Array, Array, Array | None]:
         """A point, the way to the other, and its direction if there is one."""
@@ -406,8 +465,11 @@ def _rotation(half: Array) -> Array:
 
 
 def _part(turn: Array, share: float) -> Array:
-    """About that share of a turn: Cayley's vector of it times `share`."""
-    return turn if share == 1.0 else _rotation(share * 2.0 / (1.0 + np.trace(turn)) * _axis(turn))
+    """About that share of a turn: Cayley's vector of it times `share`; none of half a turn, which has no axis."""
+    if share == 1.0:
+        return turn
+    left = 1.0 + float(np.trace(turn))
+    return _rotation(share * 2.0 / left * _axis(turn)) if left > HALF_TURN else np.eye(3)
 
 
 def _turn_about(normal: Array, covariance: Array) -> Array:

@@ -12,7 +12,7 @@ from torch import Tensor
 from .adjoint import AdjointCall, step_gradient
 from .capture import CapturedStep
 from .checks import check_like, check_whole
-from .material import MATERIAL_ROWS
+from .material import MATERIAL_ROWS, environments_of_material
 from .model import Model
 from .ops import INFO_WIDTH, refuse_tangents
 from .rollout import PerStep, Rollout, roll
@@ -79,9 +79,10 @@ class Simulator(Model):
 
     # ---- states
 
-    def rest_state(self, batch: int = 1) -> State:
-        """Everything at rest, [batch, V, 3]."""
-        shape = (check_whole("batch", batch, minimum=0), -1, -1)
+    def rest_state(self, batch: int | None = None) -> State:
+        """Everything at rest [batch, V, 3], by default once for each environment of the material."""
+        count = environments_of_material(self) if batch is None else check_whole("batch", batch, minimum=0)
+        shape = (count, -1, -1)
         positions = self.rest_positions.expand(shape).clone()
         return State(positions, torch.zeros_like(positions))
 

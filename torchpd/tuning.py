@@ -27,7 +27,7 @@ from .checks import check_has_values, check_scalar, check_whole
 from .contenders import safe_solvers
 from .diagonal import step_diagonal
 from .forecast import has_friction
-from .material import MATERIAL_ROWS, environments_of_material, fingerprint
+from .material import MATERIAL_ROWS, fingerprint
 from .parametrized import plain_copy
 from .promise import Promise, Trial
 from .solvers import Chebyshev, Multilevel, Solver
@@ -120,7 +120,7 @@ def tune(
     for solver in candidates or ():
         if not isinstance(solver, Solver):
             raise TypeError(f"tune: candidates must be solvers, such as Chebyshev() and Multilevel(), got {solver!r}")
-    start = sim.rest_state(environments_of_material(sim)) if state is None else state
+    start = sim.rest_state() if state is None else state
     check_start(sim, start, forces)
     study = _prepare(_with_targets(sim, targets, len(start[0])), start, forces, error)
     # with friction steps may come to no end, which counts as error: then a target is not attained
@@ -129,7 +129,7 @@ def tune(
     named: Mapping[str, Solver] = (
         _usual(sim, safe_solvers(study.sim, study.state))
         if candidates is None
-        else {str(number): solver for number, solver in enumerate(candidates)}
+        else {str(number): solver for number, solver in enumerate(dict.fromkeys(candidates))}
     )
     if not named:
         raise ValueError("tune: candidates must hold at least one solver, got none")
@@ -138,7 +138,11 @@ def tune(
             trials, cost = _for_error(sim, study, start, list(named.values()), error, most, bar)
         else:
             seek = _for_time(sim, study, start, milliseconds, most)
-            timed = [(found := seek(solver), _milliseconds(sim, start, found[-1])) for solver in named.values()]
+            timed = []
+            for solver in named.values():
+                found = seek(solver)
+                timed.append((found, _milliseconds(sim, start, found[-1])))
+                bar.update(1)
             trials, cost = _most_accurate(study, timed)
     promise = _promise(sim, study, start, trials, cost, error, milliseconds)
     if candidates is None and has_friction(sim):
@@ -274,7 +278,7 @@ def _for_error(
     """
     found: dict[Solver, list[Trial]] = {}
     costs: dict[Solver, float] = {}
-    for solver in sorted(dict.fromkeys(solvers), key=lambda solver: not isinstance(solver, Multilevel)):
+    for solver in sorted(solvers, key=lambda solver: not isinstance(solver, Multilevel)):
         allowed = _affordable(sim, start, solver, _HOPELESS * min(costs.values()), most) if costs else most
         trials = _fewest(study, lambda trial: trial.error <= error / SAFETY, allowed)(solver)
         found[solver] = trials

@@ -107,11 +107,16 @@ RigidFit fit_of(const Workspace<Lanes>& w, int g, int lane) {
   return RigidFit(sum);
 }
 
+// Of pieces that go on, or in the first leg all.
 template <class Lanes>
-void free_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w) {
+void free_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w, int leg) {
   for (int g = 0; g < plan.groups; ++g) {
-    for (int lane = 0; lane < Lanes::environments; ++lane)
-      set_motion(w, g, lane, fit_of(w, g, lane).free());
+    for (int lane = 0; lane < Lanes::environments; ++lane) {
+      bool& goes_on = w.goes_on[g * Lanes::environments + lane];
+      goes_on = goes_on || leg == 0;
+      const RigidFit fit = fit_of(w, g, lane);
+      set_motion(w, g, lane, goes_on ? fit.free() : fit.still());
+    }
   }
 }
 
@@ -127,7 +132,7 @@ Plane<double> plane_of(const Contacts<typename Lanes::Real>& contacts, int k, in
 
 template <class Lanes>
 void find_touched(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
-                  const Contacts<typename Lanes::Real>& contacts) {
+                  const Contacts<typename Lanes::Real>& contacts, bool first) {
   using Real = typename Lanes::Real;
   using Wide = typename Lanes::Wide;
   for (int g = 0; g < plan.groups; ++g) {
@@ -143,7 +148,7 @@ void find_touched(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
     };
     const Vec3<Real> u = Lanes::vec3(w.u[i]);
     add_touch(sums.touch, sums.bounds, contacts, Lanes::vec3(w.x[i] + w.u[i]), u, w.motion[g],
-              near);
+              !first, near);
   });
 }
 
@@ -166,8 +171,9 @@ void set_motion_on_contacts(Workspace<Lanes>& w, const Contacts<typename Lanes::
   read_lane<Touch::sums, Lanes>(sums.touch, lane, touch);
   read_lane<Touch::bounds, Lanes>(sums.bounds, lane, bounds);
   const auto plane = [&](int k) { return plane_of<Lanes>(contacts, k, lane); };
-  set_motion(w, g, lane,
-             motion_on_contacts(fit_of(w, g, lane), touched_by(w, g, lane), touch, bounds, plane));
+  const unsigned touched = touched_by(w, g, lane);
+  w.goes_on[g * Lanes::environments + lane] = comes_to_plane(touched, bounds);
+  set_motion(w, g, lane, motion_on_contacts(fit_of(w, g, lane), touched, touch, bounds, plane));
 }
 
 template <class Lanes>
@@ -231,6 +237,7 @@ bool tip_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
                        motion)) {
         set_motion(w, g, lane, motion);
         set_search(w, contacts, g, lane);
+        w.goes_on[g * lanes + lane] = tipping.comes();
       } else {
         set_motion_on_contacts(w, contacts, g, lane);
       }
@@ -246,10 +253,11 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
   using Real = typename Lanes::Real;
   using Wide = typename Lanes::Wide;
   constexpr int lanes = Lanes::environments;
-  find_touched(plan, w, contacts);
+  find_touched(plan, w, contacts, first);
   for (int g = 0; g < plan.groups; ++g) {
     for (int lane = 0; lane < lanes; ++lane) {
-      const unsigned touched = touched_by(w, g, lane);
+      const bool goes_on = w.goes_on[g * lanes + lane];
+      const unsigned touched = goes_on ? touched_by(w, g, lane) : 0;
       for (int k = 0; k < Touch::planes; ++k)
         Lanes::set_lane(w.touched[g][k], lane, T(touched >> k & 1));
       bool tips = false;
@@ -262,7 +270,7 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
         set_search(w, contacts, g, lane);
         tips = tipping.goes_on();
       }
-      if (!tips) set_motion_on_contacts(w, contacts, g, lane);
+      if (goes_on && !tips) set_motion_on_contacts(w, contacts, g, lane);
     }
   }
   while (contacts.plane_count > 0 && tip_motions(plan, w, contacts)) {
@@ -273,16 +281,31 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
     const auto touches = [&](int k) { return w.touched[g][k] > Real(T(0)); };
     const Vec3<Real> y = Lanes::vec3(w.x[i] + w.u[i]);
-    const Real least = least_gap_beside(contacts, y + w.motion[g].of(y), touches);
+    const Real least = least_gap_beside(contacts, y, w.motion[g].of(y), !first, touches);
     w.group_sums[g].gaps[0] = lesser(w.group_sums[g].gaps[0], Lanes::widen(least));
   });
   for (int g = 0; g < plan.groups; ++g) {
     for (int lane = 0; lane < lanes; ++lane) {
       const bool tips = contacts.plane_count > 0 && w.tipping[g * lanes + lane].tips;
-      if (!tips && !(Lanes::lane(w.group_sums[g].gaps[0], lane) > 0))
-        set_motion(w, g, lane, fit_of(w, g, lane).still());
+      if (tips || Lanes::lane(w.group_sums[g].gaps[0], lane) > 0) continue;
+      set_motion(w, g, lane, fit_of(w, g, lane).still());
+      w.goes_on[g * lanes + lane] = false;
     }
   }
+}
+
+// Motions of all pieces, in one leg; whether some go on in another.
+template <bool Touching, class Lanes>
+bool find_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
+                  const Contacts<typename Lanes::Real>& contacts, bool first, int leg) {
+  sum_pieces(plan, w);
+  free_motions(plan, w, leg);
+  bool some = false;
+  if constexpr (Touching) {
+    limit_motions(plan, w, contacts, first);
+    for (int n = 0; n < plan.groups * Lanes::environments; ++n) some = some || w.goes_on[n];
+  }
+  return some && leg + 1 < motion_legs;
 }
 
 }  // namespace pd::inline PD_TARGET

@@ -82,25 +82,26 @@ class Stepper {
     const bool first = !started_;
     started_ = true;
     if (plan_.groups == 0 || (first && set_.start == StartKind::given)) return;
-    if (team_.rank == 0) {
-      if constexpr (Touching) {
-        if (first)
-          begin_still(
-              plan_, w_, contacts_, [&](int i) { return vertex(i); },
-              [&](int i) { return guess(i); });
+    if constexpr (Touching) {
+      if (first && team_.rank == 0)
+        begin_still(
+            plan_, w_, contacts_, [&](int i) { return vertex(i); },
+            [&](int i) { return guess(i); });
+    }
+    bool goes_on = true;
+    for (int leg = 0; goes_on; ++leg) {
+      if (team_.rank == 0) w_.some_go_on = find_motions<Touching>(plan_, w_, contacts_, first, leg);
+      team_.barrier();
+      goes_on = w_.some_go_on;
+      for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+        if (plan_.vertex_group[i] < 0) continue;
+        const Vec3<Real> y = Lanes::vec3(w_.x[i] + w_.u[i]);
+        const Vec3<Real> way = w_.motion[plan_.vertex_group[i]].of(y);
+        w_.u[i] = vertex(i).moved(w_.u[i], way);
+        if (first) w_.before[i] = w_.u[i];
       }
-      sum_pieces(plan_, w_);
-      free_motions(plan_, w_);
-      if constexpr (Touching) limit_motions(plan_, w_, contacts_, first);
+      team_.barrier();
     }
-    team_.barrier();
-    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      if (plan_.vertex_group[i] < 0) continue;
-      const Vec3<Real> moved = w_.motion[plan_.vertex_group[i]].of(Lanes::vec3(w_.x[i] + w_.u[i]));
-      w_.u[i] = vertex(i).hold(w_.u[i], w_.u[i] + Lanes::value(moved));
-      if (first) w_.before[i] = w_.u[i];
-    }
-    team_.barrier();
   }
 
   // What the first iterate is made of.

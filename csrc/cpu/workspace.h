@@ -55,12 +55,14 @@ struct Workspace {
   Real (*touched)[Touch::planes];  // [groups] 1 for each of the first planes that it touches
   Real* still;                     // [groups] 1 if it starts from where it is
   Tipping* tipping;                // [groups, environments]
-  TippingSearch<Real>* search;     // [groups]
+  bool* goes_on;  // [groups, environments] its motion ended where it came to a contact
+  TippingSearch<Real>* search;  // [groups]
   Plane<Real>* planes;
   Ball<Real>* balls;
   T* weight;  // [elements], or [elements, W] when stiffness differs between environments
   int part_count;
   bool shared_weight;
+  bool some_go_on = false;  // pieces
 
   explicit Workspace(const StepCall<T>& call)
       : Workspace(call.plan, call.material, call.material.stiffness.stride == 0,
@@ -102,6 +104,7 @@ struct Workspace {
     const int tipping_groups = material.planes_count > 0 ? plan.groups : 0;
     place(tipping, tipping_groups * Lanes::environments, base);
     place(search, tipping_groups, base);
+    place(goes_on, plan.groups * Lanes::environments, base);
     place(planes, material.planes_count, base);
     place(balls, material.spheres_count, base);
     place(weight,

@@ -12,33 +12,13 @@ struct MotionFinder {
   Vertices<T, Touching> v;
   Contacts<T> contacts;
   const Settings& settings;
-  Aligning how;
   Piece<T>* pieces;  // of this block
   double* part_sums;
   int first_part, end_part, first_slot, slots;  // of its patch
   TeamSums<Kind> sums;
 
-  PD_DEVICE void run() {
-    bool starts = false;
-    if constexpr (Touching) {
-      starts = how.first;
-      if (starts) {
-        find<Rigid::start>();
-        begin_still();
-      }
-    }
-    if (!starts && !how.at_once) find<Rigid::mean>();
-    find<Rigid::free>();
-    if constexpr (Touching) {
-      find<Rigid::touching>();
-      while (some_tip()) find<Rigid::tipping>();
-      if (contacts.has_several()) find<Rigid::beside>();
-    }
-  }
-
- private:
   template <Rigid What>
-  PD_DEVICE void find() {
+  PD_DEVICE void find(const Aligning& how) {
     if constexpr (Kind != Blocks::one) sums.meet();  // everyone has read the sums of the last time
     const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
     for (int n = first_part + warp; n < end_part; n += warps) {
@@ -63,17 +43,14 @@ struct MotionFinder {
 
   // The same in every block of the team, since all of them work out all motions.
   PD_DEVICE bool some_tip() const {
-    bool some = false;
-    for (int n = threadIdx.x; n < plan.pieces; n += blockDim.x)
-      some = some || pieces[n].tipping.goes_on();
-    return __syncthreads_or(some);
+    return some_of(plan.pieces, [&](int n) { return pieces[n].tipping.goes_on(); });
   }
 };
 
 // Returns where the team stands.
 template <class T, bool Touching, Blocks Kind>
-PD_DEVICE_COLD TeamSums<Kind> find_motions(MotionFinder<T, Touching, Kind> finder) {
-  finder.run();
+PD_DEVICE_COLD TeamSums<Kind> find_motions(MotionFinder<T, Touching, Kind> finder, Aligning how) {
+  find_in_rounds<Touching>(finder, how, finder.contacts.has_several());
   return finder.sums;
 }
 
@@ -82,27 +59,23 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::align_pieces() {
   const bool first = !started_;
   started_ = true;
   if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
-  sums_ = find_motions<T, Touching, Kind>({plan_,
-                                           v_,
-                                           contacts_,
-                                           set_,
-                                           {plan_, Touching, first},
-                                           &piece(0),
-                                           part_sums(),
-                                           plan_.patch_part[index_],
-                                           plan_.patch_part[index_ + 1],
-                                           patch_.first_slot,
-                                           own_slots(),
-                                           sums_});
-  each_slot([&](int s) {
-    const int number = plan_.slot_piece[patch_.first_slot + s];
-    if (number < 0 || !(v_.u[s].w > 0)) return;  // of no piece, or pinned
-    const Vec3<T> u = vec3(v_.u[s]) + piece(number).motion.of(vec3(v_.x[s]) + vec3(v_.u[s]));
-    move(s, u);
-    if (first) v_.set_before(s, u);
-  });
-  moved_ = true;
-  __syncthreads();
+  Aligning how(plan_, Touching, first);
+  do {
+    sums_ = find_motions<T, Touching, Kind>(
+        {plan_, v_, contacts_, set_, &piece(0), part_sums(), plan_.patch_part[index_],
+         plan_.patch_part[index_ + 1], patch_.first_slot, own_slots(), sums_},
+        how);
+    each_slot([&](int s) {
+      const int number = plan_.slot_piece[patch_.first_slot + s];
+      if (number < 0 || !(v_.u[s].w > 0)) return;  // of no piece, or pinned
+      const Vec3<T> u = v_.moved(s, piece(number).motion);
+      move(s, u);
+      if (first) v_.set_before(s, u);
+    });
+    moved_ = true;
+    __syncthreads();
+    how.go_on();
+  } while (Touching && some_of(plan_.pieces, [&](int n) { return piece(n).leg == how.leg; }));
   // again, since registers that live across calls would be spilled in the iterations too
   if constexpr (Many) read_own();
 }

@@ -27,6 +27,7 @@ struct Piece {
   double start[PartSums::starts];
   double touched, least_gap;  // a bit for each of the first planes; see PartSums
   bool still;                 // starts from where it is
+  int leg;                    // in which it goes on, 0: in none
   Vec3<double> center;
   RigidMotion<T> motion;
   Tipping tipping;
@@ -86,17 +87,52 @@ PD_DEVICE double write_shares(const double (&value)[Count], Op op, double* to) {
   return own;
 }
 
-// What all rounds go by: whether this is before any iteration, there are pins, and no piece needs a round for its mean, since every
-// part is a whole one.
+// What all rounds go by: whether this is before any iteration; there are pins; every part is a whole piece, which then needs no round for
+// its mean; pieces may start from where they are; and the leg of the motion.
 struct Aligning {
-  bool first, pins, at_once;
+  bool first, pins, whole, starts;
+  int leg = 0;
 
   template <class T>
   PD_HD Aligning(const DevicePlan<T>& plan, bool touching, bool first)
       : first(first),
         pins(plan.pins > 0),
-        at_once(plan.parts == plan.pieces && !(touching && first)) {}
+        whole(plan.parts == plan.pieces),
+        starts(touching && first) {}
+
+  PD_HD bool at_once() const { return whole && !starts; }
+  PD_HD bool is_last() const { return leg + 1 == motion_legs; }
+  PD_HD void go_on() {
+    ++leg;
+    starts = false;
+  }
 };
+
+// Whether that is so of one of `count`, for all threads of a block, which wait for each other here.
+template <class Is>
+PD_DEVICE bool some_of(int count, const Is& is) {
+  bool some = false;
+  for (int n = threadIdx.x; n < count; n += blockDim.x) some = some || is(n);
+  return __syncthreads_or(some);
+}
+
+// The rounds of a leg. `run` finds what each is for, sets pieces to where they start, and knows whether some tip.
+template <bool Touching, class Run>
+PD_DEVICE void find_in_rounds(Run& run, const Aligning& how, bool several_contacts) {
+  if constexpr (Touching) {
+    if (how.starts) {
+      run.template find<Rigid::start>(how);
+      run.begin_still();
+    }
+  }
+  if (!how.starts && !how.whole) run.template find<Rigid::mean>(how);
+  run.template find<Rigid::free>(how);
+  if constexpr (Touching) {
+    run.template find<Rigid::touching>(how);
+    while (run.some_tip()) run.template find<Rigid::tipping>(how);
+    if (several_contacts) run.template find<Rigid::beside>(how);
+  }
+}
 
 // The lane of a warp that has the least number, the first of them.
 PD_DEVICE int lane_of_least(double number) {
@@ -115,12 +151,19 @@ PD_HD Plane<To> plane_in(const Plane<From>& p) {
   return {vector_in<To>(p.normal), To(p.height), To(p.friction)};
 }
 
+// Whether a piece does not go on in this leg. After the round for contacts it has no motion that others could change.
+template <Rigid What, class T>
+PD_DEVICE bool stands(const Aligning& how, const Piece<T>& piece) {
+  return What <= Rigid::touching && how.leg > 0 && piece.leg != how.leg;
+}
+
 // `to`: PartSums
 template <Rigid What, class T, bool Touching>
 PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts,
                              const Settings& settings, Aligning how, Part part,
                              const Piece<T>& piece, double* to) {
   using S = RigidSums;
+  if (stands<What>(how, piece)) return;
   const auto wide = [](const Vec3<T>& a) {
     return Vec3<double>{double(a.x), double(a.y), double(a.z)};
   };
@@ -149,7 +192,7 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts,
     sum_mean();
   } else if constexpr (What == Rigid::free) {
     Vec3<double> center;
-    if (how.at_once) {
+    if (how.at_once()) {
       const double own = sum_mean();
       double sum[S::lag];
       for (int n = 0; n < S::lag; ++n) sum[n] = __shfl_sync(whole_warp, own, n);
@@ -173,7 +216,7 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts,
     const auto near = [&](int k, T gap) { touched |= gap > T(0) ? 0u : 1u << k; };
     part.each([&](int i) {
       const Vec3<T> u = vec3(v.u[i]);
-      add_touch(sums, bounds, contacts, vec3(v.x[i]) + u, u, piece.motion, near);
+      add_touch(sums, bounds, contacts, vec3(v.x[i]) + u, u, piece.motion, !how.first, near);
     });
     touched = __reduce_or_sync(whole_warp, touched);
     if (threadIdx.x % warp_size == 0) to[PartSums::touched] = double(touched);
@@ -205,7 +248,7 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts,
     const auto touches = [&](int k) { return bool(touched >> k & 1); };
     part.each([&](int i) {
       const Vec3<T> y = vec3(v.x[i]) + vec3(v.u[i]);
-      const T beside = least_gap_beside(contacts, y + piece.motion.of(y), touches);
+      const T beside = least_gap_beside(contacts, y, piece.motion.of(y), !how.first, touches);
       least = Least{}(least, double(beside));
     });
     least = across_warp(least, Least{});
@@ -282,12 +325,26 @@ PD_DEVICE void find_over_parts(const DevicePlan<T>& plan, int piece, const doubl
   for (int n = 0; n < Found::count; ++n) found[n] = read_part(plan, from, best, n);
 }
 
+template <class T>
+PD_DEVICE void go_on(const Aligning& how, Piece<T>& to) {
+  to.leg = how.is_last() ? 0 : how.leg + 1;
+}
+
+template <class T>
+PD_DEVICE void stand_still(Piece<T>& to) {
+  to.motion.turn = {};
+  to.motion.shift = {};
+  to.leg = 0;
+}
+
 // What contacts leave to a piece that does not tip, by one lane.
 template <class T>
-PD_DEVICE_COLD void move_on_contacts(const Contacts<T>& contacts, Piece<T>& to) {
+PD_DEVICE_COLD void move_on_contacts(const Contacts<T>& contacts, Aligning how, Piece<T>& to) {
   const auto plane = [&](int k) { return plane_in<double>(contacts.planes[k]); };
-  to.motion = motion_in<T>(
-      motion_on_contacts(RigidFit(to.sum), unsigned(to.touched), to.touch, to.bounds, plane));
+  const unsigned touched = unsigned(to.touched);
+  if (comes_to_plane(touched, to.bounds)) go_on(how, to);
+  to.motion =
+      motion_in<T>(motion_on_contacts(RigidFit(to.sum), touched, to.touch, to.bounds, plane));
 }
 
 // `part_sum`: [parts, PartSums::count]
@@ -297,6 +354,10 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
   const bool leader = threadIdx.x % warp_size == 0;
   const auto plane = [&](int k) { return plane_in<double>(contacts.planes[k]); };
   using S = RigidSums;
+  if (stands<What>(how, to)) {
+    if (What == Rigid::free && leader) stand_still(to);
+    return;
+  }
   if constexpr (What == Rigid::start) {
     over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
     over_parts<PartSums::starts>(plan, piece, part_sum, Add{}, PartSums::start, to.start);
@@ -310,7 +371,7 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
     over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
     if (leader) to.center = center_of(to.sum);
   } else if constexpr (What == Rigid::free) {
-    if (how.at_once) over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+    if (how.at_once()) over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
     over_parts<S::pins - S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid + S::lag,
                                  to.sum + S::lag);
     if (how.pins)
@@ -323,13 +384,13 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
     to.motion = motion_in<T>(RigidFit(to.sum).free());
   } else if constexpr (What == Rigid::touching) {
     over_parts<1>(plan, piece, part_sum, Or{}, PartSums::touched, &to.touched);
-    if (leader) to.tipping.end();
+    if (leader) to.tipping.end(), to.leg = 0;
     if (to.touched == 0) return;
     over_parts<Touch::sums>(plan, piece, part_sum, Add{}, PartSums::touch, to.touch);
     over_parts<Touch::bounds>(plan, piece, part_sum, Least{}, PartSums::bounds, to.bounds);
     if (!leader) return;
     begin_tipping(to.tipping, how.first, RigidFit(to.sum), unsigned(to.touched), to.touch, plane);
-    if (!to.tipping.goes_on()) move_on_contacts(contacts, to);
+    if (!to.tipping.goes_on()) move_on_contacts(contacts, how, to);
   } else if constexpr (What == Rigid::tipping) {
     if (!to.tipping.goes_on()) return;
     double found[Found::count];
@@ -338,13 +399,13 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
     RigidMotion<double> motion;
     if (to.tipping.next(RigidFit(to.sum), plane(to.tipping.number), found, motion)) {
       to.motion = motion_in<T>(motion);
+      if (to.tipping.comes()) go_on(how, to);
     } else {
-      move_on_contacts(contacts, to);
+      move_on_contacts(contacts, how, to);
     }
   } else {
     over_parts<1>(plan, piece, part_sum, Least{}, PartSums::least_gap, &to.least_gap);
-    if (leader && !to.tipping.tips && !(to.least_gap > 0))
-      to.motion.turn = {}, to.motion.shift = {};
+    if (leader && !to.tipping.tips && !(to.least_gap > 0)) stand_still(to);
   }
 }
 

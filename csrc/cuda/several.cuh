@@ -3,7 +3,7 @@
 #include "cuda/arena.h"
 #include "cuda/launch.h"
 #include "cuda/runtime.h"
-#include "cuda/several.h"
+#include "cuda/several_rigid.h"
 #include "cuda/several_shape.h"
 
 #include <algorithm>

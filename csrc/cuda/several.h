@@ -388,7 +388,9 @@ class SeveralRunner {
     read_ahead(first_pair_);
   }
 
-  // ---- rigid motions: cuda/rigid.h
+  // ---- rigid motions: cuda/several_rigid.h
+
+  struct Rounds;
 
   PD_DEVICE void align_pieces() {
     const bool first = !started_;
@@ -409,70 +411,7 @@ class SeveralRunner {
     run.move_pieces(first);
   }
 
-  PD_DEVICE void move_pieces(bool first) {
-    const Aligning how(plan_, Touching, first);
-    bool starts = false;
-    if constexpr (Touching) {
-      starts = first;
-      if (starts) {
-        find_motions<Rigid::start>(how);
-        begin_still();
-      }
-    }
-    if (!starts && !how.at_once) find_motions<Rigid::mean>(how);
-    find_motions<Rigid::free>(how);
-    if constexpr (Touching) {
-      find_motions<Rigid::touching>(how);
-      while (some_tip()) find_motions<Rigid::tipping>(how);
-      if (contacts(0).has_several()) find_motions<Rigid::beside>(how);
-    }
-    each_slot([&](const Seat& seat, int i) {
-      const int number = plan_.slot_piece[seat.at];
-      if (number < 0 || !(v_.u[i].w > 0)) return;  // of no piece, or pinned
-      const RigidMotion<T>& motion = piece(seat.environment, number).motion;
-      const Vec3<T> u = vec3(v_.u[i]) + motion.of(vec3(v_.x[i]) + vec3(v_.u[i]));
-      move(i, u);
-      if (first) v_.set_before(i, u);
-    });
-    __syncthreads();
-  }
-
-  PD_DEVICE bool some_tip() {
-    bool some = false;
-    for (int n = threadIdx.x; n < here_ * plan_.pieces; n += blockDim.x) {
-      const Seat at = seat_of(n, plan_.pieces);
-      some = some || piece(at.environment, at.at).tipping.goes_on();
-    }
-    return __syncthreads_or(some);
-  }
-
-  PD_DEVICE void begin_still() {
-    each_slot([&](const Seat& seat, int i) {
-      const int number = plan_.slot_piece[seat.at];
-      if (number >= 0 && piece(seat.environment, number).still)
-        v_.set(i, v_.at(i).still(contacts(seat.environment)));
-    });
-    __syncthreads();
-  }
-
-  template <Rigid What>
-  PD_DEVICE void find_motions(Aligning how) {
-    const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
-    for (int n = warp; n < here_ * plan_.parts; n += warps) {
-      const Seat at = seat_of(n, plan_.parts);
-      const Part part(plan_, at.at, nullptr, at.environment * slots());
-      const Piece<T>& piece = this->piece(at.environment, part.piece(plan_));
-      sum_part<What>(v_, contacts(at.environment), set_, how, part, piece,
-                     part_sums(at.environment) + PartSums::count * at.at);
-    }
-    __syncthreads();
-    for (int n = warp; n < here_ * plan_.pieces; n += warps) {
-      const Seat at = seat_of(n, plan_.pieces);
-      move_piece<What>(plan_, at.at, contacts(at.environment), how, part_sums(at.environment),
-                       piece(at.environment, at.at));
-    }
-    __syncthreads();
-  }
+  PD_DEVICE void move_pieces(bool first);
 
   // ---- results
 

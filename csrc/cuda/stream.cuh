@@ -6,7 +6,8 @@
 #include "cuda/pipeline.h"
 #include "cuda/runtime.h"
 #include "cuda/shared_vertices.h"
-#include "cuda/stream.h"
+#include "cuda/stream_rigid.h"
+#include "cuda/teams.cuh"
 #include "plan/shared_memory.h"
 #include "solver/multilevel.h"
 #include "solver/step.h"
@@ -34,6 +35,7 @@ StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
   arena.place(m.omega, step.batch * guard_period);
   arena.place(m.pieces, step.batch * plan.pieces);
   arena.place(m.part_sum, step.batch * plan.parts * PartSums::count);
+  arena.place(m.counter, plan.pieces > 0 ? step.batch : 0);
   arena.place(m.planes, step.batch * material.planes_count);
   arena.place(m.balls, step.batch * material.spheres_count);
   return m;
@@ -85,7 +87,9 @@ class StreamRunner {
         plan_(call_.step.plan),
         outer_(outer),
         stream_(stream),
-        launcher_(stream) {
+        launcher_(stream),
+        teams_(call.step.batch, resident_blocks(rounds_kernel(), rounds_threads, 0),
+               std::max(1, (plan_.parts * warp_size + rounds_threads - 1) / rounds_threads)) {
     patches_ = call.step.batch * plan_.patches;
     pass_shared_ = pass_shared_bytes(sizeof(T), plan_.most_slots, plan_.most_entries, 2);
   }
@@ -122,24 +126,9 @@ class StreamRunner {
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
-    const Aligning how(plan_, Touching, first);
-    bool starts = false;
-    if constexpr (Touching) {
-      starts = first;
-      if (starts) {
-        move_pieces<Rigid::start>(how);
-        launcher_.run(stream_still<T>, patches_, vertex_threads, 0, call_);
-      }
-    }
-    if (!starts && !how.at_once) move_pieces<Rigid::mean>(how);
-    move_pieces<Rigid::free>(how);
-    if constexpr (Touching) {
-      move_pieces<Rigid::touching>(how);
-      const Material<T>& material = call_.step.material;
-      if (material.planes_count > 0) tip(how);
-      if (material.planes_count + material.spheres_count > 1) move_pieces<Rigid::beside>(how);
-    }
-    launcher_.run(stream_align<T>, patches_, vertex_threads, 0, call_, first);
+    RoundsCall<T> call = {call_, Aligning(plan_, Touching, first), teams_.count, teams_.blocks,
+                          call_.memory.counter};
+    launch_teams(rounds_kernel(), call, call.counter, rounds_threads, 0, stream_);
   }
 
   void iterate(int k) {
@@ -242,21 +231,8 @@ class StreamRunner {
                   call_, record);
   }
 
-  template <Rigid What>
-  void move_pieces(Aligning how) {
-    const std::int64_t batch = call_.step.batch;
-    launcher_.run(stream_parts<What, T>, blocks_for(batch * plan_.parts * warp_size),
-                  vertex_threads, 0, call_, how);
-    launcher_.run(stream_pieces<What, T>, blocks_for(batch * plan_.pieces * warp_size),
-                  vertex_threads, 0, call_, how);
-  }
-
-  void tip(Aligning how) {
-    if (plan_.parts <= tipping_parts) {
-      launcher_.run(stream_tipping<T>, call_.step.batch, tipping_threads, 0, call_, how);
-    } else {
-      for (int n = 0; n < tipping_rounds; ++n) move_pieces<Rigid::tipping>(how);
-    }
+  static const void* rounds_kernel() {
+    return reinterpret_cast<const void*>(stream_rounds<T, Touching>);
   }
 
   static std::int64_t blocks_for(std::int64_t threads) {
@@ -269,6 +245,7 @@ class StreamRunner {
   void* outer_;
   cudaStream_t stream_;
   Launcher launcher_;
+  Teams teams_;           // for rigid motions
   std::int64_t patches_;  // of all environments
   std::size_t pass_shared_;
   bool started_ = false;

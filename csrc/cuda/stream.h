@@ -27,6 +27,7 @@ struct StreamMemory {
   double* omega;          // [batch, guard_period] of the next iterations
   Piece<T>* pieces;       // [batch, pieces]
   double* part_sum;       // [batch, parts, PartSums::count]
+  unsigned* counter;      // [batch] of teams that move pieces
   Plane<T>* planes;       // [batch, planes]
   Ball<T>* balls;         // [batch, balls]
 };
@@ -375,89 +376,6 @@ __global__ void __launch_bounds__(vertex_threads)
 // Of this thread in the grid.
 PD_DEVICE std::int64_t thread_number() {
   return std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
-}
-
-// ---- rigid motions: cuda/rigid.h
-
-constexpr int tipping_threads = 512;
-// Parts of an environment: more are searched by all blocks, launch by launch.
-constexpr int tipping_parts = 128;
-
-template <Rigid What, class T>
-__global__ void __launch_bounds__(vertex_threads)
-    stream_parts(const __grid_constant__ StreamCall<T> call, Aligning how) {
-  const int parts = call.step.plan.parts;
-  const std::int64_t warp = thread_number() / warp_size;
-  if (warp >= call.step.batch * parts) return;
-  const StreamWork<T, true> w(call, warp / parts);
-  const int n = int(warp % parts);
-  const Part part(w.plan, n, w.plan.slot_vertex, 0);
-  const Piece<T>& piece = w.piece(part.piece(w.plan));
-  sum_part<What>(w.v, w.contacts, w.settings(), how, part, piece,
-                 w.part_sums() + PartSums::count * n);
-}
-
-template <Rigid What, class T>
-__global__ void __launch_bounds__(vertex_threads)
-    stream_pieces(const __grid_constant__ StreamCall<T> call, Aligning how) {
-  const int pieces = call.step.plan.pieces;
-  const std::int64_t warp = thread_number() / warp_size;
-  if (warp >= call.step.batch * pieces) return;
-  const StreamWork<T, true> w(call, warp / pieces);
-  const int piece = int(warp % pieces);
-  move_piece<What>(w.plan, piece, w.contacts, how, w.part_sums(), w.piece(piece));
-}
-
-// All searches for pieces that tip, one block for all of an environment: most often there is nothing to do.
-template <class T>
-__global__ void __launch_bounds__(tipping_threads)
-    stream_tipping(const __grid_constant__ StreamCall<T> call, Aligning how) {
-  const StreamWork<T, true> w(call, blockIdx.x);
-  const int warp = int(threadIdx.x) / warp_size, warps = int(blockDim.x) / warp_size;
-  while (true) {
-    bool some = false;
-    for (int n = threadIdx.x; n < w.plan.pieces; n += blockDim.x)
-      some = some || w.piece(n).tipping.goes_on();
-    if (!__syncthreads_or(some)) return;
-    for (int n = warp; n < w.plan.parts; n += warps) {
-      const Part part(w.plan, n, w.plan.slot_vertex, 0);
-      sum_part<Rigid::tipping>(w.v, w.contacts, w.settings(), how, part,
-                               w.piece(part.piece(w.plan)), w.part_sums() + PartSums::count * n);
-    }
-    __syncthreads();
-    for (int n = warp; n < w.plan.pieces; n += warps)
-      move_piece<Rigid::tipping>(w.plan, n, w.contacts, how, w.part_sums(), w.piece(n));
-    __syncthreads();
-  }
-}
-
-// Sets pieces to where they are that start from there.
-template <class T>
-__global__ void __launch_bounds__(vertex_threads)
-    stream_still(const __grid_constant__ StreamCall<T> call) {
-  const StreamWork<T, true> w(call, blockIdx.x / call.step.plan.patches);
-  const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
-  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
-    const int piece = w.plan.slot_piece[patch.first_slot + s], i = patch.vertex(s);
-    if (piece >= 0 && patch.owns(s) && w.piece(piece).still)
-      w.v.set(i, w.v.at(i).still(w.contacts));
-  }
-}
-
-// `first`: before any iteration, which has no iterate before it
-template <class T>
-__global__ void __launch_bounds__(vertex_threads)
-    stream_align(const __grid_constant__ StreamCall<T> call, bool first) {
-  const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
-  const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
-  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
-    const int piece = w.plan.slot_piece[patch.first_slot + s], i = patch.vertex(s);
-    if (piece < 0 || !patch.owns(s) || !(w.v.u[i].w > 0)) continue;
-    const Vec3<T> y = vec3(w.v.x[i]) + vec3(w.v.u[i]);
-    const Vec3<T> u = vec3(w.v.u[i]) + w.piece(piece).motion.of(y);
-    w.v.set(i, u);
-    if (first) w.v.set_before(i, u);
-  }
 }
 
 // ---- environment by environment

@@ -1,6 +1,7 @@
 // The state of vertices in memory, and what a step does with one of them.
 #pragma once
 #include "cuda/inputs.h"
+#include "solver/rigid.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -77,6 +78,10 @@ struct Vertices {
     const bool given = settings.start == StartKind::given;
     return at(i).first(contacts,
                        given ? in.first_iterate(vertex) - vec3(x[i]) : guess(i, settings));
+  }
+
+  PD_DEVICE Vec3<T> moved(int i, const RigidMotion<T>& motion) const {
+    return at(i).moved(vec3(u[i]), motion.of(vec3(x[i]) + vec3(u[i])));
   }
 
   PD_DEVICE void set(int i, const Vec3<T>& value) const { u[i] = quad(value, u[i].w); }

@@ -13,6 +13,9 @@
 
 namespace pd::inline PD_TARGET {
 
+// A vertex lies on a contact when it is no further off than this share of a way.
+constexpr double lies_within = 0.01;
+
 template <class R>
 struct Plane {
   Vec3<R> normal;
@@ -74,6 +77,18 @@ PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, 
   const R length = square_root(dot(slip, slip));
   const R grip = lesser(rub / select(length > none, length, R(1)), R(1));
   return select(rubs, subtract_product(pushed, grip, slip), pushed);
+}
+
+// How far from a contact a motion by `way` leaves a vertex: before, and after. Not more than 0 where it lies on the contact and the motion
+// would lift it off by less than friction * slip: then a force within the cone of friction could be what keeps it from that motion.
+template <class R>
+PD_HD R left_by(const Vec3<R>& normal, const R& friction, const R& before, const R& after,
+                const Vec3<R>& way) {
+  const R share = R(scalar_of<R>(lies_within)), across = dot(normal, way);
+  const Vec3<R> along = subtract_product(way, across, normal);
+  const auto lies = !(before > share * square_root(dot(way, way)));
+  const R lift = subtract_product(across, friction, square_root(dot(along, along)));
+  return select(lies, lesser(after, lift), after);
 }
 
 // Of a normal, squared: what earlier ones leave of one that they span but for a thousandth.
@@ -208,6 +223,22 @@ struct Contacts {
     for (int i = first; i < plane_count; ++i) least = lesser(least, gap(planes[i], x));
     for (int i = 0; i < ball_count; ++i) least = lesser(least, gap(balls[i], x));
     return least;
+  }
+
+  // The same at the end of a `way` from there; `settled`: see left_by.
+  PD_HD R least_left(const Vec3<R>& x, const Vec3<R>& way, int first, bool settled) const {
+    if (!settled) return least_gap(x + way, first);
+    R least(HUGE_VAL);
+    for (int i = first; i < plane_count; ++i) least = lesser(least, left(planes[i], x, way));
+    for (int i = 0; i < ball_count; ++i) {
+      const Ball<R>& b = balls[i];
+      least = lesser(least, left_by(outward(b, x), b.friction, gap(b, x), gap(b, x + way), way));
+    }
+    return least;
+  }
+
+  PD_HD static R left(const Plane<R>& plane, const Vec3<R>& x, const Vec3<R>& way) {
+    return left_by(plane.normal, plane.friction, gap(plane, x), gap(plane, x + way), way);
   }
 
  private:

@@ -11,7 +11,8 @@
 // What a piece touches balances part of its momentum. A plane leaves it the turn about the normal and the way along the plane;
 // planes that meet leave the way along their edge. Neither moves any vertex towards a plane; solver/tipping.h has what may. With
 // friction the way along a plane is shortened by friction times the way that the plane stops, which is Coulomb's law for the sum of all
-// forces where all vertices slide the same way; turns are left to the iterations.
+// forces where all vertices slide the same way; turns are left to the iterations. A motion that ends where it comes to a contact goes
+// on from there, on what the piece touches then.
 #pragma once
 #include "effects/contact.h"
 #include "math/rotation.h"
@@ -135,11 +136,14 @@ PD_HD Mat3<double> small_turn(const Vec3<double>& v) {
   return turn;
 }
 
-// R - I of about that share of a turn.
+// 4 cos^2(angle / 2), at most, of what counts as half a turn.
+constexpr double half_turn = 1e-6;
+
+// R - I of about that share of a turn; none of half a turn, which has no axis.
 PD_HD Mat3<double> part_of_turn(const Mat3<double>& turn, double share) {
   if (share == 1.0) return turn;
-  const double trace = turn.row[0].x + turn.row[1].y + turn.row[2].z;
-  return small_turn(2.0 * share / (4.0 + trace) * axis_of(turn));
+  const double left = 4.0 + turn.row[0].x + turn.row[1].y + turn.row[2].z;
+  return left > half_turn ? small_turn(2.0 * share / left * axis_of(turn)) : Mat3<double>{};
 }
 
 // What the sums say about a piece: where it turns, its shift, H, the square of its size, and the line along which pins hold it.
@@ -206,11 +210,11 @@ struct Touch {
 };
 
 // Sums over the vertices of a piece that say from where it starts: of a |u - s|^2 and a |v - s|^2, u being its course out of the
-// contacts, v where it is; of k = D - a, k p and k |p|^2, p being how far contacts have pushed; and how many vertices pins hold, or forces
-// would lead into other contacts than the first planes.
+// contacts, v where it is; of k = D - a, k p and k |p|^2, p being how far contacts have pushed; of a, and of k where they have; and how
+// many vertices pins hold, or forces would lead into other contacts than the first planes.
 struct StartSums {
-  static constexpr int left = 0, before = 1, stiffness = 2, push = 3, square = 6, beside = 7;
-  static constexpr int count = 8;
+  static constexpr int left = 0, before = 1, stiffness = 2, push = 3, square = 6, weight = 7;
+  static constexpr int pushed = 8, beside = 9, count = 10;
 };
 
 // Adds a vertex to these; `still`: v.
@@ -230,52 +234,65 @@ PD_HD void add_start(W (&sum)[StartSums::count], const Contacts<R>& contacts, co
   const W stiffness = W(1.0) / convert<double>(select(inverse > none, inverse, one)) - a;
   const Vec3<W> left = wide(u) - wide(target), before = wide(still) - wide(target);
   const Vec3<W> p = wide(push), pull = stiffness * p;
-  const W add[S::count] = {
-      a * dot(left, left), a * dot(before, before), stiffness, pull.x, pull.y, pull.z,
-      dot(pull, p),        convert<double>(beside)};
+  const W square = dot(p, p), pushed = select(square > W(0.0), stiffness, W(0.0));
+  const W add[S::count] = {a * dot(left, left),
+                           a * dot(before, before),
+                           stiffness,
+                           pull.x,
+                           pull.y,
+                           pull.z,
+                           stiffness * square,
+                           a,
+                           pushed,
+                           convert<double>(beside)};
   for (int n = 0; n < S::count; ++n) sum[n] = sum[n] + add[n];
 }
 
 // Of the most that pushes may squeeze a piece by.
 constexpr double likely_squeeze = 0.5;
+// Of what it costs to shift a piece as a whole by how far contacts push: so little is no reason to give up the course of what is soft.
+constexpr double likely_lift = 6.0;
 // Less of what is left is no reason to give up the course, be it rounding of what lies on a plane.
 constexpr double least_squeeze = 0.01;
 
-// Whether a piece starts from where it is, since on its course more energy would be left, as far as that is told beforehand: strain that
-// there is already is not counted, and the squeeze is estimated by what pushes p differ. For any c it is at most
-// sum k / 2 |p - c|^2, by A <= D of solver/step.h, where D is the weighted diagonal.
+// Whether a piece starts from where it is, since on its course more energy would be left than there, or than rigid motions leave that go
+// on from there: a shift by how far contacts push, d, out of them costs sum a / 2 d^2. As far as that is told beforehand: strain that there
+// is already is not counted, and the squeeze is estimated by what pushes p differ. For any c it is at most sum k / 2 |p - c|^2, by
+// A <= D of solver/step.h, where D is the weighted diagonal.
 PD_HD bool starts_still(const double (&sum)[StartSums::count]) {
   using S = StartSums;
   if (!(sum[S::stiffness] > 0) || sum[S::beside] > 0) return false;
   const double* p = sum + S::push;
   const double mean = (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) / sum[S::stiffness];
   const double squeeze = likely_squeeze * (sum[S::square] - mean);
-  return sum[S::left] + squeeze > sum[S::before] && squeeze > least_squeeze * sum[S::left];
+  const double far = sum[S::pushed] > 0 ? sum[S::square] / sum[S::pushed] : 0.0;
+  const double gain = sum[S::before] - sum[S::left], lift = likely_lift * sum[S::weight] * far;
+  return squeeze > (gain < lift ? gain : lift) && squeeze > least_squeeze * sum[S::left];
 }
 
-// A vertex lies on a plane when it is no further off than this share of the way that the plane stops.
-constexpr double lies_within = 0.01;
-
 // Adds a vertex at y = x + u, whose piece would move by `motion`, to these; `near(k, gap)` learns how far from the first planes it
-// would come, and at last from the other contacts.
+// would come, and at last from the other contacts. `settled`: after the iterations. Then contacts that go round a piece, or are curved,
+// may hold it with forces that no single one of them shows: see left_by.
 template <class W, class R, class Near>
 PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
                      const Contacts<R>& contacts, const Vec3<R>& y, const Vec3<R>& u,
-                     const RigidMotion<R>& motion, const Near& near) {
+                     const RigidMotion<R>& motion, bool settled, const Near& near) {
   const R none(0), one(1), far(HUGE_VAL);
-  const Vec3<R> moved = y + motion.of(y), arm = y - motion.center;
+  const Vec3<R> way = motion.of(y), moved = y + way, arm = y - motion.center;
+  const bool holds = settled && contacts.has_several();
   // in double, since their spread is a difference
   const Vec3<W> wide_arm = {convert<double>(arm.x), convert<double>(arm.y), convert<double>(arm.z)};
   const int told = contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
   for (int k = 0; k < told; ++k) {
     const Plane<R>& plane = contacts.planes[k];
     const R before = gap(plane, y), after = gap(plane, moved);
-    near(k, after);
+    const R left = holds ? contacts.left(plane, y, way) : after;
+    near(k, left);
     const auto comes = before > none && !(after > none);
     const R share = before / select(comes, before - after, one);
     bounds[Touch::share] =
         lesser(bounds[Touch::share],
-               convert<double>(select(after > none, far, select(comes, share, none))));
+               convert<double>(select(left > none, far, select(comes, share, none))));
     const R reach = -R(scalar_of<R>(lies_within)) * dot(motion.shift, plane.normal);
     const R lies = select(before < reach, one, none);
     const R rubs = select(plane.friction > none, lies, none);
@@ -297,25 +314,26 @@ PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
                                 at.y * wide_arm.z,
                                 at.z * wide_arm.z};
     for (int n = 0; n < Touch::sums; ++n) sums[n] = sums[n] + add[n];
-    const R way[3] = {slip.x, slip.y, slip.z};
+    const R slips[3] = {slip.x, slip.y, slip.z};
     for (int n = 0; n < 3; ++n) {
-      const R least = select(rubs > none, way[n], far), most = select(rubs > none, -way[n], far);
+      const R least = select(rubs > none, slips[n], far);
+      const R most = select(rubs > none, -slips[n], far);
       bounds[n] = lesser(bounds[n], convert<double>(least));
       bounds[3 + n] = lesser(bounds[3 + n], convert<double>(most));
     }
   }
-  near(Touch::planes, contacts.least_gap(moved, told));
+  near(Touch::planes, contacts.least_left(y, way, told, settled));
 }
 
 // Of the contacts that a piece does not touch: `touches(k)` says which of the first planes it does.
 template <class R, class Touches>
-PD_HD R least_gap_beside(const Contacts<R>& contacts, const Vec3<R>& moved,
-                         const Touches& touches) {
+PD_HD R least_gap_beside(const Contacts<R>& contacts, const Vec3<R>& y, const Vec3<R>& way,
+                         bool settled, const Touches& touches) {
   constexpr int most = Touch::planes;
   const int told = contacts.plane_count < most ? contacts.plane_count : most;
-  R least = contacts.least_gap(moved, told);
+  R least = contacts.least_left(y, way, told, settled);
   for (int k = 0; k < told; ++k)
-    least = lesser(least, select(touches(k), R(HUGE_VAL), gap(contacts.planes[k], moved)));
+    least = lesser(least, select(touches(k), R(HUGE_VAL), gap(contacts.planes[k], y + way)));
   return least;
 }
 
@@ -343,6 +361,14 @@ PD_COLD inline Vec3<double> slide(const Vec3<double>& shift, const Vec3<double>&
   return (1.0 - doubt / size) * way;
 }
 
+// Parts of a motion that contacts end one after the other, at most: over a corner and an edge on to a face there are three.
+constexpr int motion_legs = 4;
+
+// Whether a motion ends at the first of the planes, since the piece is above all that it would touch.
+PD_HD bool comes_to_plane(unsigned touched, const double (&bounds)[Touch::bounds]) {
+  return touched != 0 && touched < Touch::others && bounds[Touch::share] > lies_within;
+}
+
 // The motion that contacts leave to a piece that touches some of them; `plane(k)` are the first of them. From above all of these it
 // goes as far as the first.
 template <class PlaneAt>
@@ -354,7 +380,7 @@ PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touch
   if (touched == 0) return fit.free();
   RigidMotion<double> motion = fit.still();
   if (touched & Touch::others) return motion;
-  if (bounds[Touch::share] > lies_within) {
+  if (comes_to_plane(touched, bounds)) {
     motion = fit.free();
     motion.turn = part_of_turn(motion.turn, bounds[Touch::share]);
     motion.shift = bounds[Touch::share] * motion.shift;

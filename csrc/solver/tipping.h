@@ -7,7 +7,7 @@
 // not be able to share the force, where it twists, is left to the iterations. Which they are is found by turns, as in an active set
 // method: first the one that lies furthest to where pressure has its centre, then the one that the turn about it takes deepest; of
 // three the two remain beyond whose line that centre lies. A turn that takes other vertices into a contact goes as far as the first of
-// them; but those which lie on one already stay there. Before any iteration nothing has slid, friction acts against the way that a
+// them, and on from there by another; but those which lie on one already stay there. Before any iteration nothing has slid, friction acts against the way that a
 // piece would slide, and what is out of balance will do if it lowers E. All that costs a search over the vertices each time, and
 // nothing where a piece touches nothing or rests evenly.
 #pragma once
@@ -15,7 +15,7 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr int tipping_rounds = 5;  // searches, at most
+constexpr int tipping_rounds = 8;  // searches, at most
 // Of how near a vertex is that lies on the plane: vertices may go so deep, and the piece is lifted by as much.
 constexpr double touching_depth = 1e-3;
 constexpr double rounded_depth = 0.1;  // what one of those it turns about may go for rounding
@@ -23,7 +23,8 @@ constexpr double slips_alike = 0.02;   // distance between directions of slips t
 // Square of how far off the centre of pressure of what rests is, by the spread of what lies there: 1/2 at the edges of three vertices, 1
 // of four, and 3 of many that lie evenly. Where they crowd at one side a piece may stand with more, or pass for tipping with less.
 constexpr double resting = 0.5;
-constexpr double slips_onward = 0.9;      // least cosine between a slip before and after
+constexpr double in_line = 1e-6;      // of three vertices, by how far one is off: the ends remain
+constexpr double slips_onward = 0.9;  // least cosine between a slip before and after
 constexpr double pressure_beyond = 1e-6;  // of a line, at its ends
 constexpr int balance_steps = 8;          // of Newton's method
 constexpr double balanced = 1e-9;         // its last step
@@ -42,16 +43,14 @@ struct TippingSearch {
   R seeks;  // 1: the vertex on the plane that lies furthest `away`; 0: the one that stops the motion first
 
   // Less is more of that. Of what stops a motion: first what lies on a contact and would leave it, the deepest; then what comes to one
-  // after the least share of the motion; with no reach the deepest.
+  // after the least share of the motion.
   PD_HD R order_of(const R& left, const R& beyond) const {
-    const R none(0), one(1), two(2), three(3), deep = -beyond;
-    const auto some = reach > none, lies = left < reach;
-    const R scaled = beyond / select(some, reach, one);
+    const R one(1), two(2), three(3), deep = -beyond, scaled = beyond / reach;
+    const auto lies = left < reach;
     const auto sinks = lies && deep > R(scalar_of<R>(rounded_depth)) * reach;
     const auto comes = !lies && deep > R(scalar_of<R>(touching_depth)) * reach;
     const R share = left / select(comes, left + deep, one);
-    const R order = select(comes, share - two, select(sinks, scaled - three, scaled));
-    return select(some, order, beyond);
+    return select(comes, share - two, select(sinks, scaled - three, scaled));
   }
 
   PD_HD void look(const Contacts<R>& contacts, const RigidMotion<R>& motion, const Vec3<R>& y,
@@ -127,31 +126,29 @@ struct Tipping {
     tips = false;
   }
   PD_HD bool goes_on() const { return stage != Stage::none; }
+  // Its motion ends where the piece comes to a contact.
+  PD_HD bool comes() const { return tips && share < 1.0; }
 
-  // `sums`: of the vertices that lie on the plane, see Touch. With none the piece is to land: the first vertex is the one that
-  // its free motion takes deepest, which is what a search finds with that.
+  // `sums`: of the vertices that lie on the plane, see Touch.
   PD_HD void begin(bool first_of_step, const RigidFit& fit, int plane_number,
                    const Plane<double>& plane, const double (&sums)[Touch::sums]) {
     end();
     first = first_of_step;
     const Vec3<double> n = plane.normal;
     reach = -lies_within * dot(fit.shift, n);
-    if (fit.hold != Hold::none || !(reach > 0.0)) return;
+    if (fit.hold != Hold::none || !(reach > 0.0) || !(sums[Touch::lying] > 0.0)) return;
     number = plane_number;
     count = round = 0;
     share = 1.0;
-    const bool lands = !(sums[Touch::lying] > 0.0);
-    const double each = lands ? 0.0 : 1.0 / sums[Touch::lying];
+    const double each = 1.0 / sums[Touch::lying];
     const double* at = sums + Touch::arm;
-    const Vec3<double> middle = lands ? -gap(plane, fit.center) * n
-                                      : Vec3<double>{each * at[0], each * at[1], each * at[2]};
+    const Vec3<double> middle = {each * at[0], each * at[1], each * at[2]};
     // at rest: torque about the middle is that about the mean, and that of the force there
     const Vec3<double> force = -fit.weight * fit.shift;
     const Vec3<double> torque = -axis_of(fit.covariance) - cross(middle, force);
     away = (1.0 / dot(force, n)) * cross(n, torque);
     pressure = fit.center + middle + away;
-    stage = lands ? Stage::turn : Stage::seek;
-    if (lands) return;
+    stage = Stage::seek;
     const Mat3<double> spread =
         less_outer(each * symmetric(sums + Touch::spread), 1.0, middle, middle);
     const double least = pins_apart * pins_apart * fit.square;
@@ -164,15 +161,14 @@ struct Tipping {
   }
 
   PD_HD TippingSearch<double> search(const Plane<double>& plane) const {
-    const double down = count > 0 ? drop(plane) : 0.0, seeks = stage == Stage::seek ? 1.0 : 0.0;
-    return {plane.normal, away, plane.height, count > 0 || seeks > 0 ? reach : 0.0, down, seeks};
+    const bool seeks = stage == Stage::seek;
+    return {plane.normal, away, plane.height, reach, seeks ? 0.0 : drop(plane), seeks ? 1.0 : 0.0};
   }
 
   // Goes on by what a search has found: `motion` is where the piece goes, if this is the end, or what to search with. False where
   // this is no case of tipping.
   PD_HD bool next(const RigidFit& fit, const Plane<double>& plane,
                   const double (&found)[Found::count], RigidMotion<double>& motion) {
-    const bool seeks = stage == Stage::seek;
     stage = Stage::none;
     const double depth = found[Found::depth], left = found[Found::left];
     if (!(depth < HUGE_VAL)) return false;
@@ -183,11 +179,11 @@ struct Tipping {
       const Trial trial = turn_about(fit, plane);
       motion = trial.motion;
       if (depth < 0.0) motion.shift = subtract_product(motion.shift, depth, plane.normal);
-      return tips = trial.holds || (first && lowers(fit, motion));
+      return tips = trial.holds || (first && trial.pushes && lowers(fit, motion));
     }
     if (count == 0 || left < reach) {
       const bool lies = gap(plane, vertex.at) - (count > 0 ? drop(plane) : 0.0) < reach;
-      if (((seeks || count > 0) && !lies) || !take(vertex, plane.normal)) return false;
+      if (!lies || !take(vertex, plane.normal)) return false;
     } else if (left > depth) {
       share *= left / (left - depth);
     } else {
@@ -202,7 +198,7 @@ struct Tipping {
  private:
   struct Trial {
     RigidMotion<double> motion;
-    bool holds;
+    bool pushes, holds;  // the contact; as a contact can
   };
 
   PD_HD static Vec3<double> read(const double* a) { return {a[0], a[1], a[2]}; }
@@ -235,8 +231,10 @@ struct Tipping {
       const Vec3<double> across = cross(normal, b - a);
       const double side = dot(c - a, across), length = square_root(dot(across, across));
       const double beyond = (side > 0.0 ? -1.0 : 1.0) * dot(pressure - a, across) / length;
-      if (side != 0.0 && beyond > most) {
-        most = beyond;
+      const bool aligned = square_root(side * side) <= in_line * length * length;
+      const double own = aligned ? length : beyond;
+      if (own > most) {
+        most = own;
         left = i;
       }
     }
@@ -309,7 +307,7 @@ struct Tipping {
     const Vec3<double> torque = -axis_of(turned_covariance(covariance, turn));
     const bool holds = push > 0.0 && dot(rub, rub) <= most * most &&
                        dot(apart, apart) <= reach * reach && between(n, torque, push);
-    return {{part, on[0].at, back}, holds};
+    return {{part, on[0].at, back}, push > 0.0, holds};
   }
 
   // C R^T
@@ -324,9 +322,10 @@ struct Tipping {
     const Vec3<double> n = plane.normal, arm = on[0].at - fit.center;
     const Vec3<double> along = subtract_product(n, plane.friction, way);  // of the force
     Mat3<double> turn = {};
-    bool found = false;
+    bool found = false, done = false;
     PD_ROLLED
-    for (int step = 0; step < balance_steps && !found; ++step) {
+    for (int step = 0; step < balance_steps && !done; ++step) {
+      done = found;  // the step after the last one takes what that leaves
       const Vec3<double> at = arm + turn * arm;
       const Mat3<double> product = turned_covariance(fit.covariance, turn);
       const double push = fit.weight * lift_of(fit, plane, turn * arm);
@@ -344,8 +343,8 @@ struct Tipping {
         const Vec3<double> axis = line(), roll = axis + turn * axis;
         const double rr = dot(roll, slope * roll), rn = dot(roll, slope * n);
         const double nr = dot(n, slope * roll), nn = dot(n, slope * n);
-        const double r = dot(roll, torque), y = dot(n, torque), share = 1.0 / (rr * nn - rn * nr);
-        size = {share * (nn * r - rn * y), share * (rr * y - nr * r), 0.0};
+        const double r = dot(roll, torque), y = dot(n, torque), scale = 1.0 / (rr * nn - rn * nr);
+        size = {scale * (nn * r - rn * y), scale * (rr * y - nr * r), 0.0};
         turn = turned(turned(turn, small_turn(size.x * roll)), small_turn(size.y * n));
       }
       found = dot(size, size) < balanced * balanced;
@@ -360,9 +359,19 @@ struct Tipping {
       const Vec3<double> after = tangential(on[0].slip + turn * arm + shift, n);
       holds = holds && dot(after, way) > slips_onward * square_root(dot(after, after));
     }
-    const Mat3<double> part = part_of_turn(turn, share);
+    const Mat3<double> part = part_of_slide(turn, n);
     return {{part, fit.center, multiply_add(lift_of(fit, plane, part * arm), along, fit.shift)},
+            push > 0.0,
             holds};
+  }
+
+  // A share of how it rolls and of how it turns about the normal, so that the line of two vertices stays level.
+  PD_COLD Mat3<double> part_of_slide(const Mat3<double>& turn, const Vec3<double>& n) const {
+    if (share == 1.0 || count < 2) return part_of_turn(turn, share);
+    const Vec3<double> axis = line(), after = axis + turn * axis;
+    const Mat3<double> yaw = best_turn_about({{after.x * axis, after.y * axis, after.z * axis}}, n);
+    const Mat3<double> roll = turned(turn, transpose(yaw));
+    return turned(part_of_turn(roll, share), part_of_turn(yaw, share));
   }
 
   // How far a piece goes up from its free way, so that the vertex which moves by `turn` besides comes to lie on the plane.

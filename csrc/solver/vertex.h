@@ -91,6 +91,14 @@ struct Vertex {
     return first(contacts, Lanes::value({none, none, none}));
   }
 
+  // Where a rigid motion of its piece takes it from u, by `way`. By none it keeps its bits, the sign of a 0 too.
+  PD_HD Value moved(const Value& u, const Vec3<Real>& way) const {
+    const Vec3<Real> to = Lanes::vec3(hold(u, u + Lanes::value(way))), stays = Lanes::vec3(u);
+    const auto moves = !(dot(way, way) <= Real(T(0)));
+    return Lanes::value(
+        {select(moves, to.x, stays.x), select(moves, to.y, stays.y), select(moves, to.z, stays.z)});
+  }
+
   // dE/du, `force` being that of the elements, dE_elastic/du
   PD_HD Value gradient(const Value& u, const Value& force) const {
     return multiply_add(inertia, u - target, force);
