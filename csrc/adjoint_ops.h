@@ -2,10 +2,14 @@
 // `adjoint_result`, which run a call; and `recording(like)`, whether what is done is recorded for later, where nobody can ask
 // what comes out.
 #pragma once
+#include "checks.h"
 #include "find_op.h"
 #include "ops.h"
+#include "plan_views.h"
 #include "solver/adjoint.h"
 
+#include <cstddef>
+#include <cstdint>
 #include <optional>
 #include <string_view>
 #include <tuple>

@@ -3,14 +3,17 @@
 // Not registered from Python, where the lists of a plan and of a material cost more than a small step itself.
 #include "checks.h"
 #include "find_op.h"
+#include "plan_views.h"
 
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
 
+#include <cstddef>
+#include <cstdint>
 #include <functional>
 #include <optional>
 #include <tuple>
-#include <vector>
+#include <utility>
 
 namespace pd {
 namespace {

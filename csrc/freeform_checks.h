@@ -3,8 +3,8 @@
 #include "checks.h"
 #include "patches/tasks.h"
 
+#include <cstdint>
 #include <optional>
-#include <tuple>
 
 namespace pd::freeform {
 

@@ -2,6 +2,9 @@
 #pragma once
 #include "freeform_checks.h"
 
+#include <cmath>
+#include <tuple>
+
 namespace pd::freeform {
 
 struct SolidTensors {

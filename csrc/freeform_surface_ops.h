@@ -2,6 +2,8 @@
 #pragma once
 #include "freeform_checks.h"
 
+#include <tuple>
+
 namespace pd::freeform {
 
 template <class T>

@@ -2,10 +2,12 @@
 #include "adjoint_ops.h"
 
 #include "cpu/dispatch.h"
+#include "plan_views.h"
 
 #include <ATen/Parallel.h>
 
 #include <string>
+#include <vector>
 
 namespace pd {
 namespace {

@@ -4,12 +4,17 @@
 // `precondition`, `conjugate` and `rotation`, which run a call on the device of the tensor they are given.
 #pragma once
 #include "checks.h"
+#include "plan/views.h"
+#include "plan_views.h"
 
 #include <ATen/ATen.h>
 #include <torch/library.h>
 
+#include <cstdint>
 #include <limits>
 #include <optional>
+#include <tuple>
+#include <vector>
 
 namespace pd {
 
@@ -94,9 +99,12 @@ void step_inplace(const Tensor& positions, const Tensor& velocities, const Tenso
   const Numbers n{schedule, iterations, time_step, relaxation, rho,
                   delay,    weighted,   tolerance, inertial,   report};
   check_inplace(positions, velocities, info);
-  // the state is read before it is written: loads and stores of an environment do not overlap in time
+  // The state is read before it is written: loads and stores of an environment do not overlap in time. Nor do those of a start
+  // in the same memory, but with no iterations, in which blocks wait for each other.
+  const bool shared = start && (start->is_alias_of(positions) || start->is_alias_of(velocities));
+  const OptionalTensor own = shared && iterations == 0 ? OptionalTensor(start->clone()) : start;
   run_step<Backend>(
-      {positions, velocities, forces, start, material, plan, positions, velocities, info},
+      {positions, velocities, forces, own, material, plan, positions, velocities, info},
       settings_of(n, start.has_value(), 1, 1));
   // so that autograd notices when it needs what has been overwritten
   for (const Tensor& t : {positions, velocities, info}) {

@@ -13,6 +13,13 @@ from devices import missing_gpu
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
 
 
+# Beside each other the processes of pytest-xdist share the cores; with more threads than that they wait for each other.
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
+    share = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
+    torch.set_num_threads(share)
+    os.environ.setdefault("OMP_NUM_THREADS", str(share))  # of what tests start
+
+
 def _devices() -> list[str]:
     return ["cpu"] if missing_gpu() else ["cpu", "cuda"]
 

@@ -259,9 +259,11 @@ def test_graphs_and_rollouts_of_many_patches(
     assert all(same_bits(track.state(number), steps[number]) for number in range(6))
 
 
+@pytest.mark.parametrize("iterations", [0, 8])
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_start_may_be_the_state_that_is_overwritten(kernel: str, precision: str) -> None:
+def test_start_may_be_the_state_that_is_overwritten(kernel: str, iterations: int, precision: str) -> None:
     sim = full_on_gpu(DTYPES[precision], kernel)
+    sim.iterations = iterations
     state = moving(sim, 5)
     expected = sim(state, start=state.positions)
     sim.step_(state, start=state.positions)

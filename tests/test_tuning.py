@@ -1,53 +1,20 @@
-"""`Simulator.tune` reaches what it promises, says what it cannot, and refuses what cannot be studied."""
+"""`Simulator.tune` reaches what it promises, and says what it cannot."""
 
 from __future__ import annotations
 
-import copy
 import dataclasses
-import math
-import pickle
-import re
 import warnings
-from collections.abc import Callable
 
 import pytest
 import torch
+from tuning_cases import CANDIDATES, bar, swinging, worst_error
 
 import torchpd as pd
 from torchpd import tuning
-from torchpd.accuracy import ExactStep, exact_steps, frictionless, settled_steps
+from torchpd.accuracy import ExactStep, exact_steps, settled_steps
 from torchpd.contenders import safe_solvers
-from torchpd.promise import Promise, Trial
+from torchpd.promise import Trial
 from torchpd.tuning import TuningWarning
-
-CANDIDATES = ["guarded Chebyshev", "damped Jacobi", "Multilevel"]  # of `tune`, in its order
-
-
-def bar(youngs: float = 1e5, time_step: float = 1 / 60, **options: object) -> pd.Simulator:
-    mesh = pd.shapes.box((1.0, 0.2, 0.2), (6, 2, 2))
-    body = pd.Solid(mesh, youngs=youngs)
-    scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
-    return pd.Simulator(scene, time_step, progress=False, **options)  # type: ignore[arg-type]
-
-
-def swinging(sim: pd.Simulator, batch: int = 1, speed: float = 5.0) -> pd.State:
-    state = sim.rest_state(batch)
-    state.velocities[..., 1] = -speed * state.positions[..., 0] ** 2
-    return state
-
-
-def worst_error(sim: pd.Simulator, state: pd.State) -> float:
-    """Of one step of each environment."""
-    smooth = frictionless(sim)
-    after = smooth(state).velocities.double().numpy() * sim.time_step
-    steps = exact_steps(sim, state)
-    return max(step.error_beyond_rounding(u, sim.dtype) for step, u in zip(steps, after, strict=True))
-
-
-@pytest.fixture(scope="module")
-def tuned() -> tuple[pd.Simulator, Promise]:
-    sim = bar()
-    return sim, sim.tune(swinging(sim), error=1e-2)
 
 
 @pytest.mark.parametrize("error", [1e-1, 1e-3])
@@ -93,137 +60,6 @@ def test_less_error_takes_longer(favoured: str, monkeypatch: pytest.MonkeyPatch)
     assert costs == sorted(set(costs))
 
 
-def test_the_promise_is_printed_and_goes_stale(tuned: tuple[pd.Simulator, Promise]) -> None:
-    sim, promise = tuned
-    assert promise.covers(sim)
-    assert "tuned: error 1.0e-02" in repr(sim)
-    assert "no longer holds" not in repr(sim)
-    sim.iterations += 1
-    assert not promise.covers(sim)
-    assert "no longer holds" in repr(sim)
-    sim.iterations -= 1
-
-
-def test_residuals_are_watched(tuned: tuple[pd.Simulator, Promise]) -> None:
-    sim, promise = tuned
-    _, info = sim(swinging(sim, batch=2), return_info=True)
-    assert promise.holds(info).tolist() == [True, True]
-    # the estimate is proportional, and no studied state has more error than it says: of the chosen iterations, and of
-    # the most that break the promise
-    chosen = promise.trials[-1]
-    assert max(chosen.errors) == chosen.error
-    breaking = min((trial for trial in promise.trials if trial.error > promise.error), key=lambda trial: trial.error)
-    pairs = [pair for trial in (chosen, breaking) for pair in zip(trial.errors, trial.residuals, strict=True)]
-    assert max(e - promise.error_per_residual * r for e, r in pairs) == pytest.approx(0.0, abs=1e-12)
-    assert promise.residual_limit <= max(breaking.residuals) * promise.error / breaking.error
-    assert promise.estimate(info)[0] == pytest.approx(promise.error_per_residual * float(info.residual[0]))
-    doubted = info._replace(residual=torch.tensor([2.0 * promise.residual_limit, math.nan]))
-    assert promise.holds(doubted).tolist() == [False, False]
-
-
-def test_an_audit_finds_the_error() -> None:
-    """Three times as many iterations later hardly any error is left, so the way there is the error that was."""
-    sim = bar(dtype=torch.float64)
-    promise = sim.tune(swinging(sim), error=1e-2)
-    state = swinging(sim, batch=2)
-    after = sim(state)
-    found = promise.audit(sim, state, after)
-    true = worst_error(sim, state)
-    assert found.shape == (2,)
-    assert float(found.max()) == pytest.approx(true, rel=0.3)
-    assert sim.iterations == promise.iterations
-
-
-def test_what_is_not_doubted_is_not_audited(monkeypatch: pytest.MonkeyPatch) -> None:
-    sim = bar(dtype=torch.float64)
-    promise = sim.tune(swinging(sim), error=1e-2)
-    state = swinging(sim, batch=3)
-    after, info = sim(state, return_info=True)
-    full = promise.audit(sim, state, after)
-    # residuals at which half and twice the promised error are expected, and none
-    edge = promise.error / promise.error_per_residual
-    told = info._replace(residual=torch.tensor([0.5 * edge, 2.0 * edge, math.nan], dtype=torch.float64))
-    found = promise.audit(sim, state, after, info=told)
-    assert float(found[0]) == pytest.approx(0.5 * promise.error)
-    assert torch.equal(found[1:], full[1:])
-    promise.doubt(True)
-    assert torch.equal(promise.audit(sim, state, after, info=told), full)
-    promise.doubt(False)
-    calls: list[object] = []
-    monkeypatch.setattr(pd.Simulator, "forward", lambda *given, **more: calls.append(given))
-    calm = info._replace(residual=torch.full((3,), 0.5 * edge, dtype=torch.float64))
-    assert promise.audit(sim, state, after, info=calm).tolist() == promise.estimate(calm).tolist()
-    assert calls == []
-
-
-@pytest.mark.parametrize("error", [1e-5, 1e-7])
-def test_rounding_is_told_apart_from_error(error: float) -> None:
-    """A float32 step has 10 eps |x| of it: more than such promises, which hold beyond it and are audited beyond it."""
-    sim = bar()
-    state = swinging(sim)
-    with pytest.warns(TuningWarning, match="more than the error, in every state of the study.*dtype=torch.float64"):
-        promise = sim.tune(state, error=error)
-    assert promise.attained
-    (exact,) = exact_steps(sim, state)
-    share = 10.0 * 2.0**-23 * float(state.positions.norm()) / exact.scale
-    assert share > 10.0 * error
-    assert promise.rounding >= 0.999 * share
-    assert str(promise).startswith(f"error {error:.1e} and up to {promise.rounding:.1e} of rounding, ")
-    assert promise.audit(sim, state, sim(state)).tolist() == [0.0]
-    sim.iterations //= 4
-    found = float(promise.audit(sim, state, sim(state)))
-    assert found == pytest.approx(worst_error(sim, state), rel=0.3)
-    assert found > error
-
-
-def test_a_body_at_rest_has_no_error() -> None:
-    sim = bar()
-    promise = sim.tune(swinging(sim), error=1e-2)
-    still = pd.Scene(pd.Solid(pd.shapes.single_tet(), youngs=1e4))
-    other = pd.Simulator(still, sim.time_step, progress=False)
-    state = other.rest_state(2)
-    assert promise.audit(other, state, other(state)).tolist() == [0.0, 0.0]
-
-
-def test_what_few_iterations_more_than_solve_is_watched_too() -> None:
-    """The chosen iterations err by rounding alone; the most that break the promise say what a residual means."""
-    sim = bar(youngs=1e3)
-    state = swinging(sim)
-    promise = sim.tune(state, error=1e-2, candidates=[pd.Multilevel()])
-    assert promise.studied_error < 1e-6
-    assert bool(promise.holds(sim(state, return_info=True)[1]))
-    sim.iterations = 1
-    after, info = sim(state, return_info=True)
-    (exact,) = exact_steps(sim, state)
-    assert exact.judge(after.velocities[0].double().numpy() * sim.time_step).position > 2.0 * promise.error
-    assert not bool(promise.holds(info))
-    assert float(promise.estimate(info)) > promise.error
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_promise_for_a_time_is_watched_as_well(dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Far more iterations are paid for than are needed: trials of fewer say what a residual means."""
-    monkeypatch.setattr(tuning, "_milliseconds", lambda sim, start, trial: 0.01 * trial.iterations)
-    sim = bar(dtype=dtype)
-    promise = sim.tune(swinging(sim), milliseconds=1.0, candidates=[pd.Chebyshev()])
-    assert promise.iterations <= 95
-    assert promise.error <= promise.rounding  # so many iterations leave nothing else
-    chosen = promise.trials[-1]
-    assert promise.residual_limit >= 1.5 * max(chosen.residuals)
-    broken = min((trial for trial in promise.trials if trial.error > promise.error), key=lambda trial: trial.error)
-    assert 0 < broken.iterations < promise.iterations
-    state = swinging(sim, speed=-2.0)
-    for _ in range(30):
-        state, info = sim(state, return_info=True)
-        assert bool(promise.holds(info))
-        # of such a residual rounding is the larger part
-        assert float(promise.estimate(info)) <= promise.error + promise.rounding
-    sim.iterations = broken.iterations // 2
-    info = sim(state, return_info=True)[1]
-    assert not bool(promise.holds(info))
-    assert float(promise.estimate(info)) > promise.error
-
-
 def test_stiff_bodies_almost_at_rest_in_float64() -> None:
     """The converged steps are as certain as Newton's method makes them, not as |grad E| over inertia bounds them."""
     sim = bar(youngs=1e8, dtype=torch.float64, iterations=20)
@@ -232,15 +68,6 @@ def test_stiff_bodies_almost_at_rest_in_float64() -> None:
         promise = sim.tune(error=1e-2)
     assert promise.attained
     assert promise.studied_error <= 1e-2
-
-
-def test_an_audit_is_told_where_pins_are() -> None:
-    sim = bar(dtype=torch.float64)
-    promise = sim.tune(swinging(sim), error=1e-2)
-    state, targets = sim.rest_state(), sim.pin_targets + torch.tensor([0.0, 0.05, 0.0], dtype=torch.float64)
-    after = sim(state, targets=targets)
-    assert float(promise.audit(sim, state, after, targets=targets)) <= promise.error
-    assert float(promise.audit(sim, state, after)) > 1.0  # of another step
 
 
 def test_out_of_reach_is_said_with_the_best_there_is() -> None:
@@ -287,21 +114,6 @@ def test_stiff_beams_are_tuned() -> None:
     assert worst_error(sim, swinging(sim, speed=-10.0)) <= 1e-2
 
 
-def test_asking_about_another_simulator_changes_nothing(tuned: tuple[pd.Simulator, Promise]) -> None:
-    sim, promise = copy.deepcopy(tuned)
-    sim.promise = promise
-    other = copy.deepcopy(sim)
-    other.set_material(stiffness=1e3 * other.stiffness)
-    _, info = sim(swinging(sim), return_info=True)
-    held = promise.holds(info)
-    assert not promise.covers(other)
-    assert torch.equal(promise.holds(info), held)
-    assert "another material" not in str(promise)
-    assert pickle.loads(pickle.dumps(promise)) == promise
-    with pytest.raises(AttributeError):
-        promise.error = 1.0  # type: ignore[misc]
-
-
 def test_a_kernel_without_multilevel_is_tuned_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A GPU's "block", for one: the study moves by Chebyshev then."""
     for module in ("contenders", "tuning"):
@@ -310,34 +122,6 @@ def test_a_kernel_without_multilevel_is_tuned_without_it(monkeypatch: pytest.Mon
     promise = sim.tune(swinging(sim), error=1e-2)
     assert promise.attained
     assert not any(isinstance(trial.solver, pd.Multilevel) for trial in promise.trials)
-
-
-def material_twice(sim: pd.Simulator) -> None:
-    sim.set_material(stiffness=1000.0 * sim.stiffness)
-
-
-def material_from_a_checkpoint(sim: pd.Simulator) -> None:
-    sim.load_state_dict({**sim.state_dict(), "stiffness": 1000.0 * sim.stiffness})
-
-
-def material_in_place(sim: pd.Simulator) -> None:
-    with torch.no_grad():
-        sim.stiffness *= 1000.0
-
-
-@pytest.mark.parametrize("change", [material_twice, material_from_a_checkpoint, material_in_place])
-def test_a_promise_is_for_its_material(change: Callable[[pd.Simulator], None]) -> None:
-    sim = bar(1e3)
-    state = swinging(sim)
-    promise = sim.tune(state, error=1e-2)
-    sim.set_material(stiffness=sim.stiffness.clone())  # the same numbers
-    assert "another material" not in repr(sim)
-    assert promise.covers(copy.deepcopy(sim))
-    change(sim)
-    assert "for another material than now" in repr(sim)
-    assert not promise.covers(sim)
-    assert promise.holds(sim(state, return_info=True)[1]).tolist() == [False]
-    assert worst_error(sim, state) > promise.error
 
 
 def test_every_environment_counts() -> None:
@@ -401,19 +185,6 @@ def test_without_a_state_the_motion_starts_at_rest() -> None:
     assert sim.tune(error=1e-1).attained
 
 
-def test_candidates_may_be_given() -> None:
-    sim = bar()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert sim.tune(swinging(sim), error=0.3, candidates=[pd.Jacobi()]).solver == pd.Jacobi()
-    with pytest.raises(ValueError, match="candidates must hold at least one solver"):
-        sim.tune(error=0.1, candidates=[])
-    with pytest.raises(TypeError, match=r"candidates must be solvers, .* got 'auto'"):
-        sim.tune(error=0.1, candidates=["auto"])  # type: ignore[list-item]
-    with pytest.raises(ValueError, match=r"velocities must be \[2, 63, 3\] like positions \(m/s\), got \[3, 63, 3\]"):
-        sim.tune(pd.State(sim.rest_state(2).positions, sim.rest_state(3).velocities), error=0.1)
-
-
 # A step that takes 0.1 ms and 10 us an iteration: (0.95 budget - 0.1) / 0.01 iterations.
 @pytest.mark.parametrize(
     ("budget", "iterations", "attained"), [(1.005, 85, True), (0.505, 37, True), (0.09, 1, False), (1e3, 200, True)]
@@ -468,54 +239,6 @@ def test_a_real_budget_is_near() -> None:
     budget = tuning._milliseconds(sim, swinging(sim), trial)
     found = sim.tune(swinging(sim), milliseconds=4.0 * budget, candidates=[pd.Chebyshev()]).iterations
     assert 96 < found < 1024
-
-
-@pytest.mark.parametrize(
-    ("request_", "message"),
-    [
-        ({}, "takes one of error and milliseconds, got error=None and milliseconds=None"),
-        ({"error": 0.1, "milliseconds": 1.0}, "takes one of error and milliseconds"),
-        ({"error": 0.0}, "error must lie in (0, 1)"),
-        ({"error": 1.5}, "error must lie in (0, 1)"),
-        ({"milliseconds": -1.0}, "milliseconds must be positive and finite"),
-        ({"error": 0.1, "most": 0}, "most must be a whole number >= 1, got 0"),
-        ({"error": 0.1, "most": 1.5}, "most must be a whole number >= 1, got 1.5"),
-        ({"error": math.nan}, "error must be finite, got nan"),
-        ({"error": 0.1, "candidates": []}, "candidates must hold at least one solver"),
-    ],
-)
-def test_bad_requests_are_named(request_: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        bar().tune(**request_)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("candidates", ["auto", pd.Jacobi()])
-def test_candidates_are_a_sequence(candidates: object) -> None:
-    with pytest.raises(TypeError, match="candidates must be a sequence of solvers, got"):
-        bar().tune(error=0.1, candidates=candidates)  # type: ignore[arg-type]
-
-
-def test_numbers_of_a_request_may_be_tensors() -> None:
-    assert bar().tune(error=torch.tensor(0.125)).asked_error == 0.125  # type: ignore[arg-type]
-
-
-def test_states_that_are_not_finite_are_named() -> None:
-    sim = bar()
-    state = swinging(sim, batch=3)
-    state.velocities[1, 4, 2] = math.nan
-    with pytest.raises(ValueError, match=r"state\.velocities must be finite, got NaN or infinity in environment 1"):
-        sim.tune(state, error=0.1)
-
-
-@pytest.mark.parametrize("name", ["forces", "gravity", "pin_targets", "stiffness", "pin_stiffness"])
-def test_what_is_no_number_is_named(name: str) -> None:
-    sim = bar()
-    forces = torch.zeros_like(sim.rest_state().positions)
-    array = forces if name == "forces" else getattr(sim, name)
-    with torch.no_grad():
-        array.view(-1)[-1] = math.nan
-    with pytest.raises(ValueError, match=rf"tune: {name} must be finite, got NaN or infinity at \["):
-        sim.tune(swinging(sim), error=0.1, forces=forces)
 
 
 def test_what_friction_leaves_out_is_said() -> None:
@@ -582,22 +305,6 @@ def test_steps_without_an_end_attain_nothing(monkeypatch: pytest.MonkeyPatch) ->
     assert sim.tune(state, error=0.5).attained
 
 
-def test_a_singular_system_is_named() -> None:
-    sim = bar()
-    with torch.no_grad():
-        sim.masses[20] = 0.0
-    with pytest.raises(ValueError, match=r"the system is singular: vertex 20 has inertia 0 N/m"):
-        sim.tune(swinging(sim), error=0.1)
-
-
-def test_a_scene_without_motion_is_named() -> None:
-    mesh = pd.shapes.box((1.0, 0.2, 0.2), (4, 1, 1))
-    free = pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e5), pd.Gravity()), progress=False)
-    with pytest.raises(ValueError, match="no motion that needs solving"):
-        free.tune(error=0.1)
-    assert free.promise is None
-
-
 def test_the_hardest_states_of_the_motion_are_studied() -> None:
     """A beam of 100 kPa goes through a few states where the energy is not convex, which take four times as long."""
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (25, 5, 5))
@@ -612,10 +319,3 @@ def test_the_hardest_states_of_the_motion_are_studied() -> None:
         state = after
     # 0.46 from the states of five fixed steps
     assert worst <= promise.error
-
-
-def test_what_is_no_info_is_named(tuned: tuple[pd.Simulator, Promise]) -> None:
-    sim, promise = tuned
-    for ask in (promise.holds, promise.estimate):
-        with pytest.raises(TypeError, match=r"info must be what `state, info = .* gives, got tuple"):
-            ask(sim(sim.rest_state(), return_info=True))  # type: ignore[arg-type]

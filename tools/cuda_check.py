@@ -4,8 +4,8 @@ The C++ sources of a CUDA build are read too, as far as the compiler's syntax ch
 
 What ptxas says about registers, spills and shared memory is kept in build/cuda-check/, one report per source, and with
 --table FILE as one table (CSV) of all kernels; benchmarks/results/cuda-registers.csv is the one of this repository.
---quick takes one architecture a source, in turn, which is half the work: where that table is not stale, as a test
-demands, all have been compiled when it was made.
+--quick takes one architecture a source, in turn, and goes as far as PTX, which is an eighth of the work: where that
+table is not stale, as a test demands, ptxas has compiled all of it when it was made.
 """
 
 from __future__ import annotations
@@ -73,11 +73,14 @@ def choose_targets(sources: Sequence[Path], *, quick: bool) -> dict[Path, tuple[
     return targets
 
 
-def command_for(nvcc: str, source: Path, folders: list[str], architectures: Sequence[str]) -> list[str]:
+def command_for(
+    nvcc: str, source: Path, folders: list[str], architectures: Sequence[str], *, quick: bool = False
+) -> list[str]:
     command = [nvcc, "-c", str(source), "-o", os.devnull, "-DTORCHPD_CUDA", *folders]
     if source.suffix == ".cpp":
         return [*command, *GLUE_FLAGS]
-    targets = [f"-gencode=arch=compute_{target},code=sm_{target}" for target in architectures]
+    code = "compute" if quick else "sm"
+    targets = [f"-gencode=arch=compute_{target},code={code}_{target}" for target in architectures]
     return [*command, *nvcc_flags(), *targets, "-Xptxas=-v"]
 
 
@@ -191,7 +194,7 @@ def write_table(path: Path, reports: list[Path], made_of: str) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Compile every CUDA source; no GPU needed.")
     parser.add_argument("--table", type=Path, help="file for a table of the kernels' registers and spills (CSV)")
-    parser.add_argument("--quick", action="store_true", help="one architecture a source, in turn")
+    parser.add_argument("--quick", action="store_true", help="PTX of one architecture a source, in turn")
     options = parser.parse_args()
     if options.quick and options.table is not None:
         parser.error("--table is of all architectures, so it does not go with --quick")
@@ -208,14 +211,17 @@ def main() -> int:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         passed = list(
             pool.map(
-                lambda source: compile_source(command_for(nvcc, source, folders, targets[source]), source), everything
+                lambda source: compile_source(
+                    command_for(nvcc, source, folders, targets[source], quick=options.quick), source
+                ),
+                everything,
             )
         )
     usual, newer = (" and ".join(f"sm_{target}" for target in names) for names in (TARGETS, NEWER_TARGETS))
     all_of_them = f"{usual}, {', '.join(NEWER_SOURCES)} for {newer} too"
     print(
         f"cuda-check: {sum(passed)} of {len(everything)} sources of a CUDA build compile for "
-        f"{'one architecture each' if options.quick else all_of_them}, with {nvcc}"
+        f"{'PTX of one architecture each' if options.quick else all_of_them}, with {nvcc}"
     )
     if options.table and all(passed):
         write_table(options.table, [report_of(source) for source in sources], made_of)

@@ -24,27 +24,41 @@ from __future__ import annotations
 import argparse
 import csv
 import itertools
-import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest import mock
 
 import numpy as np
 import torch
-import trimesh
 from cuda_check import kernel_name
-from torch import Tensor
+from sanitize_plants import (  # noqa: F401  (some for tests)
+    behind_list,
+    plant,
+    planted_scene,
+    why_not_plant,
+    without_last,
+)
+from sanitize_scenes import (
+    BAR,
+    DTYPES,
+    KERNELS,
+    WAYS,
+    ball_of_patches,
+    bar,
+    compiled_for,
+    known_as,
+    samples_everywhere,
+    scene,
+)
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 import torchpd as pd
-from torchpd import multilevel, regimes
+from torchpd import multilevel
 from torchpd.device_plan import compile_device_plan
 from torchpd.gpu import properties_of
 from torchpd.plan import KERNELS as PLAN_KERNELS
@@ -53,86 +67,9 @@ from torchpd.render import Camera
 from torchpd.tables import DEVICE_PLAN_TABLE, MATERIAL_TABLE
 
 TABLE = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "cuda-registers.csv"
-DTYPES = (torch.float32, torch.float64)
 SOLVERS = (pd.Chebyshev(), pd.Jacobi(), pd.Chebyshev("classic", rho=0.9, delay=1))
-ops = torch.ops.torchpd
-
-
-def bar(*cells: int) -> pd.TetMesh:
-    """Of cells of 10 cm."""
-    return pd.shapes.box(0.1 * np.array(cells), cells)
-
-
-def cones(subdivisions: int) -> pd.TetMesh:
-    """A ball whose tetrahedra share its centre: the patch that owns it has all of them, and few other vertices."""
-    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
-    corners = np.column_stack([np.zeros(len(sphere.faces), dtype=np.int64), sphere.faces + 1])
-    return pd.TetMesh(0.1 + 0.1 * np.concatenate([np.zeros((1, 3)), sphere.vertices]), corners)
-
-
-def crumbs(count: int) -> pd.TetMesh:
-    """Tetrahedra that share no vertex: many slots for little work."""
-    corners = 0.01 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    place = 0.02 * np.column_stack(np.unravel_index(np.arange(count), (9, 9, 9)))
-    return pd.TetMesh((place[:, None] + corners).reshape(-1, 3), np.arange(4 * count).reshape(-1, 4))
-
-
-class Way(NamedTuple):
-    """What a kernel runs with: a mesh, and constants of torchpd.regimes that decide how many patches there are."""
-
-    mesh: pd.TetMesh
-    constants: dict[str, Any]
-
-
-BAR = bar(6, 2, 2)
-SMALL, LARGE = dict.fromkeys(DTYPES, 24), {torch.float32: 2304, torch.float64: 960}
-# The smallest that were found for all instantiations. "far" is a grid whose patches have several tetrahedra and several
-# vertices a thread, "large" a stream of such patches, and of one with more slots than a pipeline counts. "several" is
-# "block" in float32 of meshes so small that many environments share blocks.
-WAYS = {
-    # of several small ones a block: of each one with few registers, two of two rounds, two of one
-    "several": (Way(bar(4, 2, 2), {}), Way(BAR, {}), Way(bar(2, 2, 2), {})),
-    # all vertex arrays are in shared memory; not all: in float32, in float64
-    "block": (Way(bar(9, 2, 2), {}), Way(bar(40, 1, 1), {}), Way(bar(4, 2, 2), {})),
-    # four lanes a vertex, in few threads and in many; eight, in few and in many
-    "cluster": (
-        Way(bar(4, 2, 2), {"_CLUSTER_EACH": 60}),
-        Way(bar(4, 4, 2), {"_CLUSTER_EACH": 150}),
-        Way(cones(1), {"_CLUSTER_EACH": 10}),
-        Way(cones(2), {"_CLUSTER_EACH": 40}),
-    ),
-    "grid": (Way(BAR, {"_GRID_TETS": 8}),),
-    "far": (Way(bar(99, 1, 1), {"_GRID_TETS": 594}),),
-    "stream": (
-        Way(BAR, {"_STREAM_TETS": SMALL}),
-        Way(crumbs(9), {"_STREAM_TETS": SMALL}),  # more parts of pieces than a block has warps that move them
-    ),
-    "large": (Way(bar(19, 20, 1), {"_STREAM_TETS": LARGE}), Way(crumbs(129), {"_STREAM_TETS": LARGE})),
-}
-KERNELS = tuple(WAYS)
 RUNS = (*KERNELS, "levels", "patches")  # and what the multilevel solver runs with, and the ops of free-form patches
-
-
-@contextmanager
-def compiled_for(kernel: str, way: Way) -> Iterator[str]:
-    """The name that a simulator knows one of KERNELS by, which meanwhile has the patches of a way."""
-    with mock.patch.dict(vars(regimes), way.constants):
-        yield {"far": "grid", "large": "stream", "several": "block"}.get(kernel, kernel)
-
-
-def scene(mesh: pd.TetMesh, *, contacts: bool, pieces: bool, pins: bool) -> pd.Scene:
-    """Two bodies, the second of which is free where pieces are wanted, and tips on the ground."""
-    tilt = np.array([[0.96, 0.28, 0.0], [-0.28, 0.96, 0.0], [0.0, 0.0, 1.0]])
-    places = (mesh.vertices, mesh.vertices @ tilt + [0.0, 0.0, 1.5])
-    bodies = [pd.Solid(pd.TetMesh(vertices, mesh.tets), 1e5) for vertices in places]
-    held = bodies[:1] if pieces else bodies
-    parts: list[pd.scene.Part] = [*bodies, pd.Gravity(), pd.Damping(0.5)]
-    if pins:
-        for body in held:
-            parts += [pd.Pin(body, np.arange(9)), pd.Pin(body, len(mesh.vertices) - np.arange(1, 3), 1e3)]
-    if contacts:
-        parts += [pd.Ground(-0.001, friction=0.5), pd.Sphere((0.3, -0.1, 0.1), 0.1, friction=0.2)]
-    return pd.Scene(*parts)
+ops = torch.ops.torchpd
 
 
 def step_all_ways(sim: pd.Simulator, batch: int) -> None:
@@ -251,21 +188,6 @@ def levels(dtype: torch.dtype) -> int:
     return len(ways) + 1
 
 
-def ball_of_patches(**options: Any) -> pd.FreeFormPatches:
-    """Free-form patches, in float64 as they are made."""
-    ball = trimesh.creation.icosphere(subdivisions=1)
-    centres = torch.tensor(ball.vertices[::2])
-    amplitudes = torch.tensor(0.02 * np.random.default_rng(0).choice([-1.0, 1.0], len(centres)))
-    quadrics = pd.Quadrics.from_radii(amplitudes, centres, torch.full((len(centres),), 0.4, dtype=torch.float64))
-    mesh = pd.TriMesh.from_trimesh(ball)
-    return pd.FreeFormPatches.from_mesh(mesh, quadrics, dtype=torch.float64, **options)
-
-
-def samples_everywhere(patches: pd.FreeFormPatches) -> pd.PatchSamples:
-    """On the edges of the patches and inside of each, of the last one too."""
-    return patches.tessellate(3).samples
-
-
 def free_form(dtype: torch.dtype) -> int:
     """Every op of free-form patches and its adjoint, two poses at once."""
     rng = np.random.default_rng(0)
@@ -295,9 +217,9 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
     """All instantiations of a kernel of KERNELS; everything that a step can have with the first mesh."""
     count = 0
     flags = list(enumerate(itertools.product((False, True), repeat=2)))
+    options: dict[str, Any] = {"dtype": dtype, "kernel": known_as(kernel), "progress": False}
     for way in WAYS[kernel]:
-        with compiled_for(kernel, way) as name:
-            options: dict[str, Any] = {"dtype": dtype, "kernel": name, "progress": False}
+        with compiled_for(kernel, way):
             # of the others all but contacts of bodies that are held, which have the kernels of loose ones
             for number, (contacts, pieces) in flags if way is WAYS[kernel][0] else flags[:2] + flags[3:]:
                 solver, tolerance = SOLVERS[number % len(SOLVERS)], 1e-2 if number % 2 else 0.0
@@ -323,8 +245,11 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
         free = scene(WAYS[kernel][0].mesh, contacts=True, pieces=True, pins=False)
         step_all_ways(pd.Simulator(free, 1 / 60, 5, **options).to("cuda"), 2)
     if kernel == "grid":
-        sim.plan = in_many_patches(sim)
-        step_all_ways(sim, 3)
+        built = scene(BAR, contacts=True, pieces=True, pins=True)
+        with compiled_for(kernel, WAYS[kernel][0]):
+            many = pd.Simulator(built, 1 / 60, 5, solver=SOLVERS[0], tolerance=1e-2, **options).to("cuda")
+        many.plan = in_many_patches(many)
+        step_all_ways(many, 3)
         count += 1
     return count + 1
 
@@ -409,95 +334,7 @@ def say_what_ran(ran: Counter[str], expected: set[str]) -> bool:
     return not missing and not unknown
 
 
-# ---- controls
-
-
-def change_plan(sim: pd.Simulator, name: str, change: Callable[[Tensor], Tensor]) -> None:
-    """Puts another array into the plan."""
-    rows = zip(sim.plan.table, sim.plan.arrays, strict=True)
-    sim.plan = replace(sim.plan, arrays=tuple(change(array) if row.name == name else array for row, array in rows))
-
-
-def ends_alone(array: Tensor) -> Tensor:
-    """The array, of a size that lets nothing begin at its end."""
-    if array.numel() * array.element_size() % 256 == 0:  # allocations begin at multiples of it
-        raise RuntimeError("what lies behind may be another tensor; take a scene of another size")
-    return array
-
-
-def without_last(array: Tensor) -> Tensor:
-    """The size of part_slot is the only one that no other number of the plan tells: the ops take it as it comes."""
-    return ends_alone(array[:-1].clone())
-
-
-def into_one_place(corners: Tensor) -> Tensor:
-    """Every corner that has an entry gets the first one: in the upper 16 bits, 65535 where there is none."""
-    return torch.where(corners >> 16 == -1, corners, corners & 65535)
-
-
-def behind_list(patches: pd.FreeFormPatches) -> pd.FreeFormPatches:
-    """The last patch has an entry more than there are."""
-    names = dict(zip(("triangles", "patch_start", "entry_quadric"), patches.lists, strict=False))
-    ends_alone(names["entry_quadric"])
-    names["patch_start"][-1] += 1
-    return patches
-
-
-def plant_in_patches(tool: str) -> None:
-    """Heights in which `tool` must find an error."""
-    patches = ball_of_patches().to("cuda")
-    samples = samples_everywhere(patches)
-    if tool == "memcheck":
-        patches = behind_list(patches)
-    else:
-        q = patches.quadrics
-        unwritten = replace(q, amplitudes=torch.empty_like(q.amplitudes))
-        patches = patches.with_quadrics(unwritten, keep_lists=True)
-    patches.heights(samples)
-
-
-def planted_scene(kernel: str) -> pd.Scene:
-    """Of a mesh that is not so small that a block has one warp, which has nobody to race with."""
-    mesh = WAYS[kernel][0].mesh if kernel in ("block", "far", "large") else BAR
-    return scene(mesh, contacts=False, pieces=True, pins=False)
-
-
-def plant_in_step(tool: str, kernel: str) -> None:
-    """A step in which `tool` must find an error."""
-    with compiled_for(kernel, Way(BAR, {}) if kernel == "levels" else WAYS[kernel][0]) as name:
-        options: dict[str, Any] = {"solver": pd.Multilevel()} if kernel == "levels" else {"kernel": name}
-        sim = pd.Simulator(planted_scene(kernel), 1 / 60, 5, progress=False, **options).to("cuda")
-    state = sim.rest_state(2)
-    if tool == "memcheck":
-        change_plan(sim, "part_slot", without_last)
-    elif tool == "initcheck":
-        state = pd.State(state.positions, torch.empty_like(state.velocities))
-    else:
-        change_plan(sim, "pair_corner", into_one_place)
-    sim.step_(state)
-
-
-def plant(tool: str, kernel: str) -> None:
-    """An error that `tool` must find."""
-    if kernel == "patches":
-        plant_in_patches(tool)
-    else:
-        plant_in_step(tool, kernel)
-    torch.cuda.synchronize()
-
-
 # ---- the program
-
-
-def why_not_plant(tool: str, kernels: Sequence[str]) -> str:
-    """What keeps an error from being made; empty where nothing does."""
-    if len(kernels) != 1:
-        return "--plant wants one kernel: --kernel grid"
-    if tool == "racecheck" and kernels[0] == "patches":
-        return "the ops of free-form patches have no shared memory that racecheck could look at"
-    if tool != "racecheck" and os.environ.get("PYTORCH_NO_CUDA_MEMORY_CACHING") != "1":
-        return "the tool sees single tensors with PYTORCH_NO_CUDA_MEMORY_CACHING=1 alone"
-    return ""
 
 
 def main(words: list[str]) -> int:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils.parametrize import is_parametrized
 
 from .automatic import AIM, Choice, choose_solver
-from .checks import check_has_values, check_like, check_whole, of_each
+from .checks import check_has_values, check_whole
 from .forecast import FAR_TOO_FEW, warn_of_few_iterations
-from .material import MATERIAL_ROWS, PARTS_OF_ROWS, check_array, check_batches, material_of
-from .multilevel import has_levels, has_strangers
-from .parametrized import invert, parametrization
+from .material import MATERIAL_ROWS, material_of
+from .material_changes import check_keys, ordinary, replace_material
+from .model_checks import check_batch, check_positive_number, check_state, check_tolerance, positions_of
+from .multilevel import has_levels
 from .placing import check_wanted_device, move_plan, plan_anew, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
@@ -24,7 +23,6 @@ from .scene import Scene
 from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
 from .state import State
 from .targets import Anchors, Targets
-from .warn import warn_user
 from .written import Written
 
 if TYPE_CHECKING:
@@ -35,7 +33,6 @@ if TYPE_CHECKING:
 __all__ = ["Model"]
 
 _PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
-_OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness")  # what decides how many iterations a step takes
 # Shortest and longest time step for which iterations need no warning, nor for what lies between: long ones are slow,
 # and short ones overshoot with a relaxation for long ones.
 _EVERY, _NONE = (0.0, math.inf), (math.inf, 0.0)
@@ -71,7 +68,7 @@ class Model(nn.Module):
         if not isinstance(scene, Scene):
             raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
         self.scene = scene
-        self._time_step = _positive("time_step", time_step, "s")
+        self._time_step = check_positive_number("time_step", time_step, "s")
         self.iterations = DEFAULT_ITERATIONS if iterations is None else iterations
         self._solver: Solver = Chebyshev()
         automatic = solver is None or _is_auto(solver)
@@ -79,11 +76,11 @@ class Model(nn.Module):
         self.tolerance = tolerance
         self.promise: Promise | None = None  # of `tune`
         self.kernel = kernel
-        self._batch = _check_batch(batch)
+        self._batch = check_batch(batch)
         values = scene.values()
         self.anchors = Anchors(scene)
         self._written = Written()
-        with _ordinary():
+        with ordinary():
             self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
             self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
             for name, value in material_of(values, dtype).items():
@@ -123,7 +120,7 @@ class Model(nn.Module):
     @batch.setter
     def batch(self, batch: int | None) -> None:
         before = self._batch, self.plan
-        self._batch = _check_batch(batch)
+        self._batch = check_batch(batch)
         try:
             if self.plan.kernel is not None:
                 self.plan = move_plan(self, plan_anew(self, self.dtype, self.device), self.device)
@@ -149,7 +146,7 @@ class Model(nn.Module):
 
     @time_step.setter
     def time_step(self, time_step: float) -> None:
-        self._time_step = _positive("time_step", time_step, "s")
+        self._time_step = check_positive_number("time_step", time_step, "s")
         shortest, longest = self._judged_steps
         # where it changes in every step hardly any change shall cost more than to ask
         if not (shortest <= self._time_step <= longest or _recording(self.device)):
@@ -191,10 +188,7 @@ class Model(nn.Module):
 
     @tolerance.setter
     def tolerance(self, tolerance: float) -> None:
-        number = _number_or_nan(tolerance)
-        if not 0.0 <= number < 1.0:
-            raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance!r}")
-        self._tolerance = number
+        self._tolerance = check_tolerance(tolerance)
 
     @property
     def solver(self) -> Solver:
@@ -252,7 +246,7 @@ class Model(nn.Module):
             self._prepare()
 
     def _prepare(self) -> None:
-        with _ordinary():
+        with ordinary():
             self.plan = plan_for_solver(self, self.material())
 
     def material(self) -> list[Tensor]:
@@ -283,63 +277,7 @@ class Model(nn.Module):
                 `Multilevel` anew, see `prepare_solver`; a captured step wants to be captured again then. Where the
                 default iterations, or those of "auto", become far too few an `UnsolvedWarning` says so, once.
         """
-        self._replace_material("set_material", arrays)
-
-    def _replace_material(self, owner: str, arrays: Mapping[str, Tensor | float]) -> None:
-        """What `set_material` does, for whom errors name."""
-        check_has_values(owner, self.device)
-        for name in arrays:
-            if name not in MATERIAL_ROWS:
-                part_of = f"; {PARTS_OF_ROWS[name]}" if name in PARTS_OF_ROWS else ""
-                raise TypeError(f"{owner}: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}{part_of}")
-        checked = {name: check_array(owner, name, value, getattr(self, name)) for name, value in arrays.items()}
-        for name, value in arrays.items():
-            if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
-                warn_user(
-                    f"{owner} copies the numbers of {name}, so no gradient gets to what they were made of: give "
-                    f'it to calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it'
-                )
-        check_batches(owner, checked, dict(zip(MATERIAL_ROWS, self.material(), strict=True)))
-        with _ordinary():
-            originals = {}
-            for name in [name for name in checked if is_parametrized(self, name)]:
-                originals[name], checked[name] = invert(owner, self, name, checked[name])
-            parameters = {
-                name: nn.Parameter(tensor.clone(), requires_grad=getattr(self, name).requires_grad)
-                for name, tensor in checked.items()
-                if tensor.shape != getattr(self, name).shape
-            }
-            # before anything is replaced, because it may fail
-            plan = self._plan_with(checked)
-            if self.promise is not None and any(not torch.equal(new, getattr(self, n)) for n, new in checked.items()):
-                self.promise.doubt(True)
-            for name, tensor in checked.items():
-                if name in originals:
-                    parametrization(self, name).original.copy_(originals[name])
-                elif name in parameters:
-                    setattr(self, name, parameters[name])
-                else:
-                    getattr(self, name).copy_(tensor)
-        self._written.remember_pins(self.pin_stiffness)
-        self.plan = plan
-        if any(name in checked for name in _OF_THE_RATE):
-            self.judge_iterations(owner)
-        if learned := [name for name, parameter in parameters.items() if parameter.requires_grad]:
-            warn_user(
-                f"the simulator has a new parameter for {' and '.join(learned)}, of another batch, which an optimiser "
-                "of the one before does not know: make the optimiser anew, or set the batch first"
-            )
-
-    def _plan_with(self, arrays: dict[str, Tensor]) -> Plan:
-        """The plan that serves the material with some arrays replaced."""
-        if not has_levels(self.plan.arrays) or "pin_stiffness" not in arrays:
-            return self.plan
-        # what is held belongs to the structure of a preconditioner
-        held = _held_everywhere(self.pin_stiffness), _held_everywhere(arrays["pin_stiffness"])
-        material = [arrays.get(name, getattr(self, name)) for name in MATERIAL_ROWS]
-        if torch.equal(*held) and not has_strangers(self.plan, material, self.time_step):
-            return self.plan
-        return plan_for_solver(self, material)
+        replace_material(self, "set_material", arrays)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """As of `torch.nn.Module`, but all arrays or none: torch loads what it can before it refuses other names.
@@ -348,31 +286,14 @@ class Model(nn.Module):
 
         As a part of another module the simulator is not asked whether names are missing; then torch's order holds.
         """
-        if not isinstance(state_dict, Mapping):
-            raise TypeError(
-                f"{type(self).__name__}.load_state_dict: state_dict must be what state_dict() gave, got "
-                f"{type(state_dict).__name__}"
-            )
-        # a hook may give keys other names
-        if strict and not self._load_state_dict_pre_hooks:
-            wanted = self.state_dict()
-            faults = [
-                f"{fault} key(s) in state_dict: {', '.join(map(repr, keys))}"
-                for fault, keys in (
-                    ("Missing", [key for key in wanted if key not in state_dict]),
-                    ("Unexpected", [key for key in state_dict if key not in wanted]),
-                )
-                if keys
-            ]
-            if faults:
-                raise RuntimeError(f"{type(self).__name__}.load_state_dict: nothing is loaded. {'. '.join(faults)}")
+        check_keys(self, state_dict, strict=strict)
         return super().load_state_dict(state_dict, strict, assign)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Checks values, and takes arrays of every environment where this simulator had shared ones."""
         with torch.no_grad():
             arrays = {n: state_dict[prefix + n] for n in MATERIAL_ROWS if prefix + n in state_dict}
-            self._replace_material(f"{type(self).__name__}.load_state_dict", arrays)
+            replace_material(self, f"{type(self).__name__}.load_state_dict", arrays)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def check_state(self, state: State, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:
@@ -380,43 +301,11 @@ class Model(nn.Module):
 
         Gives the forces of every environment; `fix` ends the errors about those of another shape.
         """
-        if not _is_pair(state):
-            raise TypeError(
-                f"state must be a State, positions and velocities [B, {self.vertices}, 3], got "
-                f"{_kind_of(state)}; rest_state() makes one"
-            )
-        self._check_kind("state", state[0])
-        check_like("velocities", state[1], state[0], "m/s")
-        if forces is None:
-            return None
-        forces = of_each(forces, state[0].shape)
-        check_like("forces", forces, state[0], "N", fix=fix)
-        return forces
-
-    def _check_kind(self, name: str, positions: Tensor) -> None:
-        own = self.rest_positions
-        self._written.check_rest(own, self.scene)
-        if positions.dtype != own.dtype or positions.device != own.device:
-            raise TypeError(
-                f"{name} must be {own.dtype} on {own.device} like the simulator, got {positions.dtype} on "
-                f"{positions.device}; sim.to(...) changes the simulator"
-            )
+        return check_state(self, state, forces=forces, fix=fix)
 
     def positions_of(self, state: State | Tensor, name: str = "state") -> Tensor:
         """Positions of a state, or positions alone, after all checks: for what is not left to one op."""
-        alone = isinstance(state, Tensor)
-        if not (alone or _is_pair(state)):
-            raise TypeError(
-                f"{name} must be a State, positions and velocities [B, {self.vertices}, 3], or positions alone, got "
-                f"{_kind_of(state)}"
-            )
-        positions = state if isinstance(state, Tensor) else state[0]
-        self._check_kind(name, positions)
-        if positions.dim() != 3 or positions.shape[1:] != self.rest_positions.shape:
-            raise ValueError(f"{name} must be [B, {self.vertices}, 3], got {list(positions.shape)}")
-        if not alone:
-            check_like("velocities", state[1], positions, "m/s")
-        return positions
+        return positions_of(self, state, name)
 
     def numbers(self, *, inertial: bool, report: bool) -> dict[str, Any]:
         """The settings as keyword arguments of the ops."""
@@ -460,7 +349,7 @@ class Model(nn.Module):
             check_solver(self.solver, wanted.device)
         # digits that float32 has lost do not come back by widening, and "meta" keeps none
         loses_positions = wanted.dtype != self.dtype or self.device.type == "meta"
-        with _ordinary():
+        with ordinary():
             # first, because it may refuse
             plan = plan_on(self, wanted.dtype, wanted.device)
             super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
@@ -472,55 +361,10 @@ class Model(nn.Module):
         return self
 
 
-@contextmanager
-def _ordinary() -> Iterator[None]:
-    """For what a simulator keeps: tensors that are made in inference mode can never be changed or differentiated.
-
-    Those that name no device are for the CPU, whatever torch's default device.
-    """
-    with torch.inference_mode(False), torch.no_grad(), torch.device("cpu"):
-        yield
-
-
 def _recording(device: torch.device) -> bool:
     """Whether torch.compile or a CUDA graph is looking on, which can wait for no value."""
     return torch.compiler.is_compiling() or (device.type == "cuda" and torch.cuda.is_current_stream_capturing())
 
 
-def _check_batch(batch: int | None) -> int | None:
-    return None if batch is None else check_whole("batch", batch, minimum=1)
-
-
 def _is_auto(solver: object) -> bool:
     return isinstance(solver, str) and solver == "auto"
-
-
-def _is_pair(state: Any) -> bool:
-    pair = isinstance(state, (tuple, list)) and len(state) == 2
-    return pair and isinstance(state[0], Tensor) and isinstance(state[1], Tensor)
-
-
-def _held_everywhere(pin_stiffness: Tensor) -> Tensor:
-    """Whether each pin holds exactly in all environments [P]."""
-    hard = pin_stiffness.isinf()
-    return hard.all(0) if hard.dim() == 2 else hard
-
-
-def _kind_of(value: object) -> str:
-    """A type by its name, a tuple with the types of its parts."""
-    name = type(value).__name__
-    return f"{name} of {' and '.join(type(part).__name__ for part in value)}" if isinstance(value, tuple) else name
-
-
-def _number_or_nan(value: float) -> float:
-    try:
-        return math.nan if isinstance(value, str) else float(value)
-    except (TypeError, ValueError):
-        return math.nan
-
-
-def _positive(name: str, value: float, unit: str) -> float:
-    number = _number_or_nan(value)
-    if not 0.0 < number < float("inf"):
-        raise ValueError(f"{name} must be positive and finite [{unit}], got {value!r}")
-    return number

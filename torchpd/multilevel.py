@@ -70,7 +70,7 @@ def has_strangers(plan: Plan, material: Sequence[Tensor], time_step: float) -> b
     inertias = inertias[inertias.isfinite()]
     if not len(inertias):
         return False
-    # as Misfit in csrc/solver/multilevel.h: what has grown as a whole M serves
+    # as Misfit in csrc/solver/misfit.h: what has grown as a whole M serves
     trusted = torch.maximum(elements.max(), inertias.min())
     return bool(inertias.max() > _C.known_inertia * trusted)
 

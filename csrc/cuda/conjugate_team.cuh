@@ -2,6 +2,7 @@
 // memory, in the order of the plan, and meets between the phases of an iteration. Nobody asks in between.
 #pragma once
 #include "cuda/conjugate_sums.cuh"
+#include "cuda/cycle_triangle.h"
 #include "cuda/teams.cuh"
 
 namespace pd {

@@ -1,4 +1,4 @@
-// How far the material of a step is from that which its preconditioner was made of, see solver/multilevel.h.
+// How far the material of a step is from that which its preconditioner was made of, see solver/misfit.h.
 #pragma once
 #include "cuda/multilevel.h"
 

@@ -1,6 +1,8 @@
 // The kernels of the multilevel solver and their launches, for one precision.
 #pragma once
+#include "cuda/cycle_triangle.h"
 #include "cuda/misfit.h"
+#include "cuda/multilevel_direction.h"
 #include "cuda/outer.h"
 #include "cuda/teams.cuh"
 #include "plan/shared_memory.h"

@@ -2,6 +2,7 @@
 #include "adjoint_ops.h"
 
 #include "cuda/launch.h"
+#include "plan_views.h"
 
 #include <c10/cuda/CUDAGraphsC10Utils.h>
 #include <c10/cuda/CUDAGuard.h>

@@ -1,9 +1,8 @@
 #include "plan/device_build.h"
 
 #include "cpu/team.h"
+#include "plan/device_patch.h"
 #include "plan/ownership.h"
-#include "plan/pairing.h"
-#include "plan/partition.h"
 #include "plan/phases.h"
 #include "plan/rest.h"
 #include "plan/shared_memory.h"
@@ -11,6 +10,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstddef>
 #include <numeric>
 #include <stdexcept>
 #include <string>
@@ -20,169 +20,13 @@ namespace pd {
 
 namespace {
 
-constexpr int lanes = 32, slice = entry_slice;
-constexpr int small_pairs = 512;                          // of a patch
-constexpr std::int64_t none = 65535;                      // entries of a patch count up to one less
-constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
-// numbers of kernels, as DeviceKernel has them
-constexpr int block_kernel = 0, cluster_kernel = 1, grid_kernel = 2, stream_kernel = 3;
 constexpr int small_part = 64;  // vertices
 
-struct Mesh {
-  const double* positions;
-  const std::int64_t* tets;
-  Partition partition;
-  Numbering numbering;
-  std::vector<std::int32_t> owner;  // of a cluster: the patch of each vertex
-  int kernel;
-
-  // The patch that counts a tetrahedron, where several work it out.
-  std::int32_t counted_by(std::int32_t tet) const {
-    const std::int64_t* v = tets + 4 * std::int64_t(tet);
-    return std::min({owner[v[0]], owner[v[1]], owner[v[2]], owner[v[3]]});
-  }
-};
-
-// A patch by its own numbers.
-struct Patch {
-  std::vector<std::int32_t> vertex;  // user's vertex in each slot
-  std::vector<std::int32_t> first;   // entry of each slot
-  std::vector<std::int32_t> forces;  // corners of pairs that each slot adds up
-  std::vector<Pair> pairs;           // user's tetrahedra, corners are slots
-  std::int64_t outer = 0;            // pairs past which none touches a shared vertex
-  std::int64_t entries = 0;
-  bool piped = false;  // whether warps read and write entries as cuda/pipeline.h does
-
-  std::int64_t blocks() const { return (std::ssize(pairs) + lanes - 1) / lanes; }
-};
-
-[[noreturn]] void refuse(int patches, std::int64_t count, const char* what, std::int64_t most) {
-  throw std::invalid_argument("patches = " + std::to_string(patches) +
-                              " is too few: one of them would have at least " +
-                              std::to_string(count) + " " + what + ", and 16 bits count up to " +
-                              std::to_string(most) + "; take more patches");
-}
-
-// Slots of a patch: interior vertices first, most forces first, which leaves little padding between entries. In a small patch,
-// which has room for padding and waits for others most of the time, shared ones come as they are numbered: all their patches
-// read and write them in runs then. Padding can grow to several times the forces where a few vertices have many.
-std::vector<std::int32_t> slots_of(const Patch& patch, int number, const Numbering& numbering) {
-  std::vector<std::int32_t> order(patch.vertex.size()), slot(order.size());
-  for (std::size_t v = 0; v < order.size(); ++v) order[v] = std::int32_t(v);
-  const bool small = std::ssize(patch.pairs) <= small_pairs;
-  std::stable_sort(order.begin(), order.end(), [&](std::int32_t a, std::int32_t b) {
-    const std::int32_t one = patch.vertex[a], two = patch.vertex[b];
-    const bool shared = !numbering.is_inside(number, one);
-    const bool other = !numbering.is_inside(number, two);
-    if (shared != other) return other;
-    return shared && small ? numbering.internal[one] < numbering.internal[two]
-                           : patch.forces[a] > patch.forces[b];
-  });
-  for (std::size_t s = 0; s < order.size(); ++s) slot[order[s]] = std::int32_t(s);
-  return slot;
-}
-
-template <class T>
-void scatter(std::vector<T>& items, const std::vector<std::int32_t>& place) {
-  std::vector<T> moved(items.size());
-  for (std::size_t i = 0; i < items.size(); ++i) moved[place[i]] = items[i];
-  items = std::move(moved);
-}
-
-// Every slice of eight slots has room for as many forces as its busiest.
-void count_entries(Patch& patch) {
-  patch.first.resize(patch.forces.size());
-  SliceBanks banks;
-  for (std::size_t s = 0; s < patch.forces.size(); s += slice) {
-    const std::size_t end = std::min(s + slice, patch.forces.size());
-    if (patch.piped) patch.entries = banks.next(patch.entries);
-    for (std::size_t i = s; i < end; ++i) patch.first[i] = std::int32_t(patch.entries + i - s);
-    patch.entries += slice * *std::max_element(patch.forces.begin() + std::ptrdiff_t(s),
-                                               patch.forces.begin() + std::ptrdiff_t(end));
-  }
-}
-
-// As few as can be meet in a bank. In a patch that is not small those that touch shared vertices come in the first blocks.
-void order_pairs(Patch& patch, int number, const Numbering& numbering) {
-  patch.outer = std::ssize(patch.pairs);
-  if (patch.outer <= small_pairs) return spread_banks(patch.pairs);
-  const auto is_outer = [&](const Pair& pair) {
-    return std::any_of(pair.corner.begin(), pair.corner.end(), [&](std::int32_t s) {
-      return !numbering.is_inside(number, patch.vertex[s]);
-    });
-  };
-  const auto inner = std::stable_partition(patch.pairs.begin(), patch.pairs.end(), is_outer);
-  // whole blocks, whose lanes are ordered together
-  patch.outer = std::min((inner - patch.pairs.begin() + lanes - 1) / lanes * lanes, patch.outer);
-  std::vector<Pair> rest(patch.pairs.begin() + patch.outer, patch.pairs.end());
-  patch.pairs.resize(patch.outer);
-  spread_banks(patch.pairs);
-  spread_banks(rest);
-  patch.pairs.insert(patch.pairs.end(), rest.begin(), rest.end());
-}
-
-// `number` [vertices] is -1 before and after.
-Patch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& number) {
-  const std::span<const std::int32_t> tets = mesh.partition.patch(index);
-  Patch patch;
-  std::vector<Corners> corners(tets.size());
-  for (std::size_t t = 0; t < tets.size(); ++t) {
-    for (int k = 0; k < 4; ++k) {
-      const std::int64_t v = mesh.tets[4 * std::int64_t(tets[t]) + k];
-      if (number[v] < 0) {
-        number[v] = std::int32_t(patch.vertex.size());
-        patch.vertex.push_back(std::int32_t(v));
-      }
-      corners[t][k] = number[v];
-    }
-  }
-  for (const std::int32_t v : patch.vertex) number[v] = -1;
-
-  patch.pairs = pair_tets(corners);
-  patch.forces.assign(patch.vertex.size(), 0);
-  for (const Pair& pair : patch.pairs) {
-    for (int c = 0; c < pair.corners(); ++c) ++patch.forces[pair.corner[c]];
-  }
-  const std::vector<std::int32_t> slot = slots_of(patch, index, mesh.numbering);
-  scatter(patch.vertex, slot);
-  scatter(patch.forces, slot);
-  for (Pair& pair : patch.pairs) {
-    for (std::int32_t& corner : pair.corner) corner = slot[corner];
-    for (std::int32_t& tet : pair.tet) tet = tet < 0 ? -1 : tets[tet];
-  }
-  order_pairs(patch, index, mesh.numbering);
-  patch.piped = mesh.kernel == stream_kernel && std::ssize(patch.vertex) <= pipeline_slots;
-  count_entries(patch);
-  return patch;
-}
-
-std::vector<Patch> make_patches(const Mesh& mesh, std::int64_t vertices) {
-  const Partition& partition = mesh.partition;
-  std::int64_t most_tets = 0;
-  for (int p = 0; p < partition.patches(); ++p)
-    most_tets = std::max(most_tets, std::ssize(partition.patch(p)));
-  // five entries for two tetrahedra are the fewest
-  if (5 * most_tets / 2 >= none)
-    refuse(partition.patches(), 5 * most_tets / 2, "entries", none - 1);
-  std::vector<Patch> patches(partition.patches());
-  run_team(most_threads(), [&](const Team& team) {
-    std::vector<std::int32_t> number(vertices, -1);
-    for (std::int64_t p = team.begin(std::ssize(patches)); p < team.end(std::ssize(patches)); ++p)
-      patches[p] = make_patch(mesh, int(p), number);
-  });
-  for (const Patch& patch : patches) {
-    if (patch.entries >= none) refuse(partition.patches(), patch.entries, "entries", none - 1);
-    if (std::ssize(patch.vertex) > most_slots)
-      refuse(partition.patches(), std::ssize(patch.vertex), "slots", most_slots);
-  }
-  return patches;
-}
-
 // The numbers that say where the arrays of each patch begin.
-void number_patches(DeviceMeshPlan& plan, const std::vector<Patch>& patches, bool stored,
+void number_patches(DeviceMeshPlan& plan, const std::vector<MeshPatch>& patches, bool stored,
                     bool fixed) {
   plan.patch_block = plan.patch_slot = {0};
-  for (const Patch& patch : patches) {
+  for (const MeshPatch& patch : patches) {
     plan.patch_pairs.push_back(std::int32_t(patch.pairs.size()));
     plan.patch_outer.push_back(std::int32_t(patch.outer));
     plan.patch_block.push_back(plan.patch_block.back() + std::int32_t(patch.blocks()));
@@ -212,7 +56,7 @@ std::int32_t packed(std::int64_t low, std::int64_t high) {
 }
 
 // Rest shapes and bounds of a pair in lane `lane` of `block`.
-void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, const Pair& pair,
+void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, const Pair& pair,
                double unit, std::int64_t block, std::int64_t lane) {
   std::array<std::int64_t, 5> vertex;
   for (int c = 0; c < 5; ++c) vertex[c] = patch.vertex[pair.corner[c]];
@@ -234,7 +78,7 @@ void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, const
   }
 }
 
-void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number,
+void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, int number,
                  double unit) {
   const std::int64_t first_block = plan.patch_block[number];
   EntryChoice choice(patch.first, patch.forces, patch.piped);
@@ -262,7 +106,7 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int
 }
 
 // Interior vertices are numbered anew, in the order of their slots.
-void renumber(Numbering& numbering, const std::vector<Patch>& patches) {
+void renumber(Numbering& numbering, const std::vector<MeshPatch>& patches) {
   for (std::size_t p = 0; p < patches.size(); ++p) {
     const std::int32_t inside = numbering.patch_vertex[p];
     for (std::int32_t s = 0; s < numbering.patch_vertex[p + 1] - inside; ++s) {
@@ -272,7 +116,7 @@ void renumber(Numbering& numbering, const std::vector<Patch>& patches) {
   }
 }
 
-void fill_slots(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number) {
+void fill_slots(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, int number) {
   for (std::size_t s = 0; s < patch.vertex.size(); ++s) {
     const std::size_t slot = plan.patch_slot[number] + s;
     plan.slot_vertex[slot] = mesh.numbering.internal[patch.vertex[s]];
@@ -281,7 +125,8 @@ void fill_slots(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int 
 }
 
 // Rest positions of one patch from its first vertex, in metres or in units of which its extent has up to 2^29.
-void fill_rest_positions(DeviceMeshPlan& plan, const Mesh& mesh, const Patch& patch, int number) {
+void fill_rest_positions(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch,
+                         int number) {
   const auto offset = [&](std::size_t s, int c) {
     return mesh.positions[3 * std::int64_t(patch.vertex[s]) + c] -
            mesh.positions[3 * std::int64_t(patch.vertex[0]) + c];
@@ -393,8 +238,9 @@ void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pie
     plan.piece_part[next[part_piece[part]]++] = std::int32_t(part);
 }
 
-std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan, const std::vector<Patch>& patches,
-                                      std::int64_t tets, std::int32_t pieces, int kernel) {
+std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan,
+                                      const std::vector<MeshPatch>& patches, std::int64_t tets,
+                                      std::int32_t pieces, int kernel) {
   std::vector<std::int32_t> sizes(size_count, 0);
   sizes[size_kernel] = kernel;
   sizes[size_vertices] = std::int32_t(plan.vertex_order.size());
@@ -439,7 +285,7 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
     mesh.numbering = number_vertices(mesh.partition, tets, vertices);
   }
   progress(0.4);
-  const std::vector<Patch> made = make_patches(mesh, vertices);
+  const std::vector<MeshPatch> made = make_patches(mesh, vertices);
   progress(0.7);
 
   DeviceMeshPlan plan;

@@ -1,0 +1,171 @@
+// Members of MultilevelRunner that find the direction of a trial: M, corrected by the pairs, where contacts leave vertices free.
+#pragma once
+#include "cuda/multilevel.h"
+
+namespace pd::inline PD_TARGET {
+
+// direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
+template <class T, bool Touching, int Threads>
+PD_DEVICE void MultilevelRunner<T, Touching, Threads>::precondition() {
+  if (corotates_) corotate();
+  const double scale = c_.outer.weight(w_.settings().relaxation, is_held());
+  const auto right_side = [&](int i) {
+    Vec3<T> q = let_through(i, vec3(pull_[i]));
+    if (lbfgs_) {
+      Vec3<T> y[history];
+      see_pairs(m_.y, i, y);
+#pragma unroll
+      for (int j = 0; j < history; ++j) {
+        if (c_.pairs.valid[j]) q = subtract_product(q, T(c_.pairs.alpha[j]), y[j]);
+      }
+      q = let_through(i, q);
+    }
+    return T(scale) * q;
+  };
+  // where something holds vertices that M has free, the small problem takes its part before the cycle, and gives what that
+  // lacks after it
+  const bool around = corotated_ && !w_.plan.levels.direct && (Touching || strangers_);
+  if (corotated_) {
+    pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
+      const Vec3<T> q = right_side(i);
+      cycle_.set(i, q);
+      corotation_.multiply_modes(i, q, sum);
+    });
+    corotation_.measure(c_.total, around, scale);
+  } else {
+    each_vertex([&](int i) { cycle_.set(i, right_side(i)); });
+  }
+  // what follows the last part of the cycle in a pass has that part, too
+  const bool apart = around || !lbfgs_;
+  if (around)
+    each_vertex([&](int i) { cycle_.set(i, corotation_.without(i, cycle_.right_side(i))); });
+  cycle_.run_but_last();
+  if (apart) cycle_.finish();
+  if (around) {
+    pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
+      corotation_.multiply_images(i, cycle_.result(i), sum);
+    });
+    corotation_.answer(c_.total, scale);
+  }
+  if (lbfgs_) correct(!apart);
+}
+
+template <class T, bool Touching, int Threads>
+PD_DEVICE void MultilevelRunner<T, Touching, Threads>::corotate() {
+  const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_, Touching,
+                         c_.outer.turns());
+  const CorotationInput<T> in = {w_.v.x, w_.v.u, w_.v.target, base_, w_.weights};
+  if (plan.forget) corotated_ = false;
+  if (plan.make) {
+    ++made_;
+    doubted_ = c_.outer.restarts;
+    corotated_ = true;
+    holds_ = false;
+    team_ = make_corotation(in, m_.corotation, team_, shared_, call_.shared_corotation,
+                            c_.outer.scale, corotation_.with_plan(call_.plan()));
+    if (threadIdx.x == 0) c_.outer.strayed = 0;
+  }
+  if constexpr (Touching) {
+    if (corotated_ && !holds_)
+      team_ = hold_corotation(in, free_, m_.corotation, team_, shared_, c_.outer.scale,
+                              corotation_.control());
+    holds_ = corotated_;
+  }
+}
+
+// the second loop of L-BFGS, and the slope g.d
+// `last`: the last part of the cycle has still to be done.
+template <class T, bool Touching, int Threads>
+PD_DEVICE void MultilevelRunner<T, Touching, Threads>::correct(bool last) {
+  const auto visit = [&](int i, T(&sum)[history + 1]) {
+    // before anything is written, that it may be asked for with the rest
+    Vec3<T> y[history];
+    see_pairs(m_.y, i, y);
+    Vec3<T> z = cycle_.result(i);
+    if (corotated_) {
+      z = corotation_.with(i, z);
+      cycle_.set_result(i, z);
+    }
+#pragma unroll
+    for (int j = 0; j < history; ++j) {
+      if (c_.pairs.valid[j]) sum[j] += dot(y[j], z);
+    }
+    sum[history] += dot(vec3(pull_[i]), way(i, z));
+  };
+  pass<history + 1, T>(visit, [&](int rows, const auto& row) {
+    if (last) cycle_.run_last(rows, row);
+  });
+  if (threadIdx.x < warp_size) PairLanes(c_.pairs, newest_).second_loop(c_.total, c_.factor);
+  if (threadIdx.x == 0) {
+    Outer& outer = c_.outer;
+    outer.slope = c_.pairs.slope(c_.total[history], c_.factor);
+    // not downhill: what was learnt does not hold here
+    if (!(outer.slope >= 0 || outer.plain || outer.diagonal)) {
+      c_.pairs.clear();
+      outer.plain = true;
+      ++outer.restarts;
+    }
+  }
+  __syncthreads();
+}
+
+template <class T, bool Touching, int Threads>
+PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::direction(int i) const {
+  Vec3<T> d = cycle_.result(i);
+  if (!lbfgs_) return d;
+  Vec3<T> s[history];
+  see_pairs(m_.s, i, s);
+#pragma unroll
+  for (int j = 0; j < history; ++j) {
+    if (c_.pairs.valid[j]) d = multiply_add(T(c_.factor[j]), s[j], d);
+  }
+  return d;
+}
+
+// A field of the pairs at a vertex, all asked for at once: in place of one that is not valid any that is there.
+template <class T, bool Touching, int Threads>
+PD_DEVICE void MultilevelRunner<T, Touching, Threads>::see_pairs(const Quad<T>* field, int i,
+                                                                 Vec3<T> (&seen)[history]) const {
+#pragma unroll
+  for (int j = 0; j < history; ++j) {
+    const Quad<T>* from = c_.pairs.valid[j] ? field + j * vertices() : w_.v.u;
+    seen[j] = vec3(from[i]);
+  }
+}
+
+// whether M knows nothing of a vertex
+template <class T, bool Touching, int Threads>
+PD_DEVICE bool MultilevelRunner<T, Touching, Threads>::is_stranger(int i) const {
+  if (!(w_.plan.levels.fine_inverse[i] > T(0))) return true;
+  return w_.v.inertia(i) > T(known_inertia) * w_.plan.levels.reference_inertia[i] * trusted_;
+}
+
+// the part of a field along which contacts let a vertex go
+template <class T, bool Touching, int Threads>
+PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::open(int i, const Vec3<T>& field) const {
+  if constexpr (!Touching) return field;
+  return free_[i] * field;
+}
+
+// the part of a field that M is to work on: not across contacts, nor where it knows nothing of a vertex
+template <class T, bool Touching, int Threads>
+PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::let_through(int i,
+                                                                      const Vec3<T>& field) const {
+  return open(i, known(i, field));
+}
+
+template <class T, bool Touching, int Threads>
+PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::known(int i, const Vec3<T>& field) const {
+  return strangers_ && is_stranger(i) ? none() : field;
+}
+
+// A way that M has a say on, where it has: the rest goes along the pull, by the diagonal.
+template <class T, bool Touching, int Threads>
+PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::way(int i, const Vec3<T>& d) const {
+  const Vec3<T> plain = w_.v.u[i].w * vec3(pull_[i]);
+  if (strangers_ && is_stranger(i)) return plain;
+  if constexpr (!Touching) return d;
+  return open(i, d) + (plain - open(i, plain));
+}
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,185 @@
+// Members of Pipeline that work on the elements of a patch, a thread a pair of tetrahedra.
+#pragma once
+#include "cuda/pipeline.h"
+
+namespace pd::inline PD_TARGET {
+
+template <class T, Visit What>
+struct Pipeline<T, What>::PairInputs : PairNumbers<T> {
+  T factor[2];  // pair_factor
+};
+
+// What a warp has of a stop: blocks of pairs, as far apart as there are warps. They go on with the next stop's where the
+// last one's end, so that none of them has more to do than others.
+template <class T, Visit What>
+struct Pipeline<T, What>::Share {
+  unsigned block, end;  // none left: block >= end
+  unsigned weights;     // as of its stop
+  T patch_weight;
+};
+
+// Slots and entries of a half by 32-bit addresses, which stay in registers; by pointers they would be worked out again for
+// each of them. Three instructions find a slot, and two an entry, since pipeline_slots leaves bits 13 to 15 of a corner 0.
+template <class T, Visit What>
+class Pipeline<T, What>::SharedSlots {
+ public:
+  PD_DEVICE SharedSlots(const Pipeline& p, unsigned n) {
+    const unsigned slots = unsigned(p.plan().most_slots), entries = p.plan().most_entries;
+    first_ = in_register(shared_address(p.half(n)));
+    second_ = in_register(first_ + 16 * slots);
+    entry_ = in_register(first_ + unsigned(slots_bytes(sizeof(T), slots, 2)));
+    third_ = in_register(entry_ + 8 * entries);
+  }
+
+  // `corner`: of PairNumbers. What is volatile keeps its order, so nothing is looked at before it is awaited.
+  PD_DEVICE void look(unsigned corner, Vec3<T>& position, RestPoint<T>& rest) const {
+    const SharedAddress slot_times_8 = in_register(corner & 0xffff);
+    Quad<T> seen;
+    Vec3<T> bits;
+    asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
+                 : "=f"(seen.x), "=f"(seen.y), "=f"(seen.z), "=f"(bits.x)
+                 : "r"(first_ + 2 * slot_times_8));
+    asm volatile("ld.shared.v2.f32 {%0, %1}, [%2];"
+                 : "=f"(bits.y), "=f"(bits.z)
+                 : "r"(second_ + slot_times_8));
+    position = vec3(seen);
+    rest = RestPoint<T>::of(bits);
+  }
+  // Unless the corner has no entry.
+  PD_DEVICE void leave(unsigned corner, const Vec3<T>& force) const {
+    asm volatile(
+        "{.reg .pred p; setp.lt.u32 p, %0, 0xffff0000; @p st.shared.v2.f32 [%1], {%3, %4}; "
+        "@p st.shared.f32 [%2], %5;}" ::"r"(corner),
+        "r"(entry_ + (corner >> 13)), "r"(third_ + (corner >> 14)), "f"(force.x), "f"(force.y),
+        "f"(force.z)
+        : "memory");
+  }
+
+ private:
+  SharedAddress first_, second_, entry_, third_;
+};
+
+template <class T, Visit What>
+PD_DEVICE void Pipeline<T, What>::work_on_elements() const {
+  Share share = share_of(0);
+  PairInputs now;
+  take(now, read(share), share.patch_weight);
+#pragma unroll 1
+  for (unsigned n = 0;; ++n) {
+    bring_pairs_near(n + 1);
+    await(slots_ready, n);
+    const SharedSlots slots(*this, n);
+    T energy = T(0);
+    bool more = share.block < share.end;
+    // else the last turn has read the first pairs of the next stop
+    if (!more) {
+      share = share_of(n + 1);
+      take(now, read(share), share.patch_weight);
+    }
+#pragma unroll 1
+    while (more) {
+      PairInputs then;
+      work_on_pair(now, slots, energy, [&] {
+        share.block += element_warps;
+        more = share.block < share.end;
+        if (!more) share = share_of(n + 1);
+        then = read(share);
+      });
+      take(now, then, share.patch_weight);
+    }
+    if constexpr (What == Visit::update_guarded) {
+      const double sum = across_warp(double(energy), Add{});
+      if (threadIdx.x % warp_size == 0) energies_of(n)[element_warp()] = sum;
+    }
+    give(forces_ready, n);
+    if (told(n + 1).blocks == 0) return;
+  }
+}
+
+template <class T, Visit What>
+PD_DEVICE typename Pipeline<T, What>::Share Pipeline<T, What>::share_of(unsigned n) const {
+  const Stop& in = told(n);
+  unsigned turn = unsigned(element_warp() + element_warps - in.first_warp);
+  if (turn >= unsigned(element_warps)) turn -= element_warps;
+  const auto first = unsigned(in.first_block);
+  const bool none = turn >= unsigned(in.blocks);
+  return {none ? first : first + turn, none ? first : first + unsigned(in.blocks), in.weights,
+          in.patch_weight};
+}
+
+// A lane a pair, of the next block; where none is left, some of the stop's that nobody wants.
+template <class T, Visit What>
+PD_DEVICE typename Pipeline<T, What>::PairInputs Pipeline<T, What>::read(const Share& share) const {
+  const unsigned lane = threadIdx.x % warp_size, block = share.block;
+  const int32* corner = plan().pair_corner + (block * (5 * pair_lanes) + lane);
+  const T* factor = plan().pair_factor + (block * (2 * pair_lanes) + lane);
+  PairInputs pair;
+  // once a patch: the caches had better keep something else
+  for (int c = 0; c < 5; ++c) pair.corner[c] = unsigned(__ldcs(corner + c * pair_lanes));
+  for (int e = 0; e < 2; ++e) pair.factor[e] = __ldcs(factor + e * pair_lanes);
+  for (int e = 0; e < 2; ++e) pair.weight[e] = T(0);
+  if (share.patch_weight < T(0)) {
+    const T* weight = weights_of(share.block, share.weights) + lane;
+    for (int e = 0; e < 2; ++e) pair.weight[e] = __ldcs(weight + e * pair_lanes);
+  }
+  return pair;
+}
+
+// of a block of pairs
+template <class T, Visit What>
+PD_DEVICE const T* Pipeline<T, What>::weights_of(unsigned block, unsigned weights) const {
+  return call_.memory.weights + std::size_t(block + weights) * (2 * pair_lanes);
+}
+
+// Not before its end is what was read looked at, since whoever moves a number waits for it. `patch_weight`: of its stop.
+template <class T, Visit What>
+PD_DEVICE void Pipeline<T, What>::take(PairInputs& now, const PairInputs& read, T patch_weight) {
+  for (int c = 0; c < 5; ++c) now.corner[c] = in_register(read.corner[c]);
+  for (int e = 0; e < 2; ++e) now.factor[e] = in_register(read.factor[e]);
+  for (int e = 0; e < 2; ++e) {
+    const T found = tet_weight(patch_weight, now.factor[e]);
+    const bool there = now.corner[3 + e] < unsigned(no_entry) << 16;
+    now.weight[e] = in_register(patch_weight < T(0) ? read.weight[e] : there ? found : T(0));
+  }
+}
+
+// Has all pairs of a stop brought into the L2 cache.
+template <class T, Visit What>
+PD_DEVICE void Pipeline<T, What>::bring_pairs_near(unsigned n) const {
+  const Stop& in = told(n);
+  const auto near = [](const auto* items, int count) {
+    bring_near(items, count, int(threadIdx.x) - mover_threads - bringer_threads, element_threads);
+  };
+  constexpr int two = 2 * pair_lanes, five = 5 * pair_lanes;
+  near(plan().pair_corner + std::size_t(in.first_block) * five, in.blocks * five);
+  near(plan().pair_factor + std::size_t(in.first_block) * two, in.blocks * two);
+  if (in.patch_weight < T(0))
+    near(weights_of(unsigned(in.first_block), in.weights), in.blocks * two);
+}
+
+// `read_next`: between its tetrahedra, where the fewest registers are in use. Lanes past the last pair leave no force, and
+// what they strain weighs nothing.
+template <class T, Visit What>
+template <class ReadNext>
+PD_DEVICE void Pipeline<T, What>::work_on_pair(const PairInputs& now, const SharedSlots& slots,
+                                               T& energy, const ReadNext& read_next) const {
+  const typename ElementOf<What>::type element;
+  Pair<T, 1> pair;
+  RestPoint<T> rest[5];
+  const auto look = [&](int c) { slots.look(now.corner[c], pair.corner[0][c], rest[c]); };
+  const auto leave = [&](int c) { slots.leave(now.corner[c], pair.force[c]); };
+  for (int c = 0; c < 4; ++c) look(c);
+  element.template run<1>(PairElement<T, 1, OneOf<T, 0>>{
+      pair, ComputedRest<T>::inverse_between({rest[0], rest[1], rest[2], rest[3]}, now.factor[0]),
+      now.weight[0], energy});
+  leave(3);
+  read_next();
+  look(4);
+  element.template run<1>(PairElement<T, 1, OneOf<T, 1>>{
+      pair, ComputedRest<T>::inverse_between({rest[0], rest[1], rest[2], rest[4]}, now.factor[1]),
+      now.weight[1], energy});
+  for (int c = 0; c < 3; ++c) leave(c);
+  leave(4);
+}
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,60 @@
+// Members of Pipeline that find out which patches its block has.
+#pragma once
+#include "cuda/pipeline.h"
+
+namespace pd::inline PD_TARGET {
+
+// Stops from `first` on, by a warp: items of environments that go on.
+template <class T, Visit What>
+PD_DEVICE void Pipeline<T, What>::tell_stops(unsigned first) const {
+  __syncwarp();
+  Ahead next = ahead();
+  const int lane = bringer(), patches = plan().patches, stride = int(gridDim.x);
+  const bool own = call_.step.material.stiffness.stride != 0;
+  int found = 0;
+  while (found < int(told_at_once)) {
+    const int item = next.item + lane * stride;
+    const int environment = item / patches, patch = item - environment * patches;
+    const bool there = environment < call_.step.batch;
+    const unsigned goes_on =
+        __ballot_sync(whole_warp, there && !skips<What>(work(there ? environment : 0)));
+    const int rank = found + __popc(goes_on & ((1u << lane) - 1));
+    const bool mine = (goes_on >> lane & 1) && rank < int(told_at_once);
+    Stop s{};
+    if (mine) {
+      s.environment = environment;
+      s.patch = patch;
+      s.first_vertex = plan().patch_vertex[patch];
+      s.interior = plan().patch_vertex[patch + 1] - s.first_vertex;
+      s.first_slot = plan().patch_slot[patch];
+      s.slots = plan().patch_slot[patch + 1] - s.first_slot;
+      s.first_block = plan().patch_block[patch];
+      s.blocks = plan().patch_block[patch + 1] - s.first_block;
+      s.weights = own ? unsigned(environment) * unsigned(plan().blocks) : 0;
+      s.patch_weight = work(environment).patch_weight[patch];
+    }
+    // the guard's energies are summed alike in any batch
+    if (What == Visit::update) {
+      int until = s.blocks;
+#pragma unroll
+      for (int distance = 1; distance < warp_size; distance *= 2) {
+        const int before = __shfl_up_sync(whole_warp, until, distance);
+        if (lane >= distance) until += before;
+      }
+      s.first_warp = (next.first_warp + until - s.blocks) % element_warps;
+      next.first_warp =
+          (next.first_warp + __shfl_sync(whole_warp, until, warp_size - 1)) % element_warps;
+    }
+    if (mine) told(first + unsigned(rank)) = s;
+    found += __popc(goes_on);
+    if (!__any_sync(whole_warp, there)) {
+      if (found + lane < int(told_at_once)) told(first + unsigned(found + lane)) = Stop{};
+      break;
+    }
+    next.item =
+        __reduce_max_sync(whole_warp, mine || found < int(told_at_once) ? item : 0) + stride;
+  }
+  if (lane == 0) ahead() = next;
+}
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,98 @@
+"""What a simulator refuses: settings out of their range, and what is no state of it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from .checks import check_like, check_whole, of_each
+from .state import State
+
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = ["check_batch", "check_positive_number", "check_state", "check_tolerance", "positions_of"]
+
+
+def check_batch(batch: int | None) -> int | None:
+    """Environments that a step will have, where they are known."""
+    return None if batch is None else check_whole("batch", batch, minimum=1)
+
+
+def check_positive_number(name: str, value: float, unit: str) -> float:
+    """The number, of whatever type has one."""
+    number = _number_or_nan(value)
+    if not 0.0 < number < float("inf"):
+        raise ValueError(f"{name} must be positive and finite [{unit}], got {value!r}")
+    return number
+
+
+def check_tolerance(tolerance: float) -> float:
+    """The number, of whatever type has one."""
+    number = _number_or_nan(tolerance)
+    if not 0.0 <= number < 1.0:
+        raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance!r}")
+    return number
+
+
+def _number_or_nan(value: Any) -> float:
+    try:
+        return math.nan if isinstance(value, str) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def check_state(sim: Model, state: State, *, forces: Tensor | None, fix: str) -> Tensor | None:
+    """What `Model.check_state` does."""
+    if not _is_pair(state):
+        raise TypeError(
+            f"state must be a State, positions and velocities [B, {sim.vertices}, 3], got "
+            f"{_kind_of(state)}; rest_state() makes one"
+        )
+    _check_kind(sim, "state", state[0])
+    check_like("velocities", state[1], state[0], "m/s")
+    if forces is None:
+        return None
+    forces = of_each(forces, state[0].shape)
+    check_like("forces", forces, state[0], "N", fix=fix)
+    return forces
+
+
+def positions_of(sim: Model, state: State | Tensor, name: str) -> Tensor:
+    """What `Model.positions_of` does."""
+    alone = isinstance(state, Tensor)
+    if not (alone or _is_pair(state)):
+        raise TypeError(
+            f"{name} must be a State, positions and velocities [B, {sim.vertices}, 3], or positions alone, got "
+            f"{_kind_of(state)}"
+        )
+    positions = state if isinstance(state, Tensor) else state[0]
+    _check_kind(sim, name, positions)
+    if positions.dim() != 3 or positions.shape[1:] != sim.rest_positions.shape:
+        raise ValueError(f"{name} must be [B, {sim.vertices}, 3], got {list(positions.shape)}")
+    if not alone:
+        check_like("velocities", state[1], positions, "m/s")
+    return positions
+
+
+def _check_kind(sim: Model, name: str, positions: Tensor) -> None:
+    own = sim.rest_positions
+    sim._written.check_rest(own, sim.scene)
+    if positions.dtype != own.dtype or positions.device != own.device:
+        raise TypeError(
+            f"{name} must be {own.dtype} on {own.device} like the simulator, got {positions.dtype} on "
+            f"{positions.device}; sim.to(...) changes the simulator"
+        )
+
+
+def _is_pair(state: Any) -> bool:
+    pair = isinstance(state, (tuple, list)) and len(state) == 2
+    return pair and isinstance(state[0], Tensor) and isinstance(state[1], Tensor)
+
+
+def _kind_of(value: object) -> str:
+    """A type by its name, a tuple with the types of its parts."""
+    name = type(value).__name__
+    return f"{name} of {' and '.join(type(part).__name__ for part in value)}" if isinstance(value, tuple) else name
