@@ -49,6 +49,7 @@ _STUDIED_ROUNDINGS = 2.0
 _STEPS = (0, 1, 4, 12, 30)  # of the motion, whose states are studied
 _TURNED = (0, 4)  # those that are also studied with the axes of their velocities exchanged
 _HARDEST = 2  # other states up to there
+_OTHER_WAYS = (37.0, -110.0)  # [degrees] to the one that it starts on, of motions on rough ground that are studied too
 _ENVIRONMENTS = 3  # of a batch, and the worst conditioned one
 _HEADROOM = 0.95  # of a budget in milliseconds that is spent: times scatter
 _NEAR = 1.1  # a safer candidate wins although it takes this much longer
@@ -186,7 +187,8 @@ def _prepare(sim: Simulator, start: State, forces: Tensor | None, error: float |
     some = _of_environments(sim, items, len(start[0]))
     some.tolerance = 0.0
     given = None if forces is None else forces.detach()[items]
-    states = _motion(some, State(start[0][items], start[1][items]), given)
+    begun = State(start[0][items], start[1][items])
+    states = [state for turned in (begun, *_other_ways(some, begun)) for state in _motion(some, turned, given)]
     everyone = _of_environments(some, list(range(len(items))) * len(states), len(items))
     state = State(*(torch.cat(parts) for parts in zip(*states, strict=True)))
     repeated = None if given is None else given.repeat(len(states), 1, 1)
@@ -213,6 +215,22 @@ def _environments(sim: Simulator, batch: int) -> list[int]:
     if ratio.dim() == 2 and len(ratio) == batch:
         items.add(int(ratio.min(dim=1).values.argmin()))
     return sorted(items)
+
+
+def _other_ways(sim: Simulator, start: State) -> list[State]:
+    """The start with its velocities turned about the normal of rough ground: what sticks when depends on the way."""
+    rough = sim.planes.detach().reshape(-1, 5)
+    rough = rough[rough[:, 4] > 0.0]
+    if not len(rough):
+        return []
+    normal = rough[0, :3]
+    across = torch.linalg.cross(normal.expand_as(start[1]), start[1])
+    along = (start[1] * normal).sum(dim=-1, keepdim=True) * normal
+    return [
+        State(start[0], along + math.cos(angle) * (start[1] - along) + math.sin(angle) * across)
+        for angle in map(math.radians, _OTHER_WAYS)
+        if bool(across.any())
+    ]
 
 
 def _motion(sim: Simulator, start: State, forces: Tensor | None) -> list[State]:
