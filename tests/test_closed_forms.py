@@ -292,3 +292,31 @@ def test_sticking_point_follows_a_moving_ball(dtype: torch.dtype, device: torch.
     x = after.positions[0, 0].double().cpu().numpy()
     assert np.linalg.norm(x - [0.01, -1.0, 0.0]) == pytest.approx(1.0, abs=2e-4)
     assert x[0] == pytest.approx(0.01, abs=3e-4)
+
+
+@pytest.mark.parametrize("iterations", [3, 64])
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["Chebyshev", "Multilevel"])
+@pytest.mark.parametrize("wall", [0.0, 0.4])
+@pytest.mark.parametrize("lean", [0.0, 0.5])
+def test_along_a_wall_it_is_coulombs_law_whatever_the_iterations(
+    lean: float, wall: float, solver: pd.Solver, iterations: int, dtype: torch.dtype, device: torch.device
+) -> None:
+    """A stiff cube between a rough floor and a wall that leans: each stops it by friction times how much it bears."""
+    vertices, tets = box((0.1, 0.1, 0.1), (3, 3, 3))
+    floor, side = pd.Ground(0.0, friction=0.3), np.array([0.0, lean, 1.0]) / np.hypot(lean, 1.0)
+    shear = vertices.copy()
+    shear[:, 2] -= lean * shear[:, 1]  # its side lies on the wall
+    scene = pd.Scene(
+        pd.Solid(pd.TetMesh(shear, tets), 1e7),
+        pd.Gravity((0.0, -9.8, -4.0)),
+        floor,
+        pd.Ground(0.0, normal=tuple(side), friction=wall),
+    )
+    sim = pd.Simulator(scene, 1 / 60, iterations, solver=solver, dtype=dtype, progress=False).to(device)
+    state = sim.rest_state()
+    state.velocities[..., 0] = 2.0
+    bears = np.linalg.solve(np.stack([[0.0, 1.0, 0.0], side]).T[1:], [9.8, 4.0])
+    slows = float(bears @ [0.3, wall])
+    track = sim.rollout(state, 10)
+    expected = 2.0 - slows / 60 * torch.arange(1, 11)
+    assert float((track.velocities[:, 0, :, 0].mean(dim=1).double().cpu() - expected).abs().max()) <= 2e-2

@@ -203,6 +203,9 @@ CASES: dict[str, Callable[[], Case]] = {
     "sliding against friction": lambda: sliding(pd.Ground(0.0, friction=0.3)),
     "sliding, turning, friction": lambda: sliding(pd.Ground(0.0, friction=0.3), spin=3.0),
     "sliding along an edge": lambda: sliding(pd.Ground(0.0), pd.Ground(-0.3, normal=(-1.0, 0.1, 0.0)), spin=3.0),
+    "sliding along a wall, friction": lambda: sliding(
+        pd.Ground(0.0, friction=0.1), pd.Ground(-0.3, normal=(0.0, 0.1, -1.0), friction=0.2)
+    ),
     "tipping about a corner": lambda: tipping(0.8),
     "tipping on smooth ground": lambda: tipping(0.0),
     "tipping and sliding": lambda: tipping(0.1, velocity=(1.0, 0.0, 0.5)),

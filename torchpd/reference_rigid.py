@@ -2,9 +2,9 @@
 
 Along them E is sum a / 2 |x + u - (x + s)|^2, a weighted fit of two sets of points (Kabsch 1976). Hard pins at a point
 or along a line leave turns about that; smooth planes the turn about their normal and the way along all of them; a plane
-with friction the way along it, shortened as by Coulomb. On one plane a component may tip besides (`_Tipping`); one that
-hovers goes as far as the first plane. Other contacts leave it nothing. Where a motion ends since the component comes to
-a contact, it goes on from there.
+with friction, or the edge of two planes, the way along it, shortened as by Coulomb. On one plane a component may tip
+besides (`_Tipping`); one that hovers goes as far as the first plane. Other contacts leave it nothing. Where a motion
+ends since the component comes to a contact, it goes on from there.
 """
 
 from __future__ import annotations
@@ -239,21 +239,29 @@ class _Piece:
         along = self.lag - span.T @ (span @ self.lag)
         if not friction.any():
             return along if len(span) < 3 else np.zeros(3)
-        across = float(self.lag @ normals[0])
-        lies = self.y @ normals[0] - planes[0, 3] < -LYING * across
-        if len(planes) > 1 or not lies.any():
+        if len(span) != len(planes) or len(span) > 2:
             return np.zeros(3)
-        slips = self.slips(normals[0])[lies]
+        # how far the planes push it together, and the slips on those that are rough
+        pushes = np.linalg.solve(normals @ normals.T, -normals @ self.lag)
+        if len(planes) > 1 and not (pushes > 0.0).all():
+            return np.zeros(3)
+        rough = [plane for plane in planes if plane[4] > 0.0]
+        lies = [self.y @ plane[:3] - plane[3] < -LYING * float(self.lag @ plane[:3]) for plane in rough]
+        slips = np.concatenate([self.slips(plane[:3])[own] for plane, own in zip(rough, lies, strict=True)])
+        if not len(slips):
+            return np.zeros(3)
         mean = slips.mean(axis=0)
+        if len(span) == 2:
+            mean = mean - span.T @ (span @ mean)
         # slips that differ leave a doubt about where friction acts: what is within it is left to the iterations
-        apart = 2.0 * np.linalg.norm(slips.max(axis=0) - slips.min(axis=0))
-        free, rub, slip = mean + along, -friction[0] * across, np.linalg.norm(mean)
-        left = np.linalg.norm(free) - rub
+        apart = 2.0 * float(np.linalg.norm(slips.max(axis=0) - slips.min(axis=0)))
+        free, rub, slip = mean + along, float(friction @ pushes), float(np.linalg.norm(mean))
+        left = float(np.linalg.norm(free)) - rub
         if left <= 0.0:
             return np.asarray(-mean if slip > max(apart, apart * rub / max(slip, 1e-300)) else np.zeros(3))
         way = left * free / np.linalg.norm(free) - mean
         doubt = rub * min(2.0, apart / left)
-        return np.asarray(max(0.0, 1.0 - doubt / max(np.linalg.norm(way), 1e-300)) * way)
+        return np.asarray(max(0.0, 1.0 - doubt / max(float(np.linalg.norm(way)), 1e-300)) * way)
 
 
 class _Tipping:

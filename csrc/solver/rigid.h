@@ -10,8 +10,8 @@
 //
 // What a piece touches balances part of its momentum. A plane leaves it the turn about the normal and the way along the plane;
 // planes that meet leave the way along their edge. Neither moves any vertex towards a plane; solver/tipping.h has what may. With
-// friction the way along a plane is shortened by friction times the way that the plane stops, which is Coulomb's law for the sum of all
-// forces where all vertices slide the same way; turns are left to the iterations. A motion that ends where it comes to a contact goes
+// friction the way along a plane, or the edge of two, is shortened by friction times the way that the plane stops, which is Coulomb's law
+// for the sum of all forces where all vertices slide the same way; turns are left to the iterations. A motion that ends where it comes to a contact goes
 // on from there, on what the piece touches then.
 #pragma once
 #include "effects/contact.h"
@@ -337,20 +337,16 @@ PD_HD R least_gap_beside(const Contacts<R>& contacts, const Vec3<R>& y, const Ve
   return least;
 }
 
-// Along a rough plane with normal n, that vertices slide on by `slips`. Where these differ by up to d, friction acts along none of
-// them alone: of its force a share of up to 2 d / |slip| is in doubt, and what is within that is left to the iterations, so that
-// nothing moves once they have converged. So it is where friction could stop the whole piece, which it then does.
-PD_COLD inline Vec3<double> slide(const Vec3<double>& shift, const Vec3<double>& n, double friction,
-                                  const double (&sums)[Touch::sums],
+// Along rough planes, whose friction can stop so much of the way: `along` is how far a piece would go there, `mean` how far its vertices
+// slide. Where their slips differ by up to d, friction acts along none of them alone: of its force a share of up to 2 d / |slip| is in
+// doubt, and what is within that is left to the iterations, so that nothing moves once they have converged. So it is where friction
+// could stop the whole piece, which it then does.
+PD_COLD inline Vec3<double> slide(const Vec3<double>& mean, const Vec3<double>& along, double rub,
                                   const double (&bounds)[Touch::bounds]) {
-  if (!(sums[Touch::rubbing] > 0)) return {};
-  const double share = 1.0 / sums[Touch::rubbing], across = dot(shift, n);
-  const Vec3<double> mean =
-      share * Vec3<double>{sums[Touch::slip], sums[Touch::slip + 1], sums[Touch::slip + 2]};
   double square = 0;
   for (int a = 0; a < 3; ++a) square += (bounds[a] + bounds[3 + a]) * (bounds[a] + bounds[3 + a]);
-  const double apart = 2.0 * square_root(square), rub = -friction * across;
-  const Vec3<double> free = mean + subtract_product(shift, across, n);
+  const double apart = 2.0 * square_root(square);
+  const Vec3<double> free = mean + along;
   const double length = square_root(dot(free, free)), left = length - rub;
   const double slip = square_root(dot(mean, mean));
   if (!(left > 0)) return slip > apart && slip * slip > apart * rub ? -mean : Vec3<double>{};
@@ -359,6 +355,27 @@ PD_COLD inline Vec3<double> slide(const Vec3<double>& shift, const Vec3<double>&
   const double size = square_root(dot(way, way));
   if (!(size > doubt)) return {};
   return (1.0 - doubt / size) * way;
+}
+
+// How far a piece goes along one plane or the edge of two, by Coulomb's law for the sum of forces. A plane pushes by how much of the way it
+// stops: two together by l1 n1 + l2 n2, which leaves the way along their edge.
+PD_COLD inline Vec3<double> slide_on(const Plane<double> (&planes)[2], int count,
+                                     const Vec3<double>& shift, const double (&sums)[Touch::sums],
+                                     const double (&bounds)[Touch::bounds]) {
+  if (!(sums[Touch::rubbing] > 0)) return {};
+  const double share = 1.0 / sums[Touch::rubbing];
+  const Vec3<double> mean =
+      share * Vec3<double>{sums[Touch::slip], sums[Touch::slip + 1], sums[Touch::slip + 2]};
+  const Vec3<double> n = planes[0].normal, m = planes[1].normal;
+  const double stopped = -dot(shift, n);
+  if (count == 1)
+    return slide(mean, multiply_add(stopped, n, shift), planes[0].friction * stopped, bounds);
+  const double cosine = dot(n, m), other = -dot(shift, m), scale = 1.0 / (1.0 - cosine * cosine);
+  const double push = scale * (stopped - cosine * other), back = scale * (other - cosine * stopped);
+  if (!(push > 0 && back > 0)) return {};
+  const Vec3<double> edge = square_root(scale) * cross(n, m);
+  return slide(dot(mean, edge) * edge, dot(shift, edge) * edge,
+               planes[0].friction * push + planes[1].friction * back, bounds);
 }
 
 // Parts of a motion that contacts end one after the other, at most: over a corner and an edge on to a face there are three.
@@ -388,12 +405,14 @@ PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touch
   }
   if (fit.hold != Hold::none) return motion;
   Vec3<double> normals[3];
+  Plane<double> planes[2] = {};
   int count = 0, touches = 0;
   double friction = 0;
   PD_ROLLED
   for (int k = 0; k < Touch::planes; ++k) {
     if (!(touched >> k & 1)) continue;
     const Plane<double> p = plane(k);
+    if (touches < 2) planes[touches] = p;
     ++touches;
     if (p.friction > friction) friction = p.friction;
     Vec3<double> n = p.normal;
@@ -401,9 +420,9 @@ PD_HD RigidMotion<double> motion_on_contacts(const RigidFit& fit, unsigned touch
     const double square = dot(n, n);
     if (count < 3 && square > parallel) normals[count++] = (1.0 / square_root(square)) * n;
   }
-  if (count == 3 || (friction > 0 && touches > 1)) return motion;
+  if (count == 3 || (friction > 0 && touches != count)) return motion;
   if (friction > 0) {
-    motion.shift = slide(fit.shift, normals[0], friction, sums, bounds);
+    motion.shift = slide_on(planes, count, fit.shift, sums, bounds);
     return motion;
   }
   motion.shift = fit.shift;
