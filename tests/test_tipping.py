@@ -297,3 +297,21 @@ def test_nothing_moves_once_iterations_have_converged(case: Case) -> None:
         assert np.linalg.norm(problem.residual(solved)) <= 1e-7 * np.linalg.norm(problem.residual(problem.course()))
         assert np.abs(problem.align(solved) - solved).max() <= 1e-9
         x, v = x + solved, solved / H
+
+
+@pytest.mark.parametrize("iterations", [0, 1])
+def test_half_a_turn_to_a_contact_is_none(iterations: int, dtype: torch.dtype, device: torch.device) -> None:
+    """A start that is turned by 180 degrees, and two walls on the way: a share of that turn has no axis."""
+    vertices, tets = box((0.2, 0.2, 0.2), (2, 2, 2))
+    vertices = vertices - 0.1
+    planes = [pd.Ground(-1.0), pd.Ground(-1.0, normal=(1.0, 0.0, 0.0))]
+    case = Case(
+        pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e6), *planes),
+        vertices,
+        0.0 * vertices + [-100.0, -100.0, 0.0],
+        H,
+    )
+    sim = simulator(case, dtype, device, iterations=iterations)
+    state = state_of(case, sim)
+    after = sim(state, start=state.positions * state.positions.new_tensor([-1.0, 1.0, -1.0]))
+    assert bool(after.positions.isfinite().all())
