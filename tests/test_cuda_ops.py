@@ -258,7 +258,7 @@ def test_what_a_scene_does_not_have_is_not_launched() -> None:
     assert launches(ground, ball) == bare  # contacts are within the passes
     free = launches(pinned=False)
     assert free > bare
-    assert launches(ground, pinned=False) > free  # gaps of the shifted piece
+    assert launches(ground, pinned=False) == free  # one launch moves pieces, whatever they touch
     two, touching = launches(steps=2), launches(ball, steps=2)
     assert bare < two < 2 * bare + 1  # loading and weighing are done once
     assert touching > two  # balls move on between steps
