@@ -99,8 +99,8 @@ void step_inplace(const Tensor& positions, const Tensor& velocities, const Tenso
   const Numbers n{schedule, iterations, time_step, relaxation, rho,
                   delay,    weighted,   tolerance, inertial,   report};
   check_inplace(positions, velocities, info);
-  // The state is read before it is written: loads and stores of an environment do not overlap in time. Nor do those of a start
-  // in the same memory, but with no iterations, in which blocks wait for each other.
+  // The state is read before it is written: loads and stores of an environment do not overlap in time. A start in the same memory is
+  // safe since blocks wait for each other in iterations: with none it is copied.
   const bool shared = start && (start->is_alias_of(positions) || start->is_alias_of(velocities));
   const OptionalTensor own = shared && iterations == 0 ? OptionalTensor(start->clone()) : start;
   run_step<Backend>(

@@ -320,3 +320,27 @@ def test_along_a_wall_it_is_coulombs_law_whatever_the_iterations(
     track = sim.rollout(state, 10)
     expected = 2.0 - slows / 60 * torch.arange(1, 11)
     assert float((track.velocities[:, 0, :, 0].mean(dim=1).double().cpu() - expected).abs().max()) <= 2e-2
+
+
+@pytest.mark.parametrize("length", [1.0, 1.00009, 0.99991])
+@pytest.mark.parametrize("angle", [2e-4, 3e-4, 0.015, 0.0192, 0.025])
+def test_in_a_flat_groove_it_is_coulombs_law(
+    angle: float, length: float, dtype: torch.dtype, device: torch.device
+) -> None:
+    """Between two planes that are nearly one, whose normals are 1 to rounding and no more: each bears half."""
+    vertices, tets = box((0.1, 0.1, 0.1), (3, 3, 3))
+    vertices = vertices - [0.05, 0.0, 0.05]
+    planes = [
+        pd.Ground(0.0, normal=(side * np.sin(angle / 2), np.cos(angle / 2), 0.0), friction=0.3) for side in (-1.0, 1.0)
+    ]
+    sim = pd.Simulator(pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e8), pd.Gravity(), *planes), 1 / 60, 3,
+                       dtype=dtype, progress=False).to(device)  # fmt: skip
+    scaled = sim.planes.detach().clone()
+    scaled[:, :3] *= length
+    sim.set_material(planes=scaled)
+    state = sim.rest_state()
+    state.velocities[..., 2] = 1.0
+    found = sim.rollout(state, 4).velocities[:, 0, :, 2].mean(dim=1).double().cpu()
+    expected = 1.0 - 0.3 * 9.81 / 60 / np.cos(angle / 2) * torch.arange(1, 5)
+    # a body that cannot lie in both at once jolts where it starts
+    assert float((found - expected).abs().max()) <= 0.02

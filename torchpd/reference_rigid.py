@@ -123,33 +123,26 @@ class _Piece:
         spheres = self.problem.values.spheres if balls else np.zeros((0, 5))
         return gaps_of(positions, planes, self.problem.sphere_centers[: len(spheres)], spheres)
 
-    def left(self, moved: Array, planes: Array, *, balls: bool = True) -> Array:
-        """Gaps after a motion. After the iterations 0 or less too where a force could keep a vertex from that motion.
+    def left(self, moved: Array, planes: Array) -> Array:
+        """Gaps after a motion. After the iterations 0 or less too where a ball could keep a vertex from that motion.
 
-        That is one within the cone of friction of a contact on which it lies: contacts that go round a component, or
-        are curved, may hold it with forces that no single one of them shows.
+        That is with a force within the cone of its friction, if the vertex lies on it: balls curve away from what goes
+        along them. One ball alone holds nothing by friction that it does not push.
         """
-        after, way = self.gaps(moved, planes, balls=balls), moved - self.y
+        after, way, spheres = self.gaps(moved, planes), moved - self.y, self.problem.values.spheres
         if self.first:
             return after
-        size = np.linalg.norm(way, axis=1)
-        contacts = [(np.broadcast_to(p[:3], way.shape), self.y @ p[:3] - p[3], p[4]) for p in planes]
-        if balls:
-            for center, sphere in zip(self.problem.sphere_centers, self.problem.values.spheres, strict=True):
-                arm = self.y - center
-                length = np.linalg.norm(arm, axis=1, keepdims=True)
-                outward = np.where(length > 0.0, arm / np.maximum(length, 1e-300), [0.0, 1.0, 0.0])
-                contacts.append((outward, length[:, 0] - sphere[3], sphere[4]))
-        for normals, before, friction in contacts:
+        size, several = np.linalg.norm(way, axis=1), len(self.planes) + len(spheres) > 1
+        for center, sphere in zip(self.problem.sphere_centers, spheres, strict=True):
+            arm = self.y - center
+            length = np.linalg.norm(arm, axis=1, keepdims=True)
+            normals = np.where(length > 0.0, arm / np.maximum(length, 1e-300), [0.0, 1.0, 0.0])
             across = (normals * way).sum(axis=1)
-            lift = across - friction * np.linalg.norm(way - across[:, None] * normals, axis=1)
-            after = np.where(before <= LYING * size, np.minimum(after, lift), after)
+            along = np.linalg.norm(way - across[:, None] * normals, axis=1)
+            rounding = 4 * np.finfo(np.float64).eps * (np.linalg.norm(self.y, axis=1) + sphere[3])
+            lies = length[:, 0] - sphere[3] <= LYING * size + rounding
+            after = np.where(lies, np.minimum(after, across - several * sphere[4] * along), after)
         return after
-
-    def left_of(self, plane: Array, free: Array) -> Array:
-        """The same for one of the first planes; alone it shows what it holds."""
-        several = len(self.planes) + len(self.problem.values.spheres) > 1
-        return self.left(free, plane[None], balls=False) if several else np.asarray(free @ plane[:3] - plane[3])
 
     def deepest(self, moved: Array, drop: Array, reach: float) -> tuple[int, float, float]:
         """The vertex that stops a motion first, how deep it goes beyond where it was, and how far off a drop leaves it.
@@ -193,7 +186,7 @@ class _Piece:
         free = (self.y - pivot) @ turn.T + pivot + shift
         if self.left(free, self.planes[TOLD:]).min() <= 0.0:
             return still
-        touched = np.array([bool((self.left_of(plane, free) <= 0.0).any()) for plane in self.planes[:TOLD]], dtype=bool)
+        touched = np.array([bool((free @ plane[:3] <= plane[3]).any()) for plane in self.planes[:TOLD]], dtype=bool)
         if not touched.any():
             return np.asarray(free - self.y)
         planes = self.planes[:TOLD][touched]
@@ -223,7 +216,7 @@ class _Piece:
         least = 1.0
         for plane in planes:
             before, after = (y @ plane[:3] - plane[3] for y in (self.y, free))
-            comes, touches = (before > 0.0) & (after <= 0.0), self.left_of(plane, free) <= 0.0
+            comes, touches = (before > 0.0) & (after <= 0.0), after <= 0.0
             shares = np.where(comes, before / np.where(comes, np.maximum(before - after, 1e-300), 1.0), 0.0)
             least = min(least, float(shares[touches].min(initial=1.0)))
         return least
@@ -241,6 +234,8 @@ class _Piece:
             return along if len(span) < 3 else np.zeros(3)
         if len(span) != len(planes) or len(span) > 2:
             return np.zeros(3)
+        if len(planes) == 1 and float(self.lag @ normals[0]) >= 0.0:
+            return np.asarray(along)
         # how far the planes push it together, and the slips on those that are rough
         pushes = np.linalg.solve(normals @ normals.T, -normals @ self.lag)
         if len(planes) > 1 and not (pushes > 0.0).all():

@@ -219,11 +219,14 @@ def _environments(sim: Simulator, batch: int) -> list[int]:
 
 def _other_ways(sim: Simulator, start: State) -> list[State]:
     """The start with its velocities turned about the normal of rough ground: what sticks when depends on the way."""
-    rough = sim.planes.detach().reshape(-1, 5)
-    rough = rough[rough[:, 4] > 0.0]
-    if not len(rough):
+    planes = sim.planes.detach().reshape(-1, sim.planes.shape[-2], 5)  # [1 or B, C, 5]
+    if not bool((planes[..., 4] > 0.0).any()):
         return []
-    normal = rough[0, :3]
+    # of each environment the rough one that bears most of the weight
+    bears = -(planes[..., :3] * sim.gravity.detach().reshape(-1, 1, 3)).sum(dim=-1)
+    most = bears.masked_fill(planes[..., 4] <= 0.0, -math.inf).argmax(dim=1)
+    chosen = planes.expand(len(most), -1, -1)[torch.arange(len(most), device=most.device), most]
+    normal = chosen[:, None, :3]
     across = torch.linalg.cross(normal.expand_as(start[1]), start[1])
     along = (start[1] * normal).sum(dim=-1, keepdim=True) * normal
     return [

@@ -55,14 +55,14 @@ struct Workspace {
   Real (*touched)[Touch::planes];  // [groups] 1 for each of the first planes that it touches
   Real* still;                     // [groups] 1 if it starts from where it is
   Tipping* tipping;                // [groups, environments]
-  bool* goes_on;  // [groups, environments] its motion ended where it came to a contact
-  TippingSearch<Real>* search;  // [groups]
+  bool* goes_on;                   // [groups, environments] moves in this leg, then: in the next
+  TippingSearch<Real>* search;     // [groups]
   Plane<Real>* planes;
   Ball<Real>* balls;
   T* weight;  // [elements], or [elements, W] when stiffness differs between environments
   int part_count;
   bool shared_weight;
-  bool some_go_on = false;  // pieces
+  bool some_go_on = false;  // in the next leg, of any environment
 
   explicit Workspace(const StepCall<T>& call)
       : Workspace(call.plan, call.material, call.material.stiffness.stride == 0,

@@ -15,7 +15,7 @@ struct RoundsCall {
   unsigned* counter;  // [teams] zero
 };
 
-// A warp has a part, the same one in every round, so that nobody waits for what it moves itself.
+// A warp has the same parts in every round, and a lane the same of their vertices: it reads what it has moved itself, without waiting.
 template <class T, bool Touching>
 class StreamRounds {
  public:
@@ -32,7 +32,7 @@ class StreamRounds {
       });
       how.go_on();
     } while (Touching && some_piece([&](const Piece<T>& p) { return p.leg == how.leg; }));
-    team_.barrier();  // before the next environment, everyone has read the pieces
+    team_.barrier();  // blocks begin an environment together
   }
 
   template <Rigid What>

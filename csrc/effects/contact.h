@@ -11,6 +11,8 @@
 #include "math/mat.h"
 #include "math/scalar.h"
 
+#include <limits>
+
 namespace pd::inline PD_TARGET {
 
 // A vertex lies on a contact when it is no further off than this share of a way.
@@ -79,15 +81,19 @@ PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, 
   return select(rubs, subtract_product(pushed, grip, slip), pushed);
 }
 
-// How far from a contact a motion by `way` leaves a vertex: before, and after. Not more than 0 where it lies on the contact and the motion
-// would lift it off by less than friction * slip: then a force within the cone of friction could be what keeps it from that motion.
+// How far from a ball a vertex is after `way`; not more than 0 where it lies on it and goes along it, lifted by less than friction * slip:
+// then a force within the cone of friction could be what keeps it from that way.
 template <class R>
-PD_HD R left_by(const Vec3<R>& normal, const R& friction, const R& before, const R& after,
-                const Vec3<R>& way) {
-  const R share = R(scalar_of<R>(lies_within)), across = dot(normal, way);
+PD_HD R left_by(const Ball<R>& ball, const R& friction, const Vec3<R>& x, const Vec3<R>& way) {
+  using T = scalar_of<R>;
+  const Vec3<R> normal = outward(ball, x);
+  const R across = dot(normal, way), size = square_root(dot(way, way));
+  const R rounding =
+      R(4 * std::numeric_limits<T>::epsilon()) * (square_root(dot(x, x)) + ball.radius);
+  const auto lies = !(gap(ball, x) > multiply_add(R(T(lies_within)), size, rounding));
   const Vec3<R> along = subtract_product(way, across, normal);
-  const auto lies = !(before > share * square_root(dot(way, way)));
   const R lift = subtract_product(across, friction, square_root(dot(along, along)));
+  const R after = gap(ball, x + way);
   return select(lies, lesser(after, lift), after);
 }
 
@@ -225,20 +231,16 @@ struct Contacts {
     return least;
   }
 
-  // The same at the end of a `way` from there; `settled`: see left_by.
+  // The same after a `way` from there. `settled`: by left_by. One ball alone holds nothing by friction that it does not push.
   PD_HD R least_left(const Vec3<R>& x, const Vec3<R>& way, int first, bool settled) const {
     if (!settled) return least_gap(x + way, first);
     R least(HUGE_VAL);
-    for (int i = first; i < plane_count; ++i) least = lesser(least, left(planes[i], x, way));
+    for (int i = first; i < plane_count; ++i) least = lesser(least, gap(planes[i], x + way));
     for (int i = 0; i < ball_count; ++i) {
-      const Ball<R>& b = balls[i];
-      least = lesser(least, left_by(outward(b, x), b.friction, gap(b, x), gap(b, x + way), way));
+      const R friction = has_several() ? balls[i].friction : R(0);
+      least = lesser(least, left_by(balls[i], friction, x, way));
     }
     return least;
-  }
-
-  PD_HD static R left(const Plane<R>& plane, const Vec3<R>& x, const Vec3<R>& way) {
-    return left_by(plane.normal, plane.friction, gap(plane, x), gap(plane, x + way), way);
   }
 
  private:

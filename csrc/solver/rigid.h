@@ -271,28 +271,26 @@ PD_HD bool starts_still(const double (&sum)[StartSums::count]) {
 }
 
 // Adds a vertex at y = x + u, whose piece would move by `motion`, to these; `near(k, gap)` learns how far from the first planes it
-// would come, and at last from the other contacts. `settled`: after the iterations. Then contacts that go round a piece, or are curved,
-// may hold it with forces that no single one of them shows: see left_by.
+// would come, and at last from the other contacts. `settled`: after the iterations. Then balls, which curve away from a piece that they
+// hold, count by left_by, in numbers of 0 and less that are no distances.
 template <class W, class R, class Near>
 PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
                      const Contacts<R>& contacts, const Vec3<R>& y, const Vec3<R>& u,
                      const RigidMotion<R>& motion, bool settled, const Near& near) {
   const R none(0), one(1), far(HUGE_VAL);
   const Vec3<R> way = motion.of(y), moved = y + way, arm = y - motion.center;
-  const bool holds = settled && contacts.has_several();
   // in double, since their spread is a difference
   const Vec3<W> wide_arm = {convert<double>(arm.x), convert<double>(arm.y), convert<double>(arm.z)};
   const int told = contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
   for (int k = 0; k < told; ++k) {
     const Plane<R>& plane = contacts.planes[k];
     const R before = gap(plane, y), after = gap(plane, moved);
-    const R left = holds ? contacts.left(plane, y, way) : after;
-    near(k, left);
+    near(k, after);
     const auto comes = before > none && !(after > none);
     const R share = before / select(comes, before - after, one);
     bounds[Touch::share] =
         lesser(bounds[Touch::share],
-               convert<double>(select(left > none, far, select(comes, share, none))));
+               convert<double>(select(after > none, far, select(comes, share, none))));
     const R reach = -R(scalar_of<R>(lies_within)) * dot(motion.shift, plane.normal);
     const R lies = select(before < reach, one, none);
     const R rubs = select(plane.friction > none, lies, none);
@@ -368,12 +366,17 @@ PD_COLD inline Vec3<double> slide_on(const Plane<double> (&planes)[2], int count
       share * Vec3<double>{sums[Touch::slip], sums[Touch::slip + 1], sums[Touch::slip + 2]};
   const Vec3<double> n = planes[0].normal, m = planes[1].normal;
   const double stopped = -dot(shift, n);
-  if (count == 1)
-    return slide(mean, multiply_add(stopped, n, shift), planes[0].friction * stopped, bounds);
-  const double cosine = dot(n, m), other = -dot(shift, m), scale = 1.0 / (1.0 - cosine * cosine);
-  const double push = scale * (stopped - cosine * other), back = scale * (other - cosine * stopped);
+  if (count == 1) {
+    const Vec3<double> along = multiply_add(stopped, n, shift);
+    return stopped > 0 ? slide(mean, along, planes[0].friction * stopped, bounds) : along;
+  }
+  // by the cross product, which nothing cancels in where the planes are nearly parallel or the normals not quite of length 1
+  const Vec3<double> across = cross(n, m);
+  const double square = dot(across, across), other = -dot(shift, m), nm = dot(n, m);
+  const double push = (dot(m, m) * stopped - nm * other) / square;
+  const double back = (dot(n, n) * other - nm * stopped) / square;
   if (!(push > 0 && back > 0)) return {};
-  const Vec3<double> edge = square_root(scale) * cross(n, m);
+  const Vec3<double> edge = (1.0 / square_root(square)) * across;
   return slide(dot(mean, edge) * edge, dot(shift, edge) * edge,
                planes[0].friction * push + planes[1].friction * back, bounds);
 }
