@@ -219,9 +219,10 @@ def _environments(sim: Simulator, batch: int) -> list[int]:
 
 def _other_ways(sim: Simulator, start: State) -> list[State]:
     """The start with its velocities turned about the normal of rough ground: what sticks when depends on the way."""
-    planes = sim.planes.detach().reshape(-1, sim.planes.shape[-2], 5)  # [1 or B, C, 5]
+    planes = sim.planes.detach()
     if not bool((planes[..., 4] > 0.0).any()):
         return []
+    planes = planes.reshape(-1, planes.shape[-2], 5)  # [1 or B, C, 5]
     # of each environment the rough one that bears most of the weight
     bears = -(planes[..., :3] * sim.gravity.detach().reshape(-1, 1, 3)).sum(dim=-1)
     most = bears.masked_fill(planes[..., 4] <= 0.0, -math.inf).argmax(dim=1)
