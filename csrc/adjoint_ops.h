@@ -1,78 +1,59 @@
-// The ops of a step's adjoint on either device. Of a Backend, beside what ops.h asks for: `adjoint_system` and
-// `adjoint_result`, which run a call; and `recording(like)`, whether what is done is recorded for later, where nobody can ask
-// what comes out.
+// The ops of a step's adjoint on either device. Of a Backend, beside what ops.h asks for: `adjoint_system`,
+// `contact_gradients` and `adjoint_result`, which run a call; and `recording(like)`, whether what is done is recorded for later,
+// where nobody can ask what comes out.
 #pragma once
-#include "checks.h"
-#include "find_op.h"
-#include "ops.h"
-#include "plan_views.h"
-#include "solver/adjoint.h"
+#include "material_gradients.h"
 
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <optional>
 #include <string_view>
 #include <tuple>
+#include <utility>
 #include <vector>
 
 namespace pd {
-
-// A step that was taken, and what a loss wants of its outcome.
-struct AdjointTensors {
-  Tensor grad_positions, grad_velocities, after, positions, velocities;
-  OptionalTensor forces;
-  at::TensorList material, plan;
-};
 
 using AdjointOutputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 template <class Backend, class T>
 AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
-  AdjointSystemCall<T, typename Backend::template Plan<T>> call;
-  const Place place{t.after.device()};
-  call.plan = Backend::template plan_view<T>(t.plan, place);
-  call.batch = t.after.size(0);
-  const std::int64_t vertices = call.plan.vertices;
-  check_vertices(t.after, vertices);
-  call.material = material_view<T>(t.material, vertices, call.plan.pins, call.batch, place);
-  const Tensor& stiffness = t.material[0];
-  const Tensor elastic = diagonal_typed<Backend, T>(stiffness, t.plan, true);
+  StepTaken<Backend, T> step(t, time_step);
+  auto& call = step.call;
   const Material<T>& m = call.material;
-  call.elastic = {elastic.const_data_ptr<T>(), m.stiffness.stride ? vertices : 0};
-  const bool touching = m.planes_count + m.spheres_count > 0;
-  const bool own = touching || m.stiffness.stride || m.masses.stride || m.damping.stride ||
+  const bool own = step.touching || m.stiffness.stride || m.masses.stride || m.damping.stride ||
                    m.pin_stiffness.stride;
   call.rows = own ? call.batch : 1;
-  call.time_step = time_step;
+  const std::int64_t vertices = call.plan.vertices;
   const at::TensorOptions options = t.after.options();
-  const Tensor grad_x = t.grad_positions.contiguous(), grad_v = t.grad_velocities.contiguous();
-  const Tensor right = at::empty_like(grad_x), inertia = at::empty({call.rows, vertices}, options);
+  const Tensor right = at::empty(t.after.sizes(), options);
+  const Tensor inertia = at::empty({call.rows, vertices}, options);
   const Tensor inverse = at::empty_like(inertia);
-  call.grad_positions = grad_x.const_data_ptr<T>();
-  call.grad_velocities = grad_v.const_data_ptr<T>();
   call.right = right.mutable_data_ptr<T>();
   call.inertia = inertia.mutable_data_ptr<T>();
   call.inverse = inverse.mutable_data_ptr<T>();
-  const std::int64_t held = touching ? call.batch : 0;
+  const std::int64_t held = step.touching ? call.batch : 0;
   const Tensor projector = at::empty({held, vertices, 3, 3}, options);
   const Tensor stuck = at::empty({held, vertices}, options.dtype(at::kBool));
   const Tensor sliding = at::empty({held, vertices, slide_count, 3}, options);
-  Tensor after, x, v, f, gradient;
-  if (touching) {
-    after = t.after.contiguous(), x = t.positions.contiguous(), v = t.velocities.contiguous();
-    f = t.forces ? t.forces->contiguous() : Tensor();
-    gradient = run_field<Backend>(Field::gradient, after, {}, stiffness, t.plan);
-    call.after = after.const_data_ptr<T>();
-    call.positions = x.const_data_ptr<T>();
-    call.velocities = v.const_data_ptr<T>();
-    call.forces = f.defined() ? f.const_data_ptr<T>() : nullptr;
-    call.elastic_gradient = gradient.const_data_ptr<T>();
+  if (step.touching) {
     call.projector = projector.mutable_data_ptr<T>();
     call.stuck = stuck.mutable_data_ptr<bool>();
     call.sliding = sliding.mutable_data_ptr<T>();
   }
-  if (call.batch > 0) Backend::adjoint_system(call, grad_x);
+  if (call.batch > 0) Backend::adjoint_system(call, right);
   return {right, inertia, inverse, projector, stuck, sliding};
+}
+
+inline void check_step_taken(const AdjointTensors& t, double time_step) {
+  check_positions(t.positions, "positions");
+  check_state(t.velocities, t.positions, "velocities", "m/s");
+  check_state(t.after, t.positions, "after", "m");
+  if (t.forces) check_state(*t.forces, t.positions, "forces", "N");
+  check_state(t.grad_positions, t.positions, "grad_positions", "of a loss, 1/m");
+  check_state(t.grad_velocities, t.positions, "grad_velocities", "of a loss, 1/(m/s)");
+  check_time_step(time_step);
 }
 
 // The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1, vertices], and of
@@ -84,15 +65,9 @@ AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_v
                               const Tensor& after, const Tensor& positions,
                               const Tensor& velocities, const OptionalTensor& forces,
                               at::TensorList material, at::TensorList plan, double time_step) {
-  check_positions(positions, "positions");
-  check_state(velocities, positions, "velocities", "m/s");
-  check_state(after, positions, "after", "m");
-  if (forces) check_state(*forces, positions, "forces", "N");
-  check_state(grad_positions, positions, "grad_positions", "of a loss, 1/m");
-  check_state(grad_velocities, positions, "grad_velocities", "of a loss, 1/(m/s)");
-  check_time_step(time_step);
   const AdjointTensors tensors{grad_positions, grad_velocities, after,    positions,
                                velocities,     forces,          material, plan};
+  check_step_taken(tensors, time_step);
   return positions.scalar_type() == at::kFloat
              ? adjoint_system_typed<Backend, float>(tensors, time_step)
              : adjoint_system_typed<Backend, double>(tensors, time_step);
@@ -176,6 +151,22 @@ Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tens
   return multiplier.scalar_type() == at::kFloat
              ? adjoint_result_typed<Backend, float>(tensors, time_step)
              : adjoint_result_typed<Backend, double>(tensors, time_step);
+}
+
+// Gradients of a solved adjoint for planes [batch, planes, 5] and spheres [batch, spheres, 8].
+template <class Backend>
+std::tuple<Tensor, Tensor> contact_gradients(const Tensor& multiplier, const Tensor& elastic,
+                                             const Tensor& grad_positions,
+                                             const Tensor& grad_velocities, const Tensor& after,
+                                             const Tensor& positions, const Tensor& velocities,
+                                             const OptionalTensor& forces, at::TensorList material,
+                                             at::TensorList plan, double time_step) {
+  const AdjointTensors tensors{grad_positions, grad_velocities, after,    positions,
+                               velocities,     forces,          material, plan};
+  check_step_taken(tensors, time_step);
+  check_state(multiplier, positions, "multiplier", "of a loss, 1/N");
+  check_state(elastic, positions, "elastic", "Hessian product, of a loss, 1/m");
+  return gradients_for_contacts<Backend>(tensors, multiplier, elastic, time_step);
 }
 
 struct AdjointSystem {
@@ -277,125 +268,6 @@ std::tuple<Tensor, Tensor, OptionalTensor> solve(const AdjointTensors& t, const 
   return {solution, error, sliding};
 }
 
-// K l, by the dispatcher, whose profiler then sees it.
-inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier) {
-  static const auto op =
-      find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, at::TensorList)>(
-          "torchpd::hessian_product");
-  return op.call(t.after, multiplier, t.material[place_in_material("stiffness")], t.plan);
-}
-
-// Environments of whose ends the loss knows anything. One of no number that it leaves out must not spoil what it shares.
-class Asked {
- public:
-  Asked(const Tensor& grad_positions, const Tensor& grad_velocities) {
-    // what is alone shares nothing
-    if (grad_positions.size(0) < 2 || grad_positions[0].numel() == 0) return;
-    const auto some = [](const Tensor& gradient) { return gradient.ne(0.0).flatten(1).any(1); };
-    is_ = some(grad_positions).logical_or_(some(grad_velocities));
-  }
-
-  // [batch, ...], 0 for others
-  Tensor only(const Tensor& each) const {
-    if (!is_.defined()) return each;
-    std::vector<std::int64_t> shape(each.dim(), 1);
-    shape[0] = -1;
-    return at::where(is_.view(shape), each, 0.0);
-  }
-
- private:
-  Tensor is_;
-};
-
-// -l . dr/dp of every environment, for an array p of the material, from its formulas for all of them.
-class MaterialGradients {
- public:
-  // `elastic`: K l, undefined where nobody has worked it out
-  MaterialGradients(const AdjointTensors& t, const Tensor& multiplier, const Tensor& elastic,
-                    const Asked& asked, double time_step)
-      : t_(t), multiplier_(multiplier), elastic_(elastic), asked_(asked), h_(time_step) {}
-
-  // of the array in a place; what environments share has the sum over them
-  Tensor of(std::size_t place) const {
-    const Tensor& array = t_.material[place];
-#define X(name, width, rows, meaning)    \
-  if (place == place_in_material(#name)) \
-    return reduce(name(), array, (width > 1 ? 1 : 0) + (std::string_view(#rows) != "one"));
-#include "plan/material.def"
-#undef X
-    TORCH_INTERNAL_ASSERT(false);
-  }
-
- private:
-  Tensor reduce(const Tensor& every, const Tensor& like, std::int64_t own) const {
-    const Tensor each = asked_.only(every);
-    return like.dim() == own ? each.sum(0) : each.sum_to_size(like.sizes());
-  }
-
-  const Tensor& material(const char* name) const { return t_.material[place_in_material(name)]; }
-  Tensor mass() const { return material("masses").unsqueeze(-1); }
-  Tensor rate() const { return (t_.after - t_.positions) / h_; }
-  Tensor hard() const { return material("pin_stiffness").isinf(); }
-
-  // user's numbers of the pinned vertices
-  Tensor pins() const {
-    constexpr int vertex_order = 1, pin_vertex = 2;  // of every plan
-    return t_.plan[vertex_order].index_select(0, t_.plan[pin_vertex]).to(at::kLong);
-  }
-  Tensor pinned(const Tensor& field) const { return field.index_select(1, pins()); }
-
-  // what vertices that are held pass on
-  Tensor passed_on() const {
-    // what was worked out before does not know yet that an environment is lost
-    const Tensor product =
-        elastic_.defined() ? elastic_ + 0.0 * multiplier_ : elastic_product(t_, multiplier_);
-    return t_.grad_positions + t_.grad_velocities / h_ - product;
-  }
-
-  Tensor stiffness() const {
-    static const auto op =
-        find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, at::TensorList)>(
-            "torchpd::element_energy_product");
-    return -op.call(t_.after, multiplier_, at::ones_like(material("stiffness")), t_.plan);
-  }
-
-  Tensor masses() const {
-    const Tensor lag = 1 + material("damping").unsqueeze(-1).unsqueeze(-1) * h_;
-    const Tensor pull = (lag * rate() - t_.velocities) / h_ - material("gravity").unsqueeze(-2);
-    return -(multiplier_ * pull).sum(-1);
-  }
-
-  Tensor gravity() const { return (mass() * multiplier_).sum(1); }
-
-  Tensor damping() const { return -(mass() * multiplier_ * rate()).sum({1, 2}); }
-
-  Tensor pin_stiffness() const {
-    const Tensor stretch = pinned(t_.after) - material("pin_targets");
-    return at::where(hard(), 0.0, -(pinned(multiplier_) * stretch).sum(-1));
-  }
-
-  // hard ones take on what their vertices pass on
-  Tensor pin_targets() const {
-    const Tensor held = hard().unsqueeze(-1);
-    const Tensor springs = at::where(held, 0.0, material("pin_stiffness").unsqueeze(-1));
-    return at::where(held, pinned(passed_on()), springs * pinned(multiplier_));
-  }
-
-  // autograd refuses to ask for those of contacts
-  Tensor planes() const { return none("planes"); }
-  Tensor spheres() const { return none("spheres"); }
-  Tensor none(const char* name) const {
-    const Tensor& array = material(name);
-    return at::zeros({t_.after.size(0), array.size(-2), array.size(-1)}, array.options());
-  }
-
-  const AdjointTensors& t_;
-  const Tensor& multiplier_;
-  const Tensor& elastic_;
-  const Asked& asked_;
-  double h_;
-};
-
 using Wanted =
     std::optional<c10::List<bool>>;  // of every array of the material, whether its gradient is
 
@@ -436,7 +308,12 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
       passed_on.projector, passed_on.stuck, passed_on.sliding, time_step);
   const Asked asked(grad_positions, grad_velocities);
   std::vector<Tensor> found{asked.only(x), asked.only(v), asked.only(multiplier)};
-  const MaterialGradients gradients(t, multiplier, elastic, asked, time_step);
+  const MaterialGradients gradients(
+      t, multiplier, elastic,
+      [&, l = multiplier](const Tensor& product) {
+        return gradients_for_contacts<Backend>(t, l, product, time_step);
+      },
+      asked, time_step);
   for (std::size_t i = 0; i < material.size(); ++i) {
     if (!wanted || wanted->get(i)) found.push_back(gradients.of(i));
   }
@@ -446,6 +323,7 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
 template <class Backend>
 void register_adjoint_ops(torch::Library& m) {
   m.impl("adjoint_system", &adjoint_system<Backend>);
+  m.impl("contact_gradients", &contact_gradients<Backend>);
   m.impl("adjoint_result", &adjoint_result<Backend>);
   m.impl("conjugate_gradients", &conjugate_gradients<Backend>);
   m.impl("step_vjp", &step_vjp<Backend>);

@@ -75,19 +75,6 @@ variable_list call_step_vjp(const Tensor& grad_positions, const Tensor& grad_vel
 // Whether an array has any numbers; torch.compile has symbols for its lengths.
 bool some(const Tensor& array) { return array.sym_numel() != 0; }
 
-// Without contacts nothing depends on what they would be.
-void refuse_contacts(const c10::List<bool>& wanted, at::TensorList material) {
-  const auto without = [&](const char* name) {
-    const std::size_t at = place_in_material(name);
-    return wanted[at] && some(material[at]);
-  };
-  const bool planes = without("planes"), spheres = without("spheres");
-  TORCH_CHECK(!planes && !spheres, "torchpd: a step has no derivative for ", planes ? "planes" : "",
-              planes && spheres ? " and " : "", spheres ? "spheres" : "", "; detach them, or call ",
-              planes ? "sim.planes.requires_grad_(False)" : "", planes && spheres ? " and " : "",
-              spheres ? "sim.spheres.requires_grad_(False)" : "");
-}
-
 // What autograd does not look at, and both functions have to know; `info` is handed out past it, a report, not a function to
 // differentiate.
 struct Unvaried {
@@ -168,7 +155,6 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
                 "torchpd: a step has no derivative for its first iterate; detach start");
     const c10::List<bool> wanted =
         Edges{context, start_edge + (starts ? 1 : 0)}.material(kept.material.size());
-    refuse_contacts(wanted, kept.material);
     const variable_list values = call_step_vjp(
         grads[0], grads[1], {kept.positions, kept.velocities, kept.forces, kept.after},
         kept.material, kept.plan, context->saved_data["time_step"].toDouble(), wanted);
@@ -187,6 +173,12 @@ variable_list material_at(const variable_list& material, std::int64_t step) {
   const Tensor center = spheres.narrow(-1, 0, 3), rest = spheres.narrow(-1, 3, 5);
   spheres = at::cat({center + double(step) * spheres.narrow(-1, 5, 3), rest}, -1);
   return at_step;
+}
+
+// Of spheres at a step, seen from the start of the rollout.
+Tensor moved_back(const Tensor& gradient, std::int64_t step) {
+  const Tensor center = gradient.narrow(-1, 0, 3), rest = gradient.narrow(-1, 0, 5);
+  return at::cat({rest, gradient.narrow(-1, 5, 3) + double(step) * center}, -1);
 }
 
 class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
@@ -208,8 +200,10 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
     const Kept kept(context->get_saved_variables());
     const bool forces = kept.forces.has_value();
     const c10::List<bool> wanted = Edges{context, forces ? 3u : 2u}.material(kept.material.size());
-    refuse_contacts(wanted, kept.material);
     const double time_step = context->saved_data["time_step"].toDouble();
+    const std::size_t spheres = place_in_material("spheres");
+    std::size_t sphere_place = 3;
+    for (std::size_t i = 0; i < spheres; ++i) sphere_place += wanted[i];
     // of positions, velocities, forces and the wanted arrays; the first two of one step after another
     variable_list sums(3);
     for (std::int64_t step = kept.after.sym_size(0).guard_int(__FILE__, __LINE__) - 1; step >= 0;
@@ -221,6 +215,7 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
           call_step_vjp(add(sums[0], grads[0][step]), add(sums[1], grads[1][step]),
                         {before, speed, kept.forces, kept.after[step]},
                         material_at(kept.material, step), kept.plan, time_step, wanted);
+      if (wanted[spheres]) values[sphere_place] = moved_back(values[sphere_place], step);
       sums.resize(values.size());
       for (std::size_t i = 2; i < values.size(); ++i) values[i] = add(sums[i], values[i]);
       sums = std::move(values);

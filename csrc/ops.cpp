@@ -51,6 +51,12 @@ struct Cpu {
   static void adjoint_system(const AdjointSystemCall<double>& call, const Tensor&) {
     kernels().adjoint_system64(call, threads());
   }
+  static void contact_gradients(const ContactGradientsCall<float>& call, const Tensor&) {
+    kernels().contact_gradients32(call, threads());
+  }
+  static void contact_gradients(const ContactGradientsCall<double>& call, const Tensor&) {
+    kernels().contact_gradients64(call, threads());
+  }
   static void adjoint_result(const AdjointResultCall<float>& call, const Tensor&) {
     kernels().adjoint_result32(call, threads());
   }
@@ -121,6 +127,11 @@ TORCH_LIBRARY(torchpd, m) {
       "positions, Tensor "
       "velocities, Tensor? forces, Tensor[] material, Tensor[] plan, *, float time_step) -> "
       "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+  with_plan(
+      "contact_gradients(Tensor multiplier, Tensor elastic, Tensor grad_positions, Tensor "
+      "grad_velocities, Tensor after, Tensor positions, Tensor velocities, Tensor? forces, "
+      "Tensor[] "
+      "material, Tensor[] plan, *, float time_step) -> (Tensor, Tensor)");
   m.def(
       "adjoint_result(Tensor multiplier, Tensor error, Tensor grad_velocities, Tensor masses, "
       "Tensor "

@@ -257,6 +257,7 @@ def test_the_result_refuses(change: dict[str, Any], said: str) -> None:
         ops.adjoint_result(**{**given, **change})
 
 
+@pytest.mark.parametrize("name", ["adjoint_system", "contact_gradients"])
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -269,11 +270,25 @@ def test_the_result_refuses(change: dict[str, Any], said: str) -> None:
         ({"time_step": -1.0}, "time_step must be positive"),
     ],
 )
-def test_the_system_refuses(change: dict[str, Any], said: str) -> None:
+def test_a_step_that_was_not_taken_is_refused(change: dict[str, Any], said: str, name: str) -> None:
     sim, (x, v) = small(torch.float32)
     given = {
         "grad_positions": x, "grad_velocities": x, "after": x, "positions": x, "velocities": v, "forces": None,
         "material": material_of(sim, contacts=True), "plan": plan_of(sim), "time_step": sim.time_step,
     }  # fmt: skip
+    if name == "contact_gradients":
+        given |= {"multiplier": x, "elastic": x}
+    op = getattr(ops, name)
+    op(**given)
     with pytest.raises(ValueError, match=said):
-        ops.adjoint_system(**{**given, **change})
+        op(**{**given, **change})
+
+
+@pytest.mark.parametrize("field", ["multiplier", "elastic"])
+def test_gradients_for_contacts_refuse(field: str) -> None:
+    sim, (x, v) = small(torch.float32)
+    given = {"multiplier": x, "elastic": x, field: torch.zeros(BATCH, 2, 3)}
+    with pytest.raises(ValueError, match=f"{field} must be"):
+        ops.contact_gradients(
+            *given.values(), x, x, x, x, v, None, material_of(sim, contacts=True), plan_of(sim), time_step=0.1
+        )

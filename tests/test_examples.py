@@ -69,6 +69,15 @@ def test_grip_and_twist(run) -> None:
     assert soft_miss > 1e-3
 
 
+def test_push_to_goal(run) -> None:
+    text = run("push_to_goal.py", "--steps", "8", "--tries", "4")
+    distances = [float(number) for number in re.findall(r"^ +\d+ +(\S+)$", text, flags=re.MULTILINE)]
+    assert len(distances) == 4
+    assert distances == sorted(distances, reverse=True)  # every try comes nearer, since eight steps are too few
+    (end,) = numbers(text, r"end +(\S+)")
+    assert end < 0.95 * distances[0]
+
+
 def test_first_iterate(run) -> None:
     text = run("first_iterate.py", "--steps", "1", "--iterations", "4", "128")
     for few, many in zip(

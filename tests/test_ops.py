@@ -82,6 +82,7 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
         ),
         "conjugate_gradients": ((x, f, sim.masses, 1 / sim.masses, None, stiffness, plan), {"tolerance": 1e-3}),
         "adjoint_system": ((f, direction, x, still, zero, 0.01 * f, material, plan), h),
+        "contact_gradients": ((direction, f, f, direction, x, still, zero, 0.01 * f, material, plan), h),
         "adjoint_result": (
             (f, errors, direction, sim.masses, sim.damping, f, direction, projector, x[..., 0] > 0.1, sliding), h,
         ),
@@ -95,7 +96,7 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
     "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "conjugate_gradients_",
-    "adjoint_system", "adjoint_result", "mend_adjoint", "slide_adjoint", "conjugate_gradients",
+    "adjoint_system", "contact_gradients", "adjoint_result", "mend_adjoint", "slide_adjoint", "conjugate_gradients",
 )  # fmt: skip
 
 

@@ -132,6 +132,7 @@ def adjoint(sim: pd.Simulator, batch: int) -> None:
     freed = [t[..., :0, :] if name in ("planes", "spheres") else t for name, t in zip(names, material, strict=True)]
     for arrays, forces in ((material, d), (material, None), (freed, None)):
         right, _, _, *held = ops.adjoint_system(d, d, x + d, x, d, forces, arrays, plan, time_step=h)
+        ops.contact_gradients(d, d, d, d, x + d, x, d, forces, arrays, plan, time_step=h)
         contacts = (d, d, *held) if arrays is material else ()
         ops.adjoint_result(right, error, d, sim.masses, sim.damping, *contacts, time_step=h)
 

@@ -146,6 +146,14 @@ def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
     return positions.new_empty(positions.shape), inertia, inverse, projector, stuck, sliding
 
 
+@_register_fake("contact_gradients")
+def _(multiplier: Tensor, *step: Any, time_step: float) -> tuple[Tensor, Tensor]:
+    material = dict(zip((row.name for row in MATERIAL_TABLE), step[-2], strict=True))
+    planes, spheres = (material[name] for name in ("planes", "spheres"))
+    batch = multiplier.shape[0]
+    return multiplier.new_empty((batch, planes.shape[-2], 5)), multiplier.new_empty((batch, spheres.shape[-2], 8))
+
+
 @_register_fake("conjugate_gradients")
 def _(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
     return positions.new_empty(positions.shape), positions.new_empty(positions.shape[:1], dtype=torch.float64)

@@ -110,8 +110,8 @@ class Simulator(Model):
 
         Returns:
             The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
-            error follows that of the step), friction included, see `torchpd.sliding`; none for planes and spheres
-            themselves, nor for `start`. Forward mode and `torch.func.grad` are not provided.
+            error follows that of the step), friction included, see `torchpd.sliding`, and for planes and spheres
+            themselves; none for `start`. Forward mode and `torch.func.grad` are not provided.
         """
         forces = self.check_state(state, forces=forces)
         material = self.material_at(targets, state[0].shape[0])

@@ -2,6 +2,7 @@
 #pragma once
 #include "cpu/team.h"
 #include "solver/adjoint.h"
+#include "solver/contact_gradients.h"
 
 #include <algorithm>
 
@@ -13,21 +14,33 @@ inline int useful_threads(std::int64_t vertices, int threads) {
   return int(std::min<std::int64_t>(threads, vertices / least_share + 1));
 }
 
-template <class T>
-void adjoint_system_any(const AdjointSystemCall<T>& call, int threads) {
+// visit(vertex): all of them as if there were no pins, then those that have one.
+template <class T, class Visit>
+void each_adjoint_vertex(const AdjointSystemCall<T>& call, int threads, const Visit& visit) {
   const Plan<T>& plan = call.plan;
   using Vertex = AdjointVertex<T, Plan<T>>;
   const std::int64_t count = call.batch * plan.vertices;
   run_team(useful_threads(count, threads), [&](const Team& team) {
     for (std::int64_t n = team.begin(count); n < team.end(count); ++n)
-      Vertex{call, n / plan.vertices, int(n % plan.vertices), -1}.solve_for();
+      visit(Vertex{call, n / plan.vertices, int(n % plan.vertices), -1});
     team.barrier();
     for (std::int64_t n = team.begin(call.batch * plan.pins); n < team.end(call.batch * plan.pins);
          ++n) {
       const std::int64_t environment = n / plan.pins, pin = n % plan.pins;
-      Vertex{call, environment, plan.vertex_order[plan.pin_vertex[pin]], int(pin)}.solve_for();
+      visit(Vertex{call, environment, plan.vertex_order[plan.pin_vertex[pin]], int(pin)});
     }
   });
+}
+
+template <class T>
+void adjoint_system_any(const AdjointSystemCall<T>& call, int threads) {
+  each_adjoint_vertex(call, threads, [](const auto& vertex) { vertex.solve_for(); });
+}
+
+template <class T>
+void contact_gradients_any(const ContactGradientsCall<T>& call, int threads) {
+  each_adjoint_vertex(call.step, threads,
+                      [&](const auto& vertex) { ContactGradients(call, vertex).give(); });
 }
 
 template <class T>

@@ -22,6 +22,8 @@ struct Kernels {
   void (*conjugate64)(const ConjugateCall<double>&, int threads);
   void (*adjoint_system32)(const AdjointSystemCall<float>&, int threads);
   void (*adjoint_system64)(const AdjointSystemCall<double>&, int threads);
+  void (*contact_gradients32)(const ContactGradientsCall<float>&, int threads);
+  void (*contact_gradients64)(const ContactGradientsCall<double>&, int threads);
   void (*adjoint_result32)(const AdjointResultCall<float>&, int threads);
   void (*adjoint_result64)(const AdjointResultCall<double>&, int threads);
   void (*flops)(float* seconds, std::int64_t* operations);  // multiply-add loop, for calibration

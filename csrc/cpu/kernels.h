@@ -246,6 +246,8 @@ const Kernels PD_KERNELS = {PD_NAME,
                             &conjugate_any<double>,
                             &adjoint_system_any<float>,
                             &adjoint_system_any<double>,
+                            &contact_gradients_any<float>,
+                            &contact_gradients_any<double>,
                             &adjoint_result_any<float>,
                             &adjoint_result_any<double>,
                             &multiply_add_loop};

@@ -2,19 +2,33 @@
 #pragma once
 #include "cuda/fields.cuh"
 #include "solver/adjoint.h"
+#include "solver/contact_gradients.h"
 
 namespace pd {
 
-template <class T>
-__global__ void __launch_bounds__(field_threads)
-    adjoint_system(const __grid_constant__ AdjointSystemCall<T, DevicePlan<T>> call) {
+// visit(vertex), by a thread each.
+template <class T, class Visit>
+PD_DEVICE void visit_adjoint_vertex(const DeviceAdjointSystem<T>& call, const Visit& visit) {
   const DevicePlan<T>& plan = call.plan;
   const std::int64_t number = std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (number >= call.batch * plan.vertices) return;
   const std::int64_t environment = number / plan.vertices;
   const int internal = int(number % plan.vertices);
   const int pin = plan.pins ? plan.vertex_pin[internal] : -1;
-  AdjointVertex<T, DevicePlan<T>>{call, environment, plan.vertex_order[internal], pin}.solve_for();
+  visit(AdjointVertex<T, DevicePlan<T>>{call, environment, plan.vertex_order[internal], pin});
+}
+
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    adjoint_system(const __grid_constant__ DeviceAdjointSystem<T> call) {
+  visit_adjoint_vertex(call, [](const auto& vertex) { vertex.solve_for(); });
+}
+
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    contact_gradients(const __grid_constant__ DeviceContactGradients<T> call) {
+  visit_adjoint_vertex(call.step,
+                       [&](const auto& vertex) { ContactGradients(call, vertex).give(); });
 }
 
 template <class T>
@@ -35,6 +49,11 @@ void run_for_each(void (*kernel)(Call), const Call& call, std::int64_t count, St
 template <class T>
 void run_adjoint_system(const DeviceAdjointSystem<T>& call, Stream to) {
   run_for_each(adjoint_system<T>, call, call.batch * call.plan.vertices, to);
+}
+
+template <class T>
+void run_contact_gradients(const DeviceContactGradients<T>& call, Stream to) {
+  run_for_each(contact_gradients<T>, call, call.step.batch * call.step.plan.vertices, to);
 }
 
 template <class T>

@@ -75,6 +75,12 @@ using DeviceAdjointSystem = AdjointSystemCall<T, DevicePlan<T>>;
 
 template <class T>
 void run_adjoint_system(const DeviceAdjointSystem<T>& call, Stream stream);
+
+template <class T>
+using DeviceContactGradients = ContactGradientsCall<T, DevicePlan<T>>;
+
+template <class T>
+void run_contact_gradients(const DeviceContactGradients<T>& call, Stream stream);
 template <class T>
 void run_adjoint_result(const AdjointResultCall<T>& call, Stream stream);
 

@@ -48,6 +48,12 @@ struct Cuda {
   }
 
   template <class T>
+  static void contact_gradients(const DeviceContactGradients<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_contact_gradients(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+  template <class T>
   static void adjoint_result(const AdjointResultCall<T>& call, const Tensor& like) {
     const c10::cuda::CUDAGuard guard(like.device());
     run_adjoint_result(call, c10::cuda::getCurrentCUDAStream().stream());

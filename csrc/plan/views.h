@@ -243,6 +243,17 @@ struct AdjointSystemCall {
 // along the normal over the radius, by which the slip turns less.
 enum Slide : int { slide_along, slide_normal, slide_across, slide_bend, slide_lean, slide_count };
 
+// What a solved adjoint says of the contacts that hold vertices.
+template <class T, class P = Plan<T>>
+struct ContactGradientsCall {
+  AdjointSystemCall<T, P> step;   // whose outputs are not written
+  const T* multiplier = nullptr;  // [batch, vertices, 3] each
+  const T* elastic = nullptr;     // elastic Hessian times the multiplier
+  // of every vertex, by the columns of plan/material.def; zeros where it touches nothing
+  T* planes = nullptr;   // [batch, vertices, planes, plane_numbers]
+  T* spheres = nullptr;  // [batch, vertices, spheres, sphere_numbers]
+};
+
 // What a solved adjoint says of the state before the step.
 template <class T>
 struct AdjointResultCall {

@@ -18,6 +18,16 @@ constexpr int adjoint_iterations = 2000;  // at most
 // of what friction could take back: slip below it counts as none
 constexpr double sticking = 1e-3;
 
+// A contact as a vertex meets it.
+template <class T>
+struct ContactAt {
+  int number;  // planes, then balls
+  Vec3<T> normal;
+  T gap, friction;
+  Vec3<T> motion;
+  T curved;  // 1 / its distance from the middle of a ball
+};
+
 // What contacts do to a vertex of a solved step. One holds it when an unaccelerated iteration, x' - r / D, would end inside.
 template <class T>
 struct HeldVertex {
@@ -36,9 +46,12 @@ struct HeldVertex {
   T first_friction = T(0);
   Vec3<T> slides[slide_count] = {};
 
-  PD_HD void touch(const Vec3<T>& normal, T gap, T friction, const Vec3<T>& motion, T curved) {
+  // Returns whether it is held along a normal that earlier contacts do not span.
+  PD_HD bool touch(const ContactAt<T>& contact) {
+    const Vec3<T>&normal = contact.normal, &motion = contact.motion;
+    const T friction = contact.friction, curved = contact.curved;
     const T push = dot(residual, normal);
-    if (!(push > T(0) && gap < push / diagonal)) return;
+    if (!(push > T(0) && contact.gap < push / diagonal)) return false;
     const Vec3<T> slip = tangential(moved - motion, normal);
     const T slipped = square_root(dot(slip, slip));
     const bool sticks = friction > T(0) && holds(slipped, friction * push);
@@ -46,7 +59,8 @@ struct HeldVertex {
     // what earlier contacts leave of the normal, so that all together are a projector
     const Vec3<T> left = projector * normal;
     const T size = dot(left, left);
-    if (size > T(spanned)) projector = take_off(projector, left, T(1) / size);
+    const bool adds = size > T(spanned);
+    if (adds) projector = take_off(projector, left, T(1) / size);
     curvature = multiply_add(push, curved, curvature);
     for (Vec3<T>& of : slides) of = {T(0), T(0), T(0)};
     ++contacts;
@@ -62,6 +76,7 @@ struct HeldVertex {
     } else if (contacts == 2 && curvature == T(0)) {
       slide_along_edge(normal, friction);
     }
+    return adds;
   }
 
   // what friction can take back in one iteration is more than what has slipped
@@ -94,20 +109,33 @@ struct HeldVertex {
   }
 };
 
-template <class T>
-PD_HD void touch_all(HeldVertex<T>& vertex, const Material<T>& material, std::int64_t environment) {
+// Numbers of a contact, see plan/material.def.
+constexpr int plane_numbers = 5, sphere_numbers = 8;
+
+// adds(contact): of those by which `vertex` is held along one more normal.
+template <class T, class Adds>
+PD_HD void touch_all(HeldVertex<T>& vertex, const Material<T>& material, std::int64_t environment,
+                     const Adds& adds) {
   const Vec3<T>& x = vertex.position;
+  const auto touch = [&](const ContactAt<T>& contact) {
+    if (vertex.touch(contact)) adds(contact);
+  };
   for (int c = 0; c < material.planes_count; ++c) {
-    const T* p = material.planes.of(environment) + 5 * c;
+    const T* p = material.planes.of(environment) + plane_numbers * c;
     const Vec3<T> normal = {p[0], p[1], p[2]};
-    vertex.touch(normal, dot(normal, x) - p[3], p[4], {T(0), T(0), T(0)}, T(0));
+    touch({c, normal, dot(normal, x) - p[3], p[4], {T(0), T(0), T(0)}, T(0)});
   }
   for (int c = 0; c < material.spheres_count; ++c) {
-    const T* p = material.spheres.of(environment) + 8 * c;
+    const T* p = material.spheres.of(environment) + sphere_numbers * c;
     const Vec3<T> offset = x - Vec3<T>{p[0], p[1], p[2]};
     const T length = square_root(dot(offset, offset));
     if (!(length > T(0))) continue;
-    vertex.touch((T(1) / length) * offset, length - p[3], p[4], {p[5], p[6], p[7]}, T(1) / length);
+    touch({material.planes_count + c,
+           (T(1) / length) * offset,
+           length - p[3],
+           p[4],
+           {p[5], p[6], p[7]},
+           T(1) / length});
   }
 }
 
@@ -156,29 +184,46 @@ struct AdjointVertex {
     return sum;
   }
 
+  // Whether no pin holds it exactly; `weight`: its inertia with its spring.
+  PD_HD static bool moves(T weight) { return weight < T(HUGE_VAL) && weight > -T(HUGE_VAL); }
+
+  PD_HD T diagonal(T weight) const {
+    return moves(weight) ? weight + call.elastic.of(environment)[vertex] : T(1);
+  }
+
+  // dL/dx' + dL/dv' / h
+  PD_HD Vec3<T> asked() const {
+    return multiply_add(T(1) / T(call.time_step), read(call.grad_velocities),
+                        read(call.grad_positions));
+  }
+
+  // What contacts do to it; see touch_all.
+  template <class Adds>
+  PD_HD HeldVertex<T> hold(T weight, const Adds& adds) const {
+    const Vec3<T> after = read(call.after);
+    HeldVertex<T> held{after, after - read(call.positions), {T(0), T(0), T(0)}, diagonal(weight)};
+    if (moves(weight)) {
+      held.residual = residual(after, held.moved);
+      touch_all(held, call.material, environment, adds);
+    }
+    return held;
+  }
+
   // A vertex that a pin holds exactly, or friction, has no part in H: right side and 1 / D are zero.
   PD_HD void solve_for() const {
-    const T h = T(call.time_step), weight = inertia(spring());
-    const bool moves = weight < T(HUGE_VAL) && weight > -T(HUGE_VAL);
-    const T diagonal = moves ? weight + call.elastic.of(environment)[vertex] : T(1);
-    Vec3<T> right = {T(0), T(0), T(0)};
-    if (moves)
-      right = multiply_add(T(1) / h, read(call.grad_velocities), read(call.grad_positions));
-    T kept = moves ? weight : T(0), inverse = moves ? T(1) / diagonal : T(0);
+    const T weight = inertia(spring()), all = diagonal(weight);
+    const bool free = moves(weight);
+    Vec3<T> right = free ? asked() : Vec3<T>{T(0), T(0), T(0)};
+    T kept = free ? weight : T(0), inverse = free ? T(1) / all : T(0);
     if (call.projector) {
-      const Vec3<T> after = read(call.after);
-      HeldVertex<T> held{after, after - read(call.positions), right, diagonal};
-      if (moves) {
-        held.residual = residual(after, held.moved);
-        touch_all(held, call.material, environment);
-      }
+      const HeldVertex<T> held = hold(weight, [](const ContactAt<T>&) {});
       const std::int64_t at = environment * call.plan.vertices + vertex;
       for (int row = 0; row < 3; ++row) {
         T* to = call.projector + 9 * at + 3 * row;
-        const Vec3<T> free = (held.stuck ? held.carried : T(1)) * held.projector.row[row];
-        to[0] = free.x;
-        to[1] = free.y;
-        to[2] = free.z;
+        const Vec3<T> left = (held.stuck ? held.carried : T(1)) * held.projector.row[row];
+        to[0] = left.x;
+        to[1] = left.y;
+        to[2] = left.z;
       }
       call.stuck[at] = held.stuck;
       for (int n = 0; n < slide_count; ++n) {
@@ -191,7 +236,7 @@ struct AdjointVertex {
       kept = kept - held.curvature;
       // with the turning of the slip, which H has
       const Vec3<T>& across = held.slides[slide_across];
-      if (moves) inverse = T(1) / (diagonal + dot(across, across));
+      if (free) inverse = T(1) / (all + dot(across, across));
       if (held.stuck) inverse = T(0);
       right = held.projector * right;
     }
