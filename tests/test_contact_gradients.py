@@ -134,7 +134,7 @@ def test_friction_from_none_on() -> None:
 
 
 def test_planes_that_meet() -> None:
-    """Heights of a corner of three; a plane that turns about the edge with another leaves their right angle, see docs."""
+    """Heights of a corner of three; for what changes right angles see docs/limits.md."""
     walls = pd.Ground(), pd.Ground(0.0, (1.0, 0.0, 0.0)), pd.Ground(0.0, (0.0, 0.0, 1.0))
     sim, state = cube(*walls, velocity=(-0.3, -0.2, -0.3))
     columns = {f"height {number}": unit(sim.planes, number, 3) for number in range(3)}
@@ -188,7 +188,7 @@ def test_how_far_it_slides() -> None:
 
 
 def test_what_is_lifted_with_its_ground() -> None:
-    """Ground and body 1 m higher end 1 m higher: the slopes for the height and for all starts add up to the number of vertices."""
+    """Ground and body 1 m higher end 1 m higher: slopes for the height and all starts add up to the vertices."""
     sim, state = cube(pd.Ground(friction=ROUGH), velocity=SPEED[ROUGH])
     sim.planes.requires_grad_()
     x = state.positions.clone().requires_grad_()

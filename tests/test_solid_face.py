@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 COUNT = 400
 # In: rest edges of corners 1 to 4 in a unit, unit^2 / det Dm and w V of both, five positions. Out: three times the five
 # forces and the energy of both: with an energy, with one that is not wanted, without; then those of the first alone,
-# and its own once more in the way of the CPU.
+# its own once more in the way of the CPU, and those of both where corners are looked at one by one, with an energy and
+# without.
 PROGRAM = """
 #include "effects/solid.h"
 #include <cstdio>
@@ -86,12 +87,30 @@ T* run_one(const T* in, T* out) {
   return c.write(out);
 }
 
+// Two tetrahedra whose corners are looked at one by one.
+template <class T, bool Energy>
+T* run_pair(const T* in, T* out) {
+  Case<T, 2> c(in);
+  const T factor[2] = {in[12], in[13]};
+  int betweens = 0;
+  pd::solid_pair_gradient<Energy, pd::Vec3<T>>(
+      factor, c.weight, T(1) / (sizeof(T) == 4 ? 1 << 28 : 1), c.energy,
+      [&](int n, pd::Vec3<T>& position, pd::Vec3<T>& rest) {
+        position = c.x[n];
+        rest = n == 0 ? pd::Vec3<T>{0, 0, 0}
+                      : pd::Vec3<T>{in[3 * n - 3], in[3 * n - 2], in[3 * n - 1]};
+      },
+      [&](int n, const pd::Vec3<T>& force) { c.g[n] = force; }, [&] { ++betweens; });
+  return betweens == 1 ? c.write(out) : out;
+}
+
 template <class T>
 void run_all() {
-  T in[31], out[3 * 16 + 4 * 13];
+  T in[31], out[5 * 16 + 4 * 13];
   while (std::fread(in, sizeof(T), 31, stdin) == 31) {
-    run_one(in, run<T, 1>(in, run<T, 2>(in, out)));
-    std::fwrite(out, sizeof(T), 100, stdout);
+    T* const end = run_one(in, run<T, 1>(in, run<T, 2>(in, out)));
+    run_pair<T, false>(in, run_pair<T, true>(in, end));
+    std::fwrite(out, sizeof(T), 132, stdout);
   }
 }
 
@@ -120,9 +139,13 @@ def run(program: Path, dtype: torch.dtype, rest: Array, x: Array, factor: Array,
         [program, *(["double"] if dtype == torch.float64 else [])],
         input=np.concatenate(numbers, axis=-1).astype(real).tobytes(), stdout=subprocess.PIPE, check=True,
     ).stdout  # fmt: skip
-    runs = np.split(np.frombuffer(told, real).reshape(COUNT, 100), [16, 32, 48, 61, 74, 87], axis=-1)
+    runs = np.split(np.frombuffer(told, real).reshape(COUNT, 132), [16, 32, 48, 61, 74, 87, 100, 116], axis=-1)
     found = Found([r[:, :-1].reshape(COUNT, -1, 3) for r in runs], [r[:, -1] for r in runs])
-    return Found(found.forces[:3], found.energies[:3]), Found(found.forces[3:], found.energies[3:])
+    pairs = [*range(3), *range(7, 9)]
+    return (
+        Found([found.forces[i] for i in pairs], [found.energies[i] for i in pairs]),
+        Found(found.forces[3:7], found.energies[3:7]),
+    )
 
 
 def turned(rng: np.random.Generator) -> Array:
@@ -214,6 +237,7 @@ def test_energies_and_forces_are_those_of_the_reference(kind: str, dtype: torch.
         # nobody adds to it any more
         for energy in found.energies[1:3]:
             np.testing.assert_array_equal(energy, found.energies[0])
+    np.testing.assert_array_equal(pair.energies[4], 0.0)
 
 
 @pytest.mark.parametrize("second", [0.0, 1.0], ids=["no edge", "along the first"])

@@ -2,6 +2,8 @@
 #pragma once
 #include "math/vec.h"
 
+#include <cstdint>
+
 // Nearly everything in a kernel: what is called out of line wants its objects in memory, not in registers.
 #define PD_DEVICE __device__ __forceinline__
 // What a kernel seldom does, of values or of what lies in memory anyway: inlined, it would take registers from its iterations.
@@ -71,6 +73,21 @@ PD_DEVICE void bring_near(const Item* items, int count, int thread, int threads)
 template <class Item>
 PD_DEVICE void bring_near(const Item* items, int count) {
   bring_near(items, count, int(threadIdx.x), int(blockDim.x));
+}
+
+// The same by one thread in one instruction where there is one, from compute capability 9.0 on; else by `threads` of them.
+template <class Item>
+PD_DEVICE void bring_all_near(const Item* items, int count, int thread, int threads) {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+  constexpr std::uintptr_t unit = 16;
+  const auto begin = reinterpret_cast<std::uintptr_t>(items) / unit * unit;
+  const auto end = reinterpret_cast<std::uintptr_t>(items + count) + unit - 1;
+  if (thread == 0 && count > 0)
+    asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;" ::"l"(begin),
+                 "r"(unsigned((end - begin) / unit * unit)));
+#else
+  bring_near(items, count, thread, threads);
+#endif
 }
 
 template <class T>

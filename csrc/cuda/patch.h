@@ -227,12 +227,6 @@ struct ComputedRest {
     for (int c = 1; c < Corners; ++c) edge[c - 1] = corner[c] - corner[0];
     return face_rest<T, Corners - 3>(edge, per_unit, factor);
   }
-
-  // Dm^-1 of one tetrahedron, in no frame but its own
-  PD_HD static Mat3<T> inverse_between(const RestPoint<T> (&corner)[4], T factor) {
-    const Vec3<T> edge[3] = {corner[1] - corner[0], corner[2] - corner[0], corner[3] - corner[0]};
-    return rest_inverse(edge, factor);
-  }
 };
 
 // Rest positions from some slot on, where the plan has them.
@@ -393,10 +387,10 @@ PD_DEVICE Vec3<T> sum_entries_soon(const Quad<T>* entries, int row) {
   return sum;
 }
 
-// The same by few instructions, where a multiprocessor has no room for more. `Entries`: like a pointer.
-template <class T, class Entries>
+// The same by few instructions, where a multiprocessor has no room for more. `Entries`: like a pointer; so many are asked for at
+// once, each of which takes registers.
+template <class T, int together = 4, class Entries>
 PD_DEVICE Vec3<T> sum_entries_briefly(const Entries& entries, int row) {
-  constexpr int together = 4;
   Entries entry = entries + (unsigned(row) & 0xffff);
   int left = row >> 16 & 0x7fff;
   Vec3<T> sum = {T(0), T(0), T(0)};

@@ -16,15 +16,17 @@ namespace pd::inline PD_TARGET {
 //
 // Movers and bringers take about as long for a patch as elements do, so anything more that they do costs: one more row for
 // movers to add up 9 us, one more for bringers in its place 4 us, of an iteration of a million vertices on an H100. So a warp
-// tells 32 stops at once, entries are added up by few instructions, though movers and bringers spill some registers for it, and
-// vertices that patches share have a kernel of their own. Entries that meet in banks cost, too (plan/phases.h). Patches are dealt
-// out beforehand: blocks end up to 9 us apart, but tickets would cost more.
+// tells 32 stops at once, in words of 16 bytes; entries are added up by few instructions, though movers and bringers spill some
+// registers for it; what is read from memory is asked for before anything that waits; and vertices that patches share have a kernel
+// of their own. Entries that meet in banks cost, too (plan/phases.h). Patches are dealt out beforehand: blocks end up to 9 us
+// apart, but tickets would cost more.
 //
-// Without any arithmetic an iteration takes 12 % less; schedulers issue in 71 % of their cycles, and DRAM is busy for 46 % (by a
-// profiler, at 1.6 GHz): fewer instructions or bytes of elements alone do not help.
+// By clocks inside the kernel elements wait for 13 % of their time, movers for 9 % and bringers for 30 %: what is left to gain is
+// in the instructions of elements, and in warps for which there are no registers.
 //
 // A register that is written under a condition is kept from before, all around a loop: so where a thread has no slot, it
-// reads what is the first one's.
+// reads what is the first one's. And whoever writes to a register waits for a load that is on its way there, the fourth number of
+// 16 bytes included, which nobody reads.
 constexpr int mover_threads = 128, bringer_threads = 128, element_threads = 384;
 constexpr int pipeline_threads = mover_threads + bringer_threads + element_threads;
 
@@ -100,16 +102,21 @@ class Pipeline {
 
   // ---- stops of the block
 
-  // Where a patch lies in the arrays.
-  struct Stop {
-    int environment, patch, first_vertex, interior, first_slot, slots, first_block;
-    int blocks;        // of pairs; 0: there is no such patch
-    int first_warp;    // of the elements' warps, which has the first of them
-    T patch_weight;    // StreamMemory::patch_weight
-    unsigned weights;  // blocks of them before those of its environment
+  // Where a patch lies in the arrays. Those that have numbers for every environment are read as one array of all of them, from
+  // that of the first on, which takes one instruction; 32 bits count them, since a vertex takes more than 80 bytes.
+  struct alignas(16) Stop {
+    unsigned vertex, slot, place;  // the first of those before the environment's
+    int first_vertex, interior;    // of the plan, as are the next three
+    int first_slot, slots, first_place;
+    int environment, patch;
+    int first_block, blocks;  // of pairs; blocks 0: there is no such patch
+    int first_warp;           // of the elements' warps, which has the first of them
+    T patch_weight;           // StreamMemory::patch_weight
+    unsigned weights;         // blocks of them before those of its environment
+    T unit;                   // of rest positions [m]
   };
 
-  PD_DEVICE Work work(int environment) const { return Work(call_, environment); }
+  PD_DEVICE Work work(int environment = 0) const { return Work(call_, environment); }
 
   // Stop `n` of the block. Whoever wants to know reads it there, since registers for it would be too many. A warp tells as many
   // at once as it has lanes, in turn n of bringers those from n + 16 on, in place of n - 48 to n - 17: nobody is so far behind,
@@ -162,8 +169,8 @@ class Pipeline {
     return energies[n & 1];
   }
 
-  PD_DEVICE int place_of_force(const Stop& at, int s) const {
-    return pd::place_of_force(plan(), at.first_slot, at.first_vertex + at.interior, s);
+  PD_DEVICE unsigned place_of_force(const Stop& at, int s) const {
+    return at.place + unsigned(plan().shared_place[at.first_place + s]);
   }
 
   // ---- slots: cuda/pipeline_bring.h
@@ -174,10 +181,10 @@ class Pipeline {
   PD_DEVICE static int first_left(const Stop& at);
   PD_DEVICE Left left_at(const Stop& at, int s) const;
   PD_DEVICE void sum_shared(unsigned n, Left left) const;
-  PD_DEVICE int vertex_of(const Stop& at, int slot) const;
-  PD_DEVICE void find(const Stop& at, int (&vertex)[brought]) const;
-  PD_DEVICE void ask(const Stop& at, const int (&vertex)[brought], Held& held) const;
-  PD_DEVICE void put(const Stop& at, const Held& held, unsigned n) const;
+  PD_DEVICE unsigned vertex_of(const Stop& at, int slot) const;
+  PD_DEVICE void find(const Stop& in, unsigned (&vertex)[brought]) const;
+  PD_DEVICE void ask(const Stop& in, const unsigned (&vertex)[brought], Held& held) const;
+  PD_DEVICE void put(int slots, unsigned n, const Held& held) const;
 
   // ---- elements: cuda/pipeline_elements.h
 
@@ -191,7 +198,7 @@ class Pipeline {
   PD_DEVICE static void take(PairInputs& now, const PairInputs& read, T patch_weight);
   PD_DEVICE void bring_pairs_near(unsigned n) const;
   template <class ReadNext>
-  PD_DEVICE void work_on_pair(const PairInputs& now, const SharedSlots& slots, T& energy,
+  PD_DEVICE void work_on_pair(const PairInputs& now, const SharedSlots& slots, T unit, T& energy,
                               const ReadNext& read_next) const;
 
   // ---- vertices: cuda/pipeline_move.h
@@ -199,6 +206,10 @@ class Pipeline {
   PD_DEVICE void move_vertices() const;
   PD_DEVICE void move_patch(unsigned n) const;
   PD_DEVICE void bring_patch_near(unsigned n) const;
+  // asked for long before it is converted, which waits
+  PD_DEVICE double read_omega(int environment) const {
+    return __ldcg(call_.memory.omega + environment * guard_period + k_ % guard_period);
+  }
   PD_DEVICE void write_mover_sums(const ThreadSums& sums, unsigned n, double* row) const;
   PD_DEVICE static void meet_movers();
 

@@ -14,13 +14,14 @@ struct Pipeline<T, What>::Held {
 // The forces that movers leave to bringers, who have the time.
 template <class T, Visit What>
 struct Pipeline<T, What>::Left {
-  int row, place;
+  int row;
+  unsigned place;
 };
 
 // Past the last stop, too: nothing is brought, but the forces of the two before are there.
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::bring_slots() const {
-  int vertex[brought];
+  unsigned vertex[brought];
   find(told(0), vertex);
   await_kernel_before();
 #pragma unroll 1
@@ -30,11 +31,13 @@ PD_DEVICE void Pipeline<T, What>::bring_slots() const {
     find(told(n + 1), vertex);
     Left left{};
     if (n >= 2) {
-      left = left_at(told(n - 2), first_left(told(n - 2)));
+      const Stop at = told(n - 2);
+      left = left_at(at, first_left(at));
       await(forces_ready, n - 2);
     }
-    put(told(n), held, n);
+    // first the forces, while slots are on their way
     if (n >= 2) sum_shared(n - 2, left);
+    put(told(n).slots, n, held);
     give(slots_ready, n);
     if (n % told_at_once == told_at_once / 2 && bringer() < warp_size)
       tell_stops(n + told_at_once / 2);
@@ -54,63 +57,67 @@ PD_DEVICE typename Pipeline<T, What>::Left Pipeline<T, What>::left_at(const Stop
 
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::sum_shared(unsigned n, Left left) const {
-  const Stop& at = told(n);
-  const Work w = work(at.environment);
+  const Stop at = told(n);
+  const Work all = work();
   const Entries entries = entries_of(n);
-  const int slots = at.slots;
 #pragma unroll 1
-  for (int s = first_left(at); s < slots;) {
-    w.leave_force(left.place, sum_entries_briefly<T>(entries, left.row), round_);
+  for (int s = first_left(at); s < at.slots;) {
+    all.leave_force(left.place, sum_entries_briefly<T, 2>(entries, left.row), round_);
     s += bringer_threads;
     left = left_at(at, s);
   }
 }
 
 template <class T, Visit What>
-PD_DEVICE int Pipeline<T, What>::vertex_of(const Stop& at, int slot) const {
-  return slot < at.interior ? at.first_vertex + slot : plan().slot_vertex[at.first_slot + slot];
+PD_DEVICE unsigned Pipeline<T, What>::vertex_of(const Stop& at, int slot) const {
+  return at.vertex + unsigned(slot < at.interior ? at.first_vertex + slot
+                                                 : plan().slot_vertex[at.first_slot + slot]);
 }
 
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::find(const Stop& at, int (&vertex)[brought]) const {
+PD_DEVICE void Pipeline<T, What>::find(const Stop& in, unsigned (&vertex)[brought]) const {
+  const Stop at = in;
 #pragma unroll
   for (int r = 0; r < brought; ++r) {
     const int s = bringer() + r * bringer_threads;
-    vertex[r] = at.first_vertex + (s < at.interior ? s : 0);
-    if (s >= at.interior && s < at.slots) vertex[r] = plan().slot_vertex[at.first_slot + s];
+    int found = at.first_vertex + (s < at.interior ? s : 0);
+    if (s >= at.interior && s < at.slots) found = plan().slot_vertex[at.first_slot + s];
+    vertex[r] = unsigned(found);
   }
 }
 
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::ask(const Stop& at, const int (&vertex)[brought],
+PD_DEVICE void Pipeline<T, What>::ask(const Stop& in, const unsigned (&vertex)[brought],
                                       Held& held) const {
-  const Work w = work(at.environment);
-  const Quad<T>* origin = w.origin + at.first_slot;
-  const RestPoint<T>* rest = rest_positions(w.plan, at.first_slot);
+  const Stop at = in;
+  const Work all = work();
+  const RestPoint<T>* rest = rest_positions(plan(), 0);
 #pragma unroll
   for (int r = 0; r < brought; ++r) {
-    int s = bringer() + r * bringer_threads;
-    if (s >= at.slots) s = 0;
-    held.u[r] = vec3(w.v.u[vertex[r]]);
-    held.origin[r] = vec3(origin[s]);
-    held.rest[r] = rest[s];
+    const int s = bringer() + r * bringer_threads;
+    const unsigned slot = unsigned(at.first_slot + (s < at.slots ? s : 0));
+    held.u[r] = vec3(all.v.u[at.vertex + vertex[r]]);
+    held.origin[r] = vec3(all.origin[at.slot + slot]);
+    held.rest[r] = rest[slot];
   }
 }
 
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::put(const Stop& at, const Held& held, unsigned n) const {
-  const Work w = work(at.environment);
-  const RestPoint<T>* rest = rest_positions(w.plan, at.first_slot);
-  const Slots<T> slots = slots_of(n);
+PD_DEVICE void Pipeline<T, What>::put(int slots, unsigned n, const Held& held) const {
+  const Slots<T> to = slots_of(n);
 #pragma unroll
   for (int r = 0; r < brought; ++r) {
     const int s = bringer() + r * bringer_threads;
-    if (s < at.slots) slots.set(s, held.origin[r] + held.u[r], held.rest[r].bits());
+    if (s < slots) to.set(s, held.origin[r] + held.u[r], held.rest[r].bits());
   }
+  if (slots <= usual_slots) return;
+  const Stop at = told(n);
+  const Work all = work();
 #pragma unroll 1
-  for (int s = bringer() + usual_slots; s < at.slots; s += bringer_threads) {
-    const Vec3<T> origin = vec3(w.origin[at.first_slot + s]);
-    slots.set(s, origin + vec3(w.v.u[vertex_of(at, s)]), rest[s].bits());
+  for (int s = bringer() + usual_slots; s < slots; s += bringer_threads) {
+    const unsigned slot = unsigned(at.first_slot + s);
+    const Vec3<T> origin = vec3(all.origin[at.slot + slot]);
+    to.set(s, origin + vec3(all.v.u[vertex_of(at, s)]), rest_positions(plan(), 0)[slot].bits());
   }
 }
 

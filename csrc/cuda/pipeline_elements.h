@@ -70,6 +70,7 @@ PD_DEVICE void Pipeline<T, What>::work_on_elements() const {
     await(slots_ready, n);
     const SharedSlots slots(*this, n);
     T energy = T(0);
+    const T unit = told(n).unit;
     bool more = share.block < share.end;
     // else the last turn has read the first pairs of the next stop
     if (!more) {
@@ -79,7 +80,7 @@ PD_DEVICE void Pipeline<T, What>::work_on_elements() const {
 #pragma unroll 1
     while (more) {
       PairInputs then;
-      work_on_pair(now, slots, energy, [&] {
+      work_on_pair(now, slots, unit, energy, [&] {
         share.block += element_warps;
         more = share.block < share.end;
         if (!more) share = share_of(n + 1);
@@ -146,9 +147,10 @@ PD_DEVICE void Pipeline<T, What>::take(PairInputs& now, const PairInputs& read, 
 // Has all pairs of a stop brought into the L2 cache.
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::bring_pairs_near(unsigned n) const {
-  const Stop& in = told(n);
+  const Stop in = told(n);
   const auto near = [](const auto* items, int count) {
-    bring_near(items, count, int(threadIdx.x) - mover_threads - bringer_threads, element_threads);
+    bring_all_near(items, count, int(threadIdx.x) - mover_threads - bringer_threads,
+                   element_threads);
   };
   constexpr int two = 2 * pair_lanes, five = 5 * pair_lanes;
   near(plan().pair_corner + std::size_t(in.first_block) * five, in.blocks * five);
@@ -157,29 +159,17 @@ PD_DEVICE void Pipeline<T, What>::bring_pairs_near(unsigned n) const {
     near(weights_of(unsigned(in.first_block), in.weights), in.blocks * two);
 }
 
-// `read_next`: between its tetrahedra, where the fewest registers are in use. Lanes past the last pair leave no force, and
-// what they strain weighs nothing.
+// `read_next`: between its tetrahedra. Lanes past the last pair leave no force, and what they strain weighs nothing.
 template <class T, Visit What>
 template <class ReadNext>
 PD_DEVICE void Pipeline<T, What>::work_on_pair(const PairInputs& now, const SharedSlots& slots,
-                                               T& energy, const ReadNext& read_next) const {
-  const typename ElementOf<What>::type element;
-  Pair<T, 1> pair;
-  RestPoint<T> rest[5];
-  const auto look = [&](int c) { slots.look(now.corner[c], pair.corner[0][c], rest[c]); };
-  const auto leave = [&](int c) { slots.leave(now.corner[c], pair.force[c]); };
-  for (int c = 0; c < 4; ++c) look(c);
-  element.template run<1>(PairElement<T, 1, OneOf<T, 0>>{
-      pair, ComputedRest<T>::inverse_between({rest[0], rest[1], rest[2], rest[3]}, now.factor[0]),
-      now.weight[0], energy});
-  leave(3);
-  read_next();
-  look(4);
-  element.template run<1>(PairElement<T, 1, OneOf<T, 1>>{
-      pair, ComputedRest<T>::inverse_between({rest[0], rest[1], rest[2], rest[4]}, now.factor[1]),
-      now.weight[1], energy});
-  for (int c = 0; c < 3; ++c) leave(c);
-  leave(4);
+                                               T unit, T& energy, const ReadNext& read_next) const {
+  const auto look = [&](int c, Vec3<T>& position, RestPoint<T>& rest) {
+    slots.look(now.corner[c], position, rest);
+  };
+  const auto leave = [&](int c, const Vec3<T>& force) { slots.leave(now.corner[c], force); };
+  solid_pair_gradient<What == Visit::update_guarded, RestPoint<T>>(now.factor, now.weight, unit,
+                                                                   energy, look, leave, read_next);
 }
 
 }  // namespace pd::inline PD_TARGET

@@ -18,29 +18,25 @@ PD_DEVICE void Pipeline<T, What>::move_vertices() const {
 
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::move_patch(unsigned n) const {
-  const Stop& at = told(n);
-  const Work w = work(at.environment);
+  const Stop at = told(n);
+  const Work all = work();
   const Entries entries = entries_of(n);
-  const int interior = at.interior, first_vertex = at.first_vertex;
-  const int slots = at.slots, first_slot = at.first_slot;
+  const int interior = at.interior, slots = at.slots;
+  const unsigned first_vertex = at.vertex + unsigned(at.first_vertex);
   ThreadSums sums = no_sums<What>();
   const auto slot = [](int r) { return mover() + r * mover_threads; };
-  const auto see_slot = [&](int s) { return see<What>(w, first_vertex + (s < interior ? s : 0)); };
-  const auto visit_slot = [&](int s, const Vec3<T>& force, const auto& seen_there) {
-    if (s < interior) {
-      visit<What>(w, first_vertex + s, seen_there(), force, k_, sums);
-    } else if (s < slots) {
-      w.leave_force(place_of_force(at, s), force, round_);
-    }
+  const auto see_slot = [&](int s) {
+    return see<What>(all, first_vertex + unsigned(s < interior ? s : 0));
   };
   int row[moved];
   Vec3<T> force[moved];
-  Seen seen[soon];
+  Seen seen[moved];
 #pragma unroll
   for (int r = 0; r < moved; ++r)
-    row[r] = slot(r) < slots ? w.plan.slot_row[first_slot + slot(r)] : 0;
+    row[r] = slot(r) < slots ? plan().slot_row[at.first_slot + slot(r)] : 0;
 #pragma unroll
   for (int r = 0; r < soon; ++r) seen[r] = see_slot(slot(r));
+  const double weight = read_omega(at.environment);
   bring_patch_near(n + 1);
   await(forces_ready, n);
   if (What == Visit::update_guarded && mover() < element_warps)
@@ -48,28 +44,43 @@ PD_DEVICE void Pipeline<T, What>::move_patch(unsigned n) const {
   // first what frees the half
 #pragma unroll
   for (int r = 0; r < moved; ++r) force[r] = sum_entries_briefly<T>(entries, row[r]);
-  const auto visit_late = [&](int s, const Vec3<T>& summed) {
-    visit_slot(s, summed, [&] { return see_slot(s); });
-  };
+  const T omega = T(weight);
 #pragma unroll 1
   for (int s = slot(moved); s < interior; s += mover_threads)
-    visit_late(s, sum_entries_briefly<T>(entries, w.plan.slot_row[first_slot + s]));
+    visit<What>(all, first_vertex + unsigned(s), see<What>(all, first_vertex + unsigned(s)),
+                sum_entries_briefly<T>(entries, plan().slot_row[at.first_slot + s]), omega, sums);
   give(slots_ready, n);
+  // on the way during the first visits
+  unsigned place[moved];
 #pragma unroll
-  for (int r = 0; r < soon; ++r) visit_slot(slot(r), force[r], [&] { return seen[r]; });
+  for (int r = 0; r < moved; ++r) {
+    place[r] = slot(r) >= interior && slot(r) < slots ? place_of_force(at, slot(r)) : 0;
+    if (r >= soon) seen[r] = see_slot(slot(r));
+  }
 #pragma unroll
-  for (int r = soon; r < moved; ++r) visit_late(slot(r), force[r]);
-  if (wants_sums<What>(w)) write_mover_sums(sums, n, w.sum_row(at.patch));
+  for (int r = 0; r < moved; ++r) {
+    if (slot(r) < interior) {
+      visit<What>(all, first_vertex + unsigned(slot(r)), seen[r], force[r], omega, sums);
+    } else if (slot(r) < slots) {
+      all.leave_force(place[r], force[r], round_);
+    }
+  }
+  if (wants_sums<What>(all)) write_mover_sums(sums, n, work(at.environment).sum_row(at.patch));
 }
 
-// Has what movers read of a patch brought into the L2 cache.
+// Has what movers read of a patch brought into the L2 cache, by one thread of each of three warps.
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::bring_patch_near(unsigned n) const {
-  const Stop& at = told(n);
-  const Work w = work(at.environment);
-  bring_near(w.v.before + at.first_vertex, at.interior, mover(), mover_threads);
-  bring_near(w.v.target + at.first_vertex, at.interior, mover(), mover_threads);
-  bring_near(w.plan.slot_row + at.first_slot, at.slots, mover(), mover_threads);
+  const Stop at = told(n);
+  const Work all = work();
+  const unsigned first_vertex = at.vertex + unsigned(at.first_vertex);
+  const auto near = [](const auto* items, int count, int warp) {
+    bring_all_near(items, count, (mover() + mover_threads - warp_size * warp) % mover_threads,
+                   mover_threads);
+  };
+  near(all.v.before + first_vertex, at.interior, 0);
+  near(all.v.target + first_vertex, at.interior, 1);
+  near(plan().slot_row + at.first_slot, at.slots, 2);
 }
 
 template <class T, Visit What>

@@ -24,13 +24,18 @@ PD_DEVICE void Pipeline<T, What>::tell_stops(unsigned first) const {
     if (mine) {
       s.environment = environment;
       s.patch = patch;
+      s.vertex = unsigned(environment) * unsigned(plan().vertices);
+      s.slot = unsigned(environment) * unsigned(plan().slots);
+      s.place = unsigned(environment) * unsigned(call_.places());
       s.first_vertex = plan().patch_vertex[patch];
       s.interior = plan().patch_vertex[patch + 1] - s.first_vertex;
       s.first_slot = plan().patch_slot[patch];
       s.slots = plan().patch_slot[patch + 1] - s.first_slot;
+      s.first_place = s.first_slot - s.first_vertex - s.interior;
       s.first_block = plan().patch_block[patch];
       s.blocks = plan().patch_block[patch + 1] - s.first_block;
       s.weights = own ? unsigned(environment) * unsigned(plan().blocks) : 0;
+      s.unit = plan().patch_unit[patch];
       s.patch_weight = work(environment).patch_weight[patch];
     }
     // the guard's energies are summed alike in any batch

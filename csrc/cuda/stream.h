@@ -88,7 +88,7 @@ struct StreamWork {
   }
   PD_DEVICE Word* letters() const { return reinterpret_cast<Word*>(shared_force); }
   // What a patch has of the force on a vertex that it shares; 0 is the `round` of a pass for which nobody waits.
-  PD_DEVICE void leave_force(int place, const Vec3<T>& force, unsigned round) const {
+  PD_DEVICE void leave_force(unsigned place, const Vec3<T>& force, unsigned round) const {
     if constexpr (sizeof(T) == 4) {
       Letter<T>::post(letters() + place, force, round);
     } else {
@@ -128,15 +128,21 @@ struct ThreadSums {
 
 // What a visit goes by beside the force; nothing before there is a state.
 template <Visit What, class T, bool Touching>
-PD_DEVICE typename Vertices<T, Touching>::Seen see(const StreamWork<T, Touching>& w, int i) {
+PD_DEVICE typename Vertices<T, Touching>::Seen see(const StreamWork<T, Touching>& w, unsigned i) {
   if constexpr (What == Visit::weigh) return {};
   return w.v.see(i);
 }
 
+// omega of iteration k, asked for before it is wanted
 template <Visit What, class T, bool Touching>
-PD_DEVICE void visit(const StreamWork<T, Touching>& w, int i,
-                     const typename Vertices<T, Touching>::Seen& seen, const Vec3<T>& force, int k,
-                     ThreadSums& sums) {
+PD_DEVICE T weight_of_pass(const StreamWork<T, Touching>& w, int k) {
+  return What == Visit::update || What == Visit::update_guarded ? w.omega(k) : T(0);
+}
+
+template <Visit What, class T, bool Touching>
+PD_DEVICE void visit(const StreamWork<T, Touching>& w, unsigned i,
+                     const typename Vertices<T, Touching>::Seen& seen, const Vec3<T>& force,
+                     T omega, ThreadSums& sums) {
   double (&sum)[sums_count] = sums.value;
   if constexpr (What == Visit::weigh) {
     sum[0] = Least{}(sum[0], w.v.weigh(i, force.x));
@@ -146,7 +152,7 @@ PD_DEVICE void visit(const StreamWork<T, Touching>& w, int i,
   } else {
     if constexpr (What == Visit::update_guarded) sum[0] += seen.energy();
     if (!alternates(w.settings())) sum[2] += seen.square_of_way();
-    const Vec3<T> next = seen.next(w.contacts, force, T(w.settings().relaxation), w.omega(k));
+    const Vec3<T> next = seen.next(w.contacts, force, T(w.settings().relaxation), omega);
     if (alternates(w.settings())) {
       w.v.set_in_place_of_before(i, seen, next);
     } else {
@@ -257,10 +263,11 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   }
   bring_near(w.plan.slot_row + patch.first_slot, patch.slots);
   ThreadSums sums = no_sums<What>();
+  const T omega = weight_of_pass<What>(w, k);
   const double energy = pass_over_patch(
       w, number, shared, typename ElementOf<What>::type{}, [&](int i) { return see<What>(w, i); },
       [&](int i, const auto& seen, const Vec3<T>& force) {
-        visit<What>(w, i, seen, force, k, sums);
+        visit<What>(w, i, seen, force, omega, sums);
       });
   if constexpr (What != Visit::weigh) sums.value[0] += energy;
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));

@@ -38,13 +38,13 @@ struct Vertices {
     }
   };
 
-  PD_DEVICE Seen see(int i) const { return {at(i), vec3(u[i]), vec3(before[i])}; }
+  PD_DEVICE Seen see(unsigned i) const { return {at(i), vec3(u[i]), vec3(before[i])}; }
 
-  PD_DEVICE Vertex<Thread<T>, Touching> at(int i) const {
+  PD_DEVICE Vertex<Thread<T>, Touching> at(unsigned i) const {
     return {vec3(x[i]), vec3(target[i]), inertia(i), u[i].w};
   }
 
-  PD_DEVICE T inertia(int i) const { return target[i].w; }
+  PD_DEVICE T inertia(unsigned i) const { return target[i].w; }
 
   PD_DEVICE void load(int i, const Inputs<T>& in, int vertex, T h) const {
     x[i] = quad(in.at_vertex(in.call->positions, vertex));
@@ -84,12 +84,12 @@ struct Vertices {
     return at(i).moved(vec3(u[i]), motion.of(vec3(x[i]) + vec3(u[i])));
   }
 
-  PD_DEVICE void set(int i, const Vec3<T>& value) const { u[i] = quad(value, u[i].w); }
-  PD_DEVICE void set_before(int i, const Vec3<T>& value) const {
+  PD_DEVICE void set(unsigned i, const Vec3<T>& value) const { u[i] = quad(value, u[i].w); }
+  PD_DEVICE void set_before(unsigned i, const Vec3<T>& value) const {
     before[i] = quad(value, before[i].w);
   }
   // In place of the iterate before, for whoever then lets the two change places.
-  PD_DEVICE void set_in_place_of_before(int i, const Seen& seen, const Vec3<T>& value) const {
+  PD_DEVICE void set_in_place_of_before(unsigned i, const Seen& seen, const Vec3<T>& value) const {
     before[i] = quad(value, seen.vertex.inverse);
   }
 

@@ -21,14 +21,6 @@ PD_HD Mat3<R> deformation_gradient(const Vec3<R> (&x)[4], const FaceRest<R, 1>& 
                       multiply_add(apex.z, x[3] - x[0], multiply_add(apex.y, b, apex.x * a)));
 }
 
-// Dm^-1 of the columns of Dm, the edges from corner 0 at rest, and of 1 / det Dm. The cofactors keep all bits, however flat
-// the tetrahedron; its determinant would not.
-template <class R>
-PD_HD Mat3<R> rest_inverse(const Vec3<R> (&edge)[3], const R& per_determinant) {
-  return per_determinant * Mat3<R>{{exact_cross(edge[1], edge[2]), exact_cross(edge[2], edge[0]),
-                                    exact_cross(edge[0], edge[1])}};
-}
-
 // grad N_c of the four corners [1/m]
 template <class R>
 PD_HD void shape_gradients(const Mat3<R>& rest_inverse, Vec3<R> (&n)[4]) {

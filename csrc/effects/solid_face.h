@@ -61,21 +61,56 @@ PD_HD FaceRest<R, Count> face_rest(const Vec3<R> (&edge)[2 + Count], const R& pe
   return rest;
 }
 
+// A face at rest of which the tetrahedra are not known yet: the first two axes of its frame, by which an apex has its place there,
+// a_1, a_2 and 1 / h. Then
+//
+//   f_3 = h ((x_3 - x_0) - a_1 f_1 - a_2 f_2)
+//
+// wants no edges any more but what f_1 and f_2 have of them, which keeps registers free.
+template <class R>
+struct FaceFrame {
+  R p, q, r;         // [1/m], see above
+  Vec3<R> one, two;  // axes, times the metres of a unit of edges
+  R height;          // h is that times unit^2 / det Dm
+
+  // see face_rest
+  PD_HD FaceFrame(const Vec3<R> (&edge)[2], const R& unit) {
+    using T = scalar_of<R>;
+    const R least(sizeof(T) == 4 ? T(1) : smallest<T>());
+    const auto no_less = [&](const R& a) { return select(a < least, least, a); };
+    const Vec3<R> normal = exact_cross(edge[0], edge[1]);
+    const R length2 = no_less(dot(edge[0], edge[0])), normal2 = no_less(dot(normal, normal));
+    const R per_unit = reciprocal(unit), per_length2 = reciprocal(length2);
+    const R per_length = rough_square_root(per_length2), share = unit * per_length;
+    height = rough_square_root(normal2);
+    const R per_height = reciprocal(height);
+    p = per_unit * per_length;
+    r = per_unit * (length2 * per_length) * per_height;
+    q = -(dot(edge[0], edge[1]) * per_length2) * r;
+    one = share * edge[0];
+    two = (share * per_height) * cross(normal, edge[0]);
+  }
+};
+
 // The columns that all deformation gradients of a face have, f_1 and f_2, and the third of all their cofactors.
 template <class R>
 struct FaceColumns {
   Vec3<R> first, second, normal;        // normal = f_1 x f_2
   R first2, second2, between, normal2;  // |f_1|^2, |f_2|^2, f_1.f_2, |normal|^2
 
-  template <int Count>
-  PD_HD FaceColumns(const Vec3<R> (&edge)[2], const FaceRest<R, Count>& rest)
-      : first(rest.p * edge[0]), second(multiply_add(rest.r, edge[1], rest.q * edge[0])) {
-    normal = cross(first, second);
-    first2 = dot(first, first);
-    second2 = dot(second, second);
-    between = dot(first, second);
-    normal2 = dot(normal, normal);
-  }
+  PD_HD FaceColumns(const Vec3<R>& first, const Vec3<R>& second)
+      : first(first),
+        second(second),
+        normal(cross(first, second)),
+        first2(dot(first, first)),
+        second2(dot(second, second)),
+        between(dot(first, second)),
+        normal2(dot(normal, normal)) {}
+
+  // `Rest`: FaceRest or FaceFrame
+  template <class Rest>
+  PD_HD FaceColumns(const Vec3<R> (&edge)[2], const Rest& rest)
+      : FaceColumns(rest.p * edge[0], multiply_add(rest.r, edge[1], rest.q * edge[0])) {}
 
   PD_HD Mat3<R> with(const Vec3<R>& third) const { return from_columns(first, second, third); }
 
@@ -157,6 +192,52 @@ PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, 
   g[1] = multiply_add(rest.q, second, multiply_add(rest.p, first, g[1]));
   g[2] = multiply_add(rest.r, second, g[2]);
   g[0] = -((g[1] + g[2]) + g[0]);
+}
+
+// The same of two tetrahedra, whose corners are looked at where they are wanted, and forces left where they are known: look(corner,
+// position, rest) with rest positions in any unit, of so many metres; leave(corner, force). `factor`: unit^2 / det Dm of each.
+// between() comes after the first, where the fewest registers are in use.
+template <bool Energy, class Rest, class R, class Look, class Leave, class Between>
+PD_HD void solid_pair_gradient(const R (&factor)[2], const R (&weight)[2], const R& unit, R& energy,
+                               const Look& look, const Leave& leave, const Between& between) {
+  Vec3<R> x[3];
+  Rest rest[3];
+  for (int c = 0; c < 3; ++c) look(c, x[c], rest[c]);
+  const FaceFrame<R> frame({rest[1] - rest[0], rest[2] - rest[0]}, unit);
+  const FaceColumns<R> face({x[1] - x[0], x[2] - x[0]}, frame);
+  Vec3<R> first, second, apexes;  // what they leave to the corners of the face
+  for (int e = 0; e < 2; ++e) {
+    Vec3<R> apex;
+    Rest apex_rest;
+    look(3 + e, apex, apex_rest);
+    const Vec3<R> place = apex_rest - rest[0];
+    const R h = frame.height * factor[e];
+    const R one = dot(frame.one, place), two = dot(frame.two, place);
+    const Vec3<R> third =
+        h * subtract_product(subtract_product(apex - x[0], one, face.first), two, face.second);
+    const Invariants<R> i = face.invariants(third);
+    Vec3<R> stress[3];
+    finish_columns(face, third, i, largest_root(i), Energy ? R(scalar_of<R>(1)) : weight[e],
+                   stress);
+    if (Energy) {
+      const R square =
+          (dot(stress[0], stress[0]) + dot(stress[1], stress[1])) + dot(stress[2], stress[2]);
+      energy = multiply_add(R(scalar_of<R>(0.5)) * weight[e], square, energy);
+      for (Vec3<R>& column : stress) column = weight[e] * column;
+    }
+    const Vec3<R> force = h * stress[2];
+    leave(3 + e, force);
+    const Vec3<R> along = subtract_product(stress[0], one, force);
+    const Vec3<R> across = subtract_product(stress[1], two, force);
+    first = e == 0 ? along : first + along;
+    second = e == 0 ? across : second + across;
+    apexes = e == 0 ? force : apexes + force;
+    if (e == 0) between();
+  }
+  const Vec3<R> g1 = multiply_add(frame.q, second, frame.p * first), g2 = frame.r * second;
+  leave(0, -((g1 + g2) + apexes));
+  leave(1, g1);
+  leave(2, g2);
 }
 
 }  // namespace pd::inline PD_TARGET
