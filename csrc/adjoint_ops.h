@@ -6,11 +6,8 @@
 
 #include <cstddef>
 #include <cstdint>
-#include <functional>
 #include <optional>
-#include <string_view>
 #include <tuple>
-#include <utility>
 #include <vector>
 
 namespace pd {
@@ -311,7 +308,11 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
   const MaterialGradients gradients(
       t, multiplier, elastic,
       [&, l = multiplier](const Tensor& product) {
-        return gradients_for_contacts<Backend>(t, l, product, time_step);
+        const auto wants = [&](const char* name) {
+          return !wanted || wanted->get(place_in_material(name));
+        };
+        return gradients_for_contacts<Backend>(t, l, product, time_step,
+                                               {wants("planes"), wants("spheres")});
       },
       asked, time_step);
   for (std::size_t i = 0; i < material.size(); ++i) {

@@ -1,9 +1,8 @@
 // Gradients of a step for the arrays of its material, once its adjoint is solved.
 #pragma once
 #include "find_op.h"
-#include "ops.h"
-#include "plan_views.h"
 #include "solver/contact_gradients.h"
+#include "step_taken.h"
 
 #include <cstddef>
 #include <cstdint>
@@ -15,54 +14,6 @@
 #include <vector>
 
 namespace pd {
-
-// A step that was taken, and what a loss wants of its outcome.
-struct AdjointTensors {
-  Tensor grad_positions, grad_velocities, after, positions, velocities;
-  OptionalTensor forces;
-  at::TensorList material, plan;
-};
-
-// What a call asks of a step that was taken, and the tensors that it points into.
-template <class Backend, class T>
-class StepTaken {
- public:
-  AdjointSystemCall<T, typename Backend::template Plan<T>> call;
-  bool touching;
-
-  StepTaken(const AdjointTensors& t, double time_step) {
-    const Place place{t.after.device()};
-    call.plan = Backend::template plan_view<T>(t.plan, place);
-    call.batch = t.after.size(0);
-    check_vertices(t.after, call.plan.vertices);
-    call.material =
-        material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch, place);
-    const Tensor& stiffness = t.material[place_in_material("stiffness")];
-    const Material<T>& m = call.material;
-    call.elastic = {keep(diagonal_typed<Backend, T>(stiffness, t.plan, true)),
-                    m.stiffness.stride ? call.plan.vertices : 0};
-    touching = m.planes_count + m.spheres_count > 0;
-    call.time_step = time_step;
-    call.grad_positions = keep(t.grad_positions);
-    call.grad_velocities = keep(t.grad_velocities);
-    if (!touching) return;
-    call.after = keep(t.after);
-    call.positions = keep(t.positions);
-    call.velocities = keep(t.velocities);
-    if (t.forces) call.forces = keep(*t.forces);
-    call.elastic_gradient =
-        keep(run_field<Backend>(Field::gradient, t.after.contiguous(), {}, stiffness, t.plan));
-  }
-  StepTaken(const StepTaken&) = delete;
-
-  const T* keep(const Tensor& tensor) {
-    kept_.push_back(tensor.contiguous());
-    return kept_.back().template const_data_ptr<T>();
-  }
-
- private:
-  std::vector<Tensor> kept_;
-};
 
 // K l, by the dispatcher, whose profiler then sees it.
 inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier) {
@@ -94,32 +45,41 @@ class Asked {
   Tensor is_;
 };
 
-// Gradients for planes [batch, planes, 5] and spheres [batch, spheres, 8]; `elastic`: K l.
+// Whose gradients are wanted, of all contacts.
+struct WantedContacts {
+  bool planes = true, spheres = true;
+};
+
+// Gradients for planes [batch, planes, 5] and spheres [batch, spheres, 8], of none where nobody wants them; `elastic`: K l.
 template <class Backend, class T>
 std::tuple<Tensor, Tensor> gradients_for_contacts_typed(const AdjointTensors& t,
                                                         const Tensor& multiplier,
-                                                        const Tensor& elastic, double time_step) {
+                                                        const Tensor& elastic, double time_step,
+                                                        WantedContacts wanted) {
   StepTaken<Backend, T> step(t, time_step);
   ContactGradientsCall<T, typename Backend::template Plan<T>> call{step.call};
   call.multiplier = step.keep(multiplier);
   call.elastic = step.keep(elastic);
+  const Material<T>& m = step.call.material;
   const auto of_vertices = [&](std::int64_t count, std::int64_t numbers) {
     return at::empty({step.call.batch, step.call.plan.vertices, count, numbers}, t.after.options());
   };
-  const Tensor planes = of_vertices(step.call.material.planes_count, plane_numbers);
-  const Tensor spheres = of_vertices(step.call.material.spheres_count, sphere_numbers);
-  call.planes = planes.mutable_data_ptr<T>();
-  call.spheres = spheres.mutable_data_ptr<T>();
-  if (step.touching && step.call.batch > 0) Backend::contact_gradients(call, multiplier);
+  const Tensor planes = of_vertices(wanted.planes ? m.planes_count : 0, plane_numbers);
+  const Tensor spheres = of_vertices(wanted.spheres ? m.spheres_count : 0, sphere_numbers);
+  if (planes.numel() > 0) call.planes = planes.mutable_data_ptr<T>();
+  if (spheres.numel() > 0) call.spheres = spheres.mutable_data_ptr<T>();
+  if (call.planes || call.spheres) Backend::contact_gradients(call, multiplier);
   return {planes.sum(1), spheres.sum(1)};
 }
 
 template <class Backend>
 std::tuple<Tensor, Tensor> gradients_for_contacts(const AdjointTensors& t, const Tensor& multiplier,
-                                                  const Tensor& elastic, double time_step) {
-  return multiplier.scalar_type() == at::kFloat
-             ? gradients_for_contacts_typed<Backend, float>(t, multiplier, elastic, time_step)
-             : gradients_for_contacts_typed<Backend, double>(t, multiplier, elastic, time_step);
+                                                  const Tensor& elastic, double time_step,
+                                                  WantedContacts wanted = {}) {
+  return multiplier.scalar_type() == at::kFloat ? gradients_for_contacts_typed<Backend, float>(
+                                                      t, multiplier, elastic, time_step, wanted)
+                                                : gradients_for_contacts_typed<Backend, double>(
+                                                      t, multiplier, elastic, time_step, wanted);
 }
 
 // -l . dr/dp of every environment, for an array p of the material, from its formulas for all of them.

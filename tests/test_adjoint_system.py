@@ -111,7 +111,9 @@ def held_by_contacts(
     sliding, contacts = after.new_zeros((*after.shape[:2], 5, 3)), torch.zeros_like(diagonal)
     for normal, gap, friction, motion, curved in surfaces:
         push = (residual * normal).sum(-1)
-        holds = (push > 0) & (gap < push / diagonal)
+        left = (projector * normal.unsqueeze(-2)).sum(-1)
+        size = (left * left).sum(-1)
+        holds = (push > 0) & (gap < push / diagonal) & (size > 1e-6)
         slip = moved - motion
         slip = slip - (slip * normal).sum(-1, keepdim=True) * normal
         length = slip.norm(dim=-1)
@@ -126,9 +128,7 @@ def held_by_contacts(
         rows = friction[..., None] * way, normal, rate * across, friction[..., None] * bend * way, lean * rate * across
         mine = torch.stack([torch.where(slides, row, 0.0) for row in rows], -2)
         sliding = torch.where(holds[..., None, None], mine, sliding)
-        left = (projector * normal.unsqueeze(-2)).sum(-1)
-        size = (left * left).sum(-1)
-        share = torch.where(holds & (size > 1e-6), 1 / size, 0.0)[..., None, None]
+        share = torch.where(holds, 1 / size, 0.0)[..., None, None]
         projector = projector - share * left.unsqueeze(-1) * left.unsqueeze(-2)
         curvature = curvature + torch.where(holds, push * curved, 0.0)
     sliding = torch.where((stuck | (contacts > 1))[..., None, None], 0.0, sliding)

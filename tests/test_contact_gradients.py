@@ -149,6 +149,66 @@ def test_along_the_edge_of_two_planes() -> None:
     compare(sim.planes, lambda: loss_of(sim(state)), columns)
 
 
+STICKY_EDGE = (pd.Ground(friction=STICKY), pd.Ground(0.0, (1.0, 0.0, 0.0)))
+ROUGH_EDGE = (pd.Ground(friction=ROUGH), pd.Ground(0.0, (1.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("walls", "velocity", "names", "error"),
+    [
+        (STICKY_EDGE, (-0.3, -0.2, 0.03), ("normal to z", "height"), TOLERANCE),
+        # the steps themselves differ from exact contacts where one is rough, see torchpd.sliding
+        (ROUGH_EDGE, (-0.3, -0.2, 0.8), ("normal to z", "height", "friction"), 0.03),
+    ],
+    ids=["sticks", "slides"],
+)
+def test_a_rough_ground_beside_a_wall(
+    walls: tuple[pd.Ground, ...], velocity: tuple[float, float, float], names: tuple[str, ...], error: float
+) -> None:
+    sim, state = cube(*walls, velocity=velocity)
+    columns = {name: plane_columns(sim.planes)[name] for name in names}
+    compare(sim.planes, lambda: loss_of(sim(state)), columns, error=error)
+
+
+def test_the_same_contact_twice_counts_once() -> None:
+    """What the first has put a vertex out of, the second does nothing to."""
+    found = []
+    for count in (1, 2):
+        sim, state = cube(*(pd.Ground(friction=ROUGH) for _ in range(count)), velocity=SPEED[ROUGH])
+        sim.planes.requires_grad_()
+        x = state.positions.clone().requires_grad_()
+        found.append(torch.autograd.grad(loss_of(sim(pd.State(x, state.velocities))), (x, sim.planes)))
+    torch.testing.assert_close(found[0][0], found[1][0], rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(found[0][1], found[1][1][:1], rtol=1e-9, atol=1e-12)
+    assert torch.equal(found[1][1][1], torch.zeros_like(found[1][1][1]))
+
+
+def test_what_rests_on_smooth_ground_slips_nowhere() -> None:
+    """Which way rounding moves it must not tell what friction would do."""
+    sim, _ = cube(pd.Ground(), velocity=(0.0, 0.0, 0.0))
+    with torch.no_grad():
+        state = sim.rollout(sim.rest_state(2), 400).state()
+    sim.planes.requires_grad_()
+    (gradient,) = torch.autograd.grad(loss_of(sim(state)), sim.planes)
+    with torch.no_grad():
+        smooth = loss_of(sim(state))
+        sim.planes[0, 4] = 1e-3
+        slope = float(loss_of(sim(state)) - smooth) / 1e-3
+    assert abs(float(gradient[0, 4]) - slope) <= 1e-5
+
+
+def test_a_lost_environment_leaves_no_number() -> None:
+    """Its own gradients are NaN as those of all else, and those of others as they were."""
+    sim, state = cube(pd.Ground(friction=ROUGH), pd.Sphere((0.1, -0.3, 0.1), 0.302), velocity=SPEED[ROUGH])
+    sim.set_material(planes=sim.planes.repeat(2, 1, 1), spheres=sim.spheres.repeat(2, 1, 1))
+    state.velocities[1, 0, 0] = torch.nan
+    sim.planes.requires_grad_()
+    sim.spheres.requires_grad_()
+    for gradient in torch.autograd.grad(loss_of(sim(state)), (sim.planes, sim.spheres)):
+        assert gradient[0].isfinite().all()
+        assert gradient[1].isnan().all()
+
+
 def test_every_environment_has_its_own() -> None:
     sim, state = cube(pd.Ground(friction=ROUGH), velocity=SPEED[ROUGH])
     sim.set_material(planes=torch.stack([sim.planes, sim.planes + torch.tensor([0.0, 0.0, 0.0, 1e-3, 0.1])]))
@@ -206,7 +266,7 @@ def test_nothing_where_nothing_touches() -> None:
 
 
 def test_vertices_on_springs_touch_too() -> None:
-    """A soft pin's force counts, wherever it is looked for first."""
+    """A soft pin's force counts, though on a CPU they are looked at without their pins first."""
     solid = pd.Solid(MESH, 2e4)
     low = np.flatnonzero(MESH.vertices[:, 1] < 1e-9)
     scene = pd.Scene(solid, pd.Pin(solid, low[:4], stiffness=200.0), pd.Gravity(), pd.Ground(friction=ROUGH))

@@ -121,6 +121,7 @@ def test_blocks_that_go_from_patch_to_patch(
     options = {"iterations": iterations, "tolerance": tolerance}
     sim = on_gpu(bar(cells, pd.Gravity()), dtype, "stream", **options)
     other = on_gpu(bar(cells, pd.Gravity(), pd.Ground(-50.0)), dtype, "stream", **options)
+    assert sim.plan.patches > 1
     gpu = properties_of(GPU)
     batch = 11 * gpu.multiprocessors // sim.plan.patches + 3  # some blocks have twelve patches
     state, forces = unlike(sim, batch)

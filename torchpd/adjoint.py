@@ -12,7 +12,7 @@ A GPU solves every environment in one launch, whatever it takes, so a CUDA graph
 
 Contacts: the normal direction of a vertex that a contact holds is taken out of the system; a vertex that friction holds
 moves with its start, on a ball about its centre. What a vertex that slides against friction adds stands in
-`torchpd.sliding`.
+`torchpd.sliding`, what contacts themselves get in csrc/solver/contact_gradients.h.
 """
 
 from __future__ import annotations

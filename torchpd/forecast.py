@@ -4,13 +4,13 @@ The smallest ratio mu of inertia to diagonal bounds the spectrum of D^-1 A from 
 Jacobi and Chebyshev iterations. What `Multilevel` needs does not depend on the mesh, but on mu n^(2/3), n vertices of a
 body: about rho L^2 / (E h^2), how far a wave travels in a step against the size L of the body. It grows with the
 logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. On 132 random scenes
-without contacts nine of ten needed 0.3 to 1.5 times the forecast, meshes with slivers the least, on 65 with contacts
-Chebyshev 0.6 to 1.9 times (`benchmarks/forecast.py`).
+without contacts nine of ten needed 0.2 to 1.4 times the forecast, meshes with slivers and steps that are a rigid motion
+the least, on 65 with contacts Chebyshev 0.2 to 1.25 times (`benchmarks/forecast.py`).
 
 With contacts the forecast of `Multilevel` is that of the step in which a stiff body of slivers lands on a face: a
 seventh of what Chebyshev needs, but two square roots of it at least, which even meshes need. With friction or balls,
 and without its small problem, it is a bound: what Chebyshev needs. Nine of ten of those 65 scenes, most of which do not
-land in the step that is measured, needed 0.1 to 1.15 of it, half of them 0.5. `Simulator.tune` measures instead.
+land in the step that is measured, needed 0.06 to 1.25 of it, half of them 0.5. `Simulator.tune` measures instead.
 
 Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
 """

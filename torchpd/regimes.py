@@ -51,9 +51,10 @@ _LEVELS = ("few", "any", "many")  # how many environments it is for
 # a patch at most, five rounds of its threads where all have partners, and how many patches share a multiprocessor of an
 # H100 (csrc/cuda/stream.h)
 _STREAM_TETS = {torch.float32: 1920, torch.float64: 960}
-# of a pipeline (csrc/cuda/pipeline.h), whose threads hold the slots of so many at once, in so much shared memory
-_PIPED_TETS, _PIPED_BYTES = 2304, 200_000
 _STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
+# so many times as many in a pipeline, of which a multiprocessor works on one at a time and holds two, where there is so
+# much shared memory for them: their slots are what its threads have in registers at once (csrc/cuda/pipeline.h)
+_PIPED_MORE, _PIPED_BYTES = 1.2, 200_000
 _MOST_FIELDS = 2  # of a pass: the products with a second derivative
 
 
@@ -123,13 +124,14 @@ class _Scene(NamedTuple):
                 return max(2, int(least), -(-self.tets // _MANY_TETS))
             rounds = -(-int(least) // gpu.multiprocessors)
             return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
-        patches = -(-self.tets // (_PIPED_TETS if self.is_piped(gpu) else _STREAM_TETS[self.dtype]))
+        large = self.has_large_halves(gpu)
+        patches = math.ceil(self.tets / (_STREAM_TETS[self.dtype] * (_PIPED_MORE if large else 1)))
         # what does not run at once runs in whole waves, of which the last is full too
-        wave = _STREAM_TOGETHER[self.dtype] * gpu.multiprocessors
+        wave = gpu.multiprocessors * (1 if large else _STREAM_TOGETHER[self.dtype])
         return patches if patches <= wave else -(-patches // wave) * wave
 
-    def is_piped(self, gpu: Properties) -> bool:
-        """Whether iterations of kernel "stream" are a pipeline: those of float32 and of scenes without contacts."""
+    def has_large_halves(self, gpu: Properties) -> bool:
+        """Whether iterations of kernel "stream" are a pipeline, in float32 and without contacts, with room for more."""
         touching = len(self.values.planes) + len(self.values.spheres) > 0
         return self.dtype == torch.float32 and not touching and gpu.shared >= _PIPED_BYTES
 

@@ -1,4 +1,4 @@
-// Runner of solver/adjoint.h.
+// Runner of solver/adjoint.h and solver/contact_gradients.h.
 #pragma once
 #include "cuda/fields.cuh"
 #include "solver/adjoint.h"

@@ -71,7 +71,7 @@ class Pipeline {
   static constexpr int brought = usual_slots / bringer_threads;
   // From left_slots on bringers add up the forces of slots that are not inside the patch.
   static constexpr int moved = 3, left_slots = moved * mover_threads;
-  // Of moved, so many are mostly inside a patch: what a visit wants is asked for before it is wanted.
+  // Of moved, what visits of so many want is asked for before forces are awaited, that of the others after.
   static constexpr int soon = 2;
 
   PD_DEVICE static int mover() { return int(threadIdx.x); }
@@ -103,7 +103,7 @@ class Pipeline {
   // ---- stops of the block
 
   // Where a patch lies in the arrays. Those that have numbers for every environment are read as one array of all of them, from
-  // that of the first on, which takes one instruction; 32 bits count them, since a vertex takes more than 80 bytes.
+  // that of the first on, which takes one instruction; 32 bits count them (StreamRunner::pipe).
   struct alignas(16) Stop {
     unsigned vertex, slot, place;  // the first of those before the environment's
     int first_vertex, interior;    // of the plan, as are the next three
@@ -206,10 +206,6 @@ class Pipeline {
   PD_DEVICE void move_vertices() const;
   PD_DEVICE void move_patch(unsigned n) const;
   PD_DEVICE void bring_patch_near(unsigned n) const;
-  // asked for long before it is converted, which waits
-  PD_DEVICE double read_omega(int environment) const {
-    return __ldcg(call_.memory.omega + environment * guard_period + k_ % guard_period);
-  }
   PD_DEVICE void write_mover_sums(const ThreadSums& sums, unsigned n, double* row) const;
   PD_DEVICE static void meet_movers();
 

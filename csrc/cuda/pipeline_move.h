@@ -36,7 +36,7 @@ PD_DEVICE void Pipeline<T, What>::move_patch(unsigned n) const {
     row[r] = slot(r) < slots ? plan().slot_row[at.first_slot + slot(r)] : 0;
 #pragma unroll
   for (int r = 0; r < soon; ++r) seen[r] = see_slot(slot(r));
-  const double weight = read_omega(at.environment);
+  const double asked = work(at.environment).omega(k_);
   bring_patch_near(n + 1);
   await(forces_ready, n);
   if (What == Visit::update_guarded && mover() < element_warps)
@@ -44,7 +44,7 @@ PD_DEVICE void Pipeline<T, What>::move_patch(unsigned n) const {
   // first what frees the half
 #pragma unroll
   for (int r = 0; r < moved; ++r) force[r] = sum_entries_briefly<T>(entries, row[r]);
-  const T omega = T(weight);
+  const T omega = T(asked);
 #pragma unroll 1
   for (int s = slot(moved); s < interior; s += mover_threads)
     visit<What>(all, first_vertex + unsigned(s), see<What>(all, first_vertex + unsigned(s)),

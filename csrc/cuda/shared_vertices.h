@@ -114,10 +114,10 @@ __global__ void __launch_bounds__(shared_threads, sizeof(T) == 4 && !Touching ? 
     }
   }
   const auto seen = see_fresh<What>(w, vertex);
-  const T omega = weight_of_pass<What>(w, k);
+  const double omega = omega_of_pass<What>(w, k);
   const Vec3<T> force = await_force(w, places, round);
   ThreadSums sums = no_sums<What>();
-  if (i < w.plan.shared) visit<What>(w, vertex, seen, force, omega, sums);
+  if (i < w.plan.shared) visit<What>(w, vertex, seen, force, T(omega), sums);
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(w.plan.patches + number));
 }
 

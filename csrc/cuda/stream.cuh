@@ -17,6 +17,8 @@
 #include "solver/step.h"
 
 #include <algorithm>
+#include <cstdint>
+#include <limits>
 #include <utility>
 
 namespace pd {
@@ -202,7 +204,9 @@ class StreamRunner {
     constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
     if constexpr (updates && !Touching && sizeof(T) == 4) {
       const auto kernel = stream_pipeline<What, T>;
-      if (plan_.most_slots > pipeline_slots) return false;
+      // whose places 32 bits count; slots are the most of what an environment has
+      constexpr std::int64_t most = std::numeric_limits<std::uint32_t>::max();
+      if (plan_.most_slots > pipeline_slots || call_.step.batch * plan_.slots > most) return false;
       const std::size_t shared =
           2 * pipeline_half_bytes(sizeof(T), plan_.most_slots, plan_.most_entries);
       const std::int64_t blocks =

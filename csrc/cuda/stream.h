@@ -82,9 +82,10 @@ struct StreamWork {
         h(T(c.step.settings.time_step)) {}
 
   PD_DEVICE const Settings& settings() const { return call.step.settings; }
-  PD_DEVICE T omega(int k) const {
+  // Of iteration k; whoever asks long before it is wanted converts it then, since that waits.
+  PD_DEVICE double omega(int k) const {
     // for stream_shared, see handoff.h
-    return T(__ldcg(call.memory.omega + environment * guard_period + k % guard_period));
+    return __ldcg(call.memory.omega + environment * guard_period + k % guard_period);
   }
   PD_DEVICE Word* letters() const { return reinterpret_cast<Word*>(shared_force); }
   // What a patch has of the force on a vertex that it shares; 0 is the `round` of a pass for which nobody waits.
@@ -133,10 +134,9 @@ PD_DEVICE typename Vertices<T, Touching>::Seen see(const StreamWork<T, Touching>
   return w.v.see(i);
 }
 
-// omega of iteration k, asked for before it is wanted
 template <Visit What, class T, bool Touching>
-PD_DEVICE T weight_of_pass(const StreamWork<T, Touching>& w, int k) {
-  return What == Visit::update || What == Visit::update_guarded ? w.omega(k) : T(0);
+PD_DEVICE double omega_of_pass(const StreamWork<T, Touching>& w, int k) {
+  return What == Visit::update || What == Visit::update_guarded ? w.omega(k) : 0;
 }
 
 template <Visit What, class T, bool Touching>
@@ -263,11 +263,11 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   }
   bring_near(w.plan.slot_row + patch.first_slot, patch.slots);
   ThreadSums sums = no_sums<What>();
-  const T omega = weight_of_pass<What>(w, k);
+  const double omega = omega_of_pass<What>(w, k);
   const double energy = pass_over_patch(
       w, number, shared, typename ElementOf<What>::type{}, [&](int i) { return see<What>(w, i); },
       [&](int i, const auto& seen, const Vec3<T>& force) {
-        visit<What>(w, i, seen, force, omega, sums);
+        visit<What>(w, i, seen, force, T(omega), sums);
       });
   if constexpr (What != Visit::weigh) sums.value[0] += energy;
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));

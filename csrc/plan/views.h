@@ -249,7 +249,7 @@ struct ContactGradientsCall {
   AdjointSystemCall<T, P> step;   // whose outputs are not written
   const T* multiplier = nullptr;  // [batch, vertices, 3] each
   const T* elastic = nullptr;     // elastic Hessian times the multiplier
-  // of every vertex, by the columns of plan/material.def; zeros where it touches nothing
+  // of every vertex, by the columns of plan/material.def; zeros where it touches nothing; null where nobody wants them
   T* planes = nullptr;   // [batch, vertices, planes, plane_numbers]
   T* spheres = nullptr;  // [batch, vertices, spheres, sphere_numbers]
 };

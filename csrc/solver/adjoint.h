@@ -39,6 +39,7 @@ struct HeldVertex {
   // off the normals that hold it
   Mat3<T> projector = {{{T(1), T(0), T(0)}, {T(0), T(1), T(0)}, {T(0), T(0), T(1)}}};
   bool stuck = false;  // friction holds it
+  int sticks_to = -1;  // that of this contact, the last if there are several
   T carried = T(1);    // and it goes so far as its start does, along the surface
   T curvature = T(0);  // of the surface that it slides on, times the push
   int contacts = 0;    // that hold it
@@ -46,21 +47,23 @@ struct HeldVertex {
   T first_friction = T(0);
   Vec3<T> slides[slide_count] = {};
 
-  // Returns whether it is held along a normal that earlier contacts do not span.
+  // Returns whether it is held along a normal that earlier contacts do not span; where they have put it out of one that they span,
+  // that does nothing any more.
   PD_HD bool touch(const ContactAt<T>& contact) {
     const Vec3<T>&normal = contact.normal, &motion = contact.motion;
     const T friction = contact.friction, curved = contact.curved;
     const T push = dot(residual, normal);
     if (!(push > T(0) && contact.gap < push / diagonal)) return false;
+    // so that all together are a projector
+    const Vec3<T> left = projector * normal;
+    const T size = dot(left, left);
+    if (!(size > T(spanned))) return false;
+    projector = take_off(projector, left, T(1) / size);
     const Vec3<T> slip = tangential(moved - motion, normal);
     const T slipped = square_root(dot(slip, slip));
     const bool sticks = friction > T(0) && holds(slipped, friction * push);
     stuck = stuck || sticks;
-    // what earlier contacts leave of the normal, so that all together are a projector
-    const Vec3<T> left = projector * normal;
-    const T size = dot(left, left);
-    const bool adds = size > T(spanned);
-    if (adds) projector = take_off(projector, left, T(1) / size);
+    if (sticks) sticks_to = contact.number;
     curvature = multiply_add(push, curved, curvature);
     for (Vec3<T>& of : slides) of = {T(0), T(0), T(0)};
     ++contacts;
@@ -76,7 +79,7 @@ struct HeldVertex {
     } else if (contacts == 2 && curvature == T(0)) {
       slide_along_edge(normal, friction);
     }
-    return adds;
+    return true;
   }
 
   // what friction can take back in one iteration is more than what has slipped
@@ -100,8 +103,7 @@ struct HeldVertex {
     const Vec3<T> rub = multiply_add(friction, second, first_friction * first);
     const Vec3<T> slip = projector * moved;
     const T slipped = square_root(dot(slip, slip)), force = dot(rub, residual);
-    // the same plane twice, or smooth ones
-    if (!(share < T(1 / spanned) && force > T(0))) return;
+    if (!(force > T(0))) return;  // smooth ones
     stuck = stuck || holds(slipped, force);
     if (stuck) return;
     slides[slide_along] = (T(1) / slipped) * slip;

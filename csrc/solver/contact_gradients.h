@@ -1,11 +1,11 @@
 // What a solved adjoint says of the contacts that hold a vertex: dL/dp = -l . dr/dp - lambda . dgap/dp for all that a plane or a
-// ball is made of. The system stands in torchpd/sliding.py; beside it are the gaps, 0 = n_k . x' - height or |x' - center| - radius,
+// ball is made of. The system stands in torchpd/sliding.py; beside it are the gaps, n_k . x' - height or |x' - center| - radius,
 // whose multipliers balance what the tangential directions leave of the loss,
 //
 //   lambda_k = m_k . q,   q = dL/dx' + dL/dv' / h - H l,   m_k dual to the normals: m_k . n_j = 1 for k = j, else 0.
 //
 // Normals turn with a plane's own and with a ball's center. What multiplies their turning, n the normal, y, d, Q and kappa as
-// there, w the way of the vertex against the contact's, P w = s, and pi_k = m_k . r how hard they push (lambda x' of a plane alone):
+// there, w the way of the vertex against the contact's, P w = s, and pi_k = m_k . r how hard they push (lambda x' of planes alone):
 //
 //   one that holds by friction    (n . w) q - lambda x'; on a ball it ends at center + R (x + m - center) / |x + m - center|
 //   one that does not             pi y + mu^2 pi (d . l) d + kappa (n . w) Q y - lambda x'
@@ -27,9 +27,10 @@ class ContactGradients {
       // three span all others, but for rounding
       if (count_ < 3) by_[count_++] = contact;
     });
-    clear();
-    if (count_ == 0) return;
     const Vec3<T> l = vertex_.read(call_.multiplier);
+    // where an environment is lost, l has no numbers and nothing touches
+    clear(T(0) * ((l.x + l.y) + l.z));
+    if (count_ == 0) return;
     // what several let through of the curvature of one is in H, along all directions
     const T inertia = weight - (count_ > 1 ? held.curvature : T(0));
     const Vec3<T> q = subtract_product(vertex_.asked() - vertex_.read(call_.elastic), inertia, l);
@@ -50,15 +51,16 @@ class ContactGradients {
     return contact.number < call_.step.material.planes_count;
   }
 
-  PD_HD void clear() const {
+  PD_HD void clear(T none) const {
     const Material<T>& m = call_.step.material;
-    for (int n = 0; n < plane_numbers * m.planes_count; ++n) plane(0)[n] = T(0);
-    for (int n = 0; n < sphere_numbers * m.spheres_count; ++n) sphere(0)[n] = T(0);
+    for (int n = 0; call_.planes && n < plane_numbers * m.planes_count; ++n) plane(0)[n] = none;
+    for (int n = 0; call_.spheres && n < sphere_numbers * m.spheres_count; ++n) sphere(0)[n] = none;
   }
 
   // The columns of a contact; a ball has its center where a plane has its normal.
   PD_HD void write(const ContactAt<T>& contact, const Vec3<T>& first, T offset, T friction,
                    const Vec3<T>& motion) const {
+    if (!(is_plane(contact) ? call_.planes : call_.spheres)) return;
     T* const to = is_plane(contact) ? plane(contact.number)
                                     : sphere(contact.number - call_.step.material.planes_count);
     to[0] = first.x;
@@ -95,7 +97,9 @@ class ContactGradients {
     }
     const Vec3<T> y = tangential(l, n), slip = tangential(w, n);
     const T slipped = square_root(dot(slip, slip));
-    const Vec3<T> d = (slipped > T(0) ? T(1) / slipped : T(0)) * slip;
+    // of what rests on a smooth surface rounding would tell which way it slips
+    const bool slides = by.friction > T(0) || !held.holds(slipped, push);
+    const Vec3<T> d = (slipped > T(0) && slides ? T(1) / slipped : T(0)) * slip;
     const T back = dot(d, l), rub = by.friction * push;
     // across is the third direction, times the square root of kappa
     const Vec3<T>& across = held.slides[slide_across];
@@ -131,7 +135,7 @@ class ContactGradients {
       Vec3<T> turning = push * tangential(l, by.normal);
       if (edge)
         turning = turning - (k == 0 ? cross(by_[1].normal, turns) : cross(turns, by_[0].normal));
-      const bool carries = held.stuck && by.friction > T(0);
+      const bool carries = held.stuck && by.number == held.sticks_to;
       const Vec3<T> motion = (carries ? T(1) : T(0)) * (held.projector * q);
       write_turning(held, by, turning, lambda, edge ? -push * dot(d, l) : T(0), motion);
     }
