@@ -129,7 +129,7 @@ def test_shared_memory_of_a_cluster() -> None:
 
 def test_number_of_patches() -> None:
     """As many for a grid as leave each its least number of tetrahedra, as few for a stream as leave none too many."""
-    small, large = values_of((6, 6, 6)), values_of((13, 12, 11))
+    small, large = values_of((6, 6, 6)), values_of((13, 11, 10))
     for dtype in REAL:
         assert choose_plan(small, dtype, H100, "block").patches == 1
         grid, tets = choose_plan(small, dtype, H100, "grid").patches, len(small.tets)
@@ -144,10 +144,9 @@ def test_number_of_patches() -> None:
         assert choose_plan(small, dtype, H100._replace(multiprocessors=9), "cluster").patches == 9
         stream, tets = choose_plan(large, dtype, H100, "stream").patches, len(large.tets)
         assert stream > 1
-        most = regimes._STREAM_TETS[dtype] * (regimes._PIPED_MORE if dtype is torch.float32 else 1)
-        assert tets / stream <= most < tets / (stream - 1)
+        assert tets / stream <= regimes._STREAM_TETS[dtype] < tets / (stream - 1)
         # on a GPU that runs fewer at once, the last wave of patches is as full as the others
-        few = Properties(2, 232_448)  # two patches at once
+        few = Properties(1 if dtype is torch.float32 else 2, 166_912)  # two patches at once
         assert stream % 2 == 1
         assert choose_plan(large, dtype, few, "stream").patches == stream + 1
     one = pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e5)).values()
@@ -162,21 +161,23 @@ def test_number_of_patches() -> None:
 
 
 def test_patches_of_a_pipeline_are_larger() -> None:
-    """Of float32, without contacts, where two of them fit the shared memory of a block."""
+    """Of float32, without contacts, where a block has room for two of them and every multiprocessor has one."""
     free, touching = values_of((13, 12, 11)), values_of((13, 12, 11), pd.Ground(-1.0))
-    small = H100._replace(shared=166_912)  # compute capability 8.0
-    found = {
-        (name, gpu.shared): choose_plan(values, torch.float32, gpu, "stream").patches
-        for gpu in (H100, small)
-        for name, values in (("free", free), ("touching", touching))
-    }
+    few = H100._replace(multiprocessors=1)
+    small = few._replace(shared=166_912)  # compute capability 8.0
+
+    def patches(values: SceneValues, gpu: Properties) -> int:
+        return choose_plan(values, torch.float32, gpu, "stream").patches
+
     tets = len(free.tets)
     fewer, more = -(-tets // 2304), -(-tets // regimes._STREAM_TETS[torch.float32])
     assert fewer < more
-    assert found.pop(("free", H100.shared)) == fewer
-    assert set(found.values()) == {more}
+    assert patches(free, few) == fewer
+    assert {patches(free, H100), patches(free, small), patches(touching, few)} == {more}
+    # as many as there are multiprocessors rather than fewer larger ones
+    assert patches(free, few._replace(multiprocessors=more - 1)) == more - 1
     # their slots are what bringers hold at once (csrc/cuda/pipeline.h), and two fit
-    plan = choose_plan(values_of((40, 12, 12)), torch.float32, H100, "stream")
+    plan = choose_plan(values_of((40, 12, 12)), torch.float32, few, "stream")
     assert plan.size("most_slots") <= 640
     half = 24 * plan.size("most_slots") + 12 * plan.size("most_entries")
     assert 2 * half <= regimes._PIPED_BYTES

@@ -53,7 +53,8 @@ _LEVELS = ("few", "any", "many")  # how many environments it is for
 _STREAM_TETS = {torch.float32: 1920, torch.float64: 960}
 _STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
 # so many times as many in a pipeline, of which a multiprocessor works on one at a time and holds two, where there is so
-# much shared memory for them: their slots are what its threads have in registers at once (csrc/cuda/pipeline.h)
+# much shared memory for them and every multiprocessor has one: their slots are what its threads have in registers at
+# once (csrc/cuda/pipeline.h)
 _PIPED_MORE, _PIPED_BYTES = 1.2, 200_000
 _MOST_FIELDS = 2  # of a pass: the products with a second derivative
 
@@ -124,10 +125,12 @@ class _Scene(NamedTuple):
                 return max(2, int(least), -(-self.tets // _MANY_TETS))
             rounds = -(-int(least) // gpu.multiprocessors)
             return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
-        large = self.has_large_halves(gpu)
-        patches = math.ceil(self.tets / (_STREAM_TETS[self.dtype] * (_PIPED_MORE if large else 1)))
+        patches = -(-self.tets // _STREAM_TETS[self.dtype])
         # what does not run at once runs in whole waves, of which the last is full too
-        wave = gpu.multiprocessors * (1 if large else _STREAM_TOGETHER[self.dtype])
+        wave = _STREAM_TOGETHER[self.dtype] * gpu.multiprocessors
+        if self.has_large_halves(gpu) and patches > gpu.multiprocessors:
+            wave = gpu.multiprocessors
+            patches = max(wave, math.ceil(self.tets / (_PIPED_MORE * _STREAM_TETS[self.dtype])))
         return patches if patches <= wave else -(-patches // wave) * wave
 
     def has_large_halves(self, gpu: Properties) -> bool:
