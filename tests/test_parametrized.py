@@ -12,6 +12,8 @@ from torch.nn.utils import parametrize
 
 import torchpd as pd
 
+ONE = [pd.Chebyshev()]  # which of several is the fastest may differ from one time to the next
+
 
 class Exponential(torch.nn.Module):
     def forward(self, logarithm: Tensor) -> Tensor:
@@ -197,14 +199,14 @@ def test_tuning_asks_for_no_new_optimiser() -> None:
     places = sim.pin_targets.detach().expand(6, -1, 3).contiguous()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        promise = sim.tune(error=1e-2, targets=places)
+        promise = sim.tune(error=1e-2, targets=places, candidates=ONE)
     assert all(now is then for now, then in zip((sim.stiffness, sim.pin_targets), learned, strict=True))
     assert all(array.requires_grad for array in learned)
     made = simulator()
     made.set_material(stiffness=sim.stiffness.detach())
     for name, how in (("stiffness", Exponential()), ("pin_targets", torch.nn.Identity())):
         parametrize.register_parametrization(made, name, how)
-    again = made.tune(error=1e-2, targets=places)
+    again = made.tune(error=1e-2, targets=places, candidates=ONE)
     assert again.studied_error == pytest.approx(promise.studied_error, rel=1e-6)
     assert all(parametrize.is_parametrized(made, name) for name in ("stiffness", "pin_targets"))
     assert torch.allclose(made.stiffness, sim.stiffness, rtol=1e-14)

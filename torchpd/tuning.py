@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .accuracy import ExactStep, exact_steps, settled_steps
+from .accuracy import ROUNDINGS, ExactStep, exact_steps, settled_steps
 from .automatic import runs
 from .checks import check_has_values, check_scalar, check_whole
 from .contenders import safe_solvers
@@ -425,8 +425,10 @@ def _residual_limit(study: _Study, trials: list[Trial], promised: float) -> tupl
     asked = [chosen, *sorted(breaking, key=study.worst)[:1]]
     limits = [max(trial.residuals) * promised / study.worst(trial) for trial in asked if study.worst(trial) > 0.0]
     ratios = [e / r for trial in asked for e, r in zip(study.visible(trial), trial.residuals, strict=True) if r > 0.0]
-    # the studied states themselves keep the promise, and so do others like them
-    return max(min(limits, default=0.0), SAFETY * max(chosen.residuals)), max(ratios, default=0.0)
+    # The studied states themselves keep the promise, and so do others like them. Residuals of nothing but rounding
+    # scatter more, and the promise grants more of it than the study.
+    like = SAFETY if study.worst(chosen) > 0.0 else ROUNDINGS / _STUDIED_ROUNDINGS
+    return max(min(limits, default=0.0), like * max(chosen.residuals)), max(ratios, default=0.0)
 
 
 def _promise(
