@@ -34,16 +34,16 @@ from torchpd.patch_mesh import grid
 def test_field_is_the_same_with_every_patch_tried(
     reading: str, cones: bool, dtype: torch.dtype, device: torch.device
 ) -> None:
-    """10,000 rays, half of them grazing a ball of bumps, from outside and from within it, in two poses."""
+    """4,000 rays, half of them grazing a ball of bumps, from outside and from within it, in two poses."""
     mesh = ball()
     made = pd.FreeFormPatches.from_mesh(mesh, quadrics_on(mesh, 30), dtype=F64, thickness=0.02)
     patches = made.to(device=device, dtype=dtype)
-    o, d = towards_ball(10_000)
+    o, d = towards_ball(4_000)
     rng = np.random.default_rng(4)
-    closest = torch.tensor(rng.uniform(0.9, 1.15, (5000, 1)))
-    across = unit(torch.linalg.cross(o[:5000], d[:5000]))
-    d[:5000] = closest * unit(torch.linalg.cross(across, o[:5000])) - o[:5000]
-    o[9000:] *= 0.3
+    closest = torch.tensor(rng.uniform(0.9, 1.15, (2000, 1)))
+    across = unit(torch.linalg.cross(o[:2000], d[:2000]))
+    d[:2000] = closest * unit(torch.linalg.cross(across, o[:2000])) - o[:2000]
+    o[3600:] *= 0.3
     positions = torch.stack([patches.vertices, 1.1 * patches.vertices + 0.01 * patches.vertices.roll(1, 0)])
     W = patches.quadrics.normalized_matrices()
     if cones:  # unbounded: [x^2 + y^2 - z^2]_+ around each centre
