@@ -176,7 +176,8 @@ def test_many_contacts_do_not_stall_it(solver: pd.Multilevel) -> None:
     found, back = after(solver, 256)
     jacobi = error(after(pd.Chebyshev(), 256)[0])
     if solver == pd.Multilevel():
-        # which trials fail hangs on rounding: 2.6 times nearer on a processor with AVX2, more than 4 with AVX-512
+        # Which trials fail hangs on rounding, and the error falls by a factor of 400 from iteration 128 to 512: starts
+        # that differ by 1e-12 m end 2.2 to 7.4 times nearer than Jacobi.
         assert error(found) < jacobi / 2
         assert error(after(solver, 64)[0]) < 0.15
         assert back < 128
