@@ -25,14 +25,12 @@ __all__ = [
     "environments_of_material",
     "fingerprint",
     "material_of",
+    "real_tensor",
 ]
 
 MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
 # What users look for by the names of scenes.
 PARTS_OF_ROWS = {
-    "friction": "friction is planes[..., 4] and spheres[..., 4]",
-    "height": "the height of a ground is planes[..., 3]",
-    "radius": "the radius of a sphere is spheres[..., 3]",
     "density": "masses are of vertices [kg], a density times their share of volume",
     "youngs": "stiffness is Young's modulus of each tetrahedron [Pa]",
 }
@@ -86,17 +84,22 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
         _require(tensor[..., 4] >= 0, f"{full}: friction (column 4)", ">= 0", tensor)
 
 
-def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Tensor:
-    """What is to replace the array `own` of a simulator, in its precision and on its device."""
-    row = MATERIAL_ROWS[name]
+def real_tensor(owner: str, name: str, value: Tensor | float) -> Tensor:
+    """A tensor of real numbers that are there; on the CPU what is none yet."""
     try:
-        tensor = (value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")).detach()
+        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{owner}: {name} must be a number or a tensor, got {value!r}") from None
     if tensor.is_complex() or tensor.dtype == torch.bool:
         raise TypeError(f"{owner}: {name} must hold real numbers, got {tensor.dtype}")
     if tensor.layout != torch.strided or tensor.is_meta:
         raise TypeError(f"{owner}: {name} must be dense and have values, got {tensor.layout} on {tensor.device}")
+    return tensor
+
+
+def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Tensor:
+    """What is to replace the array `own` of a simulator, in its precision and on its device."""
+    row, tensor = MATERIAL_ROWS[name], real_tensor(owner, name, value).detach()
     tensor = tensor.to(dtype=own.dtype, device=own.device)
     shape = tuple(own.shape[own.dim() - row.dims :])
     alone = tensor.dim() == 0

@@ -12,6 +12,7 @@ from torch.nn.utils.parametrize import is_parametrized
 
 from .checks import check_has_values
 from .material import MATERIAL_ROWS, PARTS_OF_ROWS, check_array, check_batches
+from .material_parts import COLUMNS, whole_arrays
 from .multilevel import has_levels, has_strangers
 from .parametrized import invert, parametrization
 from .placing import plan_for_solver
@@ -40,9 +41,11 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
     """What `set_material` and loading do, for whom errors name."""
     check_has_values(owner, sim.device)
     for name in arrays:
-        if name not in MATERIAL_ROWS:
+        if name not in MATERIAL_ROWS and name not in COLUMNS:
+            names = ", ".join([*MATERIAL_ROWS, *COLUMNS])
             part_of = f"; {PARTS_OF_ROWS[name]}" if name in PARTS_OF_ROWS else ""
-            raise TypeError(f"{owner}: no array {name!r}; there are {', '.join(MATERIAL_ROWS)}{part_of}")
+            raise TypeError(f"{owner}: no array {name!r}; there are {names}{part_of}")
+    arrays = whole_arrays(sim, owner, arrays)
     checked = {name: check_array(owner, name, value, getattr(sim, name)) for name, value in arrays.items()}
     for name, value in arrays.items():
         if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:

@@ -272,10 +272,13 @@ class Model(nn.Module):
         Args:
             arrays: by name, see `Simulator`; one number is for all elements, vertices or pins of `stiffness`, `masses`
                 or `pin_stiffness`. It counts as it is: where tetrahedra are partly full (`mesh.fill`) multiply
-                `sim.stiffness` instead. Shapes and values are checked here, once, and that batches agree with each
-                other and with those of the arrays that stay. Pins that hold others, or much harder, make the matrix of
-                `Multilevel` anew, see `prepare_solver`; a captured step wants to be captured again then. Where the
-                default iterations, or those of "auto", become far too few an `UnsolvedWarning` says so, once.
+                `sim.stiffness` instead. Columns of contacts have names too, to be given in place of `planes` and
+                `spheres`: `friction` [C + S] of grounds, then spheres, `height` [C] and `radius` [S] in m, each also
+                one number, or [B, 1] for all of an environment. Shapes and values are checked here, once, and that
+                batches agree with each other and with those of the arrays that stay. Pins that hold others, or much
+                harder, make the matrix of `Multilevel` anew, see `prepare_solver`; a captured step wants to be captured
+                again then. Where the default iterations, or those of "auto", become far too few an `UnsolvedWarning`
+                says so, once.
         """
         replace_material(self, "set_material", arrays)
 
