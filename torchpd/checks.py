@@ -25,6 +25,7 @@ __all__ = [
     "check_target_file",
     "check_vector",
     "check_whole",
+    "in_full",
     "of_each",
 ]
 
@@ -90,6 +91,13 @@ def check_like(name: str, value: Any, positions: torch.Tensor, meaning: str, *, 
         )
     if value.shape != positions.shape:
         raise ValueError(f"{name} must be {list(positions.shape)} {like} {list(value.shape)}{fix}")
+
+
+def in_full(value: Any, like: torch.Tensor) -> Any:
+    """Where autocast is on what it made less precise, in the precision of `like`, as torch's own ops of full precision
+    take it; anything else as it is."""
+    lesser = isinstance(value, torch.Tensor) and value.dtype in (torch.float16, torch.bfloat16)
+    return value.to(like.dtype) if lesser and torch.is_autocast_enabled(like.device.type) else value
 
 
 def of_each(value: Any, shape: torch.Size) -> Any:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from .checks import check_like, check_whole, of_each
+from .checks import check_like, check_whole, in_full, of_each
 from .state import State
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def check_state(sim: Model, state: State, *, forces: Tensor | None, fix: str) ->
     check_like("velocities", state[1], state[0], "m/s")
     if forces is None:
         return None
-    forces = of_each(forces, state[0].shape)
+    forces = of_each(in_full(forces, state[0]), state[0].shape)
     check_like("forces", forces, state[0], "N", fix=fix)
     return forces
 

@@ -66,6 +66,11 @@ class QuadricTransport:
             fallback: see `PatchTransport.gradients`.
         """
         self._check_kind()
+        # in the precision of the patches, also where autocast asks for less
+        with torch.autocast(self.patches.vertices.device.type, enabled=False):
+            return self._moved(positions, fallback)
+
+    def _moved(self, positions: Tensor, fallback: Tensor | None) -> Tensor:
         patches, q = self.patches, self.patches.quadrics
         first = patches.triangles[:, 0].long()[self._patch]
         G = self.transport.gradients(positions, fallback)[:, self._patch]  # [B, N, 3, 3] of every pair
@@ -120,8 +125,9 @@ def _shares(patches: FreeFormPatches) -> tuple[Tensor, Tensor, Tensor]:
     # middles of the cells of a triangle that is cut into _STEPS x _STEPS of them
     rows = [((3 * i + 1, 3 * j + 1), (3 * i + 2, 3 * j + 2)) for i in range(_STEPS) for j in range(_STEPS)]
     b = np.array([p for cell in rows for p in cell if sum(p) < 3 * _STEPS]) / (3 * _STEPS)
-    places = torch.as_tensor(np.column_stack([1.0 - b.sum(1), b])).to(corners) @ corners[patch]
-    y = torch.einsum("nij,nkj->nki", q.triangular()[number], places - q.centres[number][:, None])
+    with torch.autocast(corners.device.type, enabled=False):
+        places = torch.as_tensor(np.column_stack([1.0 - b.sum(1), b])).to(corners) @ corners[patch]
+        y = torch.einsum("nij,nkj->nki", q.triangular()[number], places - q.centres[number][:, None])
     bump = (1.0 - y.square().sum(2)).clamp_min(0.0).pow(3).mean(1) * areas[patch]
     # one that no triangle reaches goes by those that it touches, else by the nearest
     total = torch.zeros_like(q.amplitudes).index_add_(0, number, bump)

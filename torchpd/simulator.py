@@ -96,6 +96,9 @@ class Simulator(Model):
     ) -> State | tuple[State, Info]:
         """One time step.
 
+        Within `torch.autocast` forces and targets of a lesser precision are brought to the simulator's, in which it
+        works there, too.
+
         Args:
             state: positions and velocities [B, V, 3] [m, m/s].
             forces: on the vertices [B, V, 3] [N], or [V, 3] or [1, V, 3] for all environments; constant during the

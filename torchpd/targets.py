@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .checks import in_full
 from .scene import Scene
 
 __all__ = ["Anchors", "Targets"]
@@ -81,9 +82,11 @@ class Anchors:
             raise ValueError(
                 f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}{fix}"
             )
+        value = in_full(value, like)
         if value.dtype != like.dtype or value.device != like.device:
             raise TypeError(f"{name} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}")
-        return value
+        checked: Tensor = value
+        return checked
 
     def _row(self, spheres: Tensor, number: int, value: Tensor, time_step: float) -> Tensor:
         """Centre at the end of the step, radius, friction, motion during the step."""
