@@ -6,6 +6,7 @@ import copy
 import math
 import pickle
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from tuning_cases import bar, swinging, worst_error
 import torchpd as pd
 from torchpd import tuning
 from torchpd.accuracy import exact_steps
-from torchpd.promise import Promise
+from torchpd.promise import Promise, Trial
 from torchpd.tuning import TuningWarning
 
 
@@ -153,6 +154,17 @@ def test_a_promise_for_a_time_is_watched_as_well(dtype: torch.dtype, monkeypatch
     info = sim(state, return_info=True)[1]
     assert not bool(promise.holds(info))
     assert float(promise.estimate(info)) > promise.error
+
+
+@pytest.mark.parametrize(("left", "limit"), [(0.0, 5.0), (4.0, 2.0)], ids=["rounding", "hidden by it"])
+def test_residuals_of_rounding_may_be_larger(left: float, limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In units of a rounding: the study allows two, the promise ten. What rounding only hides is no rounding."""
+    monkeypatch.setattr(tuning._Study, "roundings", [10.0])
+    study = object.__new__(tuning._Study)
+    object.__setattr__(study, "exact", [SimpleNamespace(uncertainty=0.0)])
+    chosen = Trial(pd.Chebyshev(), 20, left, (1.0,), (left,))
+    breaks = Trial(pd.Chebyshev(), 10, 22.0, (4.0,), (22.0,))
+    assert tuning._residual_limit(study, [breaks, chosen], 10.0) == (limit, 5.5)
 
 
 def test_an_audit_is_told_where_pins_are() -> None:

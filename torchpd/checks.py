@@ -94,10 +94,12 @@ def check_like(name: str, value: Any, positions: torch.Tensor, meaning: str, *, 
 
 
 def in_full(value: Any, like: torch.Tensor) -> Any:
-    """Where autocast is on what it made less precise, in the precision of `like`, as torch's own ops of full precision
-    take it; anything else as it is."""
-    lesser = isinstance(value, torch.Tensor) and value.dtype in (torch.float16, torch.bfloat16)
-    return value.to(like.dtype) if lesser and torch.is_autocast_enabled(like.device.type) else value
+    """What autocast made half as precise, in the precision of `like`, as torch's ops of full precision take it.
+
+    Anything else, and where autocast is not on, as it is.
+    """
+    half = isinstance(value, torch.Tensor) and value.dtype in (torch.float16, torch.bfloat16) and not value.is_meta
+    return value.to(like.dtype) if half and torch.is_autocast_enabled(value.device.type) else value
 
 
 def of_each(value: Any, shape: torch.Size) -> Any:

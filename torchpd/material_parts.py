@@ -47,7 +47,7 @@ def _values(sim: Model, owner: str, name: str, value: Tensor | float, rows: Mapp
     if count == 0:
         raise ValueError(f"{owner}: {name} is of {things}, and the scene has none")
     tensor = real_tensor(owner, name, value)
-    if tensor.dim() > 2 or (tensor.dim() > 0 and tensor.shape[-1] not in (1, count)):
+    if tensor.dim() > 2 or tensor.numel() == 0 or (tensor.dim() > 0 and tensor.shape[-1] not in (1, count)):
         raise ValueError(
             f"{owner}: {name} must be [{count}], or with a batch in front, got {list(tensor.shape)}; {things} of the "
             f"scene: {count}"

@@ -322,7 +322,8 @@ def _rotation_backward(ctx: Any, grad: Tensor) -> Tensor:
 
 
 def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    with torch.enable_grad():
+    # in the precision of F, also where autocast asks for less
+    with torch.enable_grad(), torch.autocast(grad.device.type, enabled=False):
         inputs = [saved.detach().requires_grad_() for saved in ctx.saved_tensors]
         grads: tuple[Tensor | None, ...] = torch.autograd.grad(_rotation_differential(*inputs), inputs, grad)
     return grads

@@ -18,6 +18,7 @@ from . import patch_ops  # noqa: F401  (registers the ops)
 from .patch_mesh import grid, tessellate, weld
 from .patches import FreeFormPatches, PatchPose, PatchSamples, SurfacePoints, check_pose
 from .quadrics import dimensions, matrix_sets
+from .small_matrices import product
 
 if TYPE_CHECKING:
     from .patch_image import PatchImage
@@ -271,7 +272,7 @@ def _fine_enough(patches: FreeFormPatches) -> int:
     corners = patches.vertices.detach()[patches.triangles.long()][patch]
     edges = corners - corners.roll(1, dims=1)
     M = patches.quadrics.triangular().detach()[quadric]
-    return min(_FINEST, max(4, math.ceil(2.0 * float((edges @ M.mT).norm(dim=2).max()))))
+    return min(_FINEST, max(4, math.ceil(2.0 * float(product(edges, M.mT).norm(dim=2).max()))))
 
 
 def _cells(patches: FreeFormPatches, level: int) -> tuple[Any, Any, Any]:

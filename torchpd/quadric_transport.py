@@ -11,6 +11,7 @@ from .ops import nearest_rotation
 from .patch_lists import corner_lists
 from .patch_transport import PatchTransport
 from .patches import FreeFormPatches
+from .small_matrices import inverse, product
 
 __all__ = ["QuadricTransport"]
 
@@ -66,24 +67,19 @@ class QuadricTransport:
             fallback: see `PatchTransport.gradients`.
         """
         self._check_kind()
-        # in the precision of the patches, also where autocast asks for less
-        with torch.autocast(self.patches.vertices.device.type, enabled=False):
-            return self._moved(positions, fallback)
-
-    def _moved(self, positions: Tensor, fallback: Tensor | None) -> Tensor:
         patches, q = self.patches, self.patches.quadrics
         first = patches.triangles[:, 0].long()[self._patch]
         G = self.transport.gradients(positions, fallback)[:, self._patch]  # [B, N, 3, 3] of every pair
         offset = q.centres[self._quadric] - patches.vertices[first]
-        moved = positions[:, first] + (G @ offset[..., None])[..., 0]
+        moved = positions[:, first] + product(G, offset[..., None])[..., 0]
         mean = self._mean(torch.cat([G.flatten(2), moved], dim=2))
         centres = mean[..., 9:]
-        inverse = torch.linalg.inv(self._clamped(mean[..., :9].unflatten(2, (3, 3))))
+        back = inverse(self._clamped(mean[..., :9].unflatten(2, (3, 3))))
         # T^-1, which takes a point of the pose back: x -> A^-1 (x - c') + c
-        back = torch.cat([inverse, (q.centres - (inverse @ centres[..., None])[..., 0])[..., None]], dim=3)
+        back = torch.cat([back, (q.centres - product(back, centres[..., None])[..., 0])[..., None]], dim=3)
         last = back.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*back.shape[:2], 1, 4)
         back = torch.cat([back, last], dim=2)
-        return back.mT @ q.normalized_matrices() @ back
+        return product(product(back.mT, q.normalized_matrices()), back)
 
     def _mean(self, of_pairs: Tensor) -> Tensor:
         """Weighted means over the pairs of every quadric, [B, N, C] to [B, Q, C], in the order of pairs."""
@@ -125,9 +121,8 @@ def _shares(patches: FreeFormPatches) -> tuple[Tensor, Tensor, Tensor]:
     # middles of the cells of a triangle that is cut into _STEPS x _STEPS of them
     rows = [((3 * i + 1, 3 * j + 1), (3 * i + 2, 3 * j + 2)) for i in range(_STEPS) for j in range(_STEPS)]
     b = np.array([p for cell in rows for p in cell if sum(p) < 3 * _STEPS]) / (3 * _STEPS)
-    with torch.autocast(corners.device.type, enabled=False):
-        places = torch.as_tensor(np.column_stack([1.0 - b.sum(1), b])).to(corners) @ corners[patch]
-        y = torch.einsum("nij,nkj->nki", q.triangular()[number], places - q.centres[number][:, None])
+    places = product(torch.as_tensor(np.column_stack([1.0 - b.sum(1), b])).to(corners), corners[patch])
+    y = product(places - q.centres[number][:, None], q.triangular()[number].mT)
     bump = (1.0 - y.square().sum(2)).clamp_min(0.0).pow(3).mean(1) * areas[patch]
     # one that no triangle reaches goes by those that it touches, else by the nearest
     total = torch.zeros_like(q.amplitudes).index_add_(0, number, bump)

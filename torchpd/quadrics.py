@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .small_matrices import product
+
 __all__ = ["Quadrics", "check_real_tensor", "dimensions", "matrix_sets"]
 
 _LOWER = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))  # entries of M in the order of `factors`
@@ -136,11 +138,9 @@ class Quadrics:
     def normalized_matrices(self) -> Tensor:
         """W [Q, 4, 4] with the value 1 at the centre: R(x) = a [(x, 1)^T W (x, 1)]_+^3."""
         m = self.triangular()
-        # in this precision, also where autocast asks for less
-        with torch.autocast(m.device.type, enabled=False):
-            A = m.mT @ m
-            Ac = A @ self.centres[:, :, None]
-            corner = 1.0 - self.centres[:, None, :] @ Ac
+        A = product(m.mT, m)
+        Ac = product(A, self.centres[:, :, None])
+        corner = 1.0 - product(self.centres[:, None, :], Ac)
         return torch.cat([torch.cat([-A, Ac], dim=2), torch.cat([Ac.mT, corner], dim=2)], dim=1)
 
     def entries(self) -> Tensor:
@@ -157,9 +157,8 @@ class Quadrics:
     def values(self, points: Tensor) -> Tensor:
         """R_i [..., Q] of each quadric at points [..., 3], in plain torch."""
         _check_points(points, self.centres.dtype)
-        with torch.autocast(points.device.type, enabled=False):
-            y = torch.einsum("qij,...qj->...qi", self.triangular(), points[..., None, :] - self.centres)
-        return self.amplitudes * (1.0 - y.square().sum(-1)).clamp_min(0.0) ** 3
+        y = product(self.triangular(), (points[..., None, :] - self.centres)[..., None])
+        return self.amplitudes * (1.0 - y[..., 0].square().sum(-1)).clamp_min(0.0) ** 3
 
     def to(self, *args: Any, **kwargs: Any) -> Quadrics:
         """The same on another device or in another precision, as `Tensor.to`."""

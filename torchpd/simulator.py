@@ -96,8 +96,7 @@ class Simulator(Model):
     ) -> State | tuple[State, Info]:
         """One time step.
 
-        Within `torch.autocast` forces and targets of a lesser precision are brought to the simulator's, in which it
-        works there, too.
+        Within `torch.autocast`, which changes no number of it, forces may be of half precision.
 
         Args:
             state: positions and velocities [B, V, 3] [m, m/s].

@@ -425,9 +425,10 @@ def _residual_limit(study: _Study, trials: list[Trial], promised: float) -> tupl
     asked = [chosen, *sorted(breaking, key=study.worst)[:1]]
     limits = [max(trial.residuals) * promised / study.worst(trial) for trial in asked if study.worst(trial) > 0.0]
     ratios = [e / r for trial in asked for e, r in zip(study.visible(trial), trial.residuals, strict=True) if r > 0.0]
-    # The studied states themselves keep the promise, and so do others like them. Residuals of nothing but rounding
-    # scatter more, and the promise grants more of it than the study.
-    like = SAFETY if study.worst(chosen) > 0.0 else ROUNDINGS / _STUDIED_ROUNDINGS
+    # The studied states themselves keep the promise, and so do others like them. Where nothing but rounding was left
+    # residuals scatter more, and the promise grants more of it than the study.
+    rounded = all(error <= step.uncertainty for error, step in zip(chosen.errors, study.exact, strict=True))
+    like = ROUNDINGS / _STUDIED_ROUNDINGS if rounded else SAFETY
     return max(min(limits, default=0.0), like * max(chosen.residuals)), max(ratios, default=0.0)
 
 
