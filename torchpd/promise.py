@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .accuracy import ROUNDINGS
+from .course import course_of
 from .material import fingerprint
 from .solvers import Solver
 from .state import Info, State
@@ -104,9 +105,8 @@ class Promise:
         further = copy.copy(sim)
         further.iterations, further.tolerance = 3 * self.iterations, 0.0
         solved: Tensor = further(state, forces, targets, start=after[0])[1]
-        further.iterations = 0
-        first: Tensor = further(state, forces, targets)[1]
         # displacements over the time step are velocities
+        first = course_of(sim, state, targets) / self.time_step
         error = (solved - after[1]).flatten(1).norm(dim=1)
         rounding = ROUNDINGS * torch.finfo(self.dtype).eps * state[0].flatten(1).norm(dim=1) / self.time_step
         # a body at rest has no error

@@ -1,0 +1,49 @@
+"""Where the error of a step is measured from: h v, with pins where they are to be, and out of contacts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from .material import MATERIAL_ROWS
+from .state import State
+from .targets import Targets
+
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = ["course_of"]
+
+
+@torch.no_grad()
+def course_of(sim: Model, state: State, targets: Targets | None = None) -> Tensor:
+    """Displacements [B, V, 3] [m] of a step in which nothing is solved: x_0 - x of `Promise`, without friction.
+
+    As `torchpd.reference.StepProblem.course`. The iterations of a step start from where rigid motions lead from there.
+    """
+    x, moved = state[0], sim.time_step * state[1]
+    material = dict(zip(MATERIAL_ROWS, sim.material_at(targets, len(x)), strict=True))
+    free = torch.ones_like(x[..., :1], dtype=torch.bool)
+    if len(sim.plan.pin_vertex):
+        vertices = sim.plan.vertex_order[sim.plan.pin_vertex.long()].long()
+        hard = material["pin_stiffness"].isinf().expand(len(x), -1)[..., None]
+        held = torch.where(hard, material["pin_targets"] - x[:, vertices], moved[:, vertices])
+        moved, free = moved.index_copy(1, vertices, held), free.index_copy(1, vertices, ~hard)
+    headed = x + moved
+    places = headed
+    for row in material["planes"].unbind(-2):
+        places = _out_of(places, row[..., None, :3], (places * row[..., None, :3]).sum(-1) - row[..., 3:4])
+    for row in material["spheres"].unbind(-2):
+        # by the normal at where the vertices were headed
+        arms = headed - row[..., None, :3]
+        lengths = arms.norm(dim=-1, keepdim=True)
+        normals = torch.where(lengths > 0.0, arms / lengths, torch.eye(3, dtype=x.dtype, device=x.device)[1])
+        gaps = ((places - row[..., None, :3]) * normals).sum(-1) - row[..., 3:4]
+        places = _out_of(places, normals, gaps)
+    return torch.where(free, moved + (places - headed), moved)
+
+
+def _out_of(places: Tensor, normals: Tensor, gaps: Tensor) -> Tensor:
+    return places + (-gaps).clamp(min=0.0)[..., None] * normals
