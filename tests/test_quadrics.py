@@ -109,3 +109,12 @@ def test_other_refusals() -> None:
 def test_printed() -> None:
     assert repr(quadrics_on(ball(), 3)) == "Quadrics(3, float64, cpu)"
     assert len(pd.Quadrics.none()) == 0
+
+
+def test_matrices_of_amplitude_zero_have_a_gradient() -> None:
+    """Zero, where the cube root has an infinite slope."""
+    amplitudes = torch.tensor([0.0, 0.008], dtype=torch.float64, requires_grad=True)
+    centres, radii = torch.zeros(2, 3, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+    (slope,) = torch.autograd.grad(pd.Quadrics.from_radii(amplitudes, centres, radii).matrices()[0].sum(), amplitudes)
+    # W = a^(1/3) diag(-1, -1, -1, 1), whose sum is -2 a^(1/3)
+    torch.testing.assert_close(slope, torch.tensor([0.0, -2.0 / 3.0 * 0.2**-2], dtype=torch.float64))

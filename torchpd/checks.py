@@ -27,6 +27,7 @@ __all__ = [
     "check_whole",
     "in_full",
     "of_each",
+    "tensor_of",
 ]
 
 # ends errors of a rollout about its constant forces and targets
@@ -91,6 +92,11 @@ def check_like(name: str, value: Any, positions: torch.Tensor, meaning: str, *, 
         )
     if value.shape != positions.shape:
         raise ValueError(f"{name} must be {list(positions.shape)} {like} {list(value.shape)}{fix}")
+
+
+def tensor_of(array: NDArray[Any]) -> torch.Tensor:
+    """A tensor in the memory of an array, but of none where that is empty: torch.export cannot save such."""
+    return torch.from_numpy(np.ascontiguousarray(array)) if array.size else torch.from_numpy(array).clone()
 
 
 def in_full(value: Any, like: torch.Tensor) -> Any:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import _C
+from .checks import tensor_of
 from .plan import KERNELS, compiling, internal_numbers, loose_pieces
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
@@ -52,5 +53,5 @@ def compile_device_plan(
         arrays["pin_vertex"] = internal_numbers(arrays["vertex_order"])[values.pin_vertices]
         arrays["vertex_pin"] = np.full(len(values.rest_positions), -1, dtype=np.int32)
         arrays["vertex_pin"][arrays["pin_vertex"]] = np.arange(pins)
-    tensors = (torch.from_numpy(np.ascontiguousarray(arrays[row.name])) for row in DEVICE_PLAN_TABLE)
+    tensors = (tensor_of(arrays[row.name]) for row in DEVICE_PLAN_TABLE)
     return tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors)

@@ -22,7 +22,7 @@ from .warn import warn_user
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_keys", "ordinary", "replace_material"]
+__all__ = ["check_keys", "check_kinds", "ordinary", "replace_material"]
 
 _OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness")  # what decides how many iterations a step takes
 
@@ -37,8 +37,8 @@ def ordinary() -> Iterator[None]:
         yield
 
 
-def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float]) -> None:
-    """What `set_material` and loading do, for whom errors name."""
+def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False) -> None:
+    """What `set_material` and loading do, for whom errors name; `anew`: new parameters, nothing is written over."""
     check_has_values(owner, sim.device)
     for name in arrays:
         if name not in MATERIAL_ROWS and name not in COLUMNS:
@@ -61,8 +61,9 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
         parameters = {
             name: nn.Parameter(tensor.clone(), requires_grad=getattr(sim, name).requires_grad)
             for name, tensor in checked.items()
-            if tensor.shape != getattr(sim, name).shape
+            if anew or tensor.shape != getattr(sim, name).shape
         }
+        reshaped = [name for name, tensor in checked.items() if tensor.shape != getattr(sim, name).shape]
         # before anything is replaced, because it may fail
         plan = _plan_with(sim, checked)
         if sim.promise is not None and any(not torch.equal(new, getattr(sim, n)) for n, new in checked.items()):
@@ -78,7 +79,7 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
     sim.plan = plan
     if any(name in checked for name in _OF_THE_RATE):
         sim.judge_iterations(owner)
-    if learned := [name for name, parameter in parameters.items() if parameter.requires_grad]:
+    if learned := [name for name in reshaped if name in parameters and parameters[name].requires_grad]:
         warn_user(
             f"the simulator has a new parameter for {' and '.join(learned)}, of another batch, which an optimiser "
             "of the one before does not know: make the optimiser anew, or set the batch first"
@@ -101,6 +102,17 @@ def _held_everywhere(pin_stiffness: Tensor) -> Tensor:
     """Whether each pin holds exactly in all environments [P]."""
     hard = pin_stiffness.isinf()
     return hard.all(0) if hard.dim() == 2 else hard
+
+
+def check_kinds(sim: Model, owner: str, arrays: Mapping[str, Any]) -> None:
+    """Refuse what a simulator cannot keep as it is: tensors of another precision or device."""
+    for name, array in arrays.items():
+        own = getattr(sim, name)
+        if isinstance(array, Tensor) and (array.dtype, array.device) != (own.dtype, own.device):
+            raise TypeError(
+                f"{owner}: {name} must be {own.dtype} on {own.device} like the simulator, got {array.dtype} on "
+                f"{array.device}; without assign=True it is converted"
+            )
 
 
 def check_keys(sim: Model, state_dict: Mapping[str, Any], *, strict: bool) -> None:

@@ -13,7 +13,7 @@ from .automatic import AIM, Choice, choose_solver
 from .checks import check_has_values, check_whole
 from .forecast import FAR_TOO_FEW, warn_of_few_iterations
 from .material import MATERIAL_ROWS, material_of
-from .material_changes import check_keys, ordinary, replace_material
+from .material_changes import check_keys, check_kinds, ordinary, replace_material
 from .model_checks import check_batch, check_positive_number, check_state, check_tolerance, positions_of
 from .multilevel import has_levels
 from .placing import check_wanted_device, move_plan, plan_anew, plan_for_solver, plan_on
@@ -287,16 +287,29 @@ class Model(nn.Module):
 
         Material of another batch makes new parameters, as `set_material` does, with its warning.
 
-        As a part of another module the simulator is not asked whether names are missing; then torch's order holds.
+        As a part of another module the simulator is not asked whether names are missing; then torch's order holds, and
+        what does not fit is among the errors that torch reports together. With `assign` nothing is converted: arrays of
+        another precision are refused.
         """
         check_keys(self, state_dict, strict=strict)
         return super().load_state_dict(state_dict, strict, assign)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Checks values, and takes arrays of every environment where this simulator had shared ones."""
-        with torch.no_grad():
-            arrays = {n: state_dict[prefix + n] for n in MATERIAL_ROWS if prefix + n in state_dict}
-            replace_material(self, f"{type(self).__name__}.load_state_dict", arrays)
+        local_metadata, errors = rest[0], rest[-1]
+        assign = bool(local_metadata.get("assign_to_params_buffers", False))
+        owner = f"{type(self).__name__}.load_state_dict"
+        arrays = {n: state_dict[prefix + n] for n in MATERIAL_ROWS if prefix + n in state_dict}
+        try:
+            with torch.no_grad():
+                if assign:
+                    check_kinds(self, owner, arrays)
+                replace_material(self, owner, arrays, anew=assign)
+        except (TypeError, ValueError) as error:
+            if not prefix:
+                raise
+            errors.append(f"{prefix.removesuffix('.')}: {error}")
+            return
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def check_state(self, state: State, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:

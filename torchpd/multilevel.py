@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import _C
+from .checks import tensor_of
 from .diagonal import named_material, step_diagonal
 from .plan import Plan, compiling
 from .scene import SceneValues
@@ -113,7 +114,7 @@ def precondition_plan(
     if plan.kernel is not None:
         arrays["coarse_columns"] = _by_columns(arrays["coarse_factor"])
     levels = (
-        torch.from_numpy(arrays[row.name]).to(
+        tensor_of(arrays[row.name]).to(
             # the host reads sizes, and must not wait for a device
             device=None if row.rows.endswith("size") else plan.device,
             dtype=plan.dtype if row.type == "real" else None,

@@ -14,6 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from . import _C
+from .checks import tensor_of
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, PLAN_TABLE, PlanRow
 
@@ -198,5 +199,5 @@ def compile_plan(
     arrays["group_size"] = group_size
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
     arrays["sizes"] = _sizes(arrays, tets)
-    tensors = (torch.from_numpy(np.ascontiguousarray(arrays[row.name])) for row in PLAN_TABLE)
+    tensors = (tensor_of(arrays[row.name]) for row in PLAN_TABLE)
     return Plan(tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors))

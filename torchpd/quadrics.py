@@ -130,9 +130,11 @@ class Quadrics:
     def matrices(self) -> tuple[Tensor, Tensor]:
         """General form: symmetric W [Q, 4, 4] and signs [Q], with R(x) = sign [(x, 1)^T W (x, 1)]_+^3.
 
-        The inverse of `from_matrices`, but for quadrics of amplitude 0, whose W is 0.
+        The inverse of `from_matrices`, but for quadrics of amplitude 0, whose W is 0, without a gradient to it.
         """
-        scale = self.amplitudes.abs().pow(1.0 / 3.0)
+        # the cube root of 0 has an infinite slope
+        there = self.amplitudes != 0
+        scale = torch.where(there, torch.where(there, self.amplitudes, 1.0).abs().pow(1.0 / 3.0), 0.0)
         return scale[:, None, None] * self.normalized_matrices(), torch.where(self.amplitudes < 0, -1.0, 1.0).to(scale)
 
     def normalized_matrices(self) -> Tensor:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 __all__ = ["Info", "State", "Track"]
 
@@ -116,5 +117,7 @@ class Track(NamedTuple):
             raise IndexError(f"Track.state: {there}, got {record}") from None
 
 
-# torch.load refuses other classes; these hold tensors and run nothing of their own
+# torch.load refuses other classes, and torch.export.save wants names of them; these hold tensors and run nothing
 torch.serialization.add_safe_globals([Info, State, Track])
+for _kind in (Info, State, Track):
+    pytree._register_namedtuple(_kind, serialized_type_name=f"torchpd.{_kind.__name__}")
