@@ -108,6 +108,11 @@ def test_states_move_copy_and_detach() -> None:
     copied = state.clone()
     assert copied.positions.requires_grad
     assert copied.velocities.data_ptr() != state.velocities.data_ptr()
+    assert (
+        pd.State(*(part.transpose(0, 1) for part in (torch.ones(2, 3, 3), torch.ones(2, 3, 3))))
+        .clone()[0]
+        .is_contiguous()
+    )
     loose = state.detach()
     assert not loose.positions.requires_grad
     assert loose.positions.data_ptr() == state.positions.data_ptr()

@@ -25,8 +25,9 @@ class State(NamedTuple):
         return State(self.positions.to(*args, **kwargs), self.velocities.to(*args, **kwargs))
 
     def clone(self) -> State:
-        """A copy that `step_` may overwrite, as `Tensor.clone`."""
-        return State(self.positions.clone(), self.velocities.clone())
+        """A copy that `step_` may overwrite, as `Tensor.clone`, but contiguous."""
+        dense = torch.contiguous_format
+        return State(self.positions.clone(memory_format=dense), self.velocities.clone(memory_format=dense))
 
     def where(self, condition: Tensor, other: State) -> State:
         """Environments of this state where `condition` [B] holds, of another one elsewhere: resets of some.
