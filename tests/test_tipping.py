@@ -83,6 +83,50 @@ def test_what_slides_and_tips_does_so_by_the_law_of_coulomb(dtype: torch.dtype, 
     assert push[[0, 2]] @ against > 0.999 * rub
 
 
+def test_what_slides_on_an_edge_rubs_where_that_is_pushed(dtype: torch.dtype, device: torch.device) -> None:
+    """Aside from the middle of it. All along it friction has one direction, so that the torque is of a force alone."""
+    case = leaning(0.3, turn=(0.0, 0.0, 20.0), velocity=(1.0, 0.0, 0.15), gravity=(0.0, -9.8, 0.1))
+    edge = np.flatnonzero(case.positions[:, 1] < 1e-12)
+    assert len(edge) == 2
+    x, v = after_step(case, dtype, device, 3)
+    push, torque, size = contact_force(case, x, v, x[edge].mean(axis=0))
+    assert abs(torque[0]) > 1e-3 * push[1]  # its centre: a torque along x by how far it is aside
+    assert abs(push @ torque) <= 256 * ULP[dtype] * size * np.linalg.norm(push)
+    assert np.hypot(push[0], push[2]) == pytest.approx(0.3 * push[1], rel=1e-3 if dtype == torch.float32 else 1e-8)
+
+
+# size of a cube of 0.1 m turned by an angle [rad], friction, Young's modulus, cells an edge, velocity, steps
+TUMBLES = [
+    pytest.param(0.3, 0.1, 1e6, 2, 1, id="slides and turns"),
+    pytest.param(0.3, 0.3, 1e5, 2, 6, id="turns while it slides back"),
+    pytest.param(0.5, 0.3, 1e7, 2, 3, id="sticks at one end of its edge"),
+    pytest.param(0.7, 0.1, 1e5, 3, 4, id="an edge of four vertices"),
+    pytest.param(np.pi / 4, 0.1, 1e6, 2, 3, id="stands on its edge"),
+]
+
+
+@pytest.mark.parametrize(("angle", "friction", "youngs", "cells", "steps"), TUMBLES)
+def test_nothing_moves_once_the_iterations_have_converged(
+    angle: float, friction: float, youngs: float, cells: int, steps: int, device: torch.device
+) -> None:
+    """A cube lands on an edge: of its steps rigid motions left up to 14 % of the residual, at any iteration count."""
+    case = leaning(
+        friction, turn=(0.0, 0.0, float(np.degrees(angle))), size=(0.1, 0.1, 0.1), cells=(cells,) * 3,
+        velocity=(0.0, -1.0, 0.0), youngs=youngs,
+    )  # fmt: skip
+    sim = simulator(case, torch.float64, device, iterations=600, solver=pd.Multilevel())
+    state = state_of(case, sim)
+    for _ in range(steps):
+        problem = step_problem(
+            case.scene.values(), state.positions[0].cpu().numpy(), state.velocities[0].cpu().numpy(), H
+        )
+        state = sim(state)
+        u = H * state.velocities[0].cpu().numpy()
+        scale = float(np.linalg.norm(problem.residual(problem.course())))
+        assert np.linalg.norm(problem.residual(u)) <= 1e-8 * scale
+        assert np.abs(problem.align(u) - u).max() <= 1e-12
+
+
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.0, 33.0, 0.0)], ids=["along axes", "askew"])
 def test_a_tall_box_tips_over_the_edge_that_it_is_pushed_over(
     turn: tuple[float, float, float], dtype: torch.dtype, device: torch.device

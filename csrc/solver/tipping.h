@@ -7,9 +7,14 @@
 // not be able to share the force, where it twists, is left to the iterations. Which they are is found by turns, as in an active set
 // method: first the one that lies furthest to where pressure has its centre, then the one that the turn about it takes deepest; of
 // three the two remain beyond whose line that centre lies. A turn that takes other vertices into a contact goes as far as the first of
-// them, and on from there by another; but those which lie on one already stay there. Before any iteration nothing has slid, friction acts against the way that a
-// piece would slide, and what is out of balance will do if it lowers E. All that costs a search over the vertices each time, and
-// nothing where a piece touches nothing or rests evenly.
+// them, and on from there by another; but those which lie on one already stay there. Before any iteration nothing has slid, friction
+// acts against the way that a piece would slide, and what is out of balance will do if it lowers E.
+//
+// A line of more than two vertices bends, and slips along it differ in direction. What is within that is no reason to move either: a
+// piece does not roll whose pressure, next to the line, is within what touches there, which one more search tells; and with friction
+// that balances all but for those differences it does not slide on.
+//
+// All that costs a search over the vertices each time, and nothing where a piece touches nothing or rests evenly.
 #pragma once
 #include "solver/rigid.h"
 
@@ -26,8 +31,11 @@ constexpr double resting = 0.5;
 constexpr double in_line = 1e-6;      // of three vertices, by how far one is off: the ends remain
 constexpr double slips_onward = 0.9;  // least cosine between a slip before and after
 constexpr double pressure_beyond = 1e-6;  // of a line, at its ends
-constexpr int balance_steps = 8;          // of Newton's method
-constexpr double balanced = 1e-9;         // its last step
+constexpr double pressure_near = 1e-3;    // how far off it may be, by the spread of what lies there
+// Of friction whose direction differs between two vertices, by that difference.
+constexpr double friction_doubt = 2.0;
+constexpr int balance_steps = 8;   // of Newton's method
+constexpr double balanced = 1e-9;  // its last step
 
 // What a search finds: the vertex of the least order; how deep it goes beyond where it is, negative, or how far it lies; its distance
 // from that contact, before and once it has dropped; where it is, and its displacement.
@@ -107,16 +115,17 @@ PD_HD Mat3<double> less_outer(Mat3<double> a, double s, const Vec3<double>& b,
 }
 
 struct Tipping {
-  enum class Stage { none, seek, turn };
+  enum class Stage { none, seek, probe, turn };
 
   struct Vertex {
     Vec3<double> at, slip;
   };
 
   Stage stage;
-  bool tips, first;          // its motion is one of these; before any iteration
-  int number, count, round;  // of the plane; of vertices that it turns about; of searches
-  double reach, share;       // of the turn
+  bool tips, first;  // its motion is one of these; before any iteration
+  bool rolls;  // since pressure is off all that touches there, else it may turn about the normal
+  int number, count, round;   // of the plane; of vertices that it turns about; of searches
+  double reach, near, share;  // of the turn
   // where pressure has its centre if nothing moves, from the middle of what lies there, and in all
   Vec3<double> away, pressure;
   Vertex on[2];
@@ -153,27 +162,40 @@ struct Tipping {
         less_outer(each * symmetric(sums + Touch::spread), 1.0, middle, middle);
     const double least = pins_apart * pins_apart * fit.square;
     const Mat3<double> minors = cofactor(spread);
-    const double across = minors.row[0].x + minors.row[1].y + minors.row[2].z;
-    const double trace = spread.row[0].x + spread.row[1].y + spread.row[2].z;
+    const double across = trace(minors), size = trace(spread);
+    near = pressure_near * square_root(size > 0.0 ? size : 0.0);
     // on a point or a line nothing rests
-    if (across <= least * (trace + least)) return;
+    if (across <= least * (size + least)) return;
     if (!(dot(away, solve(less_identity(spread, -least), away)) > resting)) stage = Stage::none;
   }
 
   PD_HD TippingSearch<double> search(const Plane<double>& plane) const {
-    const bool seeks = stage == Stage::seek;
-    return {plane.normal, away, plane.height, reach, seeks ? 0.0 : drop(plane), seeks ? 1.0 : 0.0};
+    if (stage == Stage::seek) return {plane.normal, away, plane.height, reach, 0.0, 1.0};
+    const double down = drop(plane);
+    if (stage == Stage::turn) return {plane.normal, away, plane.height, reach, down, 0.0};
+    return {plane.normal, off(plane.normal), plane.height + down, touching_depth * reach, down,
+            1.0};
   }
 
   // Goes on by what a search has found: `motion` is where the piece goes, if this is the end, or what to search with. False where
   // this is no case of tipping.
   PD_HD bool next(const RigidFit& fit, const Plane<double>& plane,
                   const double (&found)[Found::count], RigidMotion<double>& motion) {
+    const bool probed = stage == Stage::probe;
     stage = Stage::none;
     const double depth = found[Found::depth], left = found[Found::left];
-    if (!(depth < HUGE_VAL)) return false;
+    const bool has_found = depth < HUGE_VAL;
+    if (!has_found && !probed) return false;
     const Vec3<double> u = read(found + Found::way);
     const Vertex vertex = {read(found + Found::at), tangential(u, plane.normal)};
+    if (probed) {
+      const Vec3<double> beside = off(plane.normal);
+      // in float even what it turns about may not count as touching
+      rolls = !has_found || dot(vertex.at - on[0].at, beside) < dot(beside, beside);
+      motion = turn_about(fit, plane).motion;
+      stage = Stage::turn;
+      return true;
+    }
     const double allowed = (has(vertex) ? rounded_depth : touching_depth) * reach;
     if (count > 0 && depth >= -allowed) {
       const Trial trial = turn_about(fit, plane);
@@ -181,17 +203,21 @@ struct Tipping {
       if (depth < 0.0) motion.shift = subtract_product(motion.shift, depth, plane.normal);
       return tips = trial.holds || (first && trial.pushes && lowers(fit, motion));
     }
+    bool probes = false;
     if (count == 0 || left < reach) {
       const bool lies = gap(plane, vertex.at) - (count > 0 ? drop(plane) : 0.0) < reach;
       if (!lies || !take(vertex, plane.normal)) return false;
+      const Vec3<double> beside = off(plane.normal);
+      rolls = dot(beside, beside) > near * near;
+      probes = !rolls;
     } else if (left > depth) {
       share *= left / (left - depth);
     } else {
       return false;
     }
     if (++round == tipping_rounds) return false;
-    motion = turn_about(fit, plane).motion;
-    stage = Stage::turn;
+    stage = probes ? Stage::probe : Stage::turn;
+    if (!probes) motion = turn_about(fit, plane).motion;
     return true;
   }
 
@@ -202,6 +228,8 @@ struct Tipping {
   };
 
   PD_HD static Vec3<double> read(const double* a) { return {a[0], a[1], a[2]}; }
+
+  PD_HD static double trace(const Mat3<double>& a) { return a.row[0].x + a.row[1].y + a.row[2].z; }
 
   PD_HD static Vec3<double> solve(const Mat3<double>& a, const Vec3<double>& b) {
     const Mat3<double> c = cofactor(a);
@@ -260,8 +288,12 @@ struct Tipping {
   }
 
   PD_COLD Trial turn_about(const RigidFit& fit, const Plane<double>& plane) const {
-    if (!(plane.friction > 0.0)) return sliding(fit, plane, {0, 0, 0});
-    const Trial stuck = sticking(fit, plane);
+    const double friction = plane.friction;
+    if (!(friction > 0.0)) return sliding(fit, plane, {0, 0, 0});
+    Trial stuck = pivot(fit, plane, least_slip());
+    const Vec3<double> slipped = on[0].slip - on[count - 1].slip;
+    stuck.holds = stuck.holds && dot(slipped, slipped) <= reach * reach &&
+                  within_friction(fit, plane, stuck.motion);
     if (stuck.holds) return stuck;
     // the way that they slide, if that is known
     Vec3<double> slips[2] = {on[0].slip, on[count - 1].slip};
@@ -271,8 +303,10 @@ struct Tipping {
         slips[i] = slips[i] + tangential(free.of(on[i < count ? i : 0].at), plane.normal);
     }
     if (!slides(slips[0]) || !slides(slips[1])) return stuck;
-    const Vec3<double> way = direction_of(slips[0]), apart = direction_of(slips[1]) - way;
-    if (!(dot(apart, apart) <= slips_alike * slips_alike)) return stuck;
+    const Vec3<double> way = direction_of(slips[0]), differs = direction_of(slips[1]) - way;
+    const double apart = square_root(dot(differs, differs));
+    if (!(apart <= slips_alike)) return stuck;
+    if (rubs(fit, plane, way, apart)) return pivot(fit, plane, {0, 0, 0});
     const Trial slid = sliding(fit, plane, way);
     return slid.holds ? slid : stuck;
   }
@@ -290,23 +324,59 @@ struct Tipping {
     return (1.0 / square_root(dot(a, a))) * a;
   }
 
-  // About where they were before they slid.
-  PD_COLD Trial sticking(const RigidFit& fit, const Plane<double>& plane) const {
+  // How far the centre of pressure, if nothing moves, is off the vertex or line that it turns about.
+  PD_HD Vec3<double> off(const Vec3<double>& normal) const {
+    const Vec3<double> away = pressure - on[0].at;
+    if (count < 2) return away;
+    const Vec3<double> across = cross(normal, line());
+    return dot(across, away) * across;
+  }
+
+  // Of the slips between those of two vertices; none if they differ by as much.
+  PD_HD Vec3<double> least_slip() const {
+    const Vec3<double> way = on[count - 1].slip - on[0].slip;
+    const double square = dot(way, way),
+                 share = square > 0.0 ? -dot(on[0].slip, way) / square : 0.0;
+    const double within = share < 0.0 ? 0.0 : share > 1.0 ? 1.0 : share;
+    const Vec3<double> least = multiply_add(within, way, on[0].slip);
+    return dot(least, least) > square ? least : Vec3<double>{0, 0, 0};
+  }
+
+  // Whether, if nothing moves, friction balances it, but for what slips that differ leave unknown of that.
+  PD_HD bool rubs(const RigidFit& fit, const Plane<double>& plane, const Vec3<double>& way,
+                  double apart) const {
+    const Vec3<double> n = plane.normal, force = -fit.weight * fit.shift, beside = off(n);
+    const double push = dot(force, n), doubt = friction_doubt * apart * plane.friction * push;
+    const Vec3<double> left =
+        subtract_product(force, push, subtract_product(n, plane.friction, way));
+    const double twist = dot(n, axis_of(fit.covariance) + cross(pressure - fit.center, force));
+    const Vec3<double> arm = on[count - 1].at - on[0].at;
+    return dot(left, left) <= doubt * doubt && twist * twist <= doubt * doubt * dot(arm, arm) &&
+           dot(beside, beside) <= near * near;
+  }
+
+  // Whether the force for a motion is within the cone of friction.
+  PD_HD static bool within_friction(const RigidFit& fit, const Plane<double>& plane,
+                                    const RigidMotion<double>& motion) {
+    const Vec3<double> force = fit.weight * (motion.of(fit.center) - fit.shift);
+    const double push = dot(force, plane.normal), most = plane.friction * push;
+    const Vec3<double> rub = subtract_product(force, push, plane.normal);
+    return dot(rub, rub) <= most * most;
+  }
+
+  // About them where they are less a slip, on the plane.
+  PD_COLD Trial pivot(const RigidFit& fit, const Plane<double>& plane,
+                      const Vec3<double>& slip) const {
     const Vec3<double> n = plane.normal;
-    const Vec3<double> back = subtract_product(-on[0].slip, drop(plane), n);
+    const Vec3<double> back = subtract_product(-slip, drop(plane), n);
     const Vec3<double> arm = on[0].at - fit.center, goal = arm + back;
     const Mat3<double> covariance = less_outer(fit.covariance, fit.weight, fit.shift - goal, arm);
-    const Mat3<double> turn =
-        count < 2 ? best_turn(covariance) : best_turn_about(covariance, line());
+    Mat3<double> turn = {};
+    if (rolls) turn = count < 2 ? best_turn(covariance) : best_turn_about(covariance, line());
     const Mat3<double> part = part_of_turn(turn, share);
-    const Vec3<double> force = fit.weight * (back - part * arm - fit.shift);
-    const double push = dot(force, n);
-    const Vec3<double> rub = subtract_product(force, push, n);
-    const Vec3<double> apart = on[0].slip - on[count - 1].slip;
-    const double most = plane.friction * push;
+    const double push = fit.weight * dot(n, back - part * arm - fit.shift);
     const Vec3<double> torque = -axis_of(turned_covariance(covariance, turn));
-    const bool holds = push > 0.0 && dot(rub, rub) <= most * most &&
-                       dot(apart, apart) <= reach * reach && between(n, torque, push);
+    const bool holds = push > 0.0 && between(n, torque, push);
     return {{part, on[0].at, back}, push > 0.0, holds};
   }
 
@@ -316,7 +386,8 @@ struct Tipping {
     return {{c.row[0] + more.row[0], c.row[1] + more.row[1], c.row[2] + more.row[2]}};
   }
 
-  // Along `way`, or freely.
+  // Along `way`, or freely. Friction acts where the push has its centre: where that is on a line the torque is not known across both the
+  // line and the force.
   PD_COLD Trial sliding(const RigidFit& fit, const Plane<double>& plane,
                         const Vec3<double>& way) const {
     const Vec3<double> n = plane.normal, arm = on[0].at - fit.center;
@@ -330,21 +401,25 @@ struct Tipping {
       const Mat3<double> product = turned_covariance(fit.covariance, turn);
       const double push = fit.weight * lift_of(fit, plane, turn * arm);
       const Vec3<double> torque = axis_of(product) + push * cross(at, along);
-      const double trace = product.row[0].x + product.row[1].y + product.row[2].z;
       const Mat3<double> stiffness =
-          less_identity(-1.0 * transpose(product), -trace - push * dot(at, along));
+          less_identity(-1.0 * transpose(product), -trace(product) - push * dot(at, along));
       const Mat3<double> slope = less_outer(less_outer(stiffness, push, at, along), -fit.weight,
                                             cross(at, along), cross(at, n));
       Vec3<double> size;
-      if (count < 2) {
+      if (!rolls) {
+        size = {0.0, dot(along, torque) / dot(along, slope * n), 0.0};
+        turn = turned(turn, small_turn(size.y * n));
+      } else if (count < 2) {
         size = solve(slope, torque);
         turn = turned(turn, small_turn(size));
       } else {
         const Vec3<double> axis = line(), roll = axis + turn * axis;
-        const double rr = dot(roll, slope * roll), rn = dot(roll, slope * n);
-        const double nr = dot(n, slope * roll), nn = dot(n, slope * n);
-        const double r = dot(roll, torque), y = dot(n, torque), scale = 1.0 / (rr * nn - rn * nr);
-        size = {scale * (nn * r - rn * y), scale * (rr * y - nr * r), 0.0};
+        const Vec3<double> yawed = slope * n, rolled = slope * roll;
+        const double rr = dot(roll, rolled), rn = dot(roll, yawed) - dot(cross(n, roll), torque);
+        const double fr = dot(along, rolled), fn = dot(along, yawed);
+        const double r = dot(roll, torque), f = dot(along, torque),
+                     scale = 1.0 / (rr * fn - rn * fr);
+        size = {scale * (fn * r - rn * f), scale * (rr * f - fr * r), 0.0};
         turn = turned(turned(turn, small_turn(size.x * roll)), small_turn(size.y * n));
       }
       found = dot(size, size) < balanced * balanced;
