@@ -268,6 +268,12 @@ std::tuple<Tensor, Tensor, OptionalTensor> solve(const AdjointTensors& t, const 
 using Wanted =
     std::optional<c10::List<bool>>;  // of every array of the material, whether its gradient is
 
+inline void check_wanted(const Wanted& wanted, std::size_t arrays, const char* op) {
+  TORCH_CHECK_VALUE(!wanted || wanted->size() == arrays, op, ": wanted must say of each of the ",
+                    arrays, " arrays of the material whether its gradient is wanted, got ",
+                    wanted ? wanted->size() : 0, " numbers");
+}
+
 // The adjoint of a step: gradients for positions, velocities, forces [batch, vertices, 3], then for the wanted arrays of the
 // material, else all; what nobody wants costs nothing.
 template <class Backend>
@@ -279,10 +285,7 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
   for (const Tensor& array : given) material.push_back(array.contiguous());
   const AdjointTensors t{grad_positions, grad_velocities, after,    positions,
                          velocities,     forces,          material, plan};
-  TORCH_CHECK_VALUE(!wanted || wanted->size() == material.size(),
-                    "step_vjp: wanted must say of each of the ", material.size(),
-                    " arrays of the material whether its gradient is wanted, got ",
-                    wanted ? wanted->size() : 0, " numbers");
+  check_wanted(wanted, material.size(), "step_vjp");
   // in the precision of the step, also where autocast asks for less
   const c10::impl::ExcludeDispatchKeyGuard plainly(c10::autocast_dispatch_keyset);
   const auto [right, inertia, inverse, projector, stuck, sliding] =
@@ -319,15 +322,6 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
     if (!wanted || wanted->get(i)) found.push_back(gradients.of(i));
   }
   return found;
-}
-
-template <class Backend>
-void register_adjoint_ops(torch::Library& m) {
-  m.impl("adjoint_system", &adjoint_system<Backend>);
-  m.impl("contact_gradients", &contact_gradients<Backend>);
-  m.impl("adjoint_result", &adjoint_result<Backend>);
-  m.impl("conjugate_gradients", &conjugate_gradients<Backend>);
-  m.impl("step_vjp", &step_vjp<Backend>);
 }
 
 }  // namespace pd

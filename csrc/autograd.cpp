@@ -1,4 +1,4 @@
-// What autograd does around a step and a rollout. The adjoint of a step is an op of its own, step_vjp.
+// What autograd does around a step and a rollout. Their adjoints are ops of their own, step_vjp and rollout_vjp.
 //
 // Not registered from Python, where the lists of a plan and of a material cost more than a small step itself.
 #include "checks.h"
@@ -38,12 +38,11 @@ Outputs plain_step(const Tensor& positions, const Tensor& velocities, const Opti
 
 Outputs plain_rollout(const Tensor& positions, const Tensor& velocities,
                       const OptionalTensor& forces, at::TensorList material, at::TensorList plan,
-                      std::int64_t steps, std::int64_t every, const Numbers& n) {
+                      const c10::SymInt& steps, const c10::SymInt& every, const Numbers& n) {
   static const auto op =
       find_op<Outputs(const Tensor&, const Tensor&, const OptionalTensor&, at::TensorList,
-                      at::TensorList, std::int64_t, std::int64_t, std::int64_t, std::int64_t,
-                      double, double, double, std::int64_t, bool, double, bool, bool)>(
-          "torchpd::rollout");
+                      at::TensorList, c10::SymInt, c10::SymInt, std::int64_t, std::int64_t, double,
+                      double, double, std::int64_t, bool, double, bool, bool)>("torchpd::rollout");
   const at::AutoDispatchBelowADInplaceOrView below;
   return op.call(positions, velocities, forces, material, plan, steps, every, n.schedule,
                  n.iterations, n.time_step, n.relaxation, n.rho, n.delay, n.weighted, n.tolerance,
@@ -72,15 +71,25 @@ variable_list call_step_vjp(const Tensor& grad_positions, const Tensor& grad_vel
                  step.positions, step.velocities, step.forces, material, plan, time_step, wanted);
 }
 
-// Whether an array has any numbers; torch.compile has symbols for its lengths.
-bool some(const Tensor& array) { return array.sym_numel() != 0; }
+// The same of a rollout, with gradients for all that it recorded.
+variable_list call_rollout_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
+                               const Tensor& after_velocities, const Taken& steps,
+                               at::TensorList material, at::TensorList plan, double time_step,
+                               const Wanted& wanted) {
+  static const auto op =
+      find_op<variable_list(const Tensor&, const Tensor&, const Tensor&, const Tensor&,
+                            const Tensor&, const Tensor&, const OptionalTensor&, at::TensorList,
+                            at::TensorList, double, const Wanted&)>("torchpd::rollout_vjp");
+  return op.call(grad_positions, grad_velocities, steps.after, after_velocities, steps.positions,
+                 steps.velocities, steps.forces, material, plan, time_step, wanted);
+}
 
 // What autograd does not look at, and both functions have to know; `info` is handed out past it, a report, not a function to
 // differentiate.
 struct Unvaried {
   at::TensorList plan;
   Numbers numbers;
-  std::int64_t steps = 1, every = 1;
+  c10::SymInt steps = 1, every = 1;
   Tensor* info = nullptr;
 };
 
@@ -95,7 +104,7 @@ variable_list keep(AutogradContext* context, const Tensor& positions, const Tens
   saved.insert(saved.end(), rest.plan.begin(), rest.plan.end());
   context->save_for_backward(std::move(saved));
   context->saved_data["time_step"] = rest.numbers.time_step;
-  context->saved_data["every"] = rest.every;
+  context->saved_data["thins"] = rest.every != 1;
   *rest.info = info;
   return {after, after_velocities};
 }
@@ -165,22 +174,6 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
   }
 };
 
-// The material at one step of a rollout: spheres move on.
-variable_list material_at(const variable_list& material, std::int64_t step) {
-  variable_list at_step = material;
-  Tensor& spheres = at_step[place_in_material("spheres")];
-  if (!some(spheres)) return at_step;
-  const Tensor center = spheres.narrow(-1, 0, 3), rest = spheres.narrow(-1, 3, 5);
-  spheres = at::cat({center + double(step) * spheres.narrow(-1, 5, 3), rest}, -1);
-  return at_step;
-}
-
-// Of spheres at a step, seen from the start of the rollout.
-Tensor moved_back(const Tensor& gradient, std::int64_t step) {
-  const Tensor center = gradient.narrow(-1, 0, 3), rest = gradient.narrow(-1, 0, 5);
-  return at::cat({rest, gradient.narrow(-1, 5, 3) + double(step) * center}, -1);
-}
-
 class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
  public:
   static variable_list forward(AutogradContext* context, const Tensor& positions,
@@ -192,43 +185,19 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
                 rest);
   }
 
-  // backwards through the recorded states, one adjoint a step
   static variable_list backward(AutogradContext* context, const variable_list& grads) {
-    TORCH_CHECK(context->saved_data["every"].toInt() == 1,
+    TORCH_CHECK(!context->saved_data["thins"].toBool(),
                 "torchpd: the rollout op is differentiable with every=1 only, where it records "
                 "every state");
     const Kept kept(context->get_saved_variables());
     const bool forces = kept.forces.has_value();
     const c10::List<bool> wanted = Edges{context, forces ? 3u : 2u}.material(kept.material.size());
-    const double time_step = context->saved_data["time_step"].toDouble();
-    const std::size_t spheres = place_in_material("spheres");
-    std::size_t sphere_place = 3;
-    for (std::size_t i = 0; i < spheres; ++i) sphere_place += wanted[i];
-    // of positions, velocities, forces and the wanted arrays; the first two of one step after another
-    variable_list sums(3);
-    for (std::int64_t step = kept.after.sym_size(0).guard_int(__FILE__, __LINE__) - 1; step >= 0;
-         --step) {
-      const auto add = [](const Tensor& a, const Tensor& b) { return a.defined() ? a + b : b; };
-      const Tensor before = step ? kept.after[step - 1] : kept.positions;
-      const Tensor speed = step ? kept.after_velocities[step - 1] : kept.velocities;
-      variable_list values =
-          call_step_vjp(add(sums[0], grads[0][step]), add(sums[1], grads[1][step]),
-                        {before, speed, kept.forces, kept.after[step]},
-                        material_at(kept.material, step), kept.plan, time_step, wanted);
-      if (wanted[spheres]) values[sphere_place] = moved_back(values[sphere_place], step);
-      sums.resize(values.size());
-      for (std::size_t i = 2; i < values.size(); ++i) values[i] = add(sums[i], values[i]);
-      sums = std::move(values);
-    }
-    if (!sums[0].defined()) {
-      // of no steps
-      for (Tensor& sum : sums) sum = at::zeros_like(kept.positions);
-      for (std::size_t i = 0; i < wanted.size(); ++i) {
-        if (wanted[i]) sums.push_back(at::zeros_like(kept.material[i]));
-      }
-    }
-    variable_list result{sums[0], sums[1], forces ? sums[2] : Tensor()};
-    append_in_places(result, wanted, sums.data() + 3);
+    const variable_list values =
+        call_rollout_vjp(grads[0], grads[1], kept.after_velocities,
+                         {kept.positions, kept.velocities, kept.forces, kept.after}, kept.material,
+                         kept.plan, context->saved_data["time_step"].toDouble(), wanted);
+    variable_list result{values[0], values[1], forces ? values[2] : Tensor()};
+    append_in_places(result, wanted, values.data() + 3);
     result.push_back(Tensor());
     return result;
   }
@@ -278,18 +247,19 @@ Outputs step(const Tensor& positions, const Tensor& velocities, const OptionalTe
 }
 
 Outputs rollout(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
-                at::TensorList material, at::TensorList plan, std::int64_t steps,
-                std::int64_t every, std::int64_t schedule, std::int64_t iterations,
-                double time_step, double relaxation, double rho, std::int64_t delay, bool weighted,
-                double tolerance, bool inertial, bool report) {
+                at::TensorList material, at::TensorList plan, c10::SymInt steps, c10::SymInt every,
+                std::int64_t schedule, std::int64_t iterations, double time_step, double relaxation,
+                double rho, std::int64_t delay, bool weighted, double tolerance, bool inertial,
+                bool report) {
   const Numbers n{schedule, iterations, time_step, relaxation, rho,
                   delay,    weighted,   tolerance, inertial,   report};
   if (!varies(positions, velocities, forces, {}, material))
     return plain_rollout(positions, velocities, forces, material, plan, steps, every, n);
   refuse_transforms();
   Tensor info;
-  const variable_list track = RolloutFunction::apply(positions, velocities, forces, material,
-                                                     Unvaried{plan, n, steps, every, &info});
+  const variable_list track =
+      RolloutFunction::apply(positions, velocities, forces, material,
+                             Unvaried{plan, n, std::move(steps), std::move(every), &info});
   return {track[0], track[1], info};
 }
 
@@ -307,6 +277,15 @@ class LastDerivative : public torch::autograd::Function<LastDerivative> {
   }
 };
 
+variable_list differentiable_once(variable_list inputs, const OptionalTensor& forces,
+                                  at::TensorList material,
+                                  const std::function<variable_list()>& run) {
+  if (forces) inputs.push_back(*forces);
+  inputs.insert(inputs.end(), material.begin(), material.end());
+  if (!at::GradMode::is_enabled() || !varies(inputs)) return run();
+  return LastDerivative::apply(at::TensorList(inputs), run);
+}
+
 variable_list step_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
                        const Tensor& after, const Tensor& positions, const Tensor& velocities,
                        const OptionalTensor& forces, at::TensorList material, at::TensorList plan,
@@ -316,11 +295,24 @@ variable_list step_vjp(const Tensor& grad_positions, const Tensor& grad_velociti
     return call_step_vjp(grad_positions, grad_velocities, {positions, velocities, forces, after},
                          material, plan, time_step, wanted);
   };
-  variable_list inputs{grad_positions, grad_velocities, after, positions, velocities};
-  if (forces) inputs.push_back(*forces);
-  inputs.insert(inputs.end(), material.begin(), material.end());
-  if (!at::GradMode::is_enabled() || !varies(inputs)) return run();
-  return LastDerivative::apply(at::TensorList(inputs), std::function<variable_list()>(run));
+  return differentiable_once({grad_positions, grad_velocities, after, positions, velocities},
+                             forces, material, run);
+}
+
+variable_list rollout_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
+                          const Tensor& after, const Tensor& after_velocities,
+                          const Tensor& positions, const Tensor& velocities,
+                          const OptionalTensor& forces, at::TensorList material,
+                          at::TensorList plan, double time_step, const Wanted& wanted) {
+  const auto run = [&] {
+    const at::AutoDispatchBelowADInplaceOrView below;
+    return call_rollout_vjp(grad_positions, grad_velocities, after_velocities,
+                            {positions, velocities, forces, after}, material, plan, time_step,
+                            wanted);
+  };
+  return differentiable_once(
+      {grad_positions, grad_velocities, after, after_velocities, positions, velocities}, forces,
+      material, run);
 }
 
 }  // namespace
@@ -329,6 +321,7 @@ TORCH_LIBRARY_IMPL(torchpd, Autograd, m) {
   m.impl("step", &step);
   m.impl("rollout", &rollout);
   m.impl("step_vjp", &step_vjp);
+  m.impl("rollout_vjp", &rollout_vjp);
 }
 
 }  // namespace pd

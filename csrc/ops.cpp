@@ -1,5 +1,5 @@
 // The ops: schemas, and the CPU behind them.
-#include "adjoint_ops.h"
+#include "rollout_adjoint.h"
 
 #include "cpu/dispatch.h"
 #include "plan_views.h"
@@ -98,7 +98,7 @@ TORCH_LIBRARY(torchpd, m) {
       step_numbers + ") -> ()");
   with_plan(
       "rollout(Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, Tensor[] "
-      "plan, *, int steps, int every, " +
+      "plan, *, SymInt steps, SymInt every, " +
       step_numbers + ") -> (Tensor, Tensor, Tensor)");
   with_plan("gradient(Tensor positions, Tensor stiffness, Tensor[] plan) -> Tensor");
   with_plan(
@@ -115,6 +115,10 @@ TORCH_LIBRARY(torchpd, m) {
       "Tensor "
       "velocities, Tensor? forces, Tensor[] material, Tensor[] plan, *, float time_step, bool[]? "
       "wanted=None) -> Tensor[]");
+  with_plan(
+      "rollout_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
+      "after_velocities, Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, "
+      "Tensor[] plan, *, float time_step, bool[]? wanted=None) -> Tensor[]");
   // their kernels, for every device, come from Python
   with_plan(
       "slide_adjoint(Tensor solution, Tensor error, Tensor after, Tensor inertia, Tensor inverse, "

@@ -152,6 +152,52 @@ def test_rollout_op_against_single_steps(moving: bool) -> None:
     assert torch.allclose(gradient, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
 
 
+def test_rollouts_that_record_some_states_have_the_gradients_of_those() -> None:
+    sim, state = body()
+    x = state.positions.clone().requires_grad_()
+    weights = torch.linspace(1.0, 2.0, 2, dtype=torch.float64)[:, None, None, None]
+    found, expected = (
+        torch.autograd.grad((weights * track.positions * track.velocities).sum(), x)[0]
+        for track in (
+            sim.rollout(pd.State(x, state.velocities), 5, 2),
+            pd.Track(
+                *(
+                    t[1::2][:2] if isinstance(t, torch.Tensor) else t
+                    for t in sim.rollout(pd.State(x, state.velocities), 5)
+                )
+            ),
+        )
+    )
+    assert torch.equal(found, expected)
+
+
+def test_the_adjoint_of_a_rollout_checks_what_it_gets() -> None:
+    sim, state = body()
+    track = sim.rollout(state, 2)
+    x, v, arrays, plan = track.positions, track.velocities, sim.material(), list(sim.plan.arrays)
+    for wrong, name in ((x[0], "after"), (x[:, :1], "after"), (x.float(), "after")):
+        with pytest.raises((ValueError, TypeError), match=f"^{name} must be"):
+            torch.ops.torchpd.rollout_vjp(x, v, wrong, v, *state, None, arrays, plan, time_step=sim.time_step)
+    for given, name in (((x[:1], v), "grad_positions"), ((x, v.float()), "grad_velocities")):
+        with pytest.raises((ValueError, TypeError), match=f"^{name} must be"):
+            torch.ops.torchpd.rollout_vjp(*given, x, v, *state, None, arrays, plan, time_step=sim.time_step)
+    with pytest.raises(ValueError, match="rollout_vjp: wanted must say of each of the"):
+        torch.ops.torchpd.rollout_vjp(x, v, x, v, *state, None, arrays, plan, time_step=sim.time_step, wanted=[True])
+    with pytest.raises(ValueError, match="rollout_vjp: material must have"):
+        torch.ops.torchpd.rollout_vjp(x, v, x, v, *state, None, arrays[:2], plan, time_step=sim.time_step)
+
+
+def test_the_adjoint_of_no_steps_is_that_of_nothing() -> None:
+    sim, state = body()
+    none = sim.rollout(state, 0).positions
+    arrays = [array.detach() for array in sim.material()]
+    found = torch.ops.torchpd.rollout_vjp(
+        none, none, none, none, *state, None, arrays, list(sim.plan.arrays), time_step=sim.time_step
+    )
+    assert [t.shape for t in found] == [state.positions.shape] * 3 + [array.shape for array in arrays]
+    assert not any(t.any() for t in found)
+
+
 @pytest.mark.parametrize("contacts", [False, True])
 @pytest.mark.parametrize("value", [-1e5, float("inf")])
 def test_elasticity_without_bounds_leaves_its_vertices_out(value: float, contacts: bool) -> None:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from runs import ULP, noise, same_bits, small
 from torch import Tensor
+from torch._dynamo.testing import CompileCounterWithBackend
 
 import torchpd as pd
 from torchpd.solvers import Solver
@@ -57,8 +58,30 @@ def test_compiled_rollout_is_the_rollout(solver: Solver) -> None:
     assert torch.equal(torch.compile(play, fullgraph=True, backend="aot_eager")(*state), play(*state))
 
 
+def test_compiled_rollouts_of_any_length_are_two_graphs() -> None:
+    """Of the length that came first, and of all others; their backward is one op, however many the steps."""
+    sim, state = small(torch.float64, iterations=200)
+    inputs = (sim.stiffness.requires_grad_(), state.velocities.requires_grad_())
+
+    def loss(v: Tensor, steps: int, every: int) -> Tensor:
+        return sim.rollout(pd.State(state.positions, v), steps, every).positions.square().sum()
+
+    counter = CompileCounterWithBackend("aot_eager")
+    compiled = torch.compile(loss, fullgraph=True, backend=counter)
+    for steps, every in ((2, 1), (3, 1), (12, 1), (4, 2), (8, 4), (7, 3), (2, 1)):
+        found, expected = (torch.autograd.grad(play(inputs[1], steps, every), inputs) for play in (compiled, loss))
+        for one, other in zip(found, expected, strict=True):
+            assert float((one - other).abs().max()) <= 64 * ULP[torch.float64] * float(other.abs().max())
+    # records of every state, and of some
+    assert counter.frame_count <= 4
+    calls = [node.target for graph in counter.graphs for node in graph.graph.nodes if node.op == "call_function"]
+    assert calls.count(torch.ops.torchpd.rollout.default) + calls.count(torch.ops.torchpd.rollout) == len(
+        counter.graphs
+    )
+
+
 def test_compiled_rollouts_that_go_one_by_one() -> None:
-    """Functions of the step number, and records of some steps where a gradient is wanted."""
+    """Functions of the step number."""
     sim, state = small(torch.float64, iterations=200)
     (ball,) = sim.scene.spheres
     place = sim.spheres[0, :3].clone()

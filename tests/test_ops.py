@@ -50,6 +50,10 @@ def samples(
             (f, direction, still, still, zero, 0.01 * f, material, plan),
             {"time_step": sim.time_step, "wanted": [number % 3 != 1 for number in range(len(material))]},
         ),
+        "rollout_vjp": (
+            (noise(still[None]), noise(still[None], 1), still[None], zero[None], still, zero, 0.01 * f, material, plan),
+            {"time_step": sim.time_step, "wanted": [number % 3 != 1 for number in range(len(material))]},
+        ),
         "gradient": ((wanted(x), w, plan), {}),
         "element_energy": ((wanted(x), w, plan), {}),
         "element_energy_product": ((wanted(x), wanted(direction), w, plan), {}),
@@ -95,7 +99,7 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
 
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
-    "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "conjugate_gradients_",
+    "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "rollout_vjp", "conjugate_gradients_",
     "adjoint_system", "contact_gradients", "adjoint_result", "mend_adjoint", "slide_adjoint", "conjugate_gradients",
 )  # fmt: skip
 
@@ -111,13 +115,13 @@ def test_ops_with_a_plan_stay_out_of_the_graphs_of_torch_compile() -> None:
     """Which cannot return the counts that a plan has on the CPU."""
     schemas = [schema for schema in torch._C._jit_get_all_schemas() if schema.name.startswith("torchpd::")]
     with_plan = [s.name.split("::")[1] for s in schemas if any(a.name == "plan" for a in s.arguments)]
-    assert {"step", "rollout", "gradient", "precondition", "step_vjp"} <= set(with_plan)
+    assert {"step", "rollout", "gradient", "precondition", "step_vjp", "rollout_vjp"} <= set(with_plan)
     for name in with_plan:
         assert torch.Tag.cudagraph_unsafe in getattr(ops, name).default.tags, name
 
 
 @pytest.mark.parametrize("outer", ["lbfgs", "momentum"])
-@pytest.mark.parametrize("name", ["step", "step_", "rollout", "step_vjp"])
+@pytest.mark.parametrize("name", ["step", "step_", "rollout", "step_vjp", "rollout_vjp"])
 def test_opcheck_of_the_multilevel_solver(name: str, outer: str, dtype: torch.dtype) -> None:
     arguments, keywords = samples(name, dtype, torch.device("cpu"), solver=pd.Multilevel(outer))  # type: ignore[arg-type]
     report = torch.library.opcheck(getattr(ops, name).default, arguments, keywords)

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 import torch
-from runs import noise, numbers_of, plan_of, small
+from runs import ULP, noise, numbers_of, plan_of, small
 from torch import Tensor
 
 import torchpd as pd
@@ -192,6 +192,42 @@ def test_vmap_of_the_adjoint_of_a_step(batch: int, dtype: torch.dtype, device: t
         call = lambda *args, m=material: adjoint(*args, m)  # noqa: E731
         mapped = torch.vmap(call, in_dims=dims)(*given)
         _same(mapped, [call(*(t if d is None else t[m] for t, d in zip(given, dims, strict=True))) for m in range(3)])
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_vmap_of_the_adjoint_of_a_rollout(batch: int, dtype: torch.dtype, device: torch.device) -> None:
+    """Any argument mapped. What environments share adds up over the steps first there, which rounds differently."""
+    sim, (x, v) = small(dtype, device, batch)
+    plan, shared = plan_of(sim), [array.detach() for array in sim.material()]
+    after, speeds, _ = ops.rollout(x, v, None, shared, plan, **numbers_of(sim, iterations=64), steps=2, every=1)
+    grads = noise(torch.empty(3, *after.shape, dtype=dtype, device=device))
+    factor = torch.linspace(0.5, 2.0, 3, dtype=dtype, device=device)[:, None]
+
+    def adjoint(g: Tensor, y: Tensor, w: Tensor, forces: Tensor | None) -> Any:
+        arrays = [w, *shared[1:]]
+        return ops.rollout_vjp(g, 0.1 * g, y, speeds, x, v, forces, arrays, plan, time_step=sim.time_step)
+
+    moved = after + 1e-3 * factor[..., None, None, None] * x
+    cases: list[tuple[tuple[int | None, ...], tuple[Any, ...]]] = [
+        ((0, None, None, None), (grads, after, shared[0], None)),
+        ((1, None, None, 0), (grads.movedim(0, 1), after, shared[0], grads[:, 0])),
+        ((None, 0, 0, None), (grads[0], moved, factor * shared[0], None)),
+    ]
+    for dims, given in cases:
+        mapped = torch.vmap(adjoint, in_dims=dims)(*given)
+        single = [
+            adjoint(*(t if d is None else t.select(d, m) for t, d in zip(given, dims, strict=True))) for m in range(3)
+        ]
+        _same(mapped[:3], [one[:3] for one in single])
+        for m, one in enumerate(single):
+            for found, expected in zip(mapped[3:], one[3:], strict=True):
+                assert found[m].shape == expected.shape
+                bound = 256 * ULP[dtype] if device.type == "cpu" else {torch.float32: 1e-3, torch.float64: 1e-8}[dtype]
+                assert not expected.numel() or float((found[m] - expected).abs().max()) <= bound * float(
+                    expected.abs().max()
+                )
+    with pytest.raises((ValueError, RuntimeError)):
+        torch.vmap(adjoint, in_dims=(0, None, None, None))(grads[:, 0], after, shared[0], None)
 
 
 def test_batched_gradients_of_every_op(dtype: torch.dtype, device: torch.device) -> None:

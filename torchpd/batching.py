@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from torch.utils import _pytree as pytree
 from .tables import MATERIAL_TABLE
 from .vmap_rules import Rule, register_rule
 
-__all__ = ["step_vjp_rule"]
+__all__ = ["rollout_vjp_rule", "step_vjp_rule"]
 
 _ops = torch.ops.torchpd
 _OWN = [row.dims for row in MATERIAL_TABLE]  # dimensions of an array without a batch; stiffness is the first
@@ -92,7 +93,10 @@ def _batch_rule(name: str, dim: int = 0) -> Rule:
 
 def step_vjp_rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[list[Tensor], int]:
     """The adjoint of a step. An array that environments share has a gradient for each map, the sum over its own."""
-    op = _ops.step_vjp
+    return _vjp_rule(_ops.step_vjp, info, in_dims, args, **numbers)
+
+
+def _vjp_rule(op: Any, info: Any, in_dims: Any, args: Any, **numbers: Any) -> tuple[list[Tensor], int]:
     (*state, values, plan), maps = _join_all(op, info, in_dims, args, **numbers)
     each = [
         t.expand(maps[0] * maps[1], *t.shape[t.dim() - n :]).contiguous() for t, n in zip(values, _OWN, strict=True)
@@ -106,6 +110,21 @@ def step_vjp_rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[
         for grad, (shape, own) in zip(grads[3:], rows, strict=True)
     ]
     return [*grads[:3], *summed], 0
+
+
+def rollout_vjp_rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[list[Tensor], int]:
+    """The adjoint of a rollout: that of a step, and gradients and states of all steps [step, batch, V, 3] besides."""
+    shapes = [_shape_of_one(t, d) for t, d in zip(args[:5], in_dims[:5], strict=True)]
+    _check_one(
+        len(shapes[0]) == 4 and all(shape == shapes[0] for shape in shapes[:4]) and shapes[0][1:] == shapes[4],
+        _ops.rollout_vjp, in_dims, args, **numbers,
+    )  # fmt: skip
+    size = info.batch_size
+    tracks = [
+        t.repeat(1, size, 1, 1) if dim is None else t.movedim(dim, 1).flatten(1, 2)
+        for t, dim in zip(args[:4], in_dims[:4], strict=True)
+    ]
+    return _vjp_rule(partial(_ops.rollout_vjp, *tracks), info, in_dims[4:], args[4:], **numbers)
 
 
 def _diagonal_rule(info: Any, in_dims: Any, stiffness: Tensor, plan: list[Tensor], **options: Any) -> Any:

@@ -11,7 +11,7 @@ from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
 
 from .adjoint import mend_adjoint
-from .batching import step_vjp_rule
+from .batching import rollout_vjp_rule, step_vjp_rule
 from .sliding import slide_adjoint
 from .tables import MATERIAL_TABLE
 from .vmap_rules import register_rule
@@ -169,12 +169,15 @@ def _(solution: Tensor, *_: Any, **__: Any) -> Tensor:
     return solution.new_empty(solution.shape)
 
 
-@_register_fake("step_vjp")
-def _(*step: Any, time_step: float, wanted: Sequence[bool] | None = None) -> list[Tensor]:
-    _, _, _, positions, _, _, material, _ = step
+def _fake_vjp(*call: Any, time_step: float, wanted: Sequence[bool] | None = None) -> list[Tensor]:
+    *_, positions, _, _, material, _ = call
     state = [positions.new_empty(positions.shape) for _ in range(3)]
     asked = zip(material, [True] * len(material) if wanted is None else wanted, strict=True)
     return [*state, *(array.new_empty(array.shape) for array, own in asked if own)]
+
+
+for _name in ("step_vjp", "rollout_vjp"):
+    _register_fake(_name)(_fake_vjp)
 
 
 @_register_fake("adjoint_result")
@@ -330,6 +333,7 @@ def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | No
 
 
 register_rule("step_vjp", step_vjp_rule)
+register_rule("rollout_vjp", rollout_vjp_rule)
 
 
 torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_save_nothing)

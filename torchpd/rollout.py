@@ -59,9 +59,7 @@ def roll(sim: Simulator, call: Rollout, *, progress: bool) -> Track:
         sim.check_state(call.state)
     else:
         call = replace(call, forces=sim.check_state(call.state, forces=call.forces, fix=STEPS_DIFFER))
-    varies = callable(call.forces) or callable(call.targets)
-    # the op has a derivative where it records every state
-    one_by_one = varies or (call.every > 1 and call.tracks_gradient(sim.material()))
+    one_by_one = callable(call.forces) or callable(call.targets)
     if not (one_by_one or progress):
         return _piece(sim, call, _constant_material(sim, call))
     if not progress:
@@ -80,16 +78,19 @@ def _constant_material(sim: Simulator, call: Rollout) -> list[Tensor]:
 
 def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
     refuse_tangents(*call.state, call.forces if isinstance(call.forces, Tensor) else None, *material)
-    positions, velocities, rows = torch.ops.torchpd.rollout(
+    # the op has a derivative where it records every state, as its adjoint needs them
+    thinned = call.every > 1 and call.tracks_gradient(material)
+    found = torch.ops.torchpd.rollout(
         call.state[0],
         call.state[1],
         call.forces,
         material,
         list(sim.plan.arrays),
-        steps=call.steps,
-        every=call.every,
+        steps=call.records * call.every if thinned else call.steps,
+        every=1 if thinned else call.every,
         **sim.numbers(inertial=call.start == "inertial", report=call.report),
     )
+    positions, velocities, rows = (out[call.every - 1 :: call.every] if thinned else out for out in found)
     return Track(positions, velocities, Info.from_rows(rows))
 
 

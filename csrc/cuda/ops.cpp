@@ -1,5 +1,5 @@
 // The ops on CUDA: memory, stream and device come from torch, everything else from the kernels.
-#include "adjoint_ops.h"
+#include "rollout_adjoint.h"
 
 #include "cuda/launch.h"
 #include "plan_views.h"
