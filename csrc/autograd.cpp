@@ -52,11 +52,11 @@ Outputs plain_rollout(const Tensor& positions, const Tensor& velocities,
 // Which arrays of a material autograd wants to know about.
 using Wanted = std::optional<c10::List<bool>>;
 
-// A step as it was taken, for its adjoint.
+// A step as it was taken, for its adjoint; or the steps of a rollout, `after` and `after_velocities` being of all of them.
 struct Taken {
   Tensor positions, velocities;
   OptionalTensor forces;
-  Tensor after;
+  Tensor after, after_velocities;
 };
 
 // Gradients for positions, velocities, forces, then for the wanted arrays of the material.
@@ -73,15 +73,15 @@ variable_list call_step_vjp(const Tensor& grad_positions, const Tensor& grad_vel
 
 // The same of a rollout, with gradients for all that it recorded.
 variable_list call_rollout_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
-                               const Tensor& after_velocities, const Taken& steps,
-                               at::TensorList material, at::TensorList plan, double time_step,
-                               const Wanted& wanted) {
+                               const Taken& steps, at::TensorList material, at::TensorList plan,
+                               double time_step, const Wanted& wanted) {
   static const auto op =
       find_op<variable_list(const Tensor&, const Tensor&, const Tensor&, const Tensor&,
                             const Tensor&, const Tensor&, const OptionalTensor&, at::TensorList,
                             at::TensorList, double, const Wanted&)>("torchpd::rollout_vjp");
-  return op.call(grad_positions, grad_velocities, steps.after, after_velocities, steps.positions,
-                 steps.velocities, steps.forces, material, plan, time_step, wanted);
+  return op.call(grad_positions, grad_velocities, steps.after, steps.after_velocities,
+                 steps.positions, steps.velocities, steps.forces, material, plan, time_step,
+                 wanted);
 }
 
 // What autograd does not look at, and both functions have to know; `info` is handed out past it, a report, not a function to
@@ -165,7 +165,7 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
     const c10::List<bool> wanted =
         Edges{context, start_edge + (starts ? 1 : 0)}.material(kept.material.size());
     const variable_list values = call_step_vjp(
-        grads[0], grads[1], {kept.positions, kept.velocities, kept.forces, kept.after},
+        grads[0], grads[1], {kept.positions, kept.velocities, kept.forces, kept.after, {}},
         kept.material, kept.plan, context->saved_data["time_step"].toDouble(), wanted);
     variable_list result{values[0], values[1], forces ? values[2] : Tensor(), Tensor()};
     append_in_places(result, wanted, values.data() + 3);
@@ -192,10 +192,10 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
     const Kept kept(context->get_saved_variables());
     const bool forces = kept.forces.has_value();
     const c10::List<bool> wanted = Edges{context, forces ? 3u : 2u}.material(kept.material.size());
-    const variable_list values =
-        call_rollout_vjp(grads[0], grads[1], kept.after_velocities,
-                         {kept.positions, kept.velocities, kept.forces, kept.after}, kept.material,
-                         kept.plan, context->saved_data["time_step"].toDouble(), wanted);
+    const variable_list values = call_rollout_vjp(
+        grads[0], grads[1],
+        {kept.positions, kept.velocities, kept.forces, kept.after, kept.after_velocities},
+        kept.material, kept.plan, context->saved_data["time_step"].toDouble(), wanted);
     variable_list result{values[0], values[1], forces ? values[2] : Tensor()};
     append_in_places(result, wanted, values.data() + 3);
     result.push_back(Tensor());
@@ -292,8 +292,9 @@ variable_list step_vjp(const Tensor& grad_positions, const Tensor& grad_velociti
                        double time_step, const Wanted& wanted) {
   const auto run = [&] {
     const at::AutoDispatchBelowADInplaceOrView below;
-    return call_step_vjp(grad_positions, grad_velocities, {positions, velocities, forces, after},
-                         material, plan, time_step, wanted);
+    return call_step_vjp(grad_positions, grad_velocities,
+                         {positions, velocities, forces, after, {}}, material, plan, time_step,
+                         wanted);
   };
   return differentiable_once({grad_positions, grad_velocities, after, positions, velocities},
                              forces, material, run);
@@ -306,9 +307,9 @@ variable_list rollout_vjp(const Tensor& grad_positions, const Tensor& grad_veloc
                           at::TensorList plan, double time_step, const Wanted& wanted) {
   const auto run = [&] {
     const at::AutoDispatchBelowADInplaceOrView below;
-    return call_rollout_vjp(grad_positions, grad_velocities, after_velocities,
-                            {positions, velocities, forces, after}, material, plan, time_step,
-                            wanted);
+    return call_rollout_vjp(grad_positions, grad_velocities,
+                            {positions, velocities, forces, after, after_velocities}, material,
+                            plan, time_step, wanted);
   };
   return differentiable_once(
       {grad_positions, grad_velocities, after, after_velocities, positions, velocities}, forces,

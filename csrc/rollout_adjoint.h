@@ -23,14 +23,22 @@ inline Tensor moved_back(const Tensor& gradient, std::int64_t step) {
   return at::cat({rest, gradient.narrow(-1, 5, 3) + double(step) * center}, -1);
 }
 
-// States one after another, [records, batch, vertices, 3].
-inline void check_track(const Tensor& t, const Tensor& positions, const Tensor& like,
+// Of every step: [step, batch, vertex, 3], for as many steps as `after` has.
+inline void check_track(const Tensor& t, const Tensor& positions, const Tensor& after,
                         const char* name, const char* meaning) {
-  TORCH_CHECK_VALUE(t.dim() == 4 && t.sizes().slice(1) == positions.sizes(), name,
-                    " must be [step, batch, vertex, 3] (", meaning, ") of positions ",
-                    positions.sizes(), ", got ", describe(t));
-  check_state(t, like, name, meaning);
+  TORCH_CHECK_TYPE(t.scalar_type() == positions.scalar_type(), name, " must be ",
+                   at::toString(positions.scalar_type()), " like positions (", meaning, "), got ",
+                   describe(t));
+  TORCH_CHECK_VALUE(
+      t.dim() == 4 && t.sizes().slice(1) == positions.sizes() && t.size(0) == after.size(0), name,
+      " must be [step, batch, vertex, 3] (", meaning,
+      "), as many steps as after has and each like positions ", positions.sizes(), ", got ",
+      describe(t));
+  TORCH_CHECK_VALUE(t.device() == positions.device(), name, " must be on ",
+                    positions.device().str(), " like positions (", meaning, "), got ", describe(t));
 }
+
+inline Tensor zeros_for(const Tensor& t) { return at::zeros(t.sizes(), t.options()); }
 
 // Gradients for the first positions and velocities, for the forces of all steps, [batch, vertices, 3] each, then for the wanted
 // arrays of the material, else all. `after` and `after_velocities` are what the rollout recorded, every state.
@@ -41,25 +49,25 @@ std::vector<Tensor> rollout_vjp(const Tensor& grad_positions, const Tensor& grad
                                 const OptionalTensor& forces, at::TensorList material,
                                 at::TensorList plan, double time_step, const Wanted& wanted) {
   check_positions(positions, "positions");
-  TORCH_CHECK_TYPE(after.scalar_type() == positions.scalar_type(), "after must be ",
-                   at::toString(positions.scalar_type()), " like positions (m), got ",
-                   describe(after));
+  check_state(velocities, positions, "velocities", "m/s");
+  if (forces) check_state(*forces, positions, "forces", "N");
   check_track(after, positions, after, "after", "m");
   check_track(after_velocities, positions, after, "after_velocities", "m/s");
   check_track(grad_positions, positions, after, "grad_positions", "of a loss, 1/m");
   check_track(grad_velocities, positions, after, "grad_velocities", "of a loss, 1/(m/s)");
+  check_time_step(time_step);
   TORCH_CHECK_VALUE(material.size() == material_arrays, "rollout_vjp: material must have ",
                     material_arrays, " arrays, got ", material.size());
   check_wanted(wanted, material.size(), "rollout_vjp");
   const std::size_t spheres = place_in_material("spheres");
   const auto wants = [&](std::size_t i) { return !wanted || wanted->get(i); };
-  Tensor grad_x = at::zeros_like(positions), grad_v = at::zeros_like(positions);
+  Tensor grad_x = zeros_for(positions), grad_v = zeros_for(positions);
   // of forces, then of the wanted arrays
-  std::vector<Tensor> sums{at::zeros_like(positions)};
+  std::vector<Tensor> sums{zeros_for(positions)};
   std::size_t sphere_place = 1;
   for (std::size_t i = 0; i < material.size(); ++i) {
     if (i < spheres && wants(i)) ++sphere_place;
-    if (wants(i)) sums.push_back(at::zeros_like(material[i]));
+    if (wants(i)) sums.push_back(zeros_for(material[i]));
   }
   for (std::int64_t step = after.size(0) - 1; step >= 0; --step) {
     std::vector<Tensor> values = step_vjp<Backend>(

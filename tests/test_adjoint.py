@@ -8,6 +8,7 @@ from adjoint_cases import body
 from torch.profiler import ProfilerActivity, profile
 
 import torchpd as pd
+from torchpd.tables import MATERIAL_TABLE
 
 # A central difference with relative step 1e-5 errs by about 1e-10 (truncation) and 1e-16 / 1e-5 (rounding), relative to
 # the largest terms; sums that cancel lose some digits more.
@@ -171,6 +172,47 @@ def test_rollouts_that_record_some_states_have_the_gradients_of_those() -> None:
     assert torch.equal(found, expected)
 
 
+@pytest.mark.parametrize("steps", [2, 5])
+def test_records_of_some_states_are_their_own(steps: int) -> None:
+    """With gradients as without: they do not hold on to the states between, and may be changed in place."""
+    sim, state = body()
+    forces = torch.zeros_like(state.positions).requires_grad_()
+    track = sim.rollout(state, steps, 2, forces=forces)
+    for records in (track.positions, track.velocities):
+        assert records.is_contiguous()
+        assert records.untyped_storage().nbytes() == records.numel() * records.element_size()
+    (expected,) = torch.autograd.grad(track.positions.sum(), forces, retain_graph=True)
+    places = track.positions
+    places -= 1.0
+    (found,) = torch.autograd.grad(places.sum(), forces)
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("batch", [0, 2])
+def test_the_adjoint_of_a_rollout_is_that_of_its_steps(batch: int, own: bool) -> None:
+    sim, state = body(pd.Sphere((0.5, -0.29, 0.1), 0.3))
+    x, v = (t[:batch] for t in state)
+    arrays, plan = [array.detach() for array in sim.material()], list(sim.plan.arrays)
+    if own:
+        arrays = [array.expand(batch, *array.shape).clone() for array in arrays]
+    after, speeds, _ = torch.ops.torchpd.rollout(x, v, None, arrays, plan, steps=2, every=1, **sim.numbers(
+        inertial=False, report=False
+    ))  # fmt: skip
+    h = {"time_step": sim.time_step}
+    found = torch.ops.torchpd.rollout_vjp(after, speeds, after, speeds, x, v, None, arrays, plan, **h)
+    last = torch.ops.torchpd.step_vjp(after[1], speeds[1], after[1], after[0], speeds[0], None, arrays, plan, **h)
+    into = (last[0] + after[0], last[1] + speeds[0])
+    first = torch.ops.torchpd.step_vjp(*into, after[0], x, v, None, arrays, plan, **h)
+    # by the velocity of the ball it is one step further in the second
+    spheres = 3 + [row.name for row in MATERIAL_TABLE].index("spheres")
+    last[spheres][..., 5:] += last[spheres][..., :3]
+    expected = [first[0], first[1], *(a + b for a, b in zip(last[2:], first[2:], strict=True))]
+    for one, other in zip(found, expected, strict=True):
+        assert one.shape == other.shape
+        assert torch.allclose(one, other, rtol=1e-12, atol=0.0)
+
+
 def test_the_adjoint_of_a_rollout_checks_what_it_gets() -> None:
     sim, state = body()
     track = sim.rollout(state, 2)
@@ -181,6 +223,15 @@ def test_the_adjoint_of_a_rollout_checks_what_it_gets() -> None:
     for given, name in (((x[:1], v), "grad_positions"), ((x, v.float()), "grad_velocities")):
         with pytest.raises((ValueError, TypeError), match=f"^{name} must be"):
             torch.ops.torchpd.rollout_vjp(*given, x, v, *state, None, arrays, plan, time_step=sim.time_step)
+    # of no steps, too
+    none = x[:0]
+    for (first, speed, forces, h), name in (
+        ((state[0], state[1][:1], None, 0.1), "velocities"),
+        ((state[0], state[1], x[0, :1], 0.1), "forces"),
+        ((state[0], state[1], None, -1.0), "time_step"),
+    ):
+        with pytest.raises(ValueError, match=f"^{name} must be"):
+            torch.ops.torchpd.rollout_vjp(none, none, none, none, first, speed, forces, arrays, plan, time_step=h)
     with pytest.raises(ValueError, match="rollout_vjp: wanted must say of each of the"):
         torch.ops.torchpd.rollout_vjp(x, v, x, v, *state, None, arrays, plan, time_step=sim.time_step, wanted=[True])
     with pytest.raises(ValueError, match="rollout_vjp: material must have"):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import pytest
 import torch
+from functorch.compile import make_boxed_func
 from runs import ULP, noise, same_bits, small
 from torch import Tensor
-from torch._dynamo.testing import CompileCounterWithBackend
+from torch._dynamo.backends.common import aot_autograd
 
 import torchpd as pd
 from torchpd.solvers import Solver
@@ -59,25 +60,48 @@ def test_compiled_rollout_is_the_rollout(solver: Solver) -> None:
 
 
 def test_compiled_rollouts_of_any_length_are_two_graphs() -> None:
-    """Of the length that came first, and of all others; their backward is one op, however many the steps."""
+    """Of the length that came first, and of all others; forward and backward are one op, however many the steps.
+
+    Lengths of 0 and 1 are graphs of their own, which is torch's rule for numbers.
+    """
     sim, state = small(torch.float64, iterations=200)
     inputs = (sim.stiffness.requires_grad_(), state.velocities.requires_grad_())
+    graphs: dict[str, list[str]] = {"rollout": [], "rollout_vjp": []}
+
+    def compiler(name: str) -> Any:
+        def compile_graph(graph: torch.fx.GraphModule, _: Any) -> Any:
+            calls = [str(node.target) for node in graph.graph.nodes if node.op == "call_function"]
+            graphs[name].append(" ".join(call for call in calls if call.startswith("torchpd")))
+            return make_boxed_func(graph.forward)
+
+        return compile_graph
 
     def loss(v: Tensor, steps: int, every: int) -> Tensor:
         return sim.rollout(pd.State(state.positions, v), steps, every).positions.square().sum()
 
-    counter = CompileCounterWithBackend("aot_eager")
-    compiled = torch.compile(loss, fullgraph=True, backend=counter)
-    for steps, every in ((2, 1), (3, 1), (12, 1), (4, 2), (8, 4), (7, 3), (2, 1)):
-        found, expected = (torch.autograd.grad(play(inputs[1], steps, every), inputs) for play in (compiled, loss))
-        for one, other in zip(found, expected, strict=True):
-            assert float((one - other).abs().max()) <= 64 * ULP[torch.float64] * float(other.abs().max())
-    # records of every state, and of some
-    assert counter.frame_count <= 4
-    calls = [node.target for graph in counter.graphs for node in graph.graph.nodes if node.op == "call_function"]
-    assert calls.count(torch.ops.torchpd.rollout.default) + calls.count(torch.ops.torchpd.rollout) == len(
-        counter.graphs
-    )
+    backend = aot_autograd(fw_compiler=compiler("rollout"), bw_compiler=compiler("rollout_vjp"))
+    compiled = torch.compile(loss, fullgraph=True, backend=backend)
+    for lengths, every, most in (((2, 3, 12, 5, 2), 1, 2), ((4, 8, 7), 2, 4), ((9, 12), 3, 5), ((1, 0), 1, 7)):
+        for steps in lengths:
+            found, expected = (torch.autograd.grad(play(inputs[1], steps, every), inputs) for play in (compiled, loss))
+            for one, other in zip(found, expected, strict=True):
+                assert float((one - other).abs().max()) <= 64 * ULP[torch.float64] * float(other.abs().max())
+        assert len(graphs["rollout"]) <= most
+    for name, calls in graphs.items():
+        assert set(calls) == {f"torchpd.{name}.default"}
+
+
+def test_inductor_takes_rollouts_of_permuted_arrays() -> None:
+    """Whose gradients are laid out as their fakes say."""
+    sim, state = small(torch.float64, iterations=200)
+    x, f = (t.transpose(0, -1).contiguous().transpose(0, -1) for t in (state.positions, noise(state.positions)))
+    f.requires_grad_()
+
+    def loss(x: Tensor, f: Tensor) -> Tensor:
+        return sim.rollout(pd.State(x, state.velocities), 3, forces=f).positions.square().sum()
+
+    found, expected = (torch.autograd.grad(play(x, f), f)[0] for play in (torch.compile(loss, fullgraph=True), loss))
+    assert torch.allclose(found, expected, rtol=1e-9, atol=0.0)
 
 
 def test_compiled_rollouts_that_go_one_by_one() -> None:

@@ -120,6 +120,21 @@ def test_ops_with_a_plan_stay_out_of_the_graphs_of_torch_compile() -> None:
         assert torch.Tag.cudagraph_unsafe in getattr(ops, name).default.tags, name
 
 
+@pytest.mark.parametrize("name", ["step_vjp", "rollout_vjp"])
+def test_opcheck_of_adjoints_of_permuted_arrays(name: str, dtype: torch.dtype, device: torch.device) -> None:
+    """Whose results are laid out as their fakes say: torch.compile relies on that."""
+    arguments, keywords = samples(name, dtype, device)
+
+    def permuted(t: Any) -> Any:
+        if isinstance(t, list):
+            return [permuted(array) for array in t]
+        return t if t is None else t.transpose(0, -1).contiguous().transpose(0, -1)
+
+    *arrays, plan = arguments
+    report = torch.library.opcheck(getattr(ops, name).default, (*map(permuted, arrays), plan), keywords)
+    assert set(report.values()) == {"SUCCESS"}
+
+
 @pytest.mark.parametrize("outer", ["lbfgs", "momentum"])
 @pytest.mark.parametrize("name", ["step", "step_", "rollout", "step_vjp", "rollout_vjp"])
 def test_opcheck_of_the_multilevel_solver(name: str, outer: str, dtype: torch.dtype) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -63,19 +62,34 @@ def _fits(state: Sequence[torch.Size], material: Sequence[torch.Size]) -> bool:
     )
 
 
-def _join_all(op: Any, info: Any, in_dims: Any, args: Any, **numbers: Any) -> tuple[list[Any], tuple[int, int]]:
-    """The arguments (arrays of a state, material, plan) of all maps in one call; how many maps and environments."""
+def _join_all(
+    op: Any, info: Any, in_dims: Any, args: Any, tracks: int = 0, **numbers: Any
+) -> tuple[list[Any], tuple[int, int]]:
+    """The arguments (arrays of a state, material, plan) of all maps in one call; how many maps and environments.
+
+    The first `tracks` arguments are of all steps, [step, batch, V, 3].
+    """
     *state, material, plan = args
     *state_dims, material_dims, plan_dims = in_dims
     _check_plan(plan_dims)
     arrays, array_dims = _listed(material), _listed(material_dims)
     shapes = [_shape_of_one(t, d) for t, d in zip(state, state_dims, strict=True) if t is not None]
+    of_steps = shapes[:tracks]
+    shapes = shapes[tracks:]
     _check_one(
-        _fits(shapes, [_shape_of_one(t, d) for t, d in zip(arrays, array_dims, strict=True)]),
+        _fits(shapes, [_shape_of_one(t, d) for t, d in zip(arrays, array_dims, strict=True)])
+        and all(len(shape) == 4 and shape == of_steps[0] and shape[1:] == shapes[0] for shape in of_steps),
         op, in_dims, args, **numbers,
     )  # fmt: skip
     size, batch = info.batch_size, shapes[0][0]
-    joined = [None if t is None else _join(t, d, size, batch, 2) for t, d in zip(state, state_dims, strict=True)]
+    joined = [
+        t.repeat(1, size, 1, 1) if dim is None else t.movedim(dim, 1).flatten(1, 2)
+        for t, dim in zip(state[:tracks], state_dims[:tracks], strict=True)
+    ]
+    joined += [
+        None if t is None else _join(t, d, size, batch, 2)
+        for t, d in zip(state[tracks:], state_dims[tracks:], strict=True)
+    ]
     values = [_join(t, d, size, batch, own) for t, d, own in zip(arrays, array_dims, _OWN, strict=False)]
     return [*joined, values if isinstance(material, list) else values[0], plan], (size, batch)
 
@@ -96,8 +110,15 @@ def step_vjp_rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[
     return _vjp_rule(_ops.step_vjp, info, in_dims, args, **numbers)
 
 
-def _vjp_rule(op: Any, info: Any, in_dims: Any, args: Any, **numbers: Any) -> tuple[list[Tensor], int]:
-    (*state, values, plan), maps = _join_all(op, info, in_dims, args, **numbers)
+def rollout_vjp_rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[list[Tensor], int]:
+    """The adjoint of a rollout, whose gradients and states come first, of all steps."""
+    return _vjp_rule(_ops.rollout_vjp, info, in_dims, args, tracks=4, **numbers)
+
+
+def _vjp_rule(
+    op: Any, info: Any, in_dims: Any, args: Any, *, tracks: int = 0, **numbers: Any
+) -> tuple[list[Tensor], int]:
+    (*state, values, plan), maps = _join_all(op, info, in_dims, args, tracks, **numbers)
     each = [
         t.expand(maps[0] * maps[1], *t.shape[t.dim() - n :]).contiguous() for t, n in zip(values, _OWN, strict=True)
     ]
@@ -110,21 +131,6 @@ def _vjp_rule(op: Any, info: Any, in_dims: Any, args: Any, **numbers: Any) -> tu
         for grad, (shape, own) in zip(grads[3:], rows, strict=True)
     ]
     return [*grads[:3], *summed], 0
-
-
-def rollout_vjp_rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[list[Tensor], int]:
-    """The adjoint of a rollout: that of a step, and gradients and states of all steps [step, batch, V, 3] besides."""
-    shapes = [_shape_of_one(t, d) for t, d in zip(args[:5], in_dims[:5], strict=True)]
-    _check_one(
-        len(shapes[0]) == 4 and all(shape == shapes[0] for shape in shapes[:4]) and shapes[0][1:] == shapes[4],
-        _ops.rollout_vjp, in_dims, args, **numbers,
-    )  # fmt: skip
-    size = info.batch_size
-    tracks = [
-        t.repeat(1, size, 1, 1) if dim is None else t.movedim(dim, 1).flatten(1, 2)
-        for t, dim in zip(args[:4], in_dims[:4], strict=True)
-    ]
-    return _vjp_rule(partial(_ops.rollout_vjp, *tracks), info, in_dims[4:], args[4:], **numbers)
 
 
 def _diagonal_rule(info: Any, in_dims: Any, stiffness: Tensor, plan: list[Tensor], **options: Any) -> Any:

@@ -46,6 +46,7 @@ class Tipping:
         self.gap = piece.y @ self.normal - float(plane[3])
         self.reach = -LYING * float(piece.lag @ self.normal)
         self.lies, self.slips = self.gap < self.reach, piece.slips(self.normal)
+        self.free_slips, self.pressure, self.near = self.slips, piece.middle, 0.0  # of a motion
 
     def motion(self, free: Array) -> Array | None:
         """What every vertex is to be moved by [n, 3], `free` without contacts; None where it does not tip."""

@@ -90,7 +90,10 @@ def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
         every=1 if thinned else call.every,
         **sim.numbers(inertial=call.start == "inertial", report=call.report),
     )
-    positions, velocities, rows = (out[call.every - 1 :: call.every] if thinned else out for out in found)
+    if thinned:
+        # copies, since all states are kept for the adjoint: not by these, and not to change with them
+        found = [out[call.every - 1 :: call.every].clone(memory_format=torch.contiguous_format) for out in found]
+    positions, velocities, rows = found
     return Track(positions, velocities, Info.from_rows(rows))
 
 

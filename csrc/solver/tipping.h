@@ -20,7 +20,7 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr int tipping_rounds = 8;  // searches, at most
+constexpr int tipping_rounds = 8;  // searches for other vertices, at most
 // Of how near a vertex is that lies on the plane: vertices may go so deep, and the piece is lifted by as much.
 constexpr double touching_depth = 1e-3;
 constexpr double rounded_depth = 0.1;  // what one of those it turns about may go for rounding
@@ -123,7 +123,8 @@ struct Tipping {
 
   Stage stage;
   bool tips, first;  // its motion is one of these; before any iteration
-  bool rolls;  // since pressure is off all that touches there, else it may turn about the normal
+  // It turns about its vertex or line; else, sliding, about the normal alone, and sticking not at all.
+  bool rolls;
   int number, count, round;   // of the plane; of vertices that it turns about; of searches
   double reach, near, share;  // of the turn
   // where pressure has its centre if nothing moves, from the middle of what lies there, and in all
@@ -183,6 +184,7 @@ struct Tipping {
                   const double (&found)[Found::count], RigidMotion<double>& motion) {
     const bool probed = stage == Stage::probe;
     stage = Stage::none;
+    motion = fit.still();
     const double depth = found[Found::depth], left = found[Found::left];
     const bool has_found = depth < HUGE_VAL;
     if (!has_found && !probed) return false;
@@ -288,8 +290,7 @@ struct Tipping {
   }
 
   PD_COLD Trial turn_about(const RigidFit& fit, const Plane<double>& plane) const {
-    const double friction = plane.friction;
-    if (!(friction > 0.0)) return sliding(fit, plane, {0, 0, 0});
+    if (!(plane.friction > 0.0)) return sliding(fit, plane, {0, 0, 0});
     Trial stuck = pivot(fit, plane, least_slip());
     const Vec3<double> slipped = on[0].slip - on[count - 1].slip;
     stuck.holds = stuck.holds && dot(slipped, slipped) <= reach * reach &&
@@ -335,9 +336,9 @@ struct Tipping {
   // Of the slips between those of two vertices; none if they differ by as much.
   PD_HD Vec3<double> least_slip() const {
     const Vec3<double> way = on[count - 1].slip - on[0].slip;
-    const double square = dot(way, way),
-                 share = square > 0.0 ? -dot(on[0].slip, way) / square : 0.0;
-    const double within = share < 0.0 ? 0.0 : share > 1.0 ? 1.0 : share;
+    const double square = dot(way, way);
+    const double nearest = square > 0.0 ? -dot(on[0].slip, way) / square : 0.0;
+    const double within = nearest < 0.0 ? 0.0 : nearest > 1.0 ? 1.0 : nearest;
     const Vec3<double> least = multiply_add(within, way, on[0].slip);
     return dot(least, least) > square ? least : Vec3<double>{0, 0, 0};
   }
@@ -364,7 +365,7 @@ struct Tipping {
     return dot(rub, rub) <= most * most;
   }
 
-  // About them where they are less a slip, on the plane.
+  // Turns about its vertices, moved back by `slip` and down on to the plane.
   PD_COLD Trial pivot(const RigidFit& fit, const Plane<double>& plane,
                       const Vec3<double>& slip) const {
     const Vec3<double> n = plane.normal;
