@@ -95,13 +95,14 @@ def test_what_slides_on_an_edge_rubs_where_that_is_pushed(dtype: torch.dtype, de
     assert np.hypot(push[0], push[2]) == pytest.approx(0.3 * push[1], rel=1e-3 if dtype == torch.float32 else 1e-8)
 
 
-# size of a cube of 0.1 m turned by an angle [rad], friction, Young's modulus, cells an edge, velocity, steps
+# of a cube of 0.1 m: turned by an angle [rad], friction, Young's modulus, cells an edge, steps
 TUMBLES = [
     pytest.param(0.3, 0.1, 1e6, 2, 1, id="slides and turns"),
     pytest.param(0.3, 0.3, 1e5, 2, 6, id="turns while it slides back"),
     pytest.param(0.5, 0.3, 1e7, 2, 3, id="sticks at one end of its edge"),
     pytest.param(0.7, 0.1, 1e5, 3, 4, id="an edge of four vertices"),
     pytest.param(np.pi / 4, 0.1, 1e6, 2, 3, id="stands on its edge"),
+    pytest.param(0.7, 0.0, 1e5, 2, 3, id="smooth ground"),
 ]
 
 
