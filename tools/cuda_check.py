@@ -32,7 +32,13 @@ REPORTS = ROOT / "build" / "cuda-check"
 TARGETS = ("80", "90")
 # to save time only the kernels that most steps run
 NEWER_TARGETS = ("100",)
-NEWER_SOURCES = ("several_float.cu", "fused_float.cu", "stream_float.cu", "multilevel_float.cu")
+NEWER_SOURCES = (
+    "several_float.cu",
+    "fused_float.cu",
+    "fused_touching_float.cu",
+    "stream_float.cu",
+    "multilevel_float.cu",
+)
 # C++ that only a CUDA build of torch compiles, and what has parts for it
 GLUE = ("cuda/ops.cpp", "cuda/freeform_ops.cpp", "module.cpp")
 # a torch without CUDA lacks the header that says how its CUDA part was built
