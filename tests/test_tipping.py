@@ -83,16 +83,31 @@ def test_what_slides_and_tips_does_so_by_the_law_of_coulomb(dtype: torch.dtype, 
     assert push[[0, 2]] @ against > 0.999 * rub
 
 
-def test_what_slides_on_an_edge_rubs_where_that_is_pushed(dtype: torch.dtype, device: torch.device) -> None:
-    """Aside from the middle of it. All along it friction has one direction, so that the torque is of a force alone."""
-    case = leaning(0.3, turn=(0.0, 0.0, 20.0), velocity=(1.0, 0.0, 0.15), gravity=(0.0, -9.8, 0.1))
+def sliding_on_an_edge() -> Case:
+    return leaning(0.3, turn=(0.0, 0.0, 20.0), velocity=(1.0, 0.0, 0.15), gravity=(0.0, -9.8, 0.1))
+
+
+def check_that_it_rubs_where_it_is_pushed(case: Case, x: Array, v: Array, ulp: float, rounding: float) -> None:
+    """Aside from the middle of its edge. All along that friction has one direction: the torque is of a force alone."""
     edge = np.flatnonzero(case.positions[:, 1] < 1e-12)
     assert len(edge) == 2
-    x, v = after_step(case, dtype, device, 3)
     push, torque, size = contact_force(case, x, v, x[edge].mean(axis=0))
     assert abs(torque[0]) > 1e-3 * push[1]  # its centre: a torque along x by how far it is aside
-    assert abs(push @ torque) <= 256 * ULP[dtype] * size * np.linalg.norm(push)
-    assert np.hypot(push[0], push[2]) == pytest.approx(0.3 * push[1], rel=1e-3 if dtype == torch.float32 else 1e-8)
+    assert abs(push @ torque) <= 256 * ulp * size * np.linalg.norm(push)
+    assert np.hypot(push[0], push[2]) == pytest.approx(0.3 * push[1], rel=rounding)
+
+
+def test_what_slides_on_an_edge_rubs_where_that_is_pushed(dtype: torch.dtype, device: torch.device) -> None:
+    case = sliding_on_an_edge()
+    x, v = after_step(case, dtype, device, 3)
+    check_that_it_rubs_where_it_is_pushed(case, x, v, ULP[dtype], 1e-3 if dtype == torch.float32 else 1e-8)
+
+
+def test_in_the_oracle_it_rubs_there_as_well() -> None:
+    case = sliding_on_an_edge()
+    problem = step_problem(case.scene.values(), case.positions, case.velocities, H)
+    u = problem.align(problem.course(), first=True)
+    check_that_it_rubs_where_it_is_pushed(case, case.positions + u, u / H, ULP[torch.float64], 1e-12)
 
 
 # of a cube of 0.1 m: turned by an angle [rad], friction, Young's modulus, cells an edge, steps
