@@ -115,6 +115,14 @@ def test_glue_is_compiled_as_in_a_build_with_cuda(tool: dict[str, Any]) -> None:
     assert "-fsyntax-only" in " ".join(command)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_a_quick_check_hurries_where_the_compiler_can(tool: dict[str, Any], known: bool, tmp_path: Path) -> None:
+    compiler = tmp_path / "nvcc"
+    compiler.write_text(f"#!/bin/sh\necho '--optimize <level>{' --Ofast-compile <level>' * known}'\n")
+    compiler.chmod(0o755)
+    assert tool["quickly"](str(compiler)) == ["--Ofast-compile=max"] * known
+
+
 def test_a_quick_check_takes_one_architecture_a_source(tool: dict[str, Any]) -> None:
     sources = sorted((ROOT / "csrc").glob("**/*.cu"))
     everything = tool["choose_targets"](sources, quick=False)
