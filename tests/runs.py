@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from torch import Tensor
 
 import torchpd as pd
 from torchpd.reference import StepProblem, step_problem
-from torchpd.reference_solvers import Iterates, classic_chebyshev, guarded_chebyshev, jacobi
+from torchpd.reference_solvers import Iterates, Observer, classic_chebyshev, guarded_chebyshev, jacobi
 
 ULP = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}  # rounding of one operation, relative
 
@@ -69,17 +70,43 @@ def first_of(problem: StepProblem, case: Case, solver: pd.Jacobi | pd.Chebyshev)
     return problem.first_iterate(case.start, weighted=solver.numbers()["weighted"])
 
 
-def reference_run(problem: StepProblem, first: Array, solver: pd.Jacobi | pd.Chebyshev, iterations: int) -> Iterates:
-    """The iterations of `solver` in the reference."""
+def reference_run(
+    problem: StepProblem,
+    first: Array,
+    solver: pd.Jacobi | pd.Chebyshev,
+    iterations: int,
+    observe: Observer | None = None,
+) -> Iterates:
+    """The iterations of `solver` in the reference; `observe(k, u_k)` sees them."""
     numbers = solver.numbers()
     if isinstance(solver, pd.Jacobi):
-        return jacobi(problem, first, iterations=iterations, relaxation=solver.relaxation, weighted=numbers["weighted"])
+        return jacobi(
+            problem, first, iterations=iterations, relaxation=solver.relaxation, weighted=numbers["weighted"],
+            observe=observe,
+        )  # fmt: skip
     if solver.schedule == "classic":
         return classic_chebyshev(
             problem, first, iterations=iterations, rho=numbers["rho"], delay=numbers["delay"],
-            relaxation=numbers["relaxation"], weighted=numbers["weighted"],
+            relaxation=numbers["relaxation"], weighted=numbers["weighted"], observe=observe,
         )  # fmt: skip
-    return guarded_chebyshev(problem, first, iterations=iterations, relaxation=numbers["relaxation"], rho=solver.rho)
+    return guarded_chebyshev(
+        problem, first, iterations=iterations, relaxation=numbers["relaxation"], rho=solver.rho, observe=observe
+    )
+
+
+def reference_runs(
+    problem: StepProblem, first: Array, solver: pd.Jacobi | pd.Chebyshev, counts: Sequence[int]
+) -> Iterator[Iterates]:
+    """What `reference_run` gives for each of some counts, from one run; `energies` has that of its end."""
+    seen: dict[int, Array] = {}
+    run = reference_run(problem, first, solver, max(counts), seen.__setitem__)
+    diagonal = problem.weighted_diagonal if solver.numbers()["weighted"] else problem.plain_diagonal
+    scale = np.linalg.norm(problem.residual(problem.course(), diagonal))
+    for count in counts:
+        u = problem.align(seen[count])
+        residual = float(np.linalg.norm(problem.residual(u, diagonal)) / scale)
+        restarts = [k for k in run.restarts if k < count]
+        yield Iterates(u, residual, count, restarts, [(count, problem.energy(u))])
 
 
 def small_case() -> Case:
@@ -104,6 +131,15 @@ def small(
     factor = torch.linspace(0.5, 1.5, batch, dtype=dtype, device=device)[:, None, None]
     x, v = (tensor_of(array, sim) for array in (case.positions, case.velocities))
     return sim, pd.State(sim.rest_positions + factor * (x - sim.rest_positions), factor * v)
+
+
+def check_op(op: Any, arguments: Sequence[Any], keywords: dict[str, Any], dtype: torch.dtype) -> None:
+    """opcheck. Its traces, which take most of its time, know no precision, so that float64 is enough for them."""
+    utilities = ["test_schema", "test_autograd_registration", "test_faketensor"]
+    if dtype == torch.float64:
+        utilities.append("test_aot_dispatch_dynamic")
+    report = torch.library.opcheck(op.default, tuple(arguments), keywords, test_utils=utilities)
+    assert report == dict.fromkeys(utilities, "SUCCESS")
 
 
 def noise(like: Tensor, seed: int = 0) -> Tensor:

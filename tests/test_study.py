@@ -49,7 +49,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(scope="module")
 def bench() -> Bench:
-    return Bench(SUBJECTS["beam"](), CPU, series=1)
+    return Bench(SUBJECTS["beam"](), CPU, series=1, seconds=0.0)
 
 
 def test_the_time_step_has_order_one(bench: Bench) -> None:
@@ -97,7 +97,7 @@ def test_solvers_and_methods_meet_at_the_converged_step(bench: Bench) -> None:
 
 
 def test_refusals_and_divergence_become_rows() -> None:
-    landing = Bench(SUBJECTS["octopus"](), CPU, series=1)
+    landing = Bench(SUBJECTS["octopus"](), CPU, series=1, seconds=0.0)
     (row,) = baseline_rows(landing, "Newton", Setting(3e4, 1 / 60, 8), [4])
     assert row.status == "refused: this method knows no contacts; only the Jacobi family and Newton-PCG do"
     assert math.isinf(row.error)
@@ -107,7 +107,7 @@ def test_refusals_and_divergence_become_rows() -> None:
 
 def test_rows_of_the_direct_step_on_the_device(device: torch.device) -> None:
     """They approach the converged step, float64 further than float32; contacts and large meshes are refused."""
-    bench, setting = Bench(SUBJECTS["beam"](), device, series=1), Setting(1e5, 1 / 60, 2)
+    bench, setting = Bench(SUBJECTS["beam"](), device, series=1, seconds=0.0), Setting(1e5, 1 / 60, 2)
     for name in DENSE:
         for dtype, floor in ((torch.float32, 1e-4), (torch.float64, 1e-6)):
             rows = dense_rows(bench, name, dtype, setting, [1, 4, 16, 64])
@@ -116,7 +116,7 @@ def test_rows_of_the_direct_step_on_the_device(device: torch.device) -> None:
             assert all(before.error > after.error for before, after in pairwise(rows[:3]))
             assert rows[-1].error < floor
             assert all(row.milliseconds and row.setup_milliseconds and row.bytes for row in rows)
-    landing = Bench(SUBJECTS["octopus"](), device, series=1)
+    landing = Bench(SUBJECTS["octopus"](), device, series=1, seconds=0.0)
     (row,) = dense_rows(landing, "direct global step, dense", torch.float32, Setting(3e4, 1 / 60, 8), [4])
     assert row.refusal == "this method knows no contacts"
 
@@ -203,7 +203,7 @@ def test_diverged_is_what_ends_so() -> None:
 
 def test_a_stiff_beam_is_compared_with_its_converged_step() -> None:
     """3,321 vertices at 1e8 Pa, on which Chebyshev does not converge."""
-    bench, setting = Bench(SUBJECTS["beam"](), CPU, series=1), Setting(1e8, 1 / 30, 8)
+    bench, setting = Bench(SUBJECTS["beam"](), CPU, series=1, seconds=0.0), Setting(1e8, 1 / 30, 8)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UncertainWarning)
         rows = contender_rows(bench, "Multilevel", torch.float64, setting, [1, 16, 64])

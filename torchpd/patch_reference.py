@@ -37,6 +37,7 @@ class PatchReference:
         self.matrices = _numbers(patches.quadrics.triangular())
         self.on_surface = patches.measured_at == "surface"
         self.weight = 0.75 if patches.base == "phong" else 0.0
+        self._heights: dict[tuple[int, bytes], float] = {}  # they are the same in every pose
 
     def bumps(self, x: Array) -> Array:
         """sum_i R_i at x [..., 3]."""
@@ -50,22 +51,28 @@ class PatchReference:
 
     def height(self, patch: int, b: Array) -> float:
         """h, the root nearest to the outside where it is measured on the surface."""
+        place = patch, b.tobytes()
+        if place not in self._heights:
+            self._heights[place] = self._height(patch, b)
+        return self._heights[place]
+
+    def _height(self, patch: int, b: Array) -> float:
         corners = self.triangles[patch]
         base = b @ self.vertices[corners] + (b * self._lifts(patch, b)) @ self.directors[corners]
         if not self.on_surface:
             return float(self.bumps(base))
         director = b @ self.directors[corners]
 
-        def excess(h: float) -> float:
-            return float(h - self.bumps(base + h * director))
+        def excess(h: Array) -> Array:
+            return h - self.bumps(base + h[..., None] * director)
 
         low, high = np.minimum(self.amplitudes, 0.0).sum(), np.maximum(self.amplitudes, 0.0).sum()
         steps = np.linspace(high, low, 400)
-        values = np.array([excess(h) for h in steps])
-        first = int(np.flatnonzero(values <= 0.0)[0])
+        first = int(np.flatnonzero(excess(steps) <= 0.0)[0])
         if first == 0:
             return float(steps[0])
-        return float(brentq(excess, steps[first], steps[first - 1], xtol=1e-15, rtol=1e-15))
+        nearest = brentq(lambda h: float(excess(np.array(h))), steps[first], steps[first - 1], xtol=1e-15, rtol=1e-15)
+        return float(nearest)
 
     def point(self, patch: int, b: Array, positions: Array | None = None, frames: Array | None = None) -> Array:
         """S [3], at rest or with positions [V, 3] and frames [V, 3, 3]."""

@@ -88,11 +88,16 @@ def nearest_rotation(matrices: Array) -> Array:
     return left @ right
 
 
+# entries of a matrix, row by row, whose products are its cofactors
+_NEXT, _LAST = (1, 2, 0), (2, 0, 1)
+_ENTRIES = [[3 * i + j for i in rows for j in columns] for rows, columns in
+            ((_NEXT, _NEXT), (_LAST, _LAST), (_NEXT, _LAST), (_LAST, _NEXT))]  # fmt: skip
+
+
 def _cofactors(m: Array) -> Array:
     """Cofactor matrices of m [3, 3, n]: row i is the cross product of the other two rows."""
-    n, p = m[[1, 2, 0]], m[[2, 0, 1]]
-    return np.stack([n[:, 1] * p[:, 2] - n[:, 2] * p[:, 1], n[:, 2] * p[:, 0] - n[:, 0] * p[:, 2],
-                     n[:, 0] * p[:, 1] - n[:, 1] * p[:, 0]], axis=1)  # fmt: skip
+    a, b, c, d = (m.reshape(9, -1).take(entries, axis=0) for entries in _ENTRIES)
+    return np.asarray((a * b - c * d).reshape(m.shape))
 
 
 def nearest_rotation_fast(matrices: Array, *, sweeps: int = 9) -> Array:
@@ -125,7 +130,6 @@ class StepProblem:
     """The minimisation of one step, built by `step_problem`. Displacements u are [V, 3] in metres."""
 
     values: SceneValues
-    geometry: Elements
     time_step: float  # h, s
     positions: Array  # [V, 3] x_t
     velocities: Array  # [V, 3]
@@ -134,6 +138,11 @@ class StepProblem:
     free: Mask  # [V] not hard-pinned
     sphere_centers: Array  # [S, 3] at the end of the step
     sphere_motions: Array  # [S, 3] displacement of the centres during the step
+
+    @cached_property
+    def geometry(self) -> Elements:
+        """Of the rest shape."""
+        return elements(self.values.rest_positions, self.values.tets)
 
     @cached_property
     def operator(self) -> csr_array:
@@ -338,7 +347,6 @@ def step_problem(
     free[held[~soft]] = False
     return StepProblem(
         values=values,
-        geometry=elements(values.rest_positions, values.tets),
         time_step=time_step,
         positions=positions,
         velocities=velocities,

@@ -23,6 +23,7 @@ Index = NDArray[np.int64]
 # from the planes of triangles. The latter keeps triangles even where the surface is flat.
 _BOUNDARY, _PLACE = 10.0, 3e-3
 _LEAST_TURN = 0.2  # cosine between the old and the new normal of a triangle
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 _LEAST_SHAPE = 0.05  # twice the area over the longest edge squared: 0.87 for an equilateral triangle
 
 
@@ -58,6 +59,11 @@ def _vertex_quadrics(vertices: Array, triangles: Index) -> Array:
     return total
 
 
+def _cross(a: Array, b: Array) -> Array:
+    """`np.cross` of [N, 3], many times faster for few."""
+    return np.asarray(a[:, _NEXT] * b[:, _LAST] - a[:, _LAST] * b[:, _NEXT])
+
+
 class _Surface:
     """Triangles around each vertex, and a heap of the edges that may be contracted."""
 
@@ -71,19 +77,17 @@ class _Surface:
         for number, corners in enumerate(self.triangles.tolist()):
             for corner in corners:
                 self.around[corner].add(number)
-        self.heap: list[tuple[float, int, int, int, int]] = []
-        pairs = np.unique(np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-        for u, v in pairs.tolist():
-            self.offer(u, v)
+        # no two are of the same vertices and versions: places are not compared
+        self.heap: list[tuple[float, int, int, int, int, Array]] = []
+        self.offer(np.unique(np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
 
-    def place(self, u: int, v: int) -> tuple[float, Array]:
-        """Where the sum of both quadrics is least, and its value there."""
-        form = self.quadrics[u] + self.quadrics[v]
-        x = np.linalg.solve(form[:3, :3], -form[:3, 3])
-        return float(form[:3, 3] @ x + form[3, 3]), x
-
-    def offer(self, u: int, v: int) -> None:
-        heapq.heappush(self.heap, (self.place(u, v)[0], u, v, self.version[u], self.version[v]))
+    def offer(self, pairs: Index) -> None:
+        """Edges [N, 2] at what the sum of both quadrics is least, and where that is."""
+        forms = self.quadrics[pairs[:, 0]] + self.quadrics[pairs[:, 1]]
+        places = np.linalg.solve(forms[:, :3, :3], -forms[:, :3, 3:])[..., 0]
+        for (u, v), form, x in zip(pairs.tolist(), forms, places, strict=True):
+            least = float(form[:3, 3] @ x + form[3, 3])
+            heapq.heappush(self.heap, (least, u, v, self.version[u], self.version[v], x))
 
     def neighbours(self, u: int) -> set[int]:
         return {corner for face in self.around[u] for corner in self.triangles[face].tolist()} - {u}
@@ -108,8 +112,8 @@ class _Surface:
         old = self.vertices[elements]
         new = np.where(((elements == u) | (elements == v))[..., None], x, old)
         sides = new[:, [1, 2, 0]] - new
-        before = np.cross(old[:, 1] - old[:, 0], old[:, 2] - old[:, 0])
-        after = np.cross(sides[:, 0], sides[:, 1])
+        before = _cross(old[:, 1] - old[:, 0], old[:, 2] - old[:, 0])
+        after = _cross(sides[:, 0], sides[:, 1])
         longest2 = (sides**2).sum(axis=2).max(axis=1)
         size = np.linalg.norm(after, axis=1)
         turned = (before * after).sum(axis=1) > _LEAST_TURN * np.linalg.norm(before, axis=1) * size
@@ -130,8 +134,7 @@ class _Surface:
         self.quadrics[u] += self.quadrics[v]
         self.version[u] += 1
         self.version[v] += 1
-        for w in sorted(self.neighbours(u)):
-            self.offer(min(u, w), max(u, w))
+        self.offer(np.array([(min(u, w), max(u, w)) for w in sorted(self.neighbours(u))]).reshape(-1, 2))
         return len(wings)
 
 
@@ -149,10 +152,9 @@ def simplify(mesh: TriMesh, triangles: int) -> TriMesh:
     surface = _Surface(mesh)
     left = len(mesh.triangles)
     while left > most and surface.heap:
-        _, u, v, at_u, at_v = heapq.heappop(surface.heap)
+        _, u, v, at_u, at_v, x = heapq.heappop(surface.heap)
         if (surface.version[u], surface.version[v]) != (at_u, at_v):
             continue
-        _, x = surface.place(u, v)
         if surface.keeps_topology(u, v) and surface.keeps_shape(u, v, x):
             left -= surface.contract(u, v, x)
     if left > most:

@@ -159,7 +159,7 @@ def study_rows(options: StudyOptions, *, progress: bool = True) -> list[Row]:
     device = find_device(options.device)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    bench = Bench(subject, device, series=1 if options.quick else 6)
+    bench = Bench(subject, device, series=1, seconds=0.0) if options.quick else Bench(subject, device)
     setting = _setting(subject, options)
     options.out.mkdir(parents=True, exist_ok=True)
     settings = {

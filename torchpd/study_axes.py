@@ -69,8 +69,8 @@ def contender_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting
     sim = bench.simulator(setting, dtype, solver)
     rows = [
         measure_step(
-            sim, state, exact, count, series=bench.series, axis="solver", method=name, youngs=setting.youngs,
-            setup_milliseconds=setup, default=_is_default(name, dtype, count),
+            sim, state, exact, count, series=bench.series, seconds=bench.seconds, axis="solver", method=name,
+            youngs=setting.youngs, setup_milliseconds=setup, default=_is_default(name, dtype, count),
         )
         for count in counts
     ]  # fmt: skip
@@ -159,7 +159,7 @@ def dense_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, co
             Row(
                 iterations=count, local_steps=count, error=errors.position, error_energy=errors.energy,
                 residual=errors.residual, error_metres=errors.metres, setup_milliseconds=setup.median, bytes=held,
-                bytes_by=how, **time_calls(play, bench.device, series=bench.series).columns(), **common,
+                bytes_by=how, **bench.time(play).columns(), **common,
             )
         )  # fmt: skip
     return _judged(rows)
@@ -187,7 +187,7 @@ def float_rows(bench: Bench, setting: Setting, counts: list[int]) -> list[Row]:
             sim.iterations = count
             after = sim(State(*(part.to(sim.dtype) for part in state)))
             ends.append(after.velocities[0].double().cpu().numpy() * sim.time_step)
-        timing = time_calls(lambda: sims[0](given), bench.device, series=bench.series)
+        timing = bench.time(lambda: sims[0](given))
         off = ends[0] - ends[1]
         error = float(np.linalg.norm(off)) / exact.scale
         rows.append(
@@ -289,8 +289,8 @@ def paper_rows(bench: Bench) -> list[Row]:
         more = {"constraints": float(constraints), "paper_milliseconds": theirs}
         rows.append(
             measure_step(
-                sim, state, exact_steps(sim, state)[0], DEFAULT_ITERATIONS, series=bench.series, axis="paper",
-                method=DEFAULT, youngs=1e5, default=True, more=more,
+                sim, state, exact_steps(sim, state)[0], DEFAULT_ITERATIONS, series=bench.series, seconds=bench.seconds,
+                axis="paper", method=DEFAULT, youngs=1e5, default=True, more=more,
             )
         )  # fmt: skip
     return rows

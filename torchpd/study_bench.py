@@ -71,6 +71,7 @@ class Bench:
     subject: Subject
     device: torch.device
     series: int = 6  # of times, where they scatter
+    seconds: float = 0.05  # of each of them, at least
     _meshes: dict[int, TetMesh] = field(default_factory=dict)
     _steps: dict[Setting, tuple[State, ExactStep]] = field(default_factory=dict)
     motions: dict[tuple[Setting, float], Trajectory] = field(default_factory=dict)  # converged, by their seconds
@@ -94,6 +95,10 @@ class Bench:
         """The beginning of the motion in the precision of the simulator, as float32 holds it."""
         state = self.subject.start(sim)
         return State(*(part.float().to(sim.dtype) for part in state))
+
+    def time(self, work: Callable[[], object]) -> Timing:
+        """Of a call."""
+        return time_calls(work, self.device, seconds=self.seconds, series=self.series)
 
     @torch.no_grad()
     def hard_step(self, setting: Setting) -> tuple[State, ExactStep]:
@@ -265,6 +270,7 @@ def measure_step(
     iterations: int,
     *,
     series: int = 1,
+    seconds: float = 0.05,
     more: dict[str, float] | None = None,
     **columns: Any,
 ) -> Row:
@@ -273,7 +279,7 @@ def measure_step(
     given = State(*(part.to(sim.dtype) for part in state))
     after = sim(given)
     errors = exact.judge(after.velocities[0].double().cpu().numpy() * sim.time_step)
-    timing = time_calls(lambda: sim(given), sim.device, series=series)
+    timing = time_calls(lambda: sim(given), sim.device, seconds=seconds, series=series)
     real = torch.finfo(sim.dtype).bits // 8
     memory = PeakMemory(sim.device, sim.plan.bytes + workspace_bytes(sim.plan, real, sim.solver))
     sim(given)
