@@ -133,15 +133,6 @@ def small(
     return sim, pd.State(sim.rest_positions + factor * (x - sim.rest_positions), factor * v)
 
 
-def check_op(op: Any, arguments: Sequence[Any], keywords: dict[str, Any], dtype: torch.dtype) -> None:
-    """opcheck. Its traces, which take most of its time, know no precision, so that float64 is enough for them."""
-    utilities = ["test_schema", "test_autograd_registration", "test_faketensor"]
-    if dtype == torch.float64:
-        utilities.append("test_aot_dispatch_dynamic")
-    report = torch.library.opcheck(op.default, tuple(arguments), keywords, test_utils=utilities)
-    assert report == dict.fromkeys(utilities, "SUCCESS")
-
-
 def noise(like: Tensor, seed: int = 0) -> Tensor:
     return torch.randn(like.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)).to(like)
 

@@ -120,7 +120,7 @@ def test_a_quick_check_hurries_where_the_compiler_can(tool: dict[str, Any], know
     compiler = tmp_path / "nvcc"
     compiler.write_text(f"#!/bin/sh\necho '--optimize <level>{' --Ofast-compile <level>' * known}'\n")
     compiler.chmod(0o755)
-    assert tool["quickly"](str(compiler)) == ["--Ofast-compile=max"] * known
+    assert tool["fast_flags"](str(compiler)) == ["--Ofast-compile=max"] * known
 
 
 def test_a_quick_check_takes_one_architecture_a_source(tool: dict[str, Any]) -> None:

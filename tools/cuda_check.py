@@ -90,7 +90,7 @@ def command_for(
     return [*command, *nvcc_flags(), *targets, "-Xptxas=-v"]
 
 
-def quickly(nvcc: str) -> list[str]:
+def fast_flags(nvcc: str) -> list[str]:
     """What makes an nvcc that knows it compile as fast as it can."""
     described = subprocess.run([nvcc, "--help"], capture_output=True, text=True, check=False).stdout
     return ["--Ofast-compile=max"] if "--Ofast-compile" in described else []
@@ -219,14 +219,14 @@ def main() -> int:
     targets = choose_targets(everything, quick=options.quick)
     folders = include_folders()
     REPORTS.mkdir(parents=True, exist_ok=True)
-    hasty = quickly(nvcc) if options.quick else []
+    fast = fast_flags(nvcc) if options.quick else []
     made_of = fingerprint()  # now: who changes a source meanwhile makes the table stale
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         passed = list(
             pool.map(
                 lambda source: compile_source(
                     command_for(nvcc, source, folders, targets[source], quick=options.quick)
-                    + (hasty if source.suffix == ".cu" else []),
+                    + (fast if source.suffix == ".cu" else []),
                     source,
                 ),
                 everything,

@@ -99,7 +99,9 @@ def _add_study(commands: Any) -> None:
     study.add_argument("--threads", type=_whole, help="of the CPU")
     study.add_argument("--out", type=Path, default=Path("out/study"), help="folder for the files (%(default)s)")
     study.add_argument(
-        "--quick", action="store_true", help="few points, to see that everything runs: 8 iterations at most"
+        "--quick",
+        action="store_true",
+        help="few points, timed by few calls, to see that everything runs: 8 iterations at most",
     )
 
 
