@@ -219,8 +219,8 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.part_slot = pieces ? arrays[part_slot_array].size(0) : 0;
   count.piece_end = pieces ? plan.pieces + 1 : 0;
   count.part = plan.parts;
-  count.stored_block = plan.kernel == 0 ? plan.blocks : 0;
-  const bool computed = plan.kernel != 0, fixed = computed && sizeof(T) == 4;
+  const bool computed = plan.kernel == 3, fixed = computed && sizeof(T) == 4;
+  count.stored_block = computed ? 0 : plan.blocks;
   count.rest_slot = computed && !fixed ? plan.slots : 0;
   count.fixed_slot = fixed ? plan.slots : 0;
   count.computed_block = computed ? plan.blocks : 0;

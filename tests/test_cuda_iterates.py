@@ -34,6 +34,7 @@ from test_same_iterates import CASES as SAME_CASES
 from test_same_iterates import RESTARTS, SOLVERS, in_a_corner, restarting, stirred
 
 import torchpd as pd
+from torchpd import regimes
 from torchpd.reference import StepProblem, nearest_rotation_fast
 from torchpd.reference_solvers import Iterates
 
@@ -295,6 +296,20 @@ def test_iterates_of_large_patches(name: str, solver: str, precision: str) -> No
     if name != "cones":
         assert (sim.plan.patch_outer < 300).any()  # less than what threads there are have in one round
     check(sim, name, solver)
+
+
+def test_iterates_of_patches_with_many_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread has five pairs of tetrahedra and more; in float64 no such patch fits the shared memory of a block."""
+    monkeypatch.setattr(regimes, "_GRID_TETS", 4000)
+    case = bar((30, 10, 10), pd.Gravity())
+    sim = simulator(case, torch.float32, GPU, kernel="grid", iterations=12)
+    assert (sim.plan.patch_pairs > 5 * 384).all()
+    plain = simulator(case, torch.float64, iterations=12)
+    state = state_of(case, sim, 3)
+    after, info = sim(state, return_info=True)
+    expected, facts = plain(moved(state, "cpu", torch.float64), return_info=True)
+    assert relative(after.velocities, expected.velocities) <= 2 * TOLERANCE[torch.float32]
+    assert info.residual.cpu() == pytest.approx(facts.residual, rel=1e3 * TOLERANCE[torch.float32])
 
 
 @pytest.mark.parametrize("precision", DTYPES)

@@ -199,13 +199,12 @@ def test_a_kernel_that_does_not_fit_is_refused_with_numbers() -> None:
 
 
 def test_shared_memory_by_hand(dtype: torch.dtype) -> None:
-    """Many patches keep six numbers a slot (position, rest position) in place of eight, and both 1 KB for control."""
+    """Many patches keep four numbers a slot (position) in place of eight (and u), and both 1 KB for control."""
     values, real = values_of((4, 4, 4)), torch.finfo(dtype).bits // 8
-    for kernel, numbers in (("block", 8), ("grid", 6)):
+    for kernel, numbers in (("block", 8), ("grid", 4)):
         plan = choose_plan(values, dtype, H100, kernel)
         slots, entries = plan.size("most_slots"), plan.size("most_entries")
-        filled = -(-numbers * real * slots // 16) * 16
-        assert shared_bytes(plan, 2, 3) == 1024 + filled + real * (4 * entries + 5 * 2 + 8 * 3)
+        assert shared_bytes(plan, 2, 3) == 1024 + real * (numbers * slots + 4 * entries + 5 * 2 + 8 * 3)
 
 
 def test_what_is_refused_unbuilt_does_not_fit_when_built() -> None:

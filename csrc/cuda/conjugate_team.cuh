@@ -34,7 +34,8 @@ struct ConjugateTeams {
   PD_HD int product_parts() const { return call.plan.patches + parts_of(call.plan.shared); }
 };
 
-template <class T, bool Leveled>
+// `Leveled`: with a preconditioner; `Computed`: see rest_of.
+template <class T, bool Leveled, bool Computed>
 class ConjugateTeam {
   static_assert(conjugate_threads<T> % (most_parts * warp_size) == 0);
 
@@ -238,7 +239,7 @@ class ConjugateTeam {
       slots_.set(s, vec3(m_.x[i]) - anchor, direction(i));
     }
     __syncthreads();
-    each_pair<2>(patch, slots_, rest_of<true>(patch), weights_, entries_, SolidHessian{});
+    each_pair<2>(patch, slots_, rest_of<Computed>(patch), weights_, entries_, SolidHessian{});
     __syncthreads();
     for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
       const int slot = patch.first_slot + s;
@@ -320,7 +321,7 @@ __device__ ConjugateMemory<T> memory_of_team(const ConjugateTeams<T>& work, int 
   return m;
 }
 
-template <class T, bool Leveled>
+template <class T, bool Leveled, bool Computed>
 __global__ void __launch_bounds__(conjugate_threads<T>)
     conjugate_teams(const __grid_constant__ ConjugateTeams<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
@@ -330,7 +331,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
   BlockTeam team(int(blockIdx.x) % work.blocks, work.blocks, work.counter + number);
   const ConjugateMemory<T> memory = memory_of_team(work, number);
   for (std::int64_t e = number; e < work.call.batch; e += work.teams)
-    ConjugateTeam<T, Leveled>(work, memory, e, team, shared, warp_sums, cycle_sums).run();
+    ConjugateTeam<T, Leveled, Computed>(work, memory, e, team, shared, warp_sums, cycle_sums).run();
 }
 
 template <class T>
@@ -347,7 +348,7 @@ struct ConjugateLaunch {
   Teams teams;
 
   explicit ConjugateLaunch(const DeviceConjugate<T>& call)
-      : kernel(call.plan.levels.there() ? function<true>() : function<false>()),
+      : kernel(kernel_for(call.plan)),
         threads(threads_of(call.plan)),
         shared(pass_shared_bytes(sizeof(T), call.plan.most_slots, call.plan.most_entries, 2)),
         teams(std::min(call.batch, std::max<std::int64_t>(1, most_vertices / call.plan.vertices)),
@@ -359,9 +360,13 @@ struct ConjugateLaunch {
   }
 
  private:
-  template <bool Leveled>
+  static const void* kernel_for(const DevicePlan<T>& plan) {
+    if (!computes_rests(plan)) return function<false, false>();
+    return plan.levels.there() ? function<true, true>() : function<false, true>();
+  }
+  template <bool Leveled, bool Computed>
   static const void* function() {
-    return reinterpret_cast<const void*>(conjugate_teams<T, Leveled>);
+    return reinterpret_cast<const void*>(conjugate_teams<T, Leveled, Computed>);
   }
   int resident() const {
     const int blocks = resident_blocks(kernel, threads, shared);
@@ -404,7 +409,11 @@ void run_conjugate_teams(const DeviceConjugate<T>& call, void* memory, cudaStrea
   const ConjugateLaunch<T> launch(call);
   Arena arena(memory);
   ConjugateTeams<T> work = arrange_teams(arena, call, launch);
-  weigh_field<true>(work.product, stream);
+  if (computes_rests(call.plan)) {
+    weigh_field<true>(work.product, stream);
+  } else {
+    weigh_field<false>(work.product, stream);
+  }
   const int most = launch.most_iterations(call);
   for (std::int64_t done = 0; done < call.iterations; done += most) {
     work.call.iterations = int(std::min<std::int64_t>(most, call.iterations - done));

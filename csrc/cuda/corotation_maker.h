@@ -225,7 +225,7 @@ class CorotationMaker {
   // A tetrahedron of the patch, to place threadIdx.x of the tile.
   PD_DEVICE void see(const Patch<T>& patch, int first, const TurningTile<T>& tile) const {
     const int place = threadIdx.x, tet = first + place;
-    const HalfNumbers<T> numbers = read_half(patch, in_.weights, tet);
+    const HalfNumbers<T> numbers = read_half<true>(patch, in_.weights, tet);
     const bool there = tet < 2 * patch.pairs && numbers.weight > T(0);
     Vec3<T> x[4];
     T weight[turning_groups][4];

@@ -237,10 +237,10 @@ void run_field(const DeviceField<T>& field, void* memory, Stream to) {
   const auto stream = static_cast<cudaStream_t>(to);
   Arena arena(memory);
   const FieldWork<T> work = arrange(arena, field, field.batch);
-  if (field.plan.kernel == int(DeviceKernel::block)) {
-    run_field_with<false>(work, stream);
-  } else {
+  if (computes_rests(field.plan)) {
     run_field_with<true>(work, stream);
+  } else {
+    run_field_with<false>(work, stream);
   }
 }
 

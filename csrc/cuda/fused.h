@@ -5,6 +5,7 @@
 // on the vertices that they share, and each adds them up in the same order and moves its own copy. Those of a cluster share no
 // vertices: each works out all tetrahedra that touch its own, and sends where these are now.
 #pragma once
+#include "cuda/ahead.h"
 #include "cuda/fused_call.h"
 #include "cuda/half.h"
 #include "cuda/halo.h"
@@ -23,9 +24,9 @@ template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 class FusedRunner {
   static constexpr bool Many = Kind != Blocks::one;  // patches an environment
   static constexpr bool Clustered = Kind == Blocks::cluster;
-  static constexpr bool AtHand =
-      Near || Clustered;  // patches have the rest shapes of first tetrahedra
-  static constexpr bool Once = AtHand && near_once(sizeof(T));
+  static constexpr bool Once = (Near || Clustered) && near_once(sizeof(T));
+  // whether each thread keeps its first tetrahedron, or else of a grid its first pair
+  static constexpr bool Halves = Clustered || (Kind == Blocks::grid && Near);
   // near patches have their vertices at hand
   static constexpr bool looks_ahead = Kind == Blocks::grid && !Near;
   using Lanes = Thread<T>;
@@ -49,7 +50,7 @@ class FusedRunner {
         set_(call.step.settings),
         index_(Many ? int(blockIdx.x) % call.step.plan.patches : 0),
         patch_(call.step.plan, index_),
-        soon_(2 * patch_.pairs),
+        soon_(patch_.pairs),
         team_(Many ? int(blockIdx.x) / call.step.plan.patches : int(blockIdx.x)),
         memory_(call.scratch),
         control_(*reinterpret_cast<Control<T>*>(shared)),
@@ -233,8 +234,6 @@ class FusedRunner {
   PD_DEVICE void place(int s, const Vec3<T>& position) {
     if constexpr (Clustered) {
       return;
-    } else if constexpr (Many) {
-      slots_.set_first(s, position);
     } else {
       position_[s] = quad(position);
     }
@@ -260,32 +259,27 @@ class FusedRunner {
 
   template <class Element>
   PD_DEVICE T each_element(const Element& element) {
-    if constexpr (Many) {
-      // what small patches do not work out again they have registers for
-      const auto shape_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4],
-                                bool first) {
-        if (AtHand && (Once || first)) return rest_;
-        if constexpr (Clustered) {
-          return half_rest(numbers, per_unit_, rest_of<true>(patch_).position);
-        } else {
-          return half_rest(numbers, per_unit_, slots_, seen);
-        }
+    if constexpr (Halves) {
+      const auto shape_of = [&](int number, const HalfNumbers<T>&, const Quad<T>(&)[4]) {
+        return Once || number == int(threadIdx.x) ? rest_ : half_rest(patch_, number);
       };
       const auto counts = [&](int number, T met) {
         return !Clustered || this->counts(number, met);
       };
-      HalfNumbers<T> now = half_;
+      if constexpr (Clustered) {
+        return each_half<Once, false>(patch_, halo_.positions(round_), shape_of, counts, weights(),
+                                      entries_of_round(), element, half_);
+      } else {
+        return each_half<Once, false>(patch_, SlotPositions<T>{position_}, shape_of, counts,
+                                      weights(), entries_, element, half_);
+      }
+    } else if constexpr (Many) {
       T energy = T(0);
-      const int all = 2 * patch_.pairs;
 #pragma unroll 1
-      for (int begin = 0, end = soon_;; begin = end, end = all) {
-        if constexpr (Clustered) {
-          return each_half<Once>(patch_, halo_.positions(round_), shape_of, counts, weights(),
-                                 entries_of_round(), element, now, 0, all);
-        }
-        energy += each_half<Once>(patch_, slots_, shape_of, counts, weights(), entries_, element,
-                                  now, begin, end);
-        if (Near || end == all) return energy;
+      for (int begin = 0, end = soon_;; begin = end, end = patch_.pairs) {
+        energy +=
+            each_pair_ahead(patch_, position_, weights(), entries_, element, pair_, begin, end);
+        if (end == patch_.pairs) return energy;
         __syncthreads();
         post_shared();
       }
@@ -293,7 +287,7 @@ class FusedRunner {
       const auto read = [&](unsigned corner, Vec3<T>(&x)[1]) {
         x[0] = at_corner(position_, corner);
       };
-      return each_pair<1>(patch_, read, rest_of<Many>(patch_), weights(), entries_, element);
+      return each_pair<1>(patch_, read, rest_of<false>(patch_), weights(), entries_, element);
     }
   }
 
@@ -388,7 +382,9 @@ class FusedRunner {
 
   // Whether nobody waits for the sums of the last iteration but the leading warp: energies are left before the wait for letters,
   // and sent once it has made its own visits.
-  PD_DEVICE bool leaves_early() const { return Many && AtHand && !(set_.tolerance > 0); }
+  PD_DEVICE bool leaves_early() const {
+    return Many && (Near || Clustered) && !(set_.tolerance > 0);
+  }
 
   // The weight of the last iteration that was counted, whose sums are concluded.
   PD_DEVICE double omega_of_sums() const {
@@ -449,14 +445,13 @@ class FusedRunner {
   const Settings& set_;
   int index_;  // of the patch
   Patch<T> patch_;
-  int soon_;  // of a grid: tetrahedra after which forces on shared vertices are complete, a multiple of the threads, or all
+  int soon_;  // of a far grid: pairs after which forces on shared vertices are complete, a multiple of the threads, or all
   int team_;
   const FusedScratch<T>& memory_;
   Control<T>& control_;
   TeamSums<Kind> sums_;
-  // where elements read vertices, from the patch's first; of a grid with rest positions; of a cluster halo_ has them
+  // where elements read vertices, from the patch's first; of a cluster halo_ has them
   Quad<T>* position_;
-  Slots<T> slots_;
   Quad<T>* entries_;  // forces of elements
   double* energies_;  // of a cluster: what each thread has met of them
   Vertices<T, Touching> v_;
@@ -466,9 +461,9 @@ class FusedRunner {
   Inputs<T> in_;
   Contacts<T> contacts_;
   OwnHalo halo_;         // of a cluster
-  HalfNumbers<T> half_;  // with many patches: this thread's first tetrahedron
-  FaceRest<T, 1> rest_;  // with near patches, or in a cluster: its rest shape
-  T per_unit_ = T(1);    // units of rest positions that make a metre
+  HalfNumbers<T> half_;  // with Halves: this thread's first tetrahedron,
+  FaceRest<T, 1> rest_;  // and its rest shape
+  PairAhead<T> pair_;    // of a grid without: this thread's first pair, between passes
   int row_ =
       0;  // slot_row of a grid's first seat of this thread, of the vertex that it has in a cluster
   Seat at_;    // the seat that comes next,

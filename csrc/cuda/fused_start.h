@@ -8,17 +8,13 @@ namespace pd::inline PD_TARGET {
 template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::lay_out(const FusedCall<T>& call,
                                                                     std::byte* shared) {
-  std::byte* slots = shared + fused_control_bytes;
   if constexpr (Clustered) {
     energies_ = reinterpret_cast<double*>(shared + cluster_energy_begin);
     entries_ =
         reinterpret_cast<Quad<T>*>(shared + halo_begin + halo_bytes(sizeof(T), plan_.most_slots));
-  } else if constexpr (Many) {
-    slots_ = Slots<T>(slots, plan_.most_slots);
-    entries_ = reinterpret_cast<Quad<T>*>(slots + slots_bytes(sizeof(T), plan_.most_slots, 2));
   } else {
-    position_ = reinterpret_cast<Quad<T>*>(slots);
-    entries_ = position_ + 2 * plan_.most_slots;
+    position_ = reinterpret_cast<Quad<T>*>(shared + fused_control_bytes);
+    entries_ = position_ + (Many ? 1 : 2) * plan_.most_slots;
   }
   const auto array = [&](VertexArray a) {
     Quad<T>* const kept = reinterpret_cast<Quad<T>*>(shared + vertices_begin(call.step, Clustered));
@@ -45,7 +41,7 @@ template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::open(std::byte* shared) {
   if constexpr (!Near) {
     const int threads = blockDim.x;
-    soon_ = min((2 * patch_.outer + threads - 1) / threads * threads, soon_);
+    soon_ = min((patch_.outer + threads - 1) / threads * threads, soon_);
   }
   if constexpr (Clustered) {
     if (OwnHalo::vertex() < patch_.interior) row_ = patch_.row(OwnHalo::vertex());
@@ -66,8 +62,6 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::load() {
     const Vec3<T> none = {T(0), T(0), T(0)};
     if constexpr (Clustered) {
       return;
-    } else if constexpr (Many) {
-      slots_.set(s, none, rest_of<true>(patch_).position[s].bits());
     } else {
       position_[s] = quad(none);
     }
@@ -121,45 +115,43 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::weigh() {
 template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::weigh_with(const T* stiffness,
                                                                        bool bounded) {
-  weigh_pairs(patch_, rest_of<Many>(patch_), stiffness, bounded, weights());
+  weigh_pairs(patch_, rest_of<false>(patch_), stiffness, bounded, weights());
   __syncthreads();  // one lane has left the weights of two
-  if constexpr (!Many) return;
-  per_unit_ = T(1) / rest_of<true>(patch_).unit;
-  read_own();
+  if constexpr (Many) read_own();
 }
 
-// What a thread keeps of its first tetrahedron.
+// What a thread keeps of its first tetrahedron, or its first pair.
 template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::read_own() {
+  if constexpr (!Halves) {
+    pair_ = read_ahead(patch_, weights(), threadIdx.x);
+    return;
+  }
   if constexpr (Clustered && Once) {
     const T weight = half_.weight;
-    half_ = read_half<false, T>(patch_, nullptr, threadIdx.x);
+    half_ = read_half<false, false, T>(patch_, nullptr, threadIdx.x);
     half_.weight = weight;
   } else {
-    half_ = read_half(patch_, weights(), threadIdx.x);
+    half_ = read_half<false>(patch_, weights(), threadIdx.x);
   }
-  if constexpr (Clustered) {
-    rest_ = half_rest(half_, per_unit_, rest_of<true>(patch_).position);
-    counts_ = counts_energy(threadIdx.x);
-  } else if constexpr (Near) {
-    Quad<T> seen[4];
-    look(half_, slots_, seen);
-    rest_ = half_rest(half_, per_unit_, slots_, seen);
-  }
+  rest_ = half_rest(patch_, threadIdx.x);
+  if constexpr (Clustered) counts_ = counts_energy(threadIdx.x);
 }
 
 // The same without memory where no thread has more than one tetrahedron. Returns its weight without the bound.
 template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 PD_DEVICE T FusedRunner<T, Touching, Loose, Kind, Near>::weigh_own(const T* stiffness,
                                                                    bool bounded) {
-  const ComputedRest<T> rest = rest_of<true>(patch_);
   const PairPlace place = place_of(patch_, min(int(threadIdx.x) / 2, patch_.pairs - 1));
   const int which = int(threadIdx.x) % 2, tet = tet_of(plan_, place, which);
-  const T factor = read_half<false, T>(patch_, nullptr, threadIdx.x).factor;
+  const auto rest = rest_of<false>(patch_).read(place);
   const T bound = bounded ? plan_.pair_bound[place.in(2) + which * pair_lanes] : T(1);
-  const T plain = tet < 0 ? T(0) : tet_weight(patch_weight(rest.unit, stiffness[tet]), factor);
+  T plain = T(0);
+  if (tet >= 0) {
+    plain = which ? rest.template weight<OneOf<T, 1>>(stiffness[tet])
+                  : rest.template weight<OneOf<T, 0>>(stiffness[tet]);
+  }
   half_.weight = bound * plain;
-  per_unit_ = T(1) / rest.unit;
   read_own();
   return plain;
 }

@@ -79,7 +79,7 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::leave_energy(bool ow
 template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 template <bool MayStop, class Visit>
 PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::visit_patch(const Visit& visit) {
-  if (soon_ == 2 * patch_.pairs) post_shared();
+  if (soon_ == patch_.pairs) post_shared();
   heed_late<MayStop>();
   if (finished_) return;
   const int shared = patch_.shared(), all = rounds(patch_.slots);

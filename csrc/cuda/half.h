@@ -11,13 +11,13 @@ namespace pd::inline PD_TARGET {
 template <class T>
 struct HalfNumbers {
   unsigned corner[4];  // 8 times the slot, plus 65536 times the entry
-  T weight, factor;    // w V, pair_factor
+  T weight, factor;    // w V, pair_factor where rest shapes are computed
 
   PD_HD unsigned slot_times_8(int c) const { return corner[c] & 0xffff; }
 };
 
-// `number`: of the tetrahedron. Without `Weighed` the weight is not known yet.
-template <bool Weighed = true, class T>
+// `number`: of the tetrahedron; `Computed`: see rest_of. Without `Weighed` the weight is not known yet.
+template <bool Computed, bool Weighed = true, class T>
 PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int number) {
   HalfNumbers<T> numbers;
   // lanes past the end repeat the last pair
@@ -34,11 +34,19 @@ PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int 
   const unsigned own = of_two + which * pair_lanes;
   numbers.weight = T(0);
   if constexpr (Weighed) numbers.weight = weights[own];
-  numbers.factor = patch.plan.pair_factor[own];
+  numbers.factor = T(1);
+  if constexpr (Computed) numbers.factor = patch.plan.pair_factor[own];
   return numbers;
 }
 
-// Rest shape of a lane's tetrahedron, worked out from the rest positions of its slots, which were looked at.
+// Rest shape of a lane's tetrahedron, as the plan has it.
+template <class T>
+PD_DEVICE FaceRest<T, 1> half_rest(const Patch<T>& patch, int number) {
+  const PairPlace place = place_of(patch, min(number / 2, patch.pairs - 1));
+  return rest_of<false>(patch).read_one(place, number % 2);
+}
+
+// The same worked out from the rest positions of its slots, which were looked at.
 template <class T>
 PD_DEVICE FaceRest<T, 1> half_rest(const HalfNumbers<T>& numbers, T per_unit, const Slots<T>& slots,
                                    const Quad<T> (&seen)[4]) {
@@ -83,34 +91,33 @@ PD_DEVICE Vec3<T> add_partner(const Vec3<T>& a) {
           a.z + __shfl_xor_sync(whole_warp, a.z, 1)};
 }
 
-// Runs an effect on the tetrahedra [begin, end) of all pairs; returns the sum of energies that this thread has met. `begin` and
-// an `end` before the last are multiples of the threads. `slots`: where positions are. `now`: what `read_half` gave for
-// this thread's first tetrahedron from `begin` on; after it from `end` on. `shape_of(numbers, seen, first)`: rest shape of a
-// tetrahedron, given what was seen of its slots, and whether it is the thread's first of all; `counts(number, met)`: whether its
-// energy does. `Once`: no thread has a second.
-template <bool Once, class T, class Slots, class Element, class ShapeOf, class Counts>
+// Runs an effect on the tetrahedra of all pairs; returns the sum of energies that this thread has met. `slots`: where positions
+// are. `now`: what `read_half` gave for this thread's first tetrahedron. `shape_of(number, numbers, seen)`: rest shape of a
+// tetrahedron, given what was seen of its slots; `counts(number, met)`: whether its energy does. `Once`: no thread has a second.
+template <bool Once, bool Computed, class T, class Slots, class Element, class ShapeOf,
+          class Counts>
 PD_DEVICE T each_half(const Patch<T>& patch, const Slots& slots, const ShapeOf& shape_of,
                       const Counts& counts, const T* weights, Quad<T>* entries,
-                      const Element& element, HalfNumbers<T>& now, int begin, int end) {
+                      const Element& element, HalfNumbers<T> now) {
   T energy = T(0);
-  const int lane = int(threadIdx.x) % warp_size;
-  for (int first = begin + int(threadIdx.x) - lane; first < end; first += blockDim.x) {
+  const int lane = int(threadIdx.x) % warp_size, all = 2 * patch.pairs;
+  for (int first = int(threadIdx.x) - lane; first < all; first += blockDim.x) {
     HalfNumbers<T> next = now;
-    if (!Once && first + int(blockDim.x) < 2 * patch.pairs)
-      next = read_half(patch, weights, first + int(blockDim.x) + lane);
+    if (!Once && first + int(blockDim.x) < all)
+      next = read_half<Computed>(patch, weights, first + int(blockDim.x) + lane);
     Vec3<T> x[4], force[4];
     Quad<T> seen[4];
     look(now, slots, seen);
     for (int c = 0; c < 4; ++c) x[c] = vec3(seen[c]);
     T met = T(0);
-    const FaceRest<T, 1> rest = shape_of(now, seen, first < int(blockDim.x));
+    const FaceRest<T, 1> rest = shape_of(first + lane, now, seen);
     if constexpr (OnFaces<Element>) {
       element.run_face(x, rest, {now.weight}, force, met);
     } else {
       element.template run<1>(HalfElement<T>{rest.inverse(0), now.weight, force});
     }
     for (int c = 0; c < 3; ++c) force[c] = add_partner(force[c]);
-    const bool here = first + lane < 2 * patch.pairs, second = lane & 1;
+    const bool here = first + lane < all, second = lane & 1;
     // the first writes corners 0 and 1, the second corner 2, each its own apex
     const Vec3<T> own = {select(second, force[2].x, force[0].x),
                          select(second, force[2].y, force[0].y),

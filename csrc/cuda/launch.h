@@ -15,6 +15,12 @@ enum class DeviceKernel : int {
   stream = 3,  // kernels for every iteration
 };
 
+// Whether a plan has positions to work rest shapes out from, and not these themselves; see rest_of.
+template <class T>
+bool computes_rests(const DevicePlan<T>& plan) {
+  return plan.kernel == int(DeviceKernel::stream);
+}
+
 using Stream = void*;  // cudaStream_t
 
 // What a scene asks of the kernels beside elements and vertices: contacts; pieces that pins leave to move.

@@ -124,7 +124,7 @@ PD_DEVICE Vec3<T> at_corner(const Quad<T>* vectors, unsigned corner) {
   return vec3(*reinterpret_cast<const Quad<T>*>(bytes + slot_times_8 * (sizeof(Quad<T>) / 8)));
 }
 
-// Rest shapes as the plan of a small mesh has them, each pair's in the frame of its face.
+// Rest shapes as the plan has them, each pair's in the frame of its face.
 template <class T>
 struct StoredRest {
   const T* rests;  // pair_rest
@@ -140,12 +140,23 @@ struct StoredRest {
     }
   };
 
-  PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>&) const {
-    // quads of a lane side by side
-    const unsigned own = 4 * place.pair + (pair_rest_numbers - 4) * place.before();
-    const auto* const quad = reinterpret_cast<const Quad<T>*>(rests + own);
+  PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>&) const { return read(place); }
+  PD_DEVICE Numbers read(PairPlace place) const {
+    const Quad<T>* const quad = quads(place);
     const Quad<T> face = quad[0], one = quad[pair_lanes], other = quad[2 * pair_lanes];
     return {{face.x, face.y, face.z, {vec3(one), vec3(other)}}, {one.w, other.w}};
+  }
+  // of one tetrahedron
+  PD_DEVICE FaceRest<T, 1> read_one(PairPlace place, int which) const {
+    const Quad<T>* const quad = quads(place);
+    const Quad<T> face = quad[0], own = quad[(1 + which) * pair_lanes];
+    return {face.x, face.y, face.z, {vec3(own)}};
+  }
+
+ private:
+  // those of neighbouring lanes side by side
+  PD_DEVICE const Quad<T>* quads(PairPlace place) const {
+    return reinterpret_cast<const Quad<T>*>(rests) + place.in(pair_rest_numbers / 4);
   }
 };
 
@@ -193,7 +204,7 @@ PD_HD T tet_weight(T patch_weight, T factor) {
   return patch_weight * rough_reciprocal(absolute(factor));
 }
 
-// Rest shapes worked out from rest positions, which with pair_factor take half of the bytes.
+// Rest shapes worked out from rest positions, which with pair_factor take half of the bytes: where memory is what binds.
 template <class T>
 struct ComputedRest {
   const RestPoint<T>* position;  // of every slot
@@ -237,7 +248,7 @@ PD_DEVICE const RestPoint<T>* rest_positions(const DevicePlan<T>& plan, int firs
   return static_cast<const RestPoint<T>*>(positions) + first_slot;
 }
 
-// What the plan knows of a patch's rest shapes: `Computed` where it holds positions.
+// What the plan knows of a patch's rest shapes: `Computed` where it holds positions, which kernel stream alone wants.
 template <bool Computed, class T>
 PD_DEVICE auto rest_of(const Patch<T>& patch) {
   if constexpr (!Computed) {

@@ -41,12 +41,6 @@ class Slots {
     first_[slot] = quad(first, second.x);
     behind_[slot] = {second.y, second.z};
   }
-  // the second vector stays
-  PD_DEVICE void set_first(int slot, const Vec3<T>& first) const {
-    const Two two = {first.x, first.y};
-    __builtin_memcpy(first_ + slot, &two, sizeof(two));
-    first_[slot].z = first.z;
-  }
   // the first vector stays
   PD_DEVICE void set_second(int slot, const Vec3<T>& second) const {
     first_[slot].w = second.x;

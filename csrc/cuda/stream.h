@@ -207,7 +207,7 @@ template <class T, bool Touching, class Element, class See, class Here>
 PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, std::byte* shared,
                                  const Element& element, const See& see, const Here& here) {
   const Patch<T> patch(w.plan, number);
-  HalfNumbers<T> now = read_half(patch, w.weights, int(threadIdx.x));
+  const HalfNumbers<T> first = read_half<true>(patch, w.weights, int(threadIdx.x));
   const Slots<T> slots(shared, w.plan.most_slots);
   const ComputedRest<T> rest = rest_of<true>(patch);
   const T per_unit = T(1) / rest.unit;
@@ -217,12 +217,11 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
     slots.set(s, position, rest.position[s].bits());
   }
   __syncthreads();
-  const auto shape_of = [&](const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4], bool) {
+  const auto shape_of = [&](int, const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4]) {
     return half_rest(numbers, per_unit, slots, seen);
   };
-  const double energy = double(each_half<false>(
-      patch, slots, shape_of, [](int, T) { return true; }, w.weights, entries, element, now, 0,
-      2 * patch.pairs));
+  const double energy = double(each_half<false, true>(
+      patch, slots, shape_of, [](int, T) { return true; }, w.weights, entries, element, first));
   // on the way while the block meets
   int s = threadIdx.x, row = 0;
   decltype(see(0)) seen{};

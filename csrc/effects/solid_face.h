@@ -153,8 +153,8 @@ PD_HD void finish_columns(const FaceColumns<R>& face, const Vec3<R>& third, cons
   }
 }
 
-// Gradient on all corners; with `Energy` strains of weight one, whose halved squares times the weights are added to `energy`
-// where they are `wanted`. One tetrahedron after the other, which takes the fewest registers.
+// Gradient on all corners; with `Energy`, where it is `wanted`, strains of weight one, whose halved squares times the weights are
+// added to `energy`. One tetrahedron after the other, which takes the fewest registers.
 template <bool Energy, class R, int Count>
 PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, Count>& rest,
                                const R (&weight)[Count], bool wanted, Vec3<R> (&g)[3 + Count],
@@ -172,14 +172,13 @@ PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, 
     const Vec3<R>& apex = rest.apex[e];
     const Invariants<R> i = face.invariants(third[e]);
     Vec3<R> stress[3];
-    finish_columns(face, third[e], i, largest_root(i), Energy ? R(scalar_of<R>(1)) : weight[e],
+    const bool strains = Energy && wanted;
+    finish_columns(face, third[e], i, largest_root(i), strains ? R(scalar_of<R>(1)) : weight[e],
                    stress);
-    if (Energy) {
-      if (wanted) {
-        const R square =
-            (dot(stress[0], stress[0]) + dot(stress[1], stress[1])) + dot(stress[2], stress[2]);
-        energy = multiply_add(R(scalar_of<R>(0.5)) * weight[e], square, energy);
-      }
+    if (strains) {
+      const R square =
+          (dot(stress[0], stress[0]) + dot(stress[1], stress[1])) + dot(stress[2], stress[2]);
+      energy = multiply_add(R(scalar_of<R>(0.5)) * weight[e], square, energy);
       for (Vec3<R>& column : stress) column = weight[e] * column;
     }
     g[3 + e] = apex.z * stress[2];

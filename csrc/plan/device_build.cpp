@@ -289,13 +289,13 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
   progress(0.7);
 
   DeviceMeshPlan plan;
-  number_patches(plan, made, kernel == block_kernel, fixed);
+  number_patches(plan, made, kernel != stream_kernel, fixed);
   renumber(mesh.numbering, made);
   plan.vertex_order = mesh.numbering.vertex_order;
   run_team(most_threads(), [&](const Team& team) {
     for (std::int64_t p = team.begin(patches); p < team.end(patches); ++p) {
       fill_slots(plan, mesh, made[p], int(p));
-      const bool computed = kernel != block_kernel;
+      const bool computed = kernel == stream_kernel;
       if (computed) fill_rest_positions(plan, mesh, made[p], int(p));
       fill_blocks(plan, mesh, made[p], int(p), computed ? plan.patch_unit[p] : 1.0);
     }

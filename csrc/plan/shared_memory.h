@@ -21,12 +21,12 @@ constexpr std::size_t slots_bytes(std::size_t real, std::size_t slots, std::size
   return vectors == 1 ? 4 * real * slots : aligned(6 * real * slots);
 }
 
-// With one patch position and u of every slot, with `many` position and rest position; an entry for every corner of a pair;
+// With one patch position and u of every slot, with `many` position; an entry for every corner of a pair;
 // planes and balls as numbers of five and eight.
 constexpr std::size_t fused_shared_bytes(std::size_t real, bool many, std::size_t slots,
                                          std::size_t entries, std::size_t planes,
                                          std::size_t balls) {
-  return fused_control_bytes + (many ? slots_bytes(real, slots, 2) : 8 * real * slots) +
+  return fused_control_bytes + slots_bytes(real, slots, 1) * (many ? 1 : 2) +
          real * (4 * entries + 5 * planes + 8 * balls);
 }
 
