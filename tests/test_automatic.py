@@ -227,17 +227,17 @@ def test_few_environments_get_the_solver_that_was_faster(size: str, monkeypatch:
     for row in rows:
         scene = subject.scene(mesh, row["youngs"])
         sim = pd.Simulator(scene, subject.time_step, solver="auto", batch=row["batch"], progress=False)
-        took = [row["solvers"][name]["milliseconds"]["median"] for name in ("Chebyshev", "Multilevel")]
+        took = [row["solvers"][name]["milliseconds"]["min"] for name in ("Chebyshev", "Multilevel")]
         assert took[isinstance(sim.solver, pd.Multilevel)] <= 1.1 * min(took), row["youngs"]
         chosen.append(type(sim.solver))
     assert len(chosen) == 5
     assert chosen[0] is pd.Chebyshev
     assert chosen[-1] is pd.Multilevel
     # alone they get Chebyshev where sixteen get Multilevel
-    if size == "3k":
-        alone = pd.Simulator(subject.scene(mesh, 1e5), subject.time_step, solver="auto", batch=1, progress=False)
+    if size == "1k":
+        alone = pd.Simulator(subject.scene(mesh, 1e6), subject.time_step, solver="auto", batch=1, progress=False)
         assert isinstance(alone.solver, pd.Chebyshev)
-        assert chosen[1] is pd.Multilevel
+        assert chosen[2] is pd.Multilevel
 
 
 def test_the_batch_decides_where_environments_share_a_device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
