@@ -138,20 +138,12 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   return plan;
 }
 
-// A multilevel schedule needs the arrays of its preconditioner, and on a GPU the plan of the kernels that know it.
+// A multilevel schedule needs the arrays of its preconditioner.
 template <class P>
 void check_levels(const P& plan, bool wanted) {
-  if (!wanted) return;
-  TORCH_CHECK_VALUE(plan.levels.there(),
+  TORCH_CHECK_VALUE(!wanted || plan.levels.there(),
                     "plan has no multilevel preconditioner; a Simulator with solver=Multilevel() "
                     "makes one");
-  if constexpr (requires { plan.kernel; }) {
-    constexpr int stream = 3;  // of DeviceKernel, which this file does not see
-    TORCH_CHECK_VALUE(plan.kernel == stream,
-                      "plan must be one for kernel 3 (stream), which the multilevel solver runs "
-                      "with, got kernel ",
-                      plan.kernel);
-  }
 }
 
 #define X(name, type, width, rows, meaning) +1
@@ -191,6 +183,11 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
                     "plan.sizes must name a kernel, 0 to 3, and at least one patch, one alone for "
                     "kernel 0, got kernel ",
                     plan.kernel, " and ", plan.patches, " patches; compile the scene again");
+  constexpr int stream = 3;  // of DeviceKernel, which this file does not see
+  TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays || plan.kernel == stream,
+                    "plan must be one for kernel 3 (stream) where it has a multilevel "
+                    "preconditioner, which no other knows, got kernel ",
+                    plan.kernel);
   TORCH_CHECK_VALUE(plan.environments >= 0 && plan.environments <= most_environments,
                     "plan.sizes must have a multiprocessor work on 0 to ", most_environments,
                     " environments, got ", plan.environments, "; compile the scene again");
@@ -211,7 +208,7 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.slot = plan.slots;
   count.shared_end = plan.shared + 1;
   count.shared_slot = cluster ? 0 : plan.slots - (plan.vertices - plan.shared);
-  count.stream_slot = plan.kernel == 3 ? count.shared_slot : 0;
+  count.stream_slot = plan.kernel == stream ? count.shared_slot : 0;
   count.copied_vertex = cluster ? plan.vertices : 0;
   count.piece_slot = pieces ? plan.slots : 0;
   count.part_patch_end = pieces ? plan.patches + 1 : 0;
@@ -219,7 +216,7 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.part_slot = pieces ? arrays[part_slot_array].size(0) : 0;
   count.piece_end = pieces ? plan.pieces + 1 : 0;
   count.part = plan.parts;
-  const bool computed = plan.kernel == 3, fixed = computed && sizeof(T) == 4;
+  const bool computed = plan.kernel == stream, fixed = computed && sizeof(T) == 4;
   count.stored_block = computed ? 0 : plan.blocks;
   count.rest_slot = computed && !fixed ? plan.slots : 0;
   count.fixed_slot = fixed ? plan.slots : 0;

@@ -303,6 +303,15 @@ def test_plan_and_state_must_be_together() -> None:
     still_works()
 
 
+@pytest.mark.parametrize("kernel", [kernel for kernel in KERNELS if kernel != "stream"])
+def test_levels_are_refused_where_no_kernel_knows_them(kernel: str) -> None:
+    sim, state = small_on_gpu(torch.float32, kernel)
+    plain, whole = plan_of(sim), plan_of(simulator(small_case(), torch.float32, GPU, solver=pd.Multilevel()))
+    with pytest.raises(ValueError, match=r"plan must be one for kernel 3 \(stream\) where .*, got kernel [012]"):
+        ops.gradient(state.positions, sim.stiffness, [*plain, *whole[len(plain) :]])
+    still_works()
+
+
 def test_other_precisions_are_refused() -> None:
     sim, state = small_on_gpu(torch.float32, "block")
     for wrong in (torch.float16, torch.bfloat16):
