@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from machine import describe_run
+from machine import describe_run, earlier_rows, run_of
 from tqdm import tqdm
 from tune import random_scene, random_state
 
@@ -104,13 +104,14 @@ def main(words: list[str]) -> None:
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
     options = parser.parse_args(words)
     torch.set_num_threads(1)
-    known = json.loads(options.out.read_text())["rows"] if options.out and options.out.exists() else []
-    rows = {row["scene"]: row for row in known}
+    now = describe_run(torch.device("cpu"), 1)
+    rows = {row["scene"]: row for row in earlier_rows(options.out)}
     for number in tqdm(range(options.scenes), desc="scenes", unit="scene"):
-        if number not in rows:
-            rows[number] = run_scene(number)
+        if number in rows:
+            continue
+        rows[number] = {**run_scene(number), "run": run_of(now)}
         if options.out:
-            record = {"schema": 1, **describe_run(torch.device("cpu"), 1), "summary": summary(list(rows.values()))}
+            record = {"schema": 1, **now, "summary": summary(list(rows.values()))}
             options.out.parent.mkdir(parents=True, exist_ok=True)
             options.out.write_text(json.dumps({**record, "rows": list(rows.values())}, indent=1) + "\n")
     print(json.dumps(summary([rows[number] for number in range(options.scenes)]), indent=1))

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from gpu_scenes import GPU_SCENES, PAPER, GpuScene, PaperTest
 from gpu_timing import Device, describe_device, event_times, graph_times, host_seconds, kernel_seconds
-from machine import milliseconds
+from machine import PROVENANCE, milliseconds, run_of
 from scenes import TIME_STEP
 from tqdm import tqdm
 
@@ -27,7 +27,6 @@ from torchpd.plan import KERNELS
 Row = dict[str, Any]
 
 ROLLOUT = 16  # steps in one call
-PROVENANCE = ("command", "created", "commit")
 
 
 @contextmanager
@@ -256,7 +255,7 @@ def with_earlier(result: Row, earlier: Row) -> Row:
 def run_on_gpu(options: argparse.Namespace, result: Row, keep: Callable[[], None]) -> None:
     """Everything, into the result and printed."""
     device = torch.device(options.device)
-    options.run = {name: result[name] for name in PROVENANCE}
+    options.run = run_of(result)
     result.update({"call_microseconds": {}, "paper": [], "results": []})
     with torch.no_grad(), torch.cuda.device(device):
         machine = describe_device(device)

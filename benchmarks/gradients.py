@@ -88,7 +88,7 @@ def main() -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
     parser.add_argument("--seconds", type=float, default=0.5, help="of timing a scene (%(default)g)")
-    parser.add_argument("--large", action="store_true", help="also 10 and 102 thousand vertices")
+    parser.add_argument("--large", action="store_true", help="also 10 and 103 thousand vertices")
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)

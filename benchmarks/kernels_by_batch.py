@@ -17,10 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gpu import PROVENANCE
 from gpu_scenes import GpuScene
 from gpu_timing import event_times, recorded
-from machine import describe_run, write_result
+from machine import describe_run, run_of, write_result
 from scenes import TIME_STEP
 from tqdm import tqdm
 
@@ -126,8 +125,7 @@ def main() -> None:
         print(line_of(row))
     if options.out:
         result = describe_run(torch.device("cuda"), torch.get_num_threads())
-        run = {name: result[name] for name in PROVENANCE}
-        result["rows"] = [{**row, "run": run} for row in rows]
+        result["rows"] = [{**row, "run": run_of(result)} for row in rows]
         write_result(options.out, result, with_earlier if options.keep else None)
 
 
@@ -138,7 +136,7 @@ def with_earlier(new: Row, earlier: Row) -> Row:
         return row["dtype"], row["mesh"], row["vertices"], row["batch"]
 
     known = earlier.get("rows", [])
-    rows = {of(row): {"run": {name: earlier[name] for name in PROVENANCE}, **row} for row in known}
+    rows = {of(row): {"run": run_of(earlier), **row} for row in known}
     return {**new, "rows": [*(rows | {of(row): row for row in new["rows"]}).values()]}
 
 

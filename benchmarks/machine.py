@@ -19,6 +19,8 @@ from torchpd import _C, provenance
 
 Record = dict[str, Any]
 
+PROVENANCE = ("command", "created", "commit")
+
 
 def multiply_adds_per_second() -> float:
     """Float32 multiply-adds of one thread, by the loop of the extension: what the goals are scaled by."""
@@ -65,6 +67,19 @@ def write_result(path: Path, result: Record, merge: Callable[[Record, Record], R
         part.replace(path)
     finally:
         os.close(folder)
+
+
+def run_of(result: Record) -> Record:
+    """What a row says of the run that measured it, for files that several runs have filled."""
+    return {name: result[name] for name in PROVENANCE}
+
+
+def earlier_rows(path: Path | None) -> list[Record]:
+    """The rows of a result, each with its run; none where there is no file."""
+    if path is None or not path.exists():
+        return []
+    earlier = json.loads(path.read_text())
+    return [{"run": run_of(earlier), **row} for row in earlier["rows"]]
 
 
 def describe_run(device: torch.device, threads: int) -> Record:

@@ -7,7 +7,7 @@ bisection to a sixteenth, up to a limit that the rows name; what does not reach 
 
 Times are of steps in turns, the lowest and the median: with one thread on a CPU those of the processor, on a GPU those
 of the step as Python calls it, device awaited. With --batch as many equal environments take the step together. Cases
-that were measured are kept: a run that was stopped goes on.
+that were measured are kept, with the run that measured them: a run that was stopped goes on.
 
     python benchmarks/time_to_error.py --device cpu
     python benchmarks/time_to_error.py --device cuda --threads 16
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import sys
 import time
@@ -26,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from machine import describe_run
+from machine import describe_run, earlier_rows, run_of
 from tqdm import tqdm
 
 import torchpd as pd
@@ -243,13 +244,16 @@ def _short(row: Row) -> str:
     failed = [own["iterations"] is None for own in row["solvers"].values()]
     if failed[1]:
         return f"{_plain(plain)}: `Multilevel` failed"
-    before = "> " * failed[0]
-    return f"{before}{_plain(plain)} / {_plain(levels)}: {before}{_plain(row['times_faster'])} x"
+    if not failed[0]:
+        return f"{_plain(plain)} / {_plain(levels)}: {_plain(row['times_faster'])} x"
+    return f"> {_plain(plain, down=True)} / {_plain(levels)}: > {_plain(row['times_faster'], down=True)} x"
 
 
-def _plain(number: float) -> str:
-    """Two digits, without an exponent."""
-    return f"{number:,.1f}" if number < 10.0 else f"{float(f'{number:.2g}'):,.0f}"
+def _plain(number: float, *, down: bool = False) -> str:
+    """Two digits, without an exponent; what is a bound from below is not rounded up."""
+    unit = 0.1 if number < 10.0 else 10.0 ** (math.floor(math.log10(number)) - 1)
+    digits = math.floor(number / unit + 1e-9) if down else round(number / unit)
+    return f"{digits * unit:,.1f}" if number < 10.0 else f"{digits * unit:,.0f}"
 
 
 def cost_in_use(name: str, row: Row) -> Cost | None:
@@ -321,20 +325,23 @@ def main(words: list[str]) -> None:
     dtype = getattr(torch, options.dtype)
     torch.set_num_threads(options.threads)
     device = torch.device(options.device)
-    kept = json.loads(out.read_text())["rows"] if out.exists() else []
-    rows: Rows = {(row["size"], row["youngs"], row.get("batch", 1)): row for row in kept}
+    rows: Rows = {(row["size"], row["youngs"], row.get("batch", 1)): row for row in earlier_rows(out)}
+    now = describe_run(device, options.threads)
     cases = [(size, youngs) for size in options.sizes for youngs in options.youngs]
     with tqdm(cases, desc="cases", unit="case") as bar:
         for size, youngs in bar:
             bar.set_postfix_str(f"{size}, {youngs:g} Pa")
             key = size, youngs, options.batch
             if key not in rows:
-                rows[key] = run_case(size, youngs, device, options.seconds, dtype, options.batch)
+                rows[key] = run_case(size, youngs, device, options.seconds, dtype, options.batch) | {"run": run_of(now)}
             elif options.auto:
                 row = rows[key]
                 row["auto"] = run_auto(Case(SIZES[size], youngs, device, dtype, options.batch), options.seconds)
+                row["auto"]["run"] = run_of(now)
                 row.update(judged(row))
-            write(out, device, options.threads, rows)
+            else:
+                continue
+            write(out, {**now, "error": ERROR, "rows": in_order(rows)})
     found = [row for row in in_order(rows) if row.get("batch", 1) == options.batch]
     print(table(found))
     print(matrix(found))
@@ -346,11 +353,10 @@ def in_order(rows: Rows) -> list[Row]:
     return [rows[key] for key in sorted(rows, key=lambda key: (key[2], SIZES[key[0]], key[1]))]
 
 
-def write(out: Path, device: torch.device, threads: int, rows: Rows) -> None:
+def write(out: Path, result: Row) -> None:
     """Everything so far."""
     out.parent.mkdir(parents=True, exist_ok=True)
-    record = {"schema": 1, **describe_run(device, threads), "error": ERROR, "rows": in_order(rows)}
-    out.write_text(json.dumps(record, indent=1) + "\n")
+    out.write_text(json.dumps({"schema": 1, **result}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

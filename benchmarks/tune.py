@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from machine import describe_run, measure
+from machine import describe_run, earlier_rows, measure, run_of
 from scipy.spatial import Delaunay
 from tqdm import tqdm
 
@@ -234,13 +234,15 @@ def main(words: list[str]) -> None:
     kept = json.loads(options.out.read_text()) if options.out and options.out.exists() else {"rows": []}
     asked = {"asked": options.error, "dtype": options.dtype}
     dtype = getattr(torch, options.dtype)
-    rows = {row["scene"]: row for row in kept["rows"] if {"dtype": "float32", **row}.items() >= asked.items()}
+    rows = {
+        row["scene"]: row for row in earlier_rows(options.out) if {"dtype": "float32", **row}.items() >= asked.items()
+    }
     now = describe_run(torch.device("cpu"), options.threads)
     # the promises stay those of the earlier run
     header = {name: kept[name] for name in now} if options.budgets and rows else now
     for number in tqdm(range(options.scenes), desc="scenes", unit="scene"):
         if number not in rows:
-            rows[number] = {**asked, **run_scene(number, options.error, dtype)}
+            rows[number] = {**asked, **run_scene(number, options.error, dtype), "run": run_of(now)}
         elif options.budgets:
             _, sim, start, other = draw_scene(number, dtype)
             rows[number]["budget"] = {**judge_budget(sim, start, other), "commit": now["commit"]}

@@ -159,6 +159,15 @@ def test_time_to_error_keeps_failures_and_wrong_choices() -> None:
     short = [matrix([row]).splitlines()[-1] for row in rows]
     assert short[0] == "| 1,000 | 30 / 6.0: 5.0 x |"
     assert short[2] == "| 1,000 | > 30 / 6.0: > 5.0 x |"
+    # bounds from below are never rounded up
+    for number, word, bound in (
+        (12.9, "13", "12"),
+        (4.97, "5.0", "4.9"),
+        (1699.0, "1,700", "1,600"),
+        (0.3, "0.3", "0.3"),
+    ):
+        assert matrix([{**rows[0], "times_faster": number}]).endswith(f": {word} x |")
+        assert matrix([{**rows[2], "times_faster": number}]).endswith(f": > {bound} x |")
     assert "`Multilevel` failed" in short[3]
 
 

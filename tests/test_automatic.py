@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ from runs import same_bits, state_of
 import torchpd as pd
 from torchpd import automatic, model
 from torchpd.accuracy import exact_steps
-from torchpd.automatic import AIM, CPU_CHEBYSHEV, Cost, multilevel_cost
+from torchpd.automatic import AIM, CPU_CHEBYSHEV, MOST_OF_CHEBYSHEV, PATIENCE, Cost, multilevel_cost
+from torchpd.forecast import MOST_OF_LEVELS
 from torchpd.gpu import H100
 from torchpd.kernel_costs import iteration_microseconds
 from torchpd.regimes import choose_plan
@@ -382,3 +384,27 @@ def test_a_sheet_that_buckles_over_a_ball_gets_chebyshev() -> None:
     converged = pd.Simulator(scene, 1 / 60, 4000, progress=False, dtype=torch.float64)(state).positions
     error = (sim(state).positions - converged).norm()
     assert error <= 1e-3 * (state.positions + state.velocities / 60 - converged).norm()
+
+
+def clip(*parts: Any, size: float = 1e-3) -> pd.Scene:
+    """Steel, so small and stiff that no number of iterations in float32 would do."""
+    body = pd.Solid(pd.shapes.box((size, 0.2 * size, 0.2 * size), (5, 1, 1)), 2e11, 7800.0)
+    return pd.Scene(body, pd.Gravity(), *parts)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-3])
+def test_steps_end(tolerance: float) -> None:
+    """Where nothing would do "auto" takes a number that ends, and says what is left; a bound is no reason to warn."""
+    with pytest.warns(
+        pd.UnsolvedWarning, match=r'0,000 iterations that "auto" takes at most leave an error of about (0\.\d|1) '
+    ):
+        rough = pd.Simulator(clip(pd.Ground(-1e-3, friction=0.5)), solver="auto", tolerance=tolerance)
+    assert isinstance(rough.solver, pd.Chebyshev)
+    assert rough.iterations == MOST_OF_CHEBYSHEV * (PATIENCE if tolerance else 1)
+    assert "; it takes no more than 10,000" in str(rough)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        smooth = pd.Simulator(clip(pd.Ground(-1e-3)), solver="auto", tolerance=tolerance)
+    assert isinstance(smooth.solver, pd.Multilevel)
+    assert smooth.iterations == MOST_OF_LEVELS * (PATIENCE if tolerance else 1)
+    assert bool(rough(rough.rest_state()).positions.isfinite().all())

@@ -78,6 +78,25 @@ def test_a_state_dict_of_another_scene_is_refused_in_its_own_name() -> None:
         sim.load_state_dict(two)
 
 
+@pytest.mark.parametrize("assign", [False, True])
+def test_a_state_dict_is_loaded_whole_or_not_at_all(assign: bool) -> None:
+    sim = small_simulator()
+    before = [array.clone() for array in sim.material()]
+    for wrong, kind, message in (
+        (torch.tensor(5.0), ValueError, r"stiffness must have 1 or 2 dimensions, got \[\]"),
+        (5.0, TypeError, "stiffness must be a tensor, got float"),
+        (before[0].numpy(), TypeError, "stiffness must be a tensor, got ndarray"),
+    ):
+        whole = {**sim.state_dict(), "masses": 2.0 * sim.masses, "stiffness": wrong}
+        with pytest.raises(kind, match=rf"^Simulator\.load_state_dict: {message}"):
+            sim.load_state_dict(whole, assign=assign)
+        with pytest.raises(RuntimeError, match=message):
+            torch.nn.ModuleDict({"sim": sim}).load_state_dict(
+                {f"sim.{name}": array for name, array in whole.items()}, assign=assign
+            )
+        assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
+
+
 def test_one_number_is_for_what_has_one_each() -> None:
     sim = small_simulator()
     sim.set_material(stiffness=2e4, masses=torch.tensor(0.5), damping=0.25, pin_stiffness=1e3)

@@ -72,6 +72,18 @@ def test_gradcheck_of_rotations() -> None:
     assert torch.autograd.gradgradcheck(pd.nearest_rotation, (matrices,))
 
 
+def test_a_singular_matrix_keeps_its_lack_of_derivatives_to_itself() -> None:
+    def second(matrices: torch.Tensor) -> torch.Tensor:
+        matrices = matrices.clone().requires_grad_()
+        weights = torch.arange(9.0, dtype=torch.float64).reshape(3, 3)
+        (first,) = torch.autograd.grad((weights * pd.nearest_rotation(matrices)[:2]).sum(), matrices, create_graph=True)
+        return torch.autograd.grad(first[:2].square().sum(), matrices)[0]
+
+    sound = torch.stack((torch.eye(3, dtype=torch.float64), 2.0 * torch.eye(3, dtype=torch.float64))) + 0.1
+    found = second(torch.cat((sound, torch.zeros(1, 3, 3, dtype=torch.float64))))
+    assert torch.equal(found[:2], second(sound))
+
+
 def test_gradients_flow_only_where_asked() -> None:
     sim, state = small(torch.float64)
     plan, w = plan_of(sim), sim.stiffness.detach().clone()

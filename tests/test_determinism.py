@@ -73,6 +73,27 @@ def test_an_item_does_not_feel_its_batch(
         assert len(together[4].unique()) > 1  # environments stopped after different numbers of iterations
 
 
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize(("column", "sick"), [(1, 1e12), (2, np.inf), (2, np.nan)])
+@pytest.mark.parametrize("outer", ["corotated", "lbfgs", "momentum"])
+@pytest.mark.parametrize("batch", [3, 17])
+def test_environments_do_not_feel_one_that_is_lost(
+    batch: int, outer: Any, column: int, sick: float, dtype: torch.dtype, device: torch.device
+) -> None:
+    """Energies may be numbers where forces are none: no memory of these may reach another environment."""
+    body = pd.Solid(pd.shapes.box((0.2, 0.1, 0.1), (2, 1, 1)), youngs=3e4)
+    parts = pd.Scene(body, pd.Pin(body, [4]), pd.Gravity(), pd.Ground(-1e-4, friction=0.2))
+    sim = pd.Simulator(parts, iterations=12, solver=pd.Multilevel(outer), dtype=dtype).to(device)
+    state = sim.rest_state(batch)
+    state = pd.State(state.positions, state.velocities + 0.1)
+    planes = sim.planes.detach().repeat(batch, 1, 1)
+    sound = torch.func.functional_call(sim, {"planes": planes}, (state,))
+    planes[1, 0, column] = sick
+    found = torch.func.functional_call(sim, {"planes": planes}, (state,))
+    others = torch.arange(batch) != 1
+    assert_same_bits([t[others] for t in found], [t[others] for t in sound])
+
+
 def test_order_of_the_batch_does_not_matter(dtype: torch.dtype, device: torch.device) -> None:
     sim = simulator(scene(), dtype, device, iterations=20)
     state, forces = different_environments(sim)

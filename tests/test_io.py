@@ -77,6 +77,22 @@ def test_takes_the_same_steps(tmp_path: Path, solver: Solver, dtype: torch.dtype
     assert_same_bits(sim, loaded)
 
 
+@pytest.mark.parametrize("number", [np.float32, np.float64, torch.tensor], ids=["float32", "float64", "tensor"])
+def test_settings_of_a_solver_are_plain_numbers(tmp_path: Path, number: Callable[[float], Any]) -> None:
+    for given, plain in (
+        (pd.Chebyshev(rho=number(0.5), relaxation=number(1.25)), pd.Chebyshev(rho=0.5, relaxation=1.25)),
+        (pd.Chebyshev("classic", 0.75, number(5)), pd.Chebyshev("classic", 0.75, 5)),
+        (pd.Jacobi(number(0.5)), pd.Jacobi(0.5)),
+        (pd.Multilevel("momentum", number(1.5)), pd.Multilevel("momentum", 1.5)),
+    ):
+        assert given == plain
+        sim = pd.Simulator(everything(), solver=given)
+        sim.save(tmp_path / "file")
+        loaded = pd.Simulator.load(tmp_path / "file").solver
+        assert loaded == plain
+        assert {type(value) for value in vars(loaded).values()} == {type(value) for value in vars(given).values()}
+
+
 def test_scene_comes_back(tmp_path: Path) -> None:
     sim = pd.Simulator(everything())
     sim.save(tmp_path / "sim")

@@ -301,6 +301,8 @@ def test_states_of_some_environments_are_replaced() -> None:
     for wrong in (torch.tensor([True]), done.float(), done[None]):
         with pytest.raises(ValueError, match=r"State.where: condition must be bool \[3\], one for each"):
             new.where(wrong, old)
+    with pytest.raises(TypeError, match=r"State.where: condition must be a bool tensor, got list"):
+        new.where([True, False, True], old)  # type: ignore[arg-type]
     for other, message in (
         (
             pd.State(*(t[:2] for t in old)),
@@ -314,3 +316,10 @@ def test_states_of_some_environments_are_replaced() -> None:
             new.where(done, other)
     one = sim.rest_state()
     assert same_bits(new.where(done, one), new.where(done, sim.rest_state(3)))
+
+
+def test_numbers_are_no_states() -> None:
+    sim, number = simulate(torch.float32), torch.tensor(0.0)
+    for step in (sim, sim.step_, lambda state: sim.rollout(state, 2), sim.energy):
+        with pytest.raises(ValueError, match=r"must be \[B, 45, 3\], got \[\]"):
+            step(pd.State(number, number))

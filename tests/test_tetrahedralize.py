@@ -302,6 +302,10 @@ def test_an_embedding_of_the_wrong_size_is_refused() -> None:
     one = carried(tetrahedralize(ball(1), cells=2))
     with pytest.raises(ValueError, match=r"Embedding\.weights must be \[\d+, 4\]"):
         Embedding(one.surface, one.tets, one.weights[1:], one.corners, one.vertex_count)
+    mine = one.weights.copy()
+    kept = Embedding(one.surface, one.tets, mine, one.corners, one.vertex_count)
+    mine += 1.0  # the caller's own
+    assert np.array_equal(kept.weights, one.weights)
 
 
 # How it is called:

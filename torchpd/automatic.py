@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from .forecast import LANDING_ROOTS, Forecast, Spectrum, forecast, has_contacts, held_up_by, spectrum_of
+from .forecast import LANDING_ROOTS, MOST_OF_LEVELS, Forecast, Spectrum, forecast, has_contacts, held_up_by, spectrum_of
 from .gpu import H100
 from .kernel_costs import iteration_microseconds
 from .multilevel import MOST_DIRECT
@@ -28,6 +28,8 @@ __all__ = ["AIM", "CPU_CHEBYSHEV", "Choice", "Cost", "choose_solver", "multileve
 AIM = 1e-3  # error of a step that "auto" sets its iterations for
 MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes
 PATIENCE = 4  # times that where a tolerance ends easy steps: hard ones, which no forecast sees, need as many
+# iterations at most, times `PATIENCE` where there is a tolerance: beyond them float32 ends, and a step would never
+MOST_OF_CHEBYSHEV = 10_000
 # times that an iteration of Multilevel is as long where something may touch: boxes of 125 to 9,261 vertices that rest
 # took 1.1 to 1.7 times what those that swing do on an H100, 1.1 to 1.4 times on the CPU
 ON_CONTACTS = 1.4
@@ -100,13 +102,16 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
         sim: scene, time step, material, device, and the batch to choose for.
         iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error, but
             Chebyshev with friction and balls. None sets as many as are expected to reach an error of `AIM`, times
-            `MARGIN`, and with a tolerance `PATIENCE`. On smooth planes those of Multilevel are for the hardest step of
-            any mesh; with a tolerance, and unless you give them, it is compared by what landing takes on even meshes.
+            `MARGIN`, up to `MOST_OF_CHEBYSHEV` or `MOST_OF_LEVELS`, and with a tolerance `PATIENCE` times that. On
+            smooth planes those of Multilevel are for the hardest step of any mesh; with a tolerance, and unless you
+            give them, it is compared by what landing takes on even meshes.
     """
 
-    def chosen(enough: int, why: str) -> Choice:
-        most = enough * (PATIENCE if sim.tolerance > 0.0 else 1)
-        return Choice(most if iterations is None else iterations, iterations is None, why)
+    def chosen(enough: int, why: str, most: int = MOST_OF_CHEBYSHEV) -> Choice:
+        if iterations is not None:
+            return Choice(iterations, False, why)
+        why += f"; it takes no more than {most:,}" if enough > most else ""
+        return Choice(min(enough, most) * (PATIENCE if sim.tolerance > 0.0 else 1), True, why)
 
     spectrum = spectrum_of(sim)
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
@@ -139,7 +144,7 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
         better = iterations < _enough(plain) and levels.rate > plain.rate
         both += f"; {iterations} leave about {plain.error(iterations):.1g} or {levels.error(iterations):.1g}"
     if better:
-        return multilevel, chosen(_enough(levels), both)
+        return multilevel, chosen(_enough(levels), both, MOST_OF_LEVELS)
     return chebyshev, chosen(_enough(plain), both)
 
 

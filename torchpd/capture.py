@@ -24,8 +24,9 @@ class CapturedStep:
 
     A replay reads and writes the very tensors that were given: put new values into them with `copy_`, and into the
     material with `sim.pin_targets.copy_(...)` or, in the same shape, `sim.set_material(...)`. Settings (time step,
-    iterations, tolerance) and the batch are those of the recording; capture again to change them, and where
-    `set_material` prepares the solver anew: a replay refuses then.
+    iterations, tolerance), the batch, and the material that was there, where `set_material` with another batch or
+    `load_state_dict(assign=True)` makes new parameters, stay those of the recording; capture again to change them, and
+    where `set_material` prepares the solver anew: a replay refuses then.
 
         step = sim.capture(state, forces)
         for _ in range(100):

@@ -152,7 +152,7 @@ def check_vector(name: str, value: Any) -> NDArray[np.float64]:
     return array
 
 
-def check_whole(name: str, value: Any, *, minimum: int) -> int:
+def check_whole(name: str, value: Any, *, minimum: int, maximum: int | None = None) -> int:
     """One whole number, as an int."""
     try:
         number = int(value)
@@ -160,6 +160,8 @@ def check_whole(name: str, value: Any, *, minimum: int) -> int:
         number = minimum - 1
     if isinstance(value, bool) or number < minimum or number != value:
         raise ValueError(f"{name} must be a whole number >= {minimum}, got {value!r}")
+    if maximum is not None and number > maximum:
+        raise ValueError(f"{name} must be a whole number <= {maximum:,}, got {value!r}")
     return number
 
 

@@ -40,10 +40,11 @@ class Embedding:
     def __post_init__(self) -> None:
         count = len(self.surface.vertices)
         for name, shape in (("tets", (count,)), ("weights", (count, 4)), ("corners", (count, 4))):
-            array = getattr(self, name)
+            array = np.array(getattr(self, name))
             if array.shape != shape:
                 raise ValueError(f"Embedding.{name} must be {list(shape)} (surface vertices), got {list(array.shape)}")
             array.setflags(write=False)
+            object.__setattr__(self, name, array)
 
     @overload
     def apply(self, positions: NDArray[Any]) -> NDArray[Any]: ...

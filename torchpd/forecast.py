@@ -48,6 +48,8 @@ _LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum":
 # of Multilevel where something lands, in those of Chebyshev for an error of 1e-3 and in their square roots
 _LANDING_SHARE, LANDING_ROOTS = 1.0 / 7.0, 2.0
 _MOST = 10_000
+# iterations of Multilevel that "auto" takes at most: what a bound asks beyond that hardly a step needs
+MOST_OF_LEVELS = 1_000
 FAR_TOO_FEW = 0.1  # error that is left
 
 
@@ -178,13 +180,13 @@ def warn_of_few_iterations(sim: Model, changed: str | None = None, enough: float
 
     Args:
         sim: with the default number of iterations, or that of "auto".
-        changed: what brought another material or time step; None when the simulator is made.
+        changed: what brought another material or time step; None when the simulator is made, or "auto" has chosen.
         enough: the error that may be left.
 
     Returns:
         Whether it was said.
     """
-    if sim.choice is None and is_bound(sim):
+    if is_bound(sim) and (sim.choice is None or sim.iterations >= MOST_OF_LEVELS):
         return False  # most steps need far fewer
     expected = forecast(sim)
     if expected is None or expected.error(sim.iterations) <= enough:
@@ -194,7 +196,10 @@ def warn_of_few_iterations(sim: Model, changed: str | None = None, enough: float
     if changed is not None:
         what, verb, ways = f"{count} iterations", "now leave", "Set sim.iterations, or take"
     ways += ' solver="auto", or ask sim.tune(error=1e-2)'
-    if sim.choice is not None:
+    if sim.choice is not None and changed is None:
+        what, verb = f'the {count:,} iterations that "auto" takes at most', "leave"
+        ways = "Take a shorter time_step, or give iterations=..."
+    elif sim.choice is not None:
         what += ' that "auto" chose before'
         ways = "sim.prepare_solver() chooses anew"
     warn_user(

@@ -22,7 +22,7 @@ from .warn import warn_user
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_keys", "check_kinds", "ordinary", "replace_material"]
+__all__ = ["check_keys", "check_kinds", "check_saved", "ordinary", "replace_material"]
 
 _OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness")  # what decides how many iterations a step takes
 
@@ -113,6 +113,16 @@ def check_kinds(sim: Model, owner: str, arrays: Mapping[str, Any]) -> None:
                 f"{owner}: {name} must be {own.dtype} on {own.device} like the simulator, got {array.dtype} on "
                 f"{array.device}; without assign=True it is converted"
             )
+
+
+def check_saved(owner: str, arrays: Mapping[str, Any]) -> None:
+    """Refuse what `set_material` would stretch, and torch refuses after arrays before it are written."""
+    for name, array in arrays.items():
+        if not isinstance(array, Tensor):
+            raise TypeError(f"{owner}: {name} must be a tensor, got {type(array).__name__}")
+        dims = MATERIAL_ROWS[name].dims
+        if array.dim() < dims:
+            raise ValueError(f"{owner}: {name} must have {dims} or {dims + 1} dimensions, got {list(array.shape)}")
 
 
 def check_keys(sim: Model, state_dict: Mapping[str, Any], *, strict: bool) -> None:

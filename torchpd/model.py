@@ -13,8 +13,8 @@ from .automatic import AIM, Choice, choose_solver
 from .checks import check_has_values, check_whole
 from .forecast import FAR_TOO_FEW, warn_of_few_iterations
 from .material import MATERIAL_ROWS, material_of
-from .material_changes import check_keys, check_kinds, ordinary, replace_material
-from .model_checks import check_batch, check_positive_number, check_state, check_tolerance, positions_of
+from .material_changes import check_keys, check_kinds, check_saved, ordinary, replace_material
+from .model_checks import check_batch, check_state, check_time_step, check_tolerance, positions_of
 from .multilevel import has_levels
 from .placing import check_wanted_device, move_plan, plan_anew, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
@@ -36,6 +36,7 @@ _PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
 # Shortest and longest time step for which iterations need no warning, nor for what lies between: long ones are slow,
 # and short ones overshoot with a relaxation for long ones.
 _EVERY, _NONE = (0.0, math.inf), (math.inf, 0.0)
+_MOST_ITERATIONS = 1_000_000_000  # of a step, as the ops say
 
 
 class Model(nn.Module):
@@ -68,7 +69,7 @@ class Model(nn.Module):
         if not isinstance(scene, Scene):
             raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
         self.scene = scene
-        self._time_step = check_positive_number("time_step", time_step, "s")
+        self._time_step = check_time_step(time_step, dtype)
         self.iterations = DEFAULT_ITERATIONS if iterations is None else iterations
         self._solver: Solver = Chebyshev()
         automatic = solver is None or _is_auto(solver)
@@ -146,7 +147,7 @@ class Model(nn.Module):
 
     @time_step.setter
     def time_step(self, time_step: float) -> None:
-        self._time_step = check_positive_number("time_step", time_step, "s")
+        self._time_step = check_time_step(time_step, self.dtype)
         shortest, longest = self._judged_steps
         # where it changes in every step hardly any change shall cost more than to ask
         if not (shortest <= self._time_step <= longest or _recording(self.device)):
@@ -159,7 +160,7 @@ class Model(nn.Module):
 
     @iterations.setter
     def iterations(self, iterations: int) -> None:
-        self._iterations = check_whole("Simulator: iterations", iterations, minimum=0)
+        self._iterations = check_whole("Simulator: iterations", iterations, minimum=0, maximum=_MOST_ITERATIONS)
         self.named_iterations = True
 
     @property
@@ -220,6 +221,7 @@ class Model(nn.Module):
             self.solver, choice = choose_solver(self, iterations)
             self.iterations, self.choice = choice.iterations, choice
             self.named_iterations = not choice.sets_iterations
+            self.judge_iterations(None)
         except BaseException:
             self.plan, self._solver, self.choice, self.iterations, self.named_iterations = before
             raise
@@ -302,6 +304,7 @@ class Model(nn.Module):
         arrays = {n: state_dict[prefix + n] for n in MATERIAL_ROWS if prefix + n in state_dict}
         try:
             with torch.no_grad():
+                check_saved(owner, arrays)
                 if assign:
                     check_kinds(self, owner, arrays)
                 replace_material(self, owner, arrays, anew=assign)

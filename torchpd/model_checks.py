@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
 from .checks import check_like, check_whole, in_full, of_each
@@ -13,7 +14,10 @@ from .state import State
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_batch", "check_positive_number", "check_state", "check_tolerance", "positions_of"]
+__all__ = ["check_batch", "check_positive_number", "check_state", "check_time_step", "check_tolerance", "positions_of"]
+
+
+_LONGEST_STEP = {torch.float32: 1e12, torch.float64: 1e100}  # s
 
 
 def check_batch(batch: int | None) -> int | None:
@@ -29,6 +33,17 @@ def check_positive_number(name: str, value: float, unit: str) -> float:
     return number
 
 
+def check_time_step(time_step: float, dtype: torch.dtype) -> float:
+    """The number, of which h^2 and 1 / h^2 times masses are numbers in that precision, too."""
+    number = check_positive_number("time_step", time_step, "s")
+    longest = _LONGEST_STEP.get(dtype, math.inf)
+    if not 1.0 / longest <= number <= longest:
+        raise ValueError(
+            f"time_step must lie within {1.0 / longest:g} and {longest:g} [s] in {dtype}, got {time_step!r}"
+        )
+    return number
+
+
 def check_tolerance(tolerance: float) -> float:
     """The number, of whatever type has one."""
     number = _number_or_nan(tolerance)
@@ -39,7 +54,7 @@ def check_tolerance(tolerance: float) -> float:
 
 def _number_or_nan(value: Any) -> float:
     try:
-        return math.nan if isinstance(value, str) else float(value)
+        return math.nan if isinstance(value, (str, bool)) else float(value)
     except (TypeError, ValueError):
         return math.nan
 
@@ -52,6 +67,8 @@ def check_state(sim: Model, state: State, *, forces: Tensor | None, fix: str) ->
             f"{_kind_of(state)}; rest_state() makes one"
         )
     _check_kind(sim, "state", state[0])
+    if state[0].dim() == 0:  # whose batch is read before an op checks all of it
+        raise ValueError(f"positions must be [B, {sim.vertices}, 3], got []")
     check_like("velocities", state[1], state[0], "m/s")
     if forces is None:
         return None

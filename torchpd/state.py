@@ -34,6 +34,8 @@ class State(NamedTuple):
 
         The other state has as many environments, or one for all.
         """
+        if not isinstance(condition, Tensor):
+            raise TypeError(f"State.where: condition must be a bool tensor, got {type(condition).__name__}")
         if condition.dtype != torch.bool or condition.shape != self.positions.shape[:1]:
             raise ValueError(
                 f"State.where: condition must be bool [{len(self.positions)}], one for each environment, got "
@@ -72,8 +74,9 @@ class Info(NamedTuple):
     Attributes:
         residual: |grad E| / |grad E at x + h v| of the step's objective E, less what contacts balance: 1 is no better
             than where the body would fly to, and as residuals weigh short waves, an error may be larger or smaller; at
-            rest, where rounding is all that there is, it is 0.3 to 1. NaN unless it was asked for (`return_info`), and
-            where state or material are none of a step: not finite, or negative.
+            rest, where rounding is all that there is, it is about 1, of stiff bodies up to ten and more. NaN unless it
+            was asked for (`return_info`), and where what is not finite, or negative, of state and material reaches the
+            step: not of a contact that nothing touches, nor a mass that a spring outweighs.
         energy: the objective E at the last iterate [J], elastic energy and m / (2 h^2) |x - y|^2: what a solve lowers.
             Not the mechanical energy, which `Simulator.energy` gives. NaN unless asked for.
         iterations: that were used.

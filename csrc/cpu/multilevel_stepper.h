@@ -130,9 +130,9 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
         sum[2 * history + 1] = multiply_add(way, way, sum[2 * history + 1]);
       }
       if (!lbfgs_) return;
-      // a trial out of range must not poison sums in which it has no part
-      o_.s[newest_][i] = pick(finite_, s, none_);
-      o_.y[newest_][i] = pick(finite_, y, none_);
+      // what is no number must not poison sums in which it has no part, those of the next environment among them
+      o_.s[newest_][i] = pick(finite_, numbers(s), none_);
+      o_.y[newest_][i] = pick(finite_, numbers(y), none_);
       const Value g = let_through(i, o_.pull[i]);
       for (int j = 0; j < history; ++j) {
         sum[j] = multiply_add(o_.s[j][i], y, sum[j]);
@@ -300,6 +300,15 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   // where the lane accepted its trial `a`, else `b`
   Value choose(const Value& a, const Value& b) const { return pick(accepted_, a, b); }
+
+  // 0 for what is infinite or NaN
+  static Value numbers(const Value& a) {
+    const auto number = [](const Real& x) {
+      return select(lesser(x, -x) > Real(T(-HUGE_VAL)), x, Real(T(0)));
+    };
+    const Vec3<Real> v = Lanes::vec3(a);
+    return Lanes::value({number(v.x), number(v.y), number(v.z)});
+  }
 
   static Value pick(const Real& flag, const Value& a, const Value& b) {
     return pick_if(flag > Real(T(0)), a, b);
