@@ -206,7 +206,7 @@ class Simulator(Model):
                 asked for the step before, too; others are moved on by an addition for each step before.
             start: first iterate of every step, "velocity" or "inertial".
             return_info: fill in residual and energy of the recorded steps; NaN otherwise, see `Info`.
-            progress: show a bar.
+            progress: show a bar; steps come in pieces then, between which Ctrl-C ends a long rollout.
 
         Returns:
             Track of the recorded states.

@@ -126,7 +126,7 @@ def tune(
     study = _prepare(_with_targets(sim, targets, len(start[0])), start, forces, error)
     # with friction steps may come to no end, which counts as error: then a target is not attained
     if not has_friction(sim):
-        check_known(study.exact, _KNOWN if error is None else error / SAFETY)
+        check_known(study.exact, _doubt(error))
     named: Mapping[str, Solver] = (
         _usual(sim, safe_solvers(study.sim, study.state))
         if candidates is None
@@ -196,7 +196,7 @@ def _prepare(sim: Simulator, start: State, forces: Tensor | None, error: float |
         exact = settled_steps(everyone, state, forces=repeated, enough=_SETTLED * (error or _COARSE))
     else:
         exact = exact_steps(everyone, state, forces=repeated)
-    moving = [number for number, step in enumerate(exact) if step.moves(sim.dtype)]
+    moving = [number for number, step in enumerate(exact) if step.moves(sim.dtype) and not _rests(step, _doubt(error))]
     if not moving:
         raise ValueError(
             "tune: this scene has no motion that needs solving: from the given state the bodies rest or fall freely; "
@@ -205,6 +205,16 @@ def _prepare(sim: Simulator, start: State, forces: Tensor | None, error: float |
     chosen = _of_environments(everyone, moving, len(exact))
     pushed = None if repeated is None else repeated[moving]
     return _Study(chosen, State(state[0][moving], state[1][moving]), pushed, [exact[number] for number in moving])
+
+
+def _doubt(error: float | None) -> float:
+    """How uncertain a converged step may be, relative."""
+    return _KNOWN if error is None else error / SAFETY
+
+
+def _rests(step: ExactStep, allowed: float) -> bool:
+    """Whether the way of a step is so small that float64 itself makes it uncertain: of bodies that come to rest."""
+    return step.uncertainty > allowed and step.uncertainty * step.scale <= step.rounding(torch.float64)
 
 
 def _environments(sim: Simulator, batch: int) -> list[int]:
