@@ -71,7 +71,8 @@ def write_result(path: Path, result: Record, merge: Callable[[Record, Record], R
 
 def run_of(result: Record) -> Record:
     """What a row says of the run that measured it, for files that several runs have filled."""
-    return {name: result[name] for name in PROVENANCE}
+    machine = ", ".join(str(result["machine"][name]) for name in ("cpu", "simd", "device"))
+    return {**{name: result[name] for name in PROVENANCE}, "machine": machine, "torch": result["versions"]["torch"]}
 
 
 def earlier_rows(path: Path | None) -> list[Record]:

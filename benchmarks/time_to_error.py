@@ -213,7 +213,8 @@ def table(rows: list[Row]) -> str:
                 else f"not in {row['most']} it., {own['milliseconds']['min']:.3g} ms: error {own['error']:.1g}"
             )  # fmt: skip
         if row["times_faster"] is not None:
-            cells.append(f"{'more than ' * row['at_least']}{row['times_faster']:.2g}")
+            times = row["times_faster"]
+            cells.append(f"more than {_plain(times, down=True)}" if row["at_least"] else f"{times:.2g}")
         else:
             cells.append("Multilevel failed")
         auto = row["auto"]

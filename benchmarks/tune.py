@@ -251,7 +251,6 @@ def main(words: list[str]) -> None:
         write(options.out, header, list(rows.values()))
     chosen = [rows[number] for number in range(options.scenes)]
     print(json.dumps(summary(chosen), indent=1))
-    write(options.out, header, chosen)
 
 
 def write(out: Path | None, header: Row, rows: list[Row]) -> None:

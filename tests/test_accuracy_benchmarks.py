@@ -154,7 +154,7 @@ def test_time_to_error_keeps_failures_and_wrong_choices() -> None:
     right, wrong, bound, failed = table(rows).splitlines()[2:]
     assert "| 300 it., 30 ms | 20 it., 6 ms | 5 | Multilevel: 40 it., 8 ms, error 0.0001 |" in right
     assert "Chebyshev, the slower by 5:" in wrong
-    assert "| not in 8192 it., 30 ms: error 0.2 | 20 it., 6 ms | more than 5 |" in bound
+    assert "| not in 8192 it., 30 ms: error 0.2 | 20 it., 6 ms | more than 5.0 |" in bound
     assert "Multilevel failed" in failed
     short = [matrix([row]).splitlines()[-1] for row in rows]
     assert short[0] == "| 1,000 | 30 / 6.0: 5.0 x |"

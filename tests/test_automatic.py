@@ -401,10 +401,27 @@ def test_steps_end(tolerance: float) -> None:
         rough = pd.Simulator(clip(pd.Ground(-1e-3, friction=0.5)), solver="auto", tolerance=tolerance)
     assert isinstance(rough.solver, pd.Chebyshev)
     assert rough.iterations == MOST_OF_CHEBYSHEV * (PATIENCE if tolerance else 1)
-    assert "; it takes no more than 10,000" in str(rough)
+    assert f'; "auto" takes no more than {rough.iterations:,}' in " ".join(str(rough).split())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         smooth = pd.Simulator(clip(pd.Ground(-1e-3)), solver="auto", tolerance=tolerance)
     assert isinstance(smooth.solver, pd.Multilevel)
     assert smooth.iterations == MOST_OF_LEVELS * (PATIENCE if tolerance else 1)
     assert bool(rough(rough.rest_state()).positions.isfinite().all())
+
+
+def test_a_choice_that_is_not_capped_warns_when_it_has_become_too_few(tmp_path: Path) -> None:
+    body = pd.Solid(pd.shapes.box((0.05, 0.01, 0.01), (5, 1, 1)), 1e8, 7800.0)
+    sim = pd.Simulator(pd.Scene(body, pd.Gravity(), pd.Ground(-0.05)), solver="auto", tolerance=1e-3)
+    assert MOST_OF_LEVELS < sim.iterations < PATIENCE * MOST_OF_LEVELS
+    with pytest.warns(pd.UnsolvedWarning, match=r"prepare_solver\(\) chooses anew"):
+        sim.set_material(stiffness=1e4 * sim.stiffness)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sim.prepare_solver()
+    assert sim.iterations == PATIENCE * MOST_OF_LEVELS
+    # one that is capped is told so again where it comes from a file
+    with pytest.warns(pd.UnsolvedWarning, match="takes at most"):
+        pd.Simulator(clip(pd.Ground(-1e-3, friction=0.5)), solver="auto").save(tmp_path / "clip")
+    with pytest.warns(pd.UnsolvedWarning, match=r'^Simulator\.load: the 10,000 iterations that "auto" takes at most'):
+        pd.Simulator.load(tmp_path / "clip")

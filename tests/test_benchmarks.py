@@ -335,12 +335,18 @@ def test_a_run_of_some_batches_keeps_the_others() -> None:
     def row(batch: int, **more: Any) -> dict[str, Any]:
         return {"dtype": "float32", "mesh": "regular", "vertices": 64, "batch": batch, **more}
 
-    first, second = ({"command": "c", "created": "d", "commit": commit} for commit in "12")
-    earlier = {**first, "versions": 1, "rows": [row(1), row(2, auto="grid")]}
-    new = {**second, "versions": 2, "rows": [row(2, auto="block", run=second), row(3, run=second)]}
+    heads = [
+        {"command": "c", "created": "d", "commit": torch, "machine": {"cpu": "C", "simd": "s", "device": "D"}}
+        | {"versions": {"torch": torch}}
+        for torch in "12"
+    ]
+    first, second = map(by_batch.run_of, heads)
+    assert second == {"command": "c", "created": "d", "commit": "2", "machine": "C, s, D", "torch": "2"}
+    earlier = {**heads[0], "rows": [row(1), row(2, auto="grid")]}
+    new = {**heads[1], "rows": [row(2, auto="block", run=second), row(3, run=second)]}
     whole = by_batch.with_earlier(new, earlier)
     assert whole["rows"] == [row(1, run=first), row(2, auto="block", run=second), row(3, run=second)]
-    assert {**whole, "rows": 0} == {**second, "versions": 2, "rows": 0}
+    assert {**whole, "rows": 0} == {**heads[1], "rows": 0}
     assert by_batch.with_earlier(earlier, whole)["rows"] == [row(1), row(2, auto="grid"), row(3, run=second)]
     assert by_batch.with_earlier(new, {}) == new
 

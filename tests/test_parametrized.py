@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_scene import small_simulator
 from torch import Tensor
 from torch.nn.utils import parametrize
 
@@ -104,6 +105,19 @@ def test_functional_call_reaches_rollouts_in_a_module() -> None:
         ]
         assert float(slopes[1].abs().max()) > 0.0
         torch.testing.assert_close(*slopes, rtol=1e-6, atol=1e-9 * float(slopes[1].abs().max()))
+
+
+def test_originals_of_another_shape_are_refused_before_anything_is_loaded() -> None:
+    sim = small_simulator()
+    parametrize.register_parametrization(sim, "stiffness", Exponential())
+    before = [array.clone() for array in sim.material()]
+    for wrong in (torch.tensor(5.0), 5.0, sim.stiffness.detach().repeat(2, 1)):
+        whole = {**sim.state_dict(), "masses": 2.0 * sim.masses, "parametrizations.stiffness.original": wrong}
+        with pytest.raises(
+            ValueError, match=r"load_state_dict: parametrizations\.stiffness\.original must be a tensor \[48\]"
+        ):
+            sim.load_state_dict(whole)
+        assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
 
 
 def test_set_material_goes_through_the_right_inverse(tmp_path: Path) -> None:

@@ -318,6 +318,17 @@ def test_states_of_some_environments_are_replaced() -> None:
     assert same_bits(new.where(done, one), new.where(done, sim.rest_state(3)))
 
 
+def test_a_time_step_must_do_in_another_precision() -> None:
+    sim = simulate(torch.float64)
+    sim.time_step = 1e-50
+    with pytest.raises(
+        ValueError, match=r"time_step must lie within 1e-12 and 1e\+12 \[s\] in torch\.float32, got 1e-50"
+    ):
+        sim.float()
+    assert sim.dtype == torch.float64
+    sim(sim.rest_state())
+
+
 def test_numbers_are_no_states() -> None:
     sim, number = simulate(torch.float32), torch.tensor(0.0)
     for step in (sim, sim.step_, lambda state: sim.rollout(state, 2), sim.energy):

@@ -28,7 +28,7 @@ __all__ = ["AIM", "CPU_CHEBYSHEV", "Choice", "Cost", "choose_solver", "multileve
 AIM = 1e-3  # error of a step that "auto" sets its iterations for
 MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes
 PATIENCE = 4  # times that where a tolerance ends easy steps: hard ones, which no forecast sees, need as many
-# iterations at most, times `PATIENCE` where there is a tolerance: beyond them float32 ends, and a step would never
+# iterations at most, times `PATIENCE` where there is a tolerance: beyond them float32 ends, and a step must end, too
 MOST_OF_CHEBYSHEV = 10_000
 # times that an iteration of Multilevel is as long where something may touch: boxes of 125 to 9,261 vertices that rest
 # took 1.1 to 1.7 times what those that swing do on an H100, 1.1 to 1.4 times on the CPU
@@ -91,6 +91,7 @@ class Choice:
     iterations: int
     sets_iterations: bool  # the user gave none
     why: str  # follows "chosen because"
+    capped: bool = False  # more would be wanted, but a step is to end
 
 
 def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
@@ -110,8 +111,9 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     def chosen(enough: int, why: str, most: int = MOST_OF_CHEBYSHEV) -> Choice:
         if iterations is not None:
             return Choice(iterations, False, why)
-        why += f"; it takes no more than {most:,}" if enough > most else ""
-        return Choice(min(enough, most) * (PATIENCE if sim.tolerance > 0.0 else 1), True, why)
+        times, capped = PATIENCE if sim.tolerance > 0.0 else 1, enough > most
+        why += f'; "auto" takes no more than {most * times:,}' if capped else ""
+        return Choice(min(enough, most) * times, True, why, capped)
 
     spectrum = spectrum_of(sim)
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))

@@ -186,7 +186,8 @@ def warn_of_few_iterations(sim: Model, changed: str | None = None, enough: float
     Returns:
         Whether it was said.
     """
-    if is_bound(sim) and (sim.choice is None or sim.iterations >= MOST_OF_LEVELS):
+    capped = sim.choice is not None and sim.choice.capped
+    if is_bound(sim) and (sim.choice is None or capped):
         return False  # most steps need far fewer
     expected = forecast(sim)
     if expected is None or expected.error(sim.iterations) <= enough:
@@ -196,7 +197,7 @@ def warn_of_few_iterations(sim: Model, changed: str | None = None, enough: float
     if changed is not None:
         what, verb, ways = f"{count} iterations", "now leave", "Set sim.iterations, or take"
     ways += ' solver="auto", or ask sim.tune(error=1e-2)'
-    if sim.choice is not None and changed is None:
+    if capped:
         what, verb = f'the {count:,} iterations that "auto" takes at most', "leave"
         ways = "Take a shorter time_step, or give iterations=..."
     elif sim.choice is not None:

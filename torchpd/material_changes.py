@@ -22,7 +22,7 @@ from .warn import warn_user
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_keys", "check_kinds", "check_saved", "ordinary", "replace_material"]
+__all__ = ["check_keys", "check_kinds", "check_originals", "check_saved", "ordinary", "replace_material"]
 
 _OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness")  # what decides how many iterations a step takes
 
@@ -123,6 +123,20 @@ def check_saved(owner: str, arrays: Mapping[str, Any]) -> None:
         dims = MATERIAL_ROWS[name].dims
         if array.dim() < dims:
             raise ValueError(f"{owner}: {name} must have {dims} or {dims + 1} dimensions, got {list(array.shape)}")
+
+
+def check_originals(sim: Model, state_dict: Mapping[str, Any]) -> None:
+    """Refuse what does not fit a parametrization, which torch finds out after arrays before it are written."""
+    own = sim.state_dict()
+    for name, array in state_dict.items():
+        if not name.startswith("parametrizations.") or name not in own:
+            continue
+        if not isinstance(array, Tensor) or array.shape != own[name].shape:
+            came = list(array.shape) if isinstance(array, Tensor) else type(array).__name__
+            raise ValueError(
+                f"{type(sim).__name__}.load_state_dict: {name} must be a tensor {list(own[name].shape)} like that of "
+                f"the simulator, got {came}"
+            )
 
 
 def check_keys(sim: Model, state_dict: Mapping[str, Any], *, strict: bool) -> None:

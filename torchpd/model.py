@@ -13,7 +13,7 @@ from .automatic import AIM, Choice, choose_solver
 from .checks import check_has_values, check_whole
 from .forecast import FAR_TOO_FEW, warn_of_few_iterations
 from .material import MATERIAL_ROWS, material_of
-from .material_changes import check_keys, check_kinds, check_saved, ordinary, replace_material
+from .material_changes import check_keys, check_kinds, check_originals, check_saved, ordinary, replace_material
 from .model_checks import check_batch, check_state, check_time_step, check_tolerance, positions_of
 from .multilevel import has_levels
 from .placing import check_wanted_device, move_plan, plan_anew, plan_for_solver, plan_on
@@ -294,6 +294,7 @@ class Model(nn.Module):
         another precision are refused.
         """
         check_keys(self, state_dict, strict=strict)
+        check_originals(self, state_dict)
         return super().load_state_dict(state_dict, strict, assign)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
@@ -364,6 +365,7 @@ class Model(nn.Module):
                 self._choose_again(choice)
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
+        check_time_step(self.time_step, wanted.dtype)
         if wanted.device.type == "cuda":
             check_solver(self.solver, wanted.device)
         # digits that float32 has lost do not come back by widening, and "meta" keeps none

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,7 +37,7 @@ def check_positive_number(name: str, value: float, unit: str) -> float:
 def check_time_step(time_step: float, dtype: torch.dtype) -> float:
     """The number, of which h^2 and 1 / h^2 times masses are numbers in that precision, too."""
     number = check_positive_number("time_step", time_step, "s")
-    longest = _LONGEST_STEP.get(dtype, math.inf)
+    longest = _LONGEST_STEP[torch.float64 if dtype == torch.float64 else torch.float32]
     if not 1.0 / longest <= number <= longest:
         raise ValueError(
             f"time_step must lie within {1.0 / longest:g} and {longest:g} [s] in {dtype}, got {time_step!r}"
@@ -54,7 +55,8 @@ def check_tolerance(tolerance: float) -> float:
 
 def _number_or_nan(value: Any) -> float:
     try:
-        return math.nan if isinstance(value, (str, bool)) else float(value)
+        no_number = isinstance(value, (str, bool, np.bool_)) or getattr(value, "dtype", None) == torch.bool
+        return math.nan if no_number else float(value)
     except (TypeError, ValueError):
         return math.nan
 

@@ -27,7 +27,7 @@ def nearest_rotation(F: Tensor) -> Tensor:
     """The rotation R nearest to each matrix: argmax of tr(R^T F) over det R = +1.
 
     Safe for inverted, rank-deficient, huge and tiny matrices: zero gives the identity, a matrix with NaN or infinity
-    gives NaN. Differentiable, of matrices of 1e-13 to 1e12 (in float64 1e-103 to 1e102), infinitely steep where the two
+    gives NaN. Differentiable, of matrices of 1e-12 to 1e12 (in float64 1e-101 to 1e101), infinitely steep where the two
     smallest singular values cancel (with the sign of det F on the smallest): there the nearest rotation jumps.
 
     Largest root of Davenport's quartic (Markley 1993), closed form, one Newton polish; signed SVD where roots meet.

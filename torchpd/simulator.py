@@ -37,7 +37,7 @@ class Simulator(Model):
     `pin_stiffness` [P] N/m, `pin_targets` [P, 3] m, `planes` [C, 5] (unit normal, height, friction), `spheres` [S, 8]
     (centre, radius, friction, motion in a step). `set_material` checks and replaces them. What an optimiser writes, or
     `torch.func.functional_call` gives, no step checks, as that would wait for a GPU: where it is NaN, or stiffness,
-    masses or springs are negative, `Info.residual` is NaN, which has the exceptions. Let an optimiser learn the
+    masses or springs are negative, `Info.residual` is NaN (but see there for exceptions). Let an optimiser learn the
     logarithm of those. The rest
     shape is compiled and not learned. Hard pins have inf for stiffness, of which weight decay and averages make NaN:
     that is refused on a CPU (docs/limits.md, "Material that is learned").
@@ -53,9 +53,10 @@ class Simulator(Model):
         solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later. None is Chebyshev.
             "auto" takes Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner on the device,
             Chebyshev where there is friction, and as many iterations as that takes unless they are given, four times as
-            many where a `tolerance` ends easy steps; `print(sim)` says why. It chooses anew when the simulator moves to
-            another device and in `prepare_solver`, which an `UnsolvedWarning` asks for where a change of material or
-            time step makes the old choice leave 1e-2 or more.
+            many where a `tolerance` ends easy steps, but no more than 10,000, and 1000 of Multilevel, times four with a
+            tolerance; `print(sim)` says why, an `UnsolvedWarning` where that will not do. It chooses anew when the
+            simulator moves to another device and in `prepare_solver`, which an `UnsolvedWarning` asks for where a
+            change of material or time step makes the old choice leave 1e-2 or more.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x - x*| is about tolerance |x - s| or less, s being where
             inertia, forces and springs alone would take the vertices, so that |x - s| is what elasticity and contacts

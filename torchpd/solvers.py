@@ -117,7 +117,7 @@ class Chebyshev:
                     'or take schedule="guarded", which needs none'
                 )
             if self.delay is not None:
-                _keep(self, "delay", check_whole("Chebyshev.delay", self.delay, minimum=0))
+                _keep(self, "delay", check_whole("Chebyshev.delay", self.delay, minimum=0, maximum=1_000_000_000))
         else:
             if self.delay is not None:
                 raise ValueError(f'Chebyshev.delay belongs to schedule="classic"; guarded has none, got {self.delay}')
@@ -146,7 +146,7 @@ class Multilevel:
     """Iterations with a multilevel approximation M of A^-1, A the constant matrix of projective dynamics.
 
     For stiff and for accurate steps: a dozen or two of iterations do, however stiff or fine the mesh, each at four to
-    six times the cost of a Jacobi iteration on a CPU, and 14 to 29 times on a GPU, where M of a mesh of up to 1024
+    six times the cost of a Jacobi iteration on a CPU, and 11 to 29 times on a GPU, where M of a mesh of up to 1024
     vertices is A^-1 itself unless it comes in batches (`Simulator(batch=...)`). The scene takes longer to compile.
 
     Every iterate is judged by its energy before the next one starts from it. After four failures in a row come two
