@@ -167,9 +167,9 @@ def _pair(name: str, cells: tuple[int, int, int], kernel: str, aim: Aim, *, heav
     ]
 
 
-def _as_many_tets(name: str, cells: tuple[int, int, int], kernel: str, aim: Aim) -> GpuScene:
+def _as_many_tets(name: str, cells: tuple[int, int, int], kernel: str, aim: Aim, *, heavy: bool = False) -> GpuScene:
     """An irregular mesh of as many tetrahedra as the regular one, which for as many vertices has 12 % more."""
-    return GpuScene(f"{name}-irregular-as-many-tets", cells, kernel=kernel, mesh="irregular", aims=(aim,))
+    return GpuScene(f"{name}-irregular-as-many-tets", cells, kernel=kernel, mesh="irregular", aims=(aim,), heavy=heavy)
 
 
 def _iteration(must: float, stretch: float | None = None) -> Aim:
@@ -209,6 +209,7 @@ GPU_SCENES = (
     *_loose("one-10k", (39, 15, 15), kernel="grid"),
     *_loose("one-1M", (255, 63, 63), kernel="stream"),
     *_pair("one-4M", (1023, 63, 63), "stream", _iteration(480.0, 400.0), heavy=True),
+    _as_many_tets("one-4M", (977, 61, 61), "stream", _iteration(480.0, 400.0), heavy=True),
 )
 
 QUICK_GPU_SCENES = tuple(
