@@ -20,7 +20,7 @@ from .placing import check_wanted_device, move_plan, plan_anew, plan_for_solver,
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
-from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
+from .solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Multilevel, Solver, check_solver
 from .state import State
 from .targets import Anchors, Targets
 from .written import Written
@@ -36,7 +36,6 @@ _PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
 # Shortest and longest time step for which iterations need no warning, nor for what lies between: long ones are slow,
 # and short ones overshoot with a relaxation for long ones.
 _EVERY, _NONE = (0.0, math.inf), (math.inf, 0.0)
-_MOST_ITERATIONS = 1_000_000_000  # of a step, as the ops say
 
 
 class Model(nn.Module):
@@ -160,7 +159,7 @@ class Model(nn.Module):
 
     @iterations.setter
     def iterations(self, iterations: int) -> None:
-        self._iterations = check_whole("Simulator: iterations", iterations, minimum=0, maximum=_MOST_ITERATIONS)
+        self._iterations = check_whole("Simulator: iterations", iterations, minimum=0, maximum=LARGEST_COUNT)
         self.named_iterations = True
 
     @property

@@ -38,9 +38,8 @@ class Simulator(Model):
     (centre, radius, friction, motion in a step). `set_material` checks and replaces them. What an optimiser writes, or
     `torch.func.functional_call` gives, no step checks, as that would wait for a GPU: where it is NaN, or stiffness,
     masses or springs are negative, `Info.residual` is NaN (but see there for exceptions). Let an optimiser learn the
-    logarithm of those. The rest
-    shape is compiled and not learned. Hard pins have inf for stiffness, of which weight decay and averages make NaN:
-    that is refused on a CPU (docs/limits.md, "Material that is learned").
+    logarithm of those. The rest shape is compiled and not learned. Hard pins have inf for stiffness, of which weight
+    decay and averages make NaN: that is refused on a CPU (docs/limits.md, "Material that is learned").
 
     It is made on the CPU, whatever torch's default device; `.to(...)` moves it.
 

@@ -11,6 +11,7 @@ from .checks import check_scalar, check_whole
 
 __all__ = [
     "DEFAULT_ITERATIONS",
+    "LARGEST_COUNT",
     "Chebyshev",
     "Jacobi",
     "Multilevel",
@@ -19,7 +20,9 @@ __all__ = [
     "check_solver",
 ]
 
+LARGEST_COUNT = 1_000_000_000  # of iterations, as the ops say
 Diagonal = Literal["weighted", "plain"]
+_DESCENDS = ": a step of theta / D descends only there;"
 
 
 class SolverNumbers(TypedDict):
@@ -32,17 +35,18 @@ class SolverNumbers(TypedDict):
     weighted: bool
 
 
-def _keep(solver: object, name: str, value: float) -> None:
+def _keep(solver: Solver, name: str, value: float) -> None:
     """A number as a plain one, of whatever type it came: it is compared, and written into files."""
     object.__setattr__(solver, name, value)
 
 
-def _keep_relaxation(solver: Jacobi | Chebyshev, value: float) -> None:
-    name = f"{type(solver).__name__}.relaxation"
-    number = check_scalar(name, value)
-    if not 0.0 < number < 2.0:
-        raise ValueError(f"{name} must lie in (0, 2): a step of theta / D descends only there; got {value}")
-    _keep(solver, "relaxation", number)
+def _keep_within(solver: Solver, name: str, most: int, why: str = ",") -> None:
+    """The same of one that lies in (0, most)."""
+    value, full_name = getattr(solver, name), f"{type(solver).__name__}.{name}"
+    number = check_scalar(full_name, value)
+    if not 0.0 < number < most:
+        raise ValueError(f"{full_name} must lie in (0, {most}){why} got {value}")
+    _keep(solver, name, number)
 
 
 def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
@@ -64,7 +68,7 @@ class Jacobi:
     diagonal: Diagonal = "weighted"
 
     def __post_init__(self) -> None:
-        _keep_relaxation(self, self.relaxation)
+        _keep_within(self, "relaxation", 2, _DESCENDS)
         _check_choice("Jacobi.diagonal", self.diagonal, ("weighted", "plain"))
 
     def numbers(self) -> SolverNumbers:
@@ -103,11 +107,9 @@ class Chebyshev:
     def __post_init__(self) -> None:
         _check_choice("Chebyshev.schedule", self.schedule, ("guarded", "classic"))
         if self.rho is not None:
-            _keep(self, "rho", check_scalar("Chebyshev.rho", self.rho))
-            if not 0.0 < self.rho < 1.0:
-                raise ValueError(f"Chebyshev.rho must lie in (0, 1), got {self.rho}")
+            _keep_within(self, "rho", 1)
         if self.relaxation is not None:
-            _keep_relaxation(self, self.relaxation)
+            _keep_within(self, "relaxation", 2, _DESCENDS)
         if self.diagonal is not None:
             _check_choice("Chebyshev.diagonal", self.diagonal, ("weighted", "plain"))
         if self.schedule == "classic":
@@ -117,7 +119,7 @@ class Chebyshev:
                     'or take schedule="guarded", which needs none'
                 )
             if self.delay is not None:
-                _keep(self, "delay", check_whole("Chebyshev.delay", self.delay, minimum=0, maximum=1_000_000_000))
+                _keep(self, "delay", check_whole("Chebyshev.delay", self.delay, minimum=0, maximum=LARGEST_COUNT))
         else:
             if self.delay is not None:
                 raise ValueError(f'Chebyshev.delay belongs to schedule="classic"; guarded has none, got {self.delay}')
@@ -177,9 +179,7 @@ class Multilevel:
     def __post_init__(self) -> None:
         _check_choice("Multilevel.outer", self.outer, tuple(_SCHEDULES))
         if self.relaxation is not None:
-            _keep(self, "relaxation", check_scalar("Multilevel.relaxation", self.relaxation))
-            if not 0.0 < self.relaxation < 2.0:
-                raise ValueError(f"Multilevel.relaxation must lie in (0, 2), got {self.relaxation}")
+            _keep_within(self, "relaxation", 2)
 
     def numbers(self) -> SolverNumbers:
         """The keyword arguments of the ops."""
