@@ -267,6 +267,40 @@ def test_forecasts_are_judged_by_what_was_needed() -> None:
 
 
 @pytest.mark.usefixtures("on_path")
+def test_landings_are_judged_by_their_hardest_step() -> None:
+    from landings import random_landing, summary
+
+    def row(forecast: int, *steps: tuple[int | None, float], slivers: bool = False) -> dict[str, Any]:
+        own = [{"needed": needed, "auto": error} for needed, error in steps]
+        return {"slivers": slivers, "forecast": forecast, "auto": {"iterations": 40}, "steps": own}
+
+    rows = [
+        row(20, (8, 1e-4), (36, 1e-3)),
+        row(20, (37, 2e-3)),
+        row(20, (None, 0.5), slivers=True),
+        {"left_out": "soft"},
+    ]
+    found = summary(rows)
+    assert (found["scenes"], found["left out"]) == (3, 1)
+    assert found["no slivers"] == {
+        "scenes": 2,
+        "hardest step within 1.8 of the forecast": 1,
+        "steps": 3,
+        "steps not solved by 2048 iterations": 0,
+        "steps whose error was 0.001 with auto": 2,
+        "iterations needed, mean": 27.0,
+        "iterations of auto, mean": 40.0,
+    }
+    assert found["slivers"]["steps not solved by 2048 iterations"] == 1
+    assert found["slivers"]["hardest step within 1.8 of the forecast"] == 0
+    # it meets the ground in the first step, or soon
+    for number in range(6):
+        _, sim, state = random_landing(np.random.default_rng(number))
+        gap = float(state.positions[0, :, 1].min() - sim.planes[0, 3])
+        assert 0.0 < gap < 1.2 * sim.time_step * -float(state.velocities[0, 0, 1])
+
+
+@pytest.mark.usefixtures("on_path")
 @pytest.mark.parametrize("option", ["--blocks", "--mesh", "--setup", "--cells", "--youngs", "--contrasts"])
 def test_multilevel_does_not_run_something_else_for_an_option_without_values(
     option: str, capsys: pytest.CaptureFixture[str]

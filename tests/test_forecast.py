@@ -8,10 +8,12 @@ from typing import Any
 
 import pytest
 import torch
+from cases import sliver_mesh
 
 import torchpd as pd
 from torchpd.accuracy import exact_steps
-from torchpd.forecast import Forecast, Spectrum, UnsolvedWarning, forecast, spectrum_of
+from torchpd.forecast import Forecast, Spectrum, UnsolvedWarning, forecast, has_slivers, spectrum_of
+from torchpd.quality import smallest_dihedral
 
 
 def beam(youngs: float, cells: int = 3, **options: Any) -> pd.Simulator:
@@ -120,12 +122,12 @@ def test_multilevel_does_not_care_about_the_mesh() -> None:
         assert least < rates[0] / rates[1] < most
 
 
-def test_contacts_are_expected_to_take_multilevel_a_seventh_of_what_chebyshev_takes() -> None:
-    """Or two square roots of it, whichever is more; all of it with friction, and without a small problem."""
-    solid = pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2)), 1e6)
+def test_contacts_are_expected_to_take_multilevel_two_roots_of_what_chebyshev_takes() -> None:
+    """With slivers a seventh of it, if that is more; all of it with friction, and without a small problem."""
+    even, slivers = pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2)), sliver_mesh()
 
-    def needed(solver: pd.Chebyshev | pd.Multilevel, *contacts: Any, mu: float = 1e-3) -> float:
-        sim = pd.Simulator(pd.Scene(solid, *contacts), iterations=1)
+    def needed(solver: pd.Chebyshev | pd.Multilevel, *contacts: Any, mu: float = 1e-3, mesh: Any = even) -> float:
+        sim = pd.Simulator(pd.Scene(pd.Solid(mesh, 1e6), *contacts), iterations=1)
         expected = forecast(sim, solver, Spectrum(mu, mu))
         assert expected is not None
         return math.log(1e3) / expected.rate
@@ -142,10 +144,27 @@ def test_contacts_are_expected_to_take_multilevel_a_seventh_of_what_chebyshev_ta
     ):
         assert needed(solver, contact) == pytest.approx(plain, rel=0.05)
     assert needed(pd.Multilevel(), smooth, rough) == pytest.approx(plain, rel=0.05)
-    assert needed(pd.Multilevel(), smooth, mu=1e-5) == pytest.approx(needed(pd.Chebyshev(), mu=1e-5) / 7, rel=0.05)
+    stiff = needed(pd.Chebyshev(), mu=1e-5)
+    assert needed(pd.Multilevel(), smooth, mu=1e-5) == pytest.approx(2 * stiff**0.5, rel=0.05)
+    assert needed(pd.Multilevel(), smooth, mu=1e-5, mesh=slivers) == pytest.approx(stiff / 7, rel=0.05)
     soft = needed(pd.Chebyshev(), mu=1e-2)
     assert soft < 196
-    assert needed(pd.Multilevel(), smooth, mu=1e-2) == pytest.approx(2 * soft**0.5, rel=0.05)
+    for mesh in (even, slivers):
+        assert needed(pd.Multilevel(), smooth, mu=1e-2, mesh=mesh) == pytest.approx(2 * soft**0.5, rel=0.05)
+
+
+@pytest.mark.parametrize(("degrees", "sliver"), [(4.9, True), (5.1, False)])
+def test_a_sliver_has_an_angle_below_five_degrees(degrees: float, sliver: bool) -> None:
+    """A face over the x axis that leans to the plane of x and y; alone or beside a box."""
+    lean = math.radians(degrees)
+    tip = [0.3, 0.5 * math.cos(lean), 0.5 * math.sin(lean)]
+    flat = pd.TetMesh([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], tip], [[0, 1, 2, 3]])
+    box = pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2))
+    assert smallest_dihedral(flat.vertices, flat.tets) == pytest.approx(lean, abs=1e-12)
+    assert smallest_dihedral(box.vertices, box.tets) == box.quality().min_dihedral.min()
+    for meshes in ([flat], [box, flat]):
+        sim = pd.Simulator(pd.Scene(*(pd.Solid(mesh, 1e6) for mesh in meshes)), iterations=1, progress=False)
+        assert [has_slivers(sim) for _ in range(2)] == [sliver, sliver]
 
 
 def test_what_may_be_hard_to_multilevel_is_no_warning() -> None:

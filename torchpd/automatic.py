@@ -14,7 +14,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from .forecast import LANDING_ROOTS, MOST_OF_LEVELS, Forecast, Spectrum, forecast, has_contacts, held_up_by, spectrum_of
+from .forecast import (
+    LANDING_ROOTS,
+    MOST_OF_LEVELS,
+    Forecast,
+    Spectrum,
+    forecast,
+    has_contacts,
+    has_slivers,
+    held_up_by,
+    spectrum_of,
+)
 from .gpu import H100
 from .kernel_costs import iteration_microseconds
 from .multilevel import MOST_DIRECT
@@ -104,8 +114,8 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
         iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error, but
             Chebyshev with friction and balls. None sets as many as are expected to reach an error of `AIM`, times
             `MARGIN`, up to `MOST_OF_CHEBYSHEV` or `MOST_OF_LEVELS`, and with a tolerance `PATIENCE` times that. On
-            smooth planes those of Multilevel are for the hardest step of any mesh; with a tolerance, and unless you
-            give them, it is compared by what landing takes on even meshes.
+            smooth planes those of Multilevel are for a landing, of slivers where the mesh has some; with a tolerance,
+            and unless you give them, it is compared by what landing takes without.
     """
 
     def chosen(enough: int, why: str, most: int = MOST_OF_CHEBYSHEV) -> Choice:
@@ -137,10 +147,9 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     both += f" in a batch of {batch}" if batch > 1 else ""
     if iterations is None:
         count = float(levels.iterations(AIM))
-        usual = LANDING_ROOTS * math.sqrt(plain.iterations(AIM))
-        if has_contacts(sim) and sim.tolerance > 0.0 and usual < count:
-            count = usual
-            both += f"; with a tolerance about {round(usual)} on even meshes"
+        if has_contacts(sim) and sim.tolerance > 0.0 and has_slivers(sim):
+            count = min(LANDING_ROOTS * math.sqrt(plain.iterations(AIM)), count)
+            both += f"; with a tolerance about {round(count)} where no slivers land"
         better = count * ratio < plain.iterations(AIM)
     else:
         better = iterations < _enough(plain) and levels.rate > plain.rate

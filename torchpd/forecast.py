@@ -7,10 +7,10 @@ logarithm of that, with constants fitted to random scenes and to beams of 936 to
 without contacts nine of ten needed 0.2 to 1.4 times the forecast, meshes with slivers and steps that are a rigid motion
 the least, on 65 with contacts Chebyshev 0.2 to 1.25 times (`benchmarks/forecast.py`).
 
-With contacts the forecast of `Multilevel` is that of the step in which a stiff body of slivers lands on a face: a
-seventh of what Chebyshev needs, but two square roots of it at least, which even meshes need. With friction or balls,
-and without its small problem, it is a bound: what Chebyshev needs. Nine of ten of those 65 scenes, most of which do not
-land in the step that is measured, needed 0.06 to 1.25 of it, half of them 0.5. `Simulator.tune` measures instead.
+With smooth planes the forecast of `Multilevel` is that of the step in which a stiff body lands on a face: two square
+roots of what Chebyshev needs, and with slivers a seventh of it at least (`benchmarks/landings.py`). Most other steps
+need less. With friction or balls, and without its small problem, it is a bound: what Chebyshev needs. `Simulator.tune`
+measures instead.
 
 Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
 """
@@ -19,14 +19,17 @@ from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING, NamedTuple
+from weakref import WeakKeyDictionary
 
 import torch
 
 from .diagonal import step_diagonal
+from .quality import smallest_dihedral
 from .solvers import Chebyshev, Multilevel, Solver
 from .warn import warn_user
 
 if TYPE_CHECKING:
+    from .mesh import TetMesh
     from .model import Model
 
 __all__ = [
@@ -36,6 +39,7 @@ __all__ = [
     "forecast",
     "has_contacts",
     "has_friction",
+    "has_slivers",
     "held_up_by",
     "is_bound",
     "spectrum_of",
@@ -45,12 +49,14 @@ __all__ = [
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
 # iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
 _LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
-# of Multilevel where something lands, in those of Chebyshev for an error of 1e-3 and in their square roots
+# of Multilevel where something lands, in those of Chebyshev for an error of 1e-3, and in their square roots
 _LANDING_SHARE, LANDING_ROOTS = 1.0 / 7.0, 2.0
+_EVEN = math.radians(5.0)  # smallest dihedral angle of a mesh without slivers
 _MOST = 10_000
 # iterations of Multilevel that "auto" takes at most: what a bound asks beyond that hardly a step needs
 MOST_OF_LEVELS = 1_000
 FAR_TOO_FEW = 0.1  # error that is left
+_smallest_angles: WeakKeyDictionary[TetMesh, float] = WeakKeyDictionary()
 
 
 class UnsolvedWarning(UserWarning):
@@ -149,7 +155,8 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     lands = isinstance(solver, Multilevel) and solver.outer == "corotated" and not held_up_by(sim)
     if lands:
         plain = math.log(1e3) / rate
-        rate = math.log(1e3) / max(_LANDING_SHARE * plain, LANDING_ROOTS * math.sqrt(plain))
+        usual = LANDING_ROOTS * math.sqrt(plain)
+        rate = math.log(1e3) / (max(_LANDING_SHARE * plain, usual) if has_slivers(sim) else usual)
     return Forecast(rate)
 
 
@@ -161,6 +168,17 @@ def is_bound(sim: Model) -> bool:
 def has_contacts(sim: Model) -> bool:
     """Whether the scene has anything to touch."""
     return sim.planes.shape[-2] + sim.spheres.shape[-2] > 0
+
+
+def has_slivers(sim: Model) -> bool:
+    """Whether some tetrahedron has a dihedral angle below five degrees."""
+    return any(_smallest_angle(solid.mesh) < _EVEN for solid in sim.scene.solids)
+
+
+def _smallest_angle(mesh: TetMesh) -> float:
+    if mesh not in _smallest_angles:
+        _smallest_angles[mesh] = smallest_dihedral(mesh.vertices, mesh.tets)
+    return _smallest_angles[mesh]
 
 
 def has_friction(sim: Model) -> bool:

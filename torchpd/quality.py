@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-__all__ = ["MeshQuality", "element_bounds", "measure_quality", "shape_gradients"]
+__all__ = ["MeshQuality", "element_bounds", "measure_quality", "shape_gradients", "smallest_dihedral"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -87,6 +87,12 @@ def _dihedral_angles(normals: Array) -> Array:
         together = _lengths(normals[:, a] + normals[:, b])
         angles[:, column] = 2.0 * np.arctan2(together, apart)
     return angles
+
+
+def smallest_dihedral(vertices: Array, tets: Index) -> float:
+    """Of all tets of a valid mesh [rad]."""
+    gradients, _ = shape_gradients(vertices, tets)
+    return float(_dihedral_angles(_unit(gradients)).min())
 
 
 def _count_pieces(tets: Index) -> int:
