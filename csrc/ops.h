@@ -99,10 +99,13 @@ void step_inplace(const Tensor& positions, const Tensor& velocities, const Tenso
   const Numbers n{schedule, iterations, time_step, relaxation, rho,
                   delay,    weighted,   tolerance, inertial,   report};
   check_inplace(positions, velocities, info);
-  // The state is read before it is written: loads and stores of an environment do not overlap in time. A start in the same memory is
-  // safe since blocks wait for each other in iterations: with none it is copied.
+  // The state is read before it is written: loads and stores of an environment do not overlap in time. A start in the very same place is
+  // safe since blocks wait for each other in iterations: with none, and where it belongs to another environment, it is copied.
   const bool shared = start && (start->is_alias_of(positions) || start->is_alias_of(velocities));
-  const OptionalTensor own = shared && iterations == 0 ? OptionalTensor(start->clone()) : start;
+  const auto is_at = [&](const Tensor& t) { return start->const_data_ptr() == t.const_data_ptr(); };
+  const bool apart = shared && !is_at(positions) && !is_at(velocities);
+  const OptionalTensor own =
+      apart || (shared && iterations == 0) ? OptionalTensor(start->clone()) : start;
   run_step<Backend>(
       {positions, velocities, forces, own, material, plan, positions, velocities, info},
       settings_of(n, start.has_value(), 1, 1));

@@ -14,6 +14,7 @@ from on_gpu import (
     GPU,
     KERNELS,
     bar,
+    compiled_for,
     device_work,
     full_on_gpu,
     has_clusters,
@@ -376,3 +377,14 @@ def test_few_iterations_in_place_do_as_elsewhere(kernel: str, iterations: int, p
     after = sim(state)
     sim.step_(state)
     assert same_bits(after, state)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_another_kernel_is_that_of_a_simulator_made_with_it(kernel: str, precision: str) -> None:
+    expected, state = small_on_gpu(DTYPES[precision], kernel)
+    sim, _ = small_on_gpu(DTYPES[precision], "block" if kernel == "stream" else "stream")
+    assert sim.plan.kernel != kernel
+    with compiled_for(kernel):
+        sim.kernel = kernel
+    assert (sim.kernel, sim.plan.kernel, sim.plan.patches) == (kernel, kernel, expected.plan.patches)
+    assert same_bits(sim(state), expected(state))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 from dataclasses import replace
 
@@ -173,3 +174,21 @@ def test_two_recordings_take_turns(kernel: str, precision: str) -> None:
         assert same_bits(first, eager[0])
         assert same_bits(second, eager[1])
     assert not same_bits(first, second)
+
+
+@pytest.mark.skipif("torch.cuda.device_count() < 2", reason="needs two GPUs")
+def test_every_device_records_for_itself(kernel: str, precision: str) -> None:
+    """Whichever was first: torch's own stream for recordings is of that one for good."""
+    sim, start = small_on_gpu(DTYPES[precision], kernel)
+    first = sim.capture(twins(start, 1)[0])
+    there = copy.deepcopy(sim).to("cuda:1")
+    own, eager = (pd.State(*(t.to("cuda:1") for t in start)) for _ in range(2))
+    step = there.capture(own)
+    assert same_bits(own, eager)  # recording leaves it as it is
+    for _ in range(2):
+        step.replay()
+        there.step_(eager)
+        assert same_bits(own, eager)
+    sim.step_(start)
+    first.replay()
+    assert same_bits(first.state, start)

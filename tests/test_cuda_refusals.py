@@ -155,12 +155,21 @@ def test_settings_that_find_no_memory_are_not_set() -> None:
     def set_batch() -> None:
         sim.batch = 1024
 
+    def set_kernel() -> None:
+        sim.kernel = "grid"
+
     with full_device():
-        for change in (set_solver, set_batch, sim.double, lambda: sim.set_material(stiffness=own_stiffness)):
+        for change in (
+            set_solver,
+            set_batch,
+            set_kernel,
+            sim.double,
+            lambda: sim.set_material(stiffness=own_stiffness),
+        ):
             with pytest.raises(RuntimeError, match="memory"):
                 change()
     assert sim.solver == pd.Chebyshev()
-    assert sim.batch is None
+    assert (sim.batch, sim.kernel) == (None, "stream")
     assert sim.dtype == torch.float32
     assert [t.data_ptr() for t in (*sim.material(), *sim.plan.arrays)] == arrays
     assert same_bits(sim(state), expected)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import pytest
 import torch
@@ -164,3 +165,25 @@ def test_a_recording_knows_sliding_friction(precision: str) -> None:
     assert all(relative(one, other) < limit for one, other in zip(results, wanted, strict=True))
     plain = pd.Simulator(pd.Scene(block, pd.Gravity(), pd.Ground(scene.grounds[0].height)), 1 / 60, 1000)
     assert relative(results[1], Training(plain.to(DTYPES[precision]).to(GPU), state).run()[1]) > 0.1
+
+
+@pytest.mark.parametrize(("cells", "batch"), [((47, 6, 6), 66), ((13, 8, 8), 66)])
+def test_the_way_back_runs_with_patches_as_large_as_fit(
+    cells: tuple[int, int, int], batch: int, precision: str
+) -> None:
+    """In float32 of the first, in float64 of the second a step had room for patches that a solve had none for."""
+
+    def slopes(**options: Any) -> tuple[Tensor, ...]:
+        mesh = pd.shapes.box((0.1 * cells[0], 0.1 * cells[1], 0.1 * cells[2]), cells)
+        body = pd.Solid(mesh, 1e4)
+        scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+        sim = pd.Simulator(scene, 1 / 60, 200, dtype=DTYPES[precision], progress=False, **options).to(GPU)
+        state, stiffness = sim.rest_state(2), sim.stiffness.requires_grad_()
+        forces = (1e-2 * noise(state.positions)).requires_grad_()
+        loss = (noise(state.positions, 5) * sim(state, forces).positions).sum()
+        return torch.autograd.grad(loss, [forces, stiffness])
+
+    expected = slopes(kernel="stream")
+    for options in ({"batch": batch}, {"batch": batch, "kernel": "grid"}):
+        for found, other in zip(slopes(**options), expected, strict=True):
+            assert relative(found, other) < {"float32": 1e-3, "float64": 1e-8}[precision]

@@ -64,6 +64,30 @@ def test_gpu_without_cuda_build_is_a_problem(built: None, monkeypatch: pytest.Mo
     assert "not built: nvcc is CUDA 12.4" in problem
 
 
+@pytest.mark.parametrize(
+    ("capabilities", "said"),
+    [
+        ([], "torch sees no CUDA device: look at the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES"),
+        ([(7, 5)], "compute capability 7.5 and the kernels need 8.0 or newer"),
+        ([(7, 5), (9, 0)], ""),
+    ],
+)
+def test_a_cuda_build_without_a_gpu_for_it_is_a_problem(
+    built: None, capabilities: list[tuple[int, int]], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that `.to("cuda")` refuses, and sends here."""
+    monkeypatch.setattr(doctor, "_load_build", lambda: ({**BUILD, "cuda": "13.0"}, ""))
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: bool(capabilities))
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: capabilities[index])
+    found = doctor.problems()
+    assert len(found) == bool(said)
+    if said:
+        assert said in found[0]
+        assert "doctor" not in found[0]
+
+
 def test_devices_and_driver_are_shown(built: None, monkeypatch: pytest.MonkeyPatch) -> None:
     kinds = [
         SimpleNamespace(name="Old", major=7, minor=5, total_memory=16 * 2**30),

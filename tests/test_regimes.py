@@ -18,7 +18,7 @@ from torchpd import _C, kernel_costs, model, placing, regimes
 from torchpd.gpu import H100, Properties, refuse_full_memory, why_not
 from torchpd.multilevel import precondition_plan
 from torchpd.plan import KERNELS, Plan, compile_plan
-from torchpd.regimes import choose_plan, shared_bytes
+from torchpd.regimes import choose_plan, most_shared_bytes, shared_bytes
 from torchpd.scene import SceneValues
 from torchpd.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 
@@ -35,7 +35,7 @@ def test_auto_takes_the_first_that_fits() -> None:
     """Just enough memory for a kernel chooses it, one byte less the next one."""
     values = values_of((6, 6, 6))
     for dtype in REAL:
-        needs = {name: shared_bytes(choose_plan(values, dtype, H100, name), 0, 0) for name in KERNELS[:-1]}
+        needs = {name: most_shared_bytes(choose_plan(values, dtype, H100, name), 0, 0) for name in KERNELS[:-1]}
         assert needs["grid"] < needs["cluster"] < needs["block"]
         for shared, kernel in (
             (needs["block"], "block"),
@@ -207,6 +207,25 @@ def test_shared_memory_by_hand(dtype: torch.dtype) -> None:
         assert shared_bytes(plan, 2, 3) == 1024 + real * (numbers * slots + 4 * entries + 5 * 2 + 8 * 3)
 
 
+@pytest.mark.parametrize(
+    ("kernel", "batch", "cells"),
+    [("grid", None, (13, 8, 8)), ("grid", 66, (13, 8, 8)), ("cluster", None, (6, 6, 6)), ("block", 1000, (4, 4, 4))],
+)
+def test_the_way_back_fits_where_the_step_does(
+    kernel: str, batch: int | None, cells: tuple[int, int, int], dtype: torch.dtype
+) -> None:
+    """Its passes keep a position and a direction of every slot, beside static memory, where a grid has a position."""
+    values, real = values_of(cells), torch.finfo(dtype).bits // 8
+    plan = choose_plan(values, dtype, H100, kernel, batch=batch)
+    step, most = shared_bytes(plan, 0, 0), most_shared_bytes(plan, 0, 0)
+    passes = -(-6 * real * plan.size("most_slots") // 16) * 16 + 4 * real * plan.size("most_entries")
+    assert most == max(step, passes + _C.pass_static_bytes)
+    assert (most > step) == (kernel == "grid")
+    # what has room for the step alone gets another plan
+    tight = H100._replace(shared=most - 1)
+    assert most_shared_bytes(choose_plan(values, dtype, tight, batch=batch), 0, 0) <= tight.shared
+
+
 def test_what_is_refused_unbuilt_does_not_fit_when_built() -> None:
     """The bound from the numbers of vertices and tetrahedra never exceeds what the plan then needs."""
     for cells in ((1, 1, 1), (5, 4, 3), (9, 9, 2)):
@@ -318,6 +337,44 @@ def test_shared_vertices_have_room_beside_the_pipeline(architecture: str) -> Non
     assert len(pipelines) == 2
     assert len(beside) == 4
     assert 640 * max(pipelines) + 128 * max(beside) <= 65536
+
+
+def test_another_kernel_makes_the_plan_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a GPU; where it does not fit everything stays."""
+
+    def compiled(sim: pd.Simulator, dtype: torch.dtype, _: torch.device) -> Plan:
+        if sim.kernel == "cluster":
+            raise ValueError("does not fit")
+        return choose_plan(sim.scene.values(), dtype, H100, sim.kernel, progress=False)
+
+    sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.box((1, 1, 1), (3, 3, 3)), 1e4)), 1 / 60, 8, progress=False)
+    sim.kernel = "grid"
+    assert sim.plan.kernel is None
+    monkeypatch.setattr(placing, "_compile", compiled)
+    sim.plan = compiled(sim, torch.float32, torch.device("cuda"))
+    assert sim.plan.kernel == "grid"
+    sim.kernel = "block"
+    assert (sim.kernel, sim.plan.kernel) == ("block", "block")
+    plan = sim.plan
+    for wrong, error in (("cluster", "does not fit"), ("warp", "kernel must be")):
+        with pytest.raises(ValueError, match=error):
+            sim.kernel = wrong
+        assert (sim.kernel, sim.plan) == ("block", plan)
+
+
+def test_bars_show_for_another_device_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = []
+
+    def chosen(values: SceneValues, *_: object, progress: bool, **__: object) -> Plan:
+        shown.append(progress)
+        return compile_plan(values, progress=False)
+
+    monkeypatch.setattr(placing, "choose_plan", chosen)
+    monkeypatch.setattr(placing, "properties_of", lambda _: H100)
+    for progress in (True, False):
+        sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e4)), 1 / 60, 8, progress=progress)
+        placing.plan_anew(sim, torch.float32, torch.device("cuda"))
+        assert shown.pop() == progress
 
 
 def test_a_simulator_passes_its_batch_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,6 +45,22 @@ def test_rollout_is_repeated_steps(batch: int, dtype: torch.dtype, device: torch
             assert all(torch.equal(one, other) for one, other in zip(columns, info, strict=True))
 
 
+@pytest.mark.parametrize("places", [-1, 1])
+def test_a_start_may_lie_where_other_environments_are_overwritten(
+    places: int, dtype: torch.dtype, device: torch.device
+) -> None:
+    sim = simulate(dtype, device, iterations=1)
+    count = 40
+    memory = sim.rest_positions + 0.02 * torch.randn(
+        count + 1, sim.vertices, 3, dtype=dtype, generator=torch.Generator().manual_seed(3)
+    ).to(device)
+    own, other = (memory[1:], memory[:-1]) if places < 0 else (memory[:-1], memory[1:])
+    state = pd.State(own, torch.zeros_like(own))
+    expected = sim(pd.State(own.clone(), state.velocities.clone()), start=other.clone())
+    sim.step_(state, start=other)
+    assert same_bits(state, expected)
+
+
 def test_progress_and_functions_change_no_bit(
     dtype: torch.dtype, device: torch.device, capsys: pytest.CaptureFixture[str]
 ) -> None:

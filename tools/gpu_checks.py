@@ -7,7 +7,8 @@ python tools/gpu_checks.py --only clean --kernels block far --out ...           
 suite     the tests that use a GPU, counted by pytest
 list      every kernel of benchmarks/results/cuda-registers.csv runs in tools/sanitize.py
 clean     compute-sanitizer: memcheck, racecheck, initcheck and synccheck, each on all kernels, find nothing
-plants    and each finds the error that tools/sanitize.py --plant makes, on every kernel; synccheck has none
+plants    and each finds the error that tools/sanitize.py --plant makes, in one of the kernels that run with each plan;
+          synccheck has none
 
 racecheck looks at shared memory alone: what blocks exchange through the memory of the device is for the tests that
 compare the bits of runs. Exits with 1 where anything is not as wanted.
@@ -111,17 +112,19 @@ def counted(report: str) -> dict[str, Any]:
     return {"passed": len(cases) - len(failed) - len(skipped), "skipped": len(skipped), "failed": names}
 
 
-def record(out: Path | None, command: str, rows: list[Row]) -> None:
+def record(out: Path | None, rows: list[Row]) -> None:
     """With rows of earlier runs that this one does not repeat."""
     if out is None:
         return
-    run = describe_run(command, torch.device("cuda" if torch.cuda.is_available() else "cpu"), torch.get_num_threads())
+    run = describe_run("", torch.device("cuda" if torch.cuda.is_available() else "cpu"), torch.get_num_threads())
     own = {(row["kind"], row["name"]) for row in rows}
     known = json.loads(out.read_text(encoding="utf-8"))["rows"] if out.exists() else []
     kept = [row for row in known if (row["kind"], row["name"]) not in own]
     rows = [*kept, *({**row, "commit": run["commit"], "created": run["created"]} for row in rows)]
+    # rows have a command, commit and time of their own
+    head = {name: run[name] for name in ("machine", "versions")}
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps({"schema": 1, **run, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+    out.write_text(json.dumps({"schema": 1, **head, "rows": rows}, indent=1) + "\n", encoding="utf-8")
 
 
 def main(words: list[str]) -> int:
@@ -134,9 +137,8 @@ def main(words: list[str]) -> int:
     options = parser.parse_args(words)
     if not torch.cuda.is_available():
         parser.error("torch finds no CUDA device")
-    command = shlex.join(["python", "tools/gpu_checks.py", *words])
     rows = [run_suite(options.pytest)] if "suite" in options.only else []
-    record(options.out, command, rows)
+    record(options.out, rows)
     with ThreadPoolExecutor(options.jobs) as pool:
         for row in pool.map(Check.run, checks(options.only, options.kernels)):
             rows.append(row)
@@ -144,7 +146,7 @@ def main(words: list[str]) -> int:
                 f"{row['kind']}: {row['name']}: {'ok' if row['ok'] else 'NOT AS WANTED'}, {row['seconds']} s",
                 flush=True,
             )
-            record(options.out, command, rows)
+            record(options.out, rows)
     return 0 if all(row["ok"] for row in rows) else 1
 
 

@@ -8,7 +8,8 @@ H the exact Hessian of the step's objective (the rotations' derivative included)
 the weighted diagonal, or with the multilevel preconditioner of a plan that has one. The error of the gradient follows
 the error of the step: iterate far enough, and look at the residual.
 
-A GPU solves every environment in one launch, whatever it takes, so a CUDA graph can record it.
+A GPU solves every environment in one launch, however many iterations it takes (of half a million vertices and more in a
+few, as many as the plan and batch ask for), so a CUDA graph can record it.
 
 Contacts: the normal direction of a vertex that a contact holds is taken out of the system; a vertex that friction holds
 moves with its start, on a ball about its centre. What a vertex that slides against friction adds stands in

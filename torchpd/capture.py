@@ -68,7 +68,8 @@ class CapturedStep:
                 run(State(state[0].clone(), state[1].clone()))
             torch.cuda.current_stream().wait_stream(stream)
             self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph):
+            # torch's own stream for recording is of one device for good
+            with torch.cuda.graph(self._graph, stream=stream):
                 run(state)
 
     def replay(self) -> None:

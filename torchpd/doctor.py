@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 
 from .extension import BUILD_COMMAND, load_extension
-from .gpu import LEAST_CAPABILITY
+from .gpu import DOCTOR, LEAST_CAPABILITY, why_not
 from .toolkit import Toolkit, find_toolkit
 from .version import __version__
 
@@ -122,6 +122,11 @@ def problems() -> list[str]:
         found.append(f"the extension torchpd._C cannot be loaded ({reason}): build it with {BUILD_COMMAND}")
     elif torch.cuda.is_available() and not build["cuda"]:
         found.append(f"a GPU is there, but CUDA is {_cuda_state(build, find_toolkit())}")
+    elif build["cuda"]:
+        count = torch.cuda.device_count()
+        best = max((torch.cuda.get_device_capability(index) for index in range(count)), default=None)
+        if reason := why_not(True, torch.version.cuda, count, best):
+            found.append(f"CUDA is built, but there is no GPU to run on: {reason.removesuffix(f'; {DOCTOR}')}")
     return found
 
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from .plan import Plan
 
 __all__ = [
+    "DOCTOR",
     "H100",
     "LEAST_CAPABILITY",
     "Properties",
@@ -24,7 +25,7 @@ __all__ = [
 ]
 
 LEAST_CAPABILITY = (8, 0)
-_DOCTOR = "`python -m torchpd doctor` says more"
+DOCTOR = "`python -m torchpd doctor` says more"
 
 
 class Properties(NamedTuple):
@@ -61,15 +62,15 @@ def why_not(built: bool, torch_cuda: str | None, devices: int, capability: tuple
     if torch_cuda is None:
         return (
             "this torch is a CPU build: install a torch for CUDA (pytorch.org/get-started), then build torchpd again; "
-            f"{_DOCTOR}"
+            f"{DOCTOR}"
         )
     if not built:
         return (
             f"this build of torchpd has no CUDA kernels: install the CUDA {torch_cuda} toolkit or set CUDA_HOME, then "
-            f"build torchpd again; {_DOCTOR}"
+            f"build torchpd again; {DOCTOR}"
         )
     if devices == 0:
-        return f"torch sees no CUDA device: look at the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES; {_DOCTOR}"
+        return f"torch sees no CUDA device: look at the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES; {DOCTOR}"
     if capability is not None and capability < LEAST_CAPABILITY:
         return (
             f"the GPU has compute capability {_dotted(capability)} and the kernels need {_dotted(LEAST_CAPABILITY)} or "

@@ -75,8 +75,9 @@ class Model(nn.Module):
         given = self._solver if automatic else check_solver(solver, torch.device("cpu"))
         self.tolerance = tolerance
         self.promise: Promise | None = None  # of `tune`
-        self.kernel = kernel
+        self._kernel = check_kernel(kernel)
         self._batch = check_batch(batch)
+        self.progress = progress  # whether bars show while a large scene compiles, for another device too
         values = scene.values()
         self.anchors = Anchors(scene)
         self._written = Written()
@@ -122,22 +123,33 @@ class Model(nn.Module):
         before = self._batch, self.plan
         self._batch = check_batch(batch)
         try:
-            if self.plan.kernel is not None:
-                self.plan = move_plan(self, plan_anew(self, self.dtype, self.device), self.device)
-            if self.choice is not None:
-                self._choose_again(self.choice)
+            self._plan_again()
         except BaseException:
             self._batch, self.plan = before
             raise
 
+    def _plan_again(self) -> None:
+        """After what a GPU's plan and the choice of "auto" depend on has changed."""
+        if self.plan.kernel is not None:
+            self.plan = move_plan(self, plan_anew(self, self.dtype, self.device), self.device)
+        if self.choice is not None:
+            self._choose_again(self.choice)
+
     @property
     def kernel(self) -> str:
-        """How a GPU is to step the scene: what its plan is made for, when the simulator moves there or gets a batch."""
+        """How a GPU is to step the scene; setting it makes the plan of one and the choice of "auto" anew."""
         return self._kernel
 
     @kernel.setter
     def kernel(self, kernel: str) -> None:
+        before = self._kernel, self.plan
         self._kernel = check_kernel(kernel)
+        try:
+            if self.plan.kernel is not None:
+                self._plan_again()
+        except BaseException:
+            self._kernel, self.plan = before
+            raise
 
     @property
     def time_step(self) -> float:

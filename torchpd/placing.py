@@ -71,10 +71,10 @@ def _compile(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
     """The scene's plan for a device and the solver, on the CPU, without what the solver prepares."""
     values = sim.scene.values()
     if device.type != "cuda":
-        return compile_plan(values, dtype=dtype, progress=False)
+        return compile_plan(values, dtype=dtype, progress=sim.progress)
     levels = isinstance(sim.solver, Multilevel)
     gpu = properties_of(device)
-    return choose_plan(values, dtype, gpu, sim.kernel, levels=levels, batch=sim.batch, progress=False)
+    return choose_plan(values, dtype, gpu, sim.kernel, levels=levels, batch=sim.batch, progress=sim.progress)
 
 
 def plan_for_solver(sim: Model, material: Sequence[Tensor]) -> Plan:
@@ -85,7 +85,8 @@ def plan_for_solver(sim: Model, material: Sequence[Tensor]) -> Plan:
     if plan.kernel is not None and wants != plan.for_levels:
         plan = _compile(sim, sim.dtype, sim.device)
     if wants:
-        plan = precondition_plan(plan, sim.scene.values(), *reference_of(sim.plan, material, sim.time_step))
+        reference = reference_of(sim.plan, material, sim.time_step)
+        plan = precondition_plan(plan, sim.scene.values(), *reference, progress=sim.progress)
     return move_plan(sim, plan, sim.device)
 
 
@@ -111,7 +112,7 @@ def plan_anew(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
         reference = reference_of(source, arrays, sim.time_step)
     else:
         reference = reference_of_levels(sim.plan.arrays)
-    return precondition_plan(plan, sim.scene.values(), *reference)
+    return precondition_plan(plan, sim.scene.values(), *reference, progress=sim.progress)
 
 
 def plan_on(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:

@@ -74,10 +74,21 @@ def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
     if plan.for_levels:
         return _C.outer_shared_bytes(real, slots, entries)
     if plan.kernel == "stream":
-        return _C.pass_shared_bytes(real, slots, entries, _MOST_FIELDS) + _C.pass_static_bytes
+        return _pass_bytes(plan)
     if plan.kernel == "cluster":
         return _C.cluster_shared_bytes(real, slots, entries, plan.size("most_interior"), planes, balls)
     return _C.fused_shared_bytes(real, plan.kernel == "grid", slots, entries, planes, balls)
+
+
+def most_shared_bytes(plan: Plan, planes: int, balls: int) -> int:
+    """The same of whatever runs with a plan: a step, and the way back through it, which passes over all patches."""
+    return max(shared_bytes(plan, planes, balls), _pass_bytes(plan))
+
+
+def _pass_bytes(plan: Plan) -> int:
+    real = torch.finfo(plan.dtype).bits // 8
+    bytes_of_pass = _C.pass_shared_bytes(real, plan.size("most_slots"), plan.size("most_entries"), _MOST_FIELDS)
+    return bytes_of_pass + _C.pass_static_bytes
 
 
 class _Scene(NamedTuple):
@@ -104,7 +115,7 @@ class _Scene(NamedTuple):
         return Plan(arrays, DEVICE_PLAN_TABLE)
 
     def shared_bytes(self, plan: Plan) -> int:
-        return shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
+        return most_shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
 
     def patches(self, kernel: str, gpu: Properties) -> int:
         """By the name of a kernel, or for a multilevel solver "few", "many" or any other number of environments."""
