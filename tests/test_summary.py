@@ -129,11 +129,9 @@ def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...], mo
     sim.plan = choose_plan(values, torch.float32, Properties(132, 232_448))
     assert "why block: shared memory a thread block: block needs" in str(sim)
     assert "232,448 B are there" in str(sim)
-    told = simulator(bare(pd.Ground()), torch.float32, batch=7)
-    told.plan = sim.plan
-    assert "; for a batch of 7; " in str(told)
-    for kernel, depends in (("block", True), ("grid", True), ("cluster", False), ("stream", False)):
-        told.kernel = kernel
+    for kernel, depends in (("auto", True), ("block", True), ("grid", True), ("cluster", False), ("stream", False)):
+        told = simulator(bare(pd.Ground()), torch.float32, batch=7, kernel=kernel)
+        told.plan = sim.plan
         assert ("; for a batch of 7; " in str(told)) == depends
 
 
