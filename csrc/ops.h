@@ -99,16 +99,19 @@ void step_inplace(const Tensor& positions, const Tensor& velocities, const Tenso
   const Numbers n{schedule, iterations, time_step, relaxation, rho,
                   delay,    weighted,   tolerance, inertial,   report};
   check_inplace(positions, velocities, info);
-  // The state is read before it is written: loads and stores of an environment do not overlap in time. A start in the very same place is
-  // safe since blocks wait for each other in iterations: with none, and where it belongs to another environment, it is copied.
-  const bool shared = start && (start->is_alias_of(positions) || start->is_alias_of(velocities));
-  const auto is_at = [&](const Tensor& t) { return start->const_data_ptr() == t.const_data_ptr(); };
-  const bool apart = shared && !is_at(positions) && !is_at(velocities);
-  const OptionalTensor own =
-      apart || (shared && iterations == 0) ? OptionalTensor(start->clone()) : start;
-  run_step<Backend>(
-      {positions, velocities, forces, own, material, plan, positions, velocities, info},
-      settings_of(n, start.has_value(), 1, 1));
+  // The state is read before it is written: loads and stores of an environment do not overlap in time. Others in the very same place are
+  // safe since blocks wait for each other in iterations: with none, and where they belong to other environments, they are copied.
+  const auto copied = [&](const OptionalTensor& given) {
+    if (!given || !(given->is_alias_of(positions) || given->is_alias_of(velocities))) return given;
+    const auto is_at = [&](const Tensor& t) {
+      return given->const_data_ptr() == t.const_data_ptr();
+    };
+    const bool same = is_at(positions) || is_at(velocities);
+    return same && iterations > 0 ? given : OptionalTensor(given->clone());
+  };
+  run_step<Backend>({positions, velocities, copied(forces), copied(start), material, plan,
+                     positions, velocities, info},
+                    settings_of(n, start.has_value(), 1, 1));
   // so that autograd notices when it needs what has been overwritten
   for (const Tensor& t : {positions, velocities, info}) {
     if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -267,35 +268,42 @@ def test_forecasts_are_judged_by_what_was_needed() -> None:
 
 
 @pytest.mark.usefixtures("on_path")
-def test_landings_are_judged_by_their_hardest_step() -> None:
-    from landings import random_landing, summary
+def test_landings_are_judged_by_what_their_steps_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    import landings
 
-    def row(forecast: int, *steps: tuple[int | None, float], slivers: bool = False) -> dict[str, Any]:
+    def row(forecast: int, *steps: tuple[int | None, float], uneven: bool = False) -> dict[str, Any]:
+        auto = {"solver": "Multilevel" if forecast > 10 else "Chebyshev", "iterations": 2 * forecast}
         own = [{"needed": needed, "auto": error} for needed, error in steps]
-        return {"slivers": slivers, "forecast": forecast, "auto": {"iterations": 40}, "steps": own}
+        return {"uneven": uneven, "forecast": forecast, "auto": auto, "steps": own}
 
-    rows = [
-        row(20, (8, 1e-4), (36, 1e-3)),
-        row(20, (37, 2e-3)),
-        row(20, (None, 0.5), slivers=True),
-        {"left_out": "soft"},
-    ]
-    found = summary(rows)
-    assert (found["scenes"], found["left out"]) == (3, 1)
-    assert found["no slivers"] == {
-        "scenes": 2,
-        "hardest step within 1.8 of the forecast": 1,
-        "steps": 3,
-        "steps not solved by 2048 iterations": 0,
-        "steps whose error was 0.001 with auto": 2,
+    rows = [row(20, (8, 1e-4), (36, 1e-3)), row(20, (37, 2e-3)), row(5, (9, 1e-9)), {"left_out": "soft"}]
+    found = landings.summary([*rows, row(20, (None, 0.5), (5, 1e-9), uneven=True)])
+    assert (found["scenes"], found["left out"]) == (4, 1)
+    assert found["even"] == {
+        "scenes": 3,
+        "Multilevel": 2,
+        "steps": 4,
+        "steps that 2048 iterations end elsewhere than the converged one": 0,
+        "of the others: 0.001 with auto": 3,
+        "of the others: within 1.8 of the forecast": 3,
         "iterations needed, mean": 27.0,
         "iterations of auto, mean": 40.0,
     }
-    assert found["slivers"]["steps not solved by 2048 iterations"] == 1
-    assert found["slivers"]["hardest step within 1.8 of the forecast"] == 0
+    assert found["uneven"]["steps that 2048 iterations end elsewhere than the converged one"] == 1
+    assert found["uneven"]["of the others: 0.001 with auto"] == 1
+
+    # those from which an error stays, 1e-3 or less from 13 iterations on, but not with 16, and in the end or not
+    def judged(end: float) -> dict[str, Any]:
+        errors = {count: 1.0 if count < 13 or count == 16 else 1e-4 for count in landings.COUNTS} | {2048: end}
+        monkeypatch.setattr(landings, "error_of", lambda sim, state, exact: errors[sim.iterations])
+        found: dict[str, Any] = landings.needed(SimpleNamespace(), None, None)
+        return found
+
+    assert judged(1e-3) == {"needed": 19, "last": 1e-3}
+    assert judged(0.1) == {"needed": None, "last": 0.1}
     # it meets the ground in the first step, or soon
     for number in range(6):
-        _, sim, state = random_landing(np.random.default_rng(number))
+        _, sim, state = landings.random_landing(np.random.default_rng(number))
         gap = float(state.positions[0, :, 1].min() - sim.planes[0, 3])
         assert 0.0 < gap < 1.2 * sim.time_step * -float(state.velocities[0, 0, 1])
 

@@ -181,7 +181,7 @@ def test_a_tolerance_makes_multilevel_worth_it_where_slivers_may_land(monkeypatc
 
     assert isinstance(made(0.0).solver, pd.Chebyshev)
     assert isinstance(made(1e-3).solver, pd.Multilevel)
-    assert "about 227 of Multilevel, each as long as 11; with a tolerance about 79 where no slivers" in repr(made(1e-3))
+    assert "about 227 of Multilevel, each as long as 11; with a tolerance about 79 where no sliver" in repr(made(1e-3))
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])

@@ -72,20 +72,23 @@ def test_gpu_without_cuda_build_is_a_problem(built: None, monkeypatch: pytest.Mo
         ([(7, 5), (9, 0)], ""),
     ],
 )
-def test_a_cuda_build_without_a_gpu_for_it_is_a_problem(
+def test_a_cuda_build_without_a_gpu_for_it_is_told(
     built: None, capabilities: list[tuple[int, int]], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those that `.to("cuda")` refuses, and sends here."""
+    """Those that `.to("cuda")` refuses, and sends here: on the CPU all is well."""
     monkeypatch.setattr(doctor, "_load_build", lambda: ({**BUILD, "cuda": "13.0"}, ""))
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: bool(capabilities))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: capabilities[index])
-    found = doctor.problems()
+    monkeypatch.setattr(doctor, "_devices", list)
+    assert doctor.problems() == []
+    found = doctor.notes()
     assert len(found) == bool(said)
-    if said:
-        assert said in found[0]
-        assert "doctor" not in found[0]
+    for note in found:
+        assert said in note
+        assert "doctor" not in note
+        assert f"Note: {note}\nNo problem found." in doctor.report()
 
 
 def test_devices_and_driver_are_shown(built: None, monkeypatch: pytest.MonkeyPatch) -> None:

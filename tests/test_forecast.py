@@ -12,7 +12,7 @@ from cases import sliver_mesh
 
 import torchpd as pd
 from torchpd.accuracy import exact_steps
-from torchpd.forecast import Forecast, Spectrum, UnsolvedWarning, forecast, has_slivers, spectrum_of
+from torchpd.forecast import Forecast, Spectrum, UnsolvedWarning, forecast, is_uneven, spectrum_of
 from torchpd.quality import smallest_dihedral
 
 
@@ -164,7 +164,20 @@ def test_a_sliver_has_an_angle_below_five_degrees(degrees: float, sliver: bool) 
     assert smallest_dihedral(box.vertices, box.tets) == box.quality().min_dihedral.min()
     for meshes in ([flat], [box, flat]):
         sim = pd.Simulator(pd.Scene(*(pd.Solid(mesh, 1e6) for mesh in meshes)), iterations=1, progress=False)
-        assert [has_slivers(sim) for _ in range(2)] == [sliver, sliver]
+        assert [is_uneven(sim) for _ in range(2)] == [sliver, sliver]
+
+
+def test_a_body_of_very_different_stiffness_is_uneven() -> None:
+    """Of any environment, and after `set_material`; two bodies may differ."""
+    mesh = pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2))
+    soft, stiff = (pd.Solid(mesh, youngs) for youngs in (1e4, 1e6))
+    sim = pd.Simulator(pd.Scene(soft, stiff), iterations=1, progress=False)
+    assert not is_uneven(sim)
+    factor = torch.ones(2, sim.stiffness.shape[-1])
+    for most, uneven in ((29.0, False), (31.0, True)):
+        factor[1, -1] = most
+        sim.set_material(stiffness=factor * sim.stiffness.new_tensor([1e4]))
+        assert is_uneven(sim) == uneven
 
 
 def test_what_may_be_hard_to_multilevel_is_no_warning() -> None:

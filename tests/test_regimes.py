@@ -14,9 +14,11 @@ import torch
 from cases import box
 
 import torchpd as pd
-from torchpd import _C, kernel_costs, model, placing, regimes
+from torchpd import _C, automatic, kernel_costs, model, placing, regimes
+from torchpd.forecast import Spectrum
 from torchpd.gpu import H100, Properties, refuse_full_memory, why_not
-from torchpd.multilevel import precondition_plan
+from torchpd.multilevel import precondition_plan, reference_of
+from torchpd.parametrized import plain_copy
 from torchpd.plan import KERNELS, Plan, compile_plan
 from torchpd.regimes import choose_plan, most_shared_bytes, shared_bytes
 from torchpd.scene import SceneValues
@@ -362,6 +364,39 @@ def test_another_kernel_makes_the_plan_anew(monkeypatch: pytest.MonkeyPatch) -> 
         assert (sim.kernel, sim.plan) == ("block", plan)
 
 
+def test_another_kernel_makes_the_choice_of_auto_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Multilevel runs with "stream" alone, so "auto" leaves it where another kernel is asked for."""
+    asked = []
+
+    def compiled(sim: pd.Simulator, dtype: torch.dtype, _: torch.device) -> Plan:
+        asked.append((sim.kernel, type(sim.solver)))
+        levels = isinstance(sim.solver, pd.Multilevel)
+        return choose_plan(sim.scene.values(), dtype, H100, sim.kernel, levels=levels, progress=False)
+
+    body = pd.Solid(pd.shapes.box((1, 1, 1), (3, 3, 3)), 1e8)
+    sim = pd.Simulator(pd.Scene(body, pd.Gravity(), pd.Ground(-1.0)), 1 / 60, solver="auto", progress=False)
+    assert isinstance(sim.solver, pd.Multilevel)
+    monkeypatch.setattr(placing, "_compile", compiled)
+    monkeypatch.setattr(placing, "move_plan", lambda sim, plan, device: plan)
+    monkeypatch.setattr(model, "move_plan", lambda sim, plan, device: plan)
+    monkeypatch.setattr(automatic, "spectrum_of", lambda sim: Spectrum(1e-6, 1e-6))
+    monkeypatch.setattr(automatic, "runs", lambda solver, sim: sim.kernel == "auto")
+    values, reference = sim.scene.values(), reference_of(sim.plan, sim.material(), sim.time_step)
+    sim.plan = precondition_plan(choose_plan(values, torch.float32, H100, levels=True), values, *reference)
+    sim.kernel = "grid"
+    assert (sim.plan.kernel, type(sim.solver), asked) == ("grid", pd.Chebyshev, [("grid", pd.Chebyshev)])
+
+
+@pytest.mark.parametrize("setting", ["kernel", "batch"])
+def test_a_plan_made_in_inference_mode_can_be_learnt_with(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(placing, "_compile", lambda sim, dtype, _: choose_plan(sim.scene.values(), dtype, H100))
+    sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e4)), 1 / 60, 8, progress=False)
+    sim.plan = choose_plan(sim.scene.values(), torch.float32, H100)
+    with torch.inference_mode():
+        setattr(sim, setting, {"kernel": "block", "batch": 5}[setting])
+    assert not any(array.is_inference() for array in sim.plan.arrays)
+
+
 def test_bars_show_for_another_device_too(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = []
 
@@ -375,6 +410,8 @@ def test_bars_show_for_another_device_too(monkeypatch: pytest.MonkeyPatch) -> No
         sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e4)), 1 / 60, 8, progress=progress)
         placing.plan_anew(sim, torch.float32, torch.device("cuda"))
         assert shown.pop() == progress
+        # nobody waits for those that the library makes for itself
+        assert not plain_copy(sim).progress
 
 
 def test_a_simulator_passes_its_batch_on(monkeypatch: pytest.MonkeyPatch) -> None:

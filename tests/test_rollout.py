@@ -59,6 +59,11 @@ def test_a_start_may_lie_where_other_environments_are_overwritten(
     expected = sim(pd.State(own.clone(), state.velocities.clone()), start=other.clone())
     sim.step_(state, start=other)
     assert same_bits(state, expected)
+    # forces among the velocities
+    state, forces = pd.State(torch.zeros_like(own) + sim.rest_positions, own), other
+    expected = sim(pd.State(*(t.clone() for t in state)), forces.clone())
+    sim.step_(state, forces)
+    assert same_bits(state, expected)
 
 
 def test_progress_and_functions_change_no_bit(

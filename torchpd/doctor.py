@@ -21,7 +21,7 @@ from .gpu import DOCTOR, LEAST_CAPABILITY, why_not
 from .toolkit import Toolkit, find_toolkit
 from .version import __version__
 
-__all__ = ["Package", "missing_packages", "problems", "report"]
+__all__ = ["Package", "missing_packages", "notes", "problems", "report"]
 
 
 class Package(NamedTuple):
@@ -122,12 +122,18 @@ def problems() -> list[str]:
         found.append(f"the extension torchpd._C cannot be loaded ({reason}): build it with {BUILD_COMMAND}")
     elif torch.cuda.is_available() and not build["cuda"]:
         found.append(f"a GPU is there, but CUDA is {_cuda_state(build, find_toolkit())}")
-    elif build["cuda"]:
-        count = torch.cuda.device_count()
-        best = max((torch.cuda.get_device_capability(index) for index in range(count)), default=None)
-        if reason := why_not(True, torch.version.cuda, count, best):
-            found.append(f"CUDA is built, but there is no GPU to run on: {reason.removesuffix(f'; {DOCTOR}')}")
     return found
+
+
+def notes() -> list[str]:
+    """What it does without, although it was built with it: a GPU."""
+    build, _ = _load_build()
+    if build is None or not build["cuda"]:
+        return []
+    count = torch.cuda.device_count()
+    best = max((torch.cuda.get_device_capability(index) for index in range(count)), default=None)
+    reason = why_not(True, torch.version.cuda, count, best).removesuffix(f"; {DOCTOR}")
+    return [f"CUDA is built, but there is no GPU to run on: {reason}"] if reason else []
 
 
 def _section(title: str, rows: Iterable[tuple[str, str]]) -> list[str]:
@@ -167,6 +173,7 @@ def report() -> str:
     lines += _section("Devices", _devices())
     lines += _section("Build", _build_rows())
     lines += _section("Optional packages", map(_optional_row, OPTIONAL))
+    lines += [f"Note: {note}" for note in notes()]
     found = problems()
     lines += [f"Problem: {problem}" for problem in found] or ["No problem found."]
     return "\n".join(lines)

@@ -8,9 +8,9 @@ without contacts nine of ten needed 0.2 to 1.4 times the forecast, meshes with s
 the least, on 65 with contacts Chebyshev 0.2 to 1.25 times (`benchmarks/forecast.py`).
 
 With smooth planes the forecast of `Multilevel` is that of the step in which a stiff body lands on a face: two square
-roots of what Chebyshev needs, and with slivers a seventh of it at least. Of 260 scenes in which a body lands the
-hardest steps of 238 took 1.8 of it at most (`benchmarks/landings.py`), most steps far less. With friction or balls, and
-without its small problem, it is a bound: what Chebyshev needs. `Simulator.tune` measures instead.
+roots of what Chebyshev needs, and a seventh of it at least with slivers or stiffness that varies much within a body
+(`benchmarks/landings.py`); most steps need far less. With friction or balls, and with schedules that do not know the
+rigid turns of a body, it is a bound: what Chebyshev needs. `Simulator.tune` measures instead.
 
 Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
 """
@@ -39,9 +39,9 @@ __all__ = [
     "forecast",
     "has_contacts",
     "has_friction",
-    "has_slivers",
     "held_up_by",
     "is_bound",
+    "is_uneven",
     "spectrum_of",
     "warn_of_few_iterations",
 ]
@@ -51,7 +51,9 @@ _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
 _LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
 # of Multilevel where something lands, in those of Chebyshev for an error of 1e-3, and in their square roots
 _LANDING_SHARE, LANDING_ROOTS = 1.0 / 7.0, 2.0
-_EVEN = math.radians(5.0)  # smallest dihedral angle of a mesh without slivers
+# of a body that is not uneven: the smallest dihedral angle, and how much stiffer one tetrahedron is than another, which
+# is up to ten times where `tetrahedralize` leaves some partly empty
+_EVEN_ANGLE, _EVEN_STIFFNESS = math.radians(5.0), 30.0
 _MOST = 10_000
 # iterations of Multilevel that "auto" takes at most: what a bound asks beyond that hardly a step needs
 MOST_OF_LEVELS = 1_000
@@ -156,7 +158,7 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     if lands:
         plain = math.log(1e3) / rate
         usual = LANDING_ROOTS * math.sqrt(plain)
-        rate = math.log(1e3) / (max(_LANDING_SHARE * plain, usual) if has_slivers(sim) else usual)
+        rate = math.log(1e3) / (max(_LANDING_SHARE * plain, usual) if is_uneven(sim) else usual)
     return Forecast(rate)
 
 
@@ -170,9 +172,12 @@ def has_contacts(sim: Model) -> bool:
     return sim.planes.shape[-2] + sim.spheres.shape[-2] > 0
 
 
-def has_slivers(sim: Model) -> bool:
-    """Whether some tetrahedron has a dihedral angle below five degrees."""
-    return any(_smallest_angle(solid.mesh) < _EVEN for solid in sim.scene.solids)
+def is_uneven(sim: Model) -> bool:
+    """Whether a body has tetrahedra with an angle below five degrees, or one that is 30 times as stiff as another."""
+    if any(_smallest_angle(solid.mesh) < _EVEN_ANGLE for solid in sim.scene.solids):
+        return True
+    bodies = sim.stiffness.detach().split([len(solid.mesh.tets) for solid in sim.scene.solids], dim=-1)
+    return any(bool((body.amax(-1) > _EVEN_STIFFNESS * body.amin(-1)).any()) for body in bodies)
 
 
 def _smallest_angle(mesh: TetMesh) -> float:

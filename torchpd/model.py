@@ -50,6 +50,7 @@ class Model(nn.Module):
     pin_targets: Tensor
     planes: Tensor
     spheres: Tensor
+    progress: bool = True  # whether bars show while a large scene compiles, for another device too
 
     def __init__(
         self,
@@ -77,7 +78,7 @@ class Model(nn.Module):
         self.promise: Promise | None = None  # of `tune`
         self._kernel = check_kernel(kernel)
         self._batch = check_batch(batch)
-        self.progress = progress  # whether bars show while a large scene compiles, for another device too
+        self.progress = progress
         values = scene.values()
         self.anchors = Anchors(scene)
         self._written = Written()
@@ -130,8 +131,10 @@ class Model(nn.Module):
 
     def _plan_again(self) -> None:
         """After what a GPU's plan and the choice of "auto" depend on has changed."""
-        if self.plan.kernel is not None:
-            self.plan = move_plan(self, plan_anew(self, self.dtype, self.device), self.device)
+        # "auto" begins with a plan for Chebyshev
+        if self.plan.kernel is not None and not (self.choice is not None and self.plan.for_levels):
+            with ordinary():
+                self.plan = move_plan(self, plan_anew(self, self.dtype, self.device), self.device)
         if self.choice is not None:
             self._choose_again(self.choice)
 

@@ -58,6 +58,9 @@ def plain_copy(module: _Module) -> _Module:
     """A deep copy whose arrays are numbers, which nothing makes and nobody learns: any others may replace them."""
     with torch.inference_mode(False), torch.no_grad():
         copied = copy.deepcopy(module)
+        # what a copy compiles is nobody's to wait for
+        if "progress" in vars(copied):
+            vars(copied)["progress"] = False
         if is_parametrized(copied):
             made: Any = copied.parametrizations
             arrays = {name: getattr(copied, name).detach().clone() for name in made}

@@ -54,22 +54,22 @@ class Simulator(Model):
             Chebyshev where there is friction, and as many iterations as that takes unless they are given, four times as
             many where a `tolerance` ends easy steps, but no more than 10,000, and 1000 of Multilevel, times four with a
             tolerance; `print(sim)` says why, an `UnsolvedWarning` where that will not do. It chooses anew when the
-            simulator moves to another device and in `prepare_solver`, which an `UnsolvedWarning` asks for where a
-            change of material or time step makes the old choice leave 1e-2 or more.
+            simulator moves to another device, for another `kernel` or `batch`, and in `prepare_solver`, which an
+            `UnsolvedWarning` asks for where a change of material or time step makes the old choice leave 1e-2 or more.
         dtype: precision, torch.float32 or torch.float64.
         tolerance: an environment stops iterating when |x - x*| is about tolerance |x - s| or less, s being where
             inertia, forces and springs alone would take the vertices, so that |x - s| is what elasticity and contacts
             do, or what gravity does if that is more; 0 never. The error is judged by the changes of iterations and by
             how slow the slowest mode can be, from the weights of the step: see docs/limits.md.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "cluster", "grid" or "stream", see
-            `torchpd.regimes`; "auto" takes the first that fits, and with `batch` the quickest. Changes nothing on the
-            CPU.
+            `torchpd.regimes`; "auto" takes the first that fits, and with `batch` the quickest. `sim.kernel` may be
+            set later. Changes nothing on the CPU.
         batch: environments that a step will have, where you know it: a GPU's kernel, its patches and thread blocks, the
             patches and preconditioner of `Multilevel` and the choice of "auto" are for so many. States of any batch may
             come, and an environment has the same bits in all of them, but takes longer in some; thread blocks of the
             smallest meshes in float32 are for the batch that comes. None: not known: a small mesh gets "block", which
             is for many, and "auto" chooses for one. `sim.batch` may be set later. Changes nothing on the CPU.
-        progress: show a bar while a large scene compiles.
+        progress: show a bar while a large scene compiles, for another device too.
     """
 
     def extra_repr(self) -> str:
