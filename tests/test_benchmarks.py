@@ -6,6 +6,7 @@ import importlib
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -76,9 +77,9 @@ def assert_schema(value: Any, schema: Any, where: str) -> None:
         assert isinstance(value, schema), where
 
 
-def run(*words: str, script: str = "run.py") -> subprocess.CompletedProcess[str]:
+def run(*words: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, ROOT / "benchmarks" / script, *words]
+    command = [sys.executable, ROOT / "benchmarks" / "run.py", *words]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
@@ -124,10 +125,18 @@ def test_table_shows_every_row(quick: tuple[dict[str, Any], str]) -> None:
         assert line.split()[:2] == [row["scene"], row["dtype"]]
 
 
-def test_unknown_scene_is_refused() -> None:
-    ended = run("--only", "nothing")
-    assert ended.returncode == 2
-    assert "no scene nothing; there are 1k, 10k" in ended.stderr
+def refusal(words: list[str], script: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+    """What a script says that refuses its arguments, in this process: to import everything again takes seconds."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    monkeypatch.setattr(sys, "argv", [script, *words])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(ROOT / "benchmarks" / script), run_name="__main__")
+    assert ended.value.code == 2
+    return capsys.readouterr().err
+
+
+def test_unknown_scene_is_refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "no scene nothing; there are 1k, 10k" in refusal(["--only", "nothing"], "run.py", capsys, monkeypatch)
 
 
 def test_beam_counts_iterations(tmp_path: Path) -> None:
@@ -374,15 +383,11 @@ def test_runs_side_by_side_keep_each_others_rows(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not missing_gpu(), reason="there is a GPU")
-def test_a_gpu_that_is_missing_is_refused() -> None:
+def test_a_gpu_that_is_missing_is_refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     if torch.cuda.is_available():
         pytest.skip("there is a GPU, but no kernels")
-    ended = run("--device", "cuda", "--quick")
-    assert ended.returncode == 2
-    assert "torch finds no CUDA device" in ended.stderr
-    ended = run(script="kernels_by_batch.py")
-    assert ended.returncode == 2
-    assert "torch finds no CUDA device" in ended.stderr
+    for script, words in (("run.py", ["--device", "cuda", "--quick"]), ("kernels_by_batch.py", [])):
+        assert "torch finds no CUDA device" in refusal(words, script, capsys, monkeypatch)
 
 
 @pytest.mark.skipif(bool(missing_gpu()), reason="needs a GPU")
