@@ -7,16 +7,12 @@ Iterations are counted on a grid of four an octave. Scenes that were measured ar
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from machine import describe_run, earlier_rows, run_of
-from tqdm import tqdm
+from machine import judge_scenes
 from tune import random_scene, random_state
 
 import torchpd as pd
@@ -98,24 +94,5 @@ def summary(rows: list[Row]) -> Row:
     return out
 
 
-def main(words: list[str]) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", type=int, default=200, help="how many (%(default)s)")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
-    options = parser.parse_args(words)
-    torch.set_num_threads(1)
-    now = describe_run(torch.device("cpu"), 1)
-    rows = {row["scene"]: row for row in earlier_rows(options.out)}
-    for number in tqdm(range(options.scenes), desc="scenes", unit="scene"):
-        if number in rows:
-            continue
-        rows[number] = {**run_scene(number), "run": run_of(now)}
-        if options.out:
-            record = {"schema": 1, **now, "summary": summary(list(rows.values()))}
-            options.out.parent.mkdir(parents=True, exist_ok=True)
-            options.out.write_text(json.dumps({**record, "rows": list(rows.values())}, indent=1) + "\n")
-    print(json.dumps(summary([rows[number] for number in range(options.scenes)]), indent=1))
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    judge_scenes(sys.argv[1:], str(__doc__), 200, run_scene, summary)

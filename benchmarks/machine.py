@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import fcntl
 import json
 import os
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
 from torchpd import _C, provenance
 
@@ -87,3 +89,28 @@ def describe_run(device: torch.device, threads: int) -> Record:
     """Everything that another run needs to be compared with this one."""
     command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]])
     return provenance.describe_run(command, device, threads)
+
+
+def judge_scenes(
+    words: list[str],
+    about: str,
+    scenes: int,
+    run_scene: Callable[[int], Record],
+    summary: Callable[[list[Record]], Record],
+) -> None:
+    """The command of a benchmark of random scenes, on one thread: rows that its file has are kept."""
+    parser = argparse.ArgumentParser(description=about.splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=scenes, help="how many are drawn (%(default)s)")
+    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    options = parser.parse_args(words)
+    torch.set_num_threads(1)
+    now = describe_run(torch.device("cpu"), 1)
+    rows = {row["scene"]: row for row in earlier_rows(options.out)}
+    for number in tqdm(range(options.scenes), desc="scenes", unit="scene"):
+        if number in rows:
+            continue
+        rows[number] = {**run_scene(number), "run": run_of(now)}
+        if options.out:
+            every = list(rows.values())
+            write_result(options.out, {"schema": 1, **now, "summary": summary(every), "rows": every})
+    print(json.dumps(summary([rows[number] for number in range(options.scenes)]), indent=1))
