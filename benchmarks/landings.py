@@ -6,13 +6,14 @@ flat as half a degree; points between tetrahedra of Delaunay, with slivers. What
 as uneven. They hit smooth ground with a face, tilted or in any position, and six steps from there are judged in
 float64, of those with a converged step that is known to 1e-4 and further from the first iterate than float32 can tell.
 Soft bodies, which Chebyshev takes in less than 60 iterations, are left out. Iterations are counted on a grid of four an
-octave: the first that reach 1e-3 and still do so at the next number of the grid and at the last. Scenes that were
-measured are kept.
+octave: the first that reach 1e-3 and still do so at the next number of the grid and at the last. Where none do,
+residual and energy tell whether they are on their way or in another minimum. Scenes that were measured are kept.
 """
 
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from tune import random_mesh
 
 import torchpd as pd
-from torchpd.accuracy import ExactStep, exact_steps
+from torchpd.accuracy import Errors, ExactStep, exact_steps
 from torchpd.automatic import AIM, MARGIN
 from torchpd.forecast import forecast, is_uneven
 from torchpd.quality import smallest_dihedral
@@ -33,6 +34,7 @@ SOFT = 60  # iterations of Chebyshev
 MOST = 700  # vertices
 COUNTS = sorted({round(2.0 ** (k / 4)) for k in range(45)})  # to 2048
 SURE = 1e-4  # of the error, that the converged step itself may have
+SOLVED = 1e-6  # residual of a step that more iterations change no more
 SEED = 99
 Row = dict[str, Any]
 
@@ -76,8 +78,8 @@ def random_landing(rng: np.random.Generator) -> tuple[Row, pd.Simulator, pd.Stat
     return facts, sim, pd.State(sim.rest_state().positions, velocities)
 
 
-def error_of(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> float:
-    return exact.judge(sim(state).velocities[0].numpy() * sim.time_step).position
+def errors_of(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> Errors:
+    return exact.judge(sim(state).velocities[0].numpy() * sim.time_step)
 
 
 @torch.no_grad()
@@ -102,27 +104,34 @@ def run_scene(number: int) -> Row:
     for _ in range(STEPS):
         exact = exact_steps(sim, state, iterations=4000)[0]
         if exact.uncertainty <= SURE and exact.moves(torch.float32):
-            row["steps"].append({**needed(sim, state, exact), "auto": error_of(auto, state, exact)})
+            row["steps"].append({**needed(sim, state, exact), "auto": errors_of(auto, state, exact).position})
         state = ahead(state)
     return row if row["steps"] else {**row, "left_out": "no step to compare with"}
 
 
 def needed(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> Row:
-    """The iterations that reach `AIM`, None where the last of `COUNTS` do not, and the error of those."""
+    """The iterations that reach `AIM`, None where the last of `COUNTS` do not, and the errors of those."""
 
-    def error(count: int) -> float:
+    def errors(count: int) -> Errors:
         sim.iterations = count
-        return error_of(sim, state, exact)
+        return errors_of(sim, state, exact)
 
-    last, before = error(COUNTS[-1]), False
-    if last > AIM:
-        return {"needed": None, "last": last}
+    last, before = errors(COUNTS[-1]), False
+    if last.position > AIM:
+        return {"needed": None, "last": last.position, "energy": last.energy, "residual": last.residual}
     for place, count in enumerate(COUNTS):
-        reached = error(count) <= AIM
+        reached = errors(count).position <= AIM
         if reached and before:
-            return {"needed": COUNTS[place - 1], "last": last}
+            return {"needed": COUNTS[place - 1], "last": last.position}
         before = reached
-    return {"needed": COUNTS[-1], "last": last}
+    return {"needed": COUNTS[-1], "last": last.position}
+
+
+def place_of(step: Row) -> str:
+    """Where iterations end that reach no `AIM`."""
+    if step["residual"] > SOLVED:
+        return "on their way"
+    return "in a minimum of less energy" if step["energy"] < 0.0 else "in one of more energy"
 
 
 def summary(rows: list[Row]) -> Row:
@@ -138,7 +147,8 @@ def summary(rows: list[Row]) -> Row:
             "scenes": len(group),
             "Multilevel": sum(row["auto"]["solver"] == "Multilevel" for row in group),
             "steps": len(steps),
-            f"steps that {COUNTS[-1]} iterations end elsewhere than the converged one": len(steps) - len(solved),
+            f"steps that {COUNTS[-1]} iterations leave unsolved": len(steps) - len(solved),
+            "of those": dict(Counter(place_of(step) for _, step in steps if step["needed"] is None)),
             f"of the others: {AIM:g} with auto": sum(step["auto"] <= AIM for _, step in solved),
             f"of the others: within {MARGIN:g} of the forecast": sum(
                 step["needed"] <= MARGIN * row["forecast"] for row, step in solved

@@ -273,7 +273,7 @@ def test_landings_are_judged_by_what_their_steps_needed(monkeypatch: pytest.Monk
 
     def row(forecast: int, *steps: tuple[int | None, float], uneven: bool = False) -> dict[str, Any]:
         auto = {"solver": "Multilevel" if forecast > 10 else "Chebyshev", "iterations": 2 * forecast}
-        own = [{"needed": needed, "auto": error} for needed, error in steps]
+        own = [{"needed": needed, "auto": error, "energy": -0.1, "residual": 1e-9} for needed, error in steps]
         return {"uneven": uneven, "forecast": forecast, "auto": auto, "steps": own}
 
     rows = [row(20, (8, 1e-4), (36, 1e-3)), row(20, (37, 2e-3)), row(5, (9, 1e-9)), {"left_out": "soft"}]
@@ -283,24 +283,30 @@ def test_landings_are_judged_by_what_their_steps_needed(monkeypatch: pytest.Monk
         "scenes": 3,
         "Multilevel": 2,
         "steps": 4,
-        "steps that 2048 iterations end elsewhere than the converged one": 0,
+        "steps that 2048 iterations leave unsolved": 0,
+        "of those": {},
         "of the others: 0.001 with auto": 3,
         "of the others: within 1.8 of the forecast": 3,
         "iterations needed, mean": 27.0,
         "iterations of auto, mean": 40.0,
     }
-    assert found["uneven"]["steps that 2048 iterations end elsewhere than the converged one"] == 1
+    assert found["uneven"]["steps that 2048 iterations leave unsolved"] == 1
+    assert found["uneven"]["of those"] == {"in a minimum of less energy": 1}
+    assert landings.place_of({"energy": -0.1, "residual": 1e-5}) == "on their way"
+    assert landings.place_of({"energy": 0.1, "residual": 1e-7}) == "in one of more energy"
     assert found["uneven"]["of the others: 0.001 with auto"] == 1
 
     # those from which an error stays, 1e-3 or less from 13 iterations on, but not with 16, and in the end or not
     def judged(end: float) -> dict[str, Any]:
         errors = {count: 1.0 if count < 13 or count == 16 else 1e-4 for count in landings.COUNTS} | {2048: end}
-        monkeypatch.setattr(landings, "error_of", lambda sim, state, exact: errors[sim.iterations])
+        monkeypatch.setattr(
+            landings, "errors_of", lambda sim, state, exact: landings.Errors(errors[sim.iterations], 0.2, 0.3, 0.4)
+        )
         found: dict[str, Any] = landings.needed(SimpleNamespace(), None, None)
         return found
 
     assert judged(1e-3) == {"needed": 19, "last": 1e-3}
-    assert judged(0.1) == {"needed": None, "last": 0.1}
+    assert judged(0.1) == {"needed": None, "last": 0.1, "energy": 0.2, "residual": 0.3}
     # it meets the ground in the first step, or soon
     for number in range(6):
         _, sim, state = landings.random_landing(np.random.default_rng(number))

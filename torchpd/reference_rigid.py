@@ -136,9 +136,9 @@ class Piece:
             after = np.where(lies, np.minimum(after, across - several * sphere[4] * along), after)
         return after
 
-    def lowers(self, way: Array) -> bool:
-        """Whether there is less energy after a motion by that [n, 3]."""
-        return bool((self.weight * ((self.y + way - self.z) ** 2 - (self.y - self.z) ** 2)).sum() < 0.0)
+    def gain(self, way: Array) -> float:
+        """What a motion by that [n, 3] adds to the energy."""
+        return float((0.5 * self.weight * ((self.y + way - self.z) ** 2 - (self.y - self.z) ** 2)).sum())
 
     def motion(self) -> Array:
         """What every vertex is to be moved by [n, 3]."""

@@ -30,6 +30,7 @@ NEAR = 1e-3  # of the spread of what lies on the plane: pressure is no further o
 DOUBT = 2.0  # of friction whose direction differs between two vertices, by that difference
 NEWTON = 8  # steps to a balance of torques
 ONWARD = 0.9  # least cosine between a slip before and after
+UPHILL = 1e-9  # what rounding may add to the energy, of that of the way that it goes
 HALF_TURN = 1e-6  # 4 cos^2(angle / 2), at most, of what counts as half a turn
 
 
@@ -73,7 +74,8 @@ class Tipping:
             if depth >= -(ROUNDED if worst in on else TOUCHING) * self.reach:
                 way = np.asarray(moved - piece.y + max(0.0, -depth) * n)
                 # a first iterate may be out of balance
-                if not holds and not (piece.first and pushes and piece.lowers(way)):
+                lowers = piece.first and pushes and piece.gain(way) < 0.0
+                if not lowers and (not holds or self.climbs(on, way)):
                     return None
                 piece.comes = share < 1.0
                 return way
@@ -90,6 +92,17 @@ class Tipping:
                     return None
                 on = pair
         return None
+
+    def climbs(self, on: list[int], way: Array) -> bool:
+        """Whether a motion [n, 3] adds more energy than it spares friction: balances of torques may lie uphill."""
+        piece, n = self.piece, self.normal
+        slips, (first, line, _) = self.slips[on], self.line(on)
+        after = slips + way[on] - np.outer(way[on] @ n, n)
+        further = np.linalg.norm(after, axis=1) - np.linalg.norm(slips, axis=1)
+        within = min(max(float((self.pressure - first) @ line) / max(float(line @ line), 1e-300), 0.0), 1.0)
+        slid = (1.0 - within) * further[0] + within * further[-1]
+        rub = self.friction * self.push(piece.y + way) * float(slid)
+        return piece.gain(way) + rub > UPHILL * float(piece.weight.sum()) * float(piece.lag @ piece.lag)
 
     def deepest(self, moved: Array, drop: float) -> tuple[int, float, float]:
         """The vertex that stops a motion first, how deep it goes beyond where it was, and how far off a drop leaves it.

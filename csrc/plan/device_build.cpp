@@ -256,14 +256,10 @@ std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan,
     const auto raise = [&](DeviceSize which, std::int64_t size) {
       sizes[which] = std::max(sizes[which], std::int32_t(size));
     };
-    const std::int64_t slots = std::ssize(patches[p].vertex);
-    raise(size_most_slots, slots);
+    raise(size_most_slots, std::ssize(patches[p].vertex));
     raise(size_most_pairs, std::ssize(patches[p].pairs));
     raise(size_most_entries, patches[p].entries);
-    const std::int64_t interior = plan.patch_vertex[p + 1] - plan.patch_vertex[p];
-    raise(size_most_interior, interior);
-    raise(size_most_shared, slots - interior);
-    if (pieces > 0) raise(size_most_parts, plan.patch_part[p + 1] - plan.patch_part[p]);
+    raise(size_most_interior, plan.patch_vertex[p + 1] - plan.patch_vertex[p]);
   }
   return sizes;
 }

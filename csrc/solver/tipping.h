@@ -36,6 +36,7 @@ constexpr double pressure_near = 1e-3;    // how far off it may be, by the sprea
 constexpr double friction_doubt = 2.0;
 constexpr int balance_steps = 8;   // of Newton's method
 constexpr double balanced = 1e-9;  // its last step
+constexpr double uphill = 1e-9;    // what rounding may add to E, of that of the way that it goes
 
 // What a search finds: the vertex of the least order; how deep it goes beyond where it is, negative, or how far it lies; its distance
 // from that contact, before and once it has dropped; where it is, and its displacement.
@@ -203,7 +204,8 @@ struct Tipping {
       const Trial trial = turn_about(fit, plane);
       motion = trial.motion;
       if (depth < 0.0) motion.shift = subtract_product(motion.shift, depth, plane.normal);
-      return tips = trial.holds || (first && trial.pushes && lowers(fit, motion));
+      return tips = (trial.holds && !climbs(fit, plane, motion)) ||
+                    (first && trial.pushes && gain(fit, motion) < 0.0);
     }
     bool probes = false;
     if (count == 0 || left < reach) {
@@ -312,11 +314,31 @@ struct Tipping {
     return slid.holds ? slid : stuck;
   }
 
-  // Whether E is less after a motion.
-  PD_HD static bool lowers(const RigidFit& fit, const RigidMotion<double>& motion) {
+  // What a motion adds to E.
+  PD_HD static double gain(const RigidFit& fit, const RigidMotion<double>& motion) {
     const Vec3<double> left = motion.of(fit.center) - fit.shift;
     const double shifted = 0.5 * fit.weight * (dot(left, left) - dot(fit.shift, fit.shift));
-    return shifted < frobenius(motion.turn, fit.covariance);
+    return shifted - frobenius(motion.turn, fit.covariance);
+  }
+
+  // Whether a motion adds to E more than it spares friction, by more than rounding: balances of torques may lie uphill.
+  PD_HD bool climbs(const RigidFit& fit, const Plane<double>& plane,
+                    const RigidMotion<double>& motion) const {
+    const Vec3<double> force = fit.weight * (motion.of(fit.center) - fit.shift);
+    const Vec3<double> way = on[count - 1].at - on[0].at;
+    const double far = dot(pressure - on[0].at, way), square = dot(way, way);
+    const double within = !(far > 0.0) ? 0.0 : far < square ? far / square : 1.0;
+    const double slid = (1.0 - within) * slides_on(on[0], plane, motion) +
+                        within * slides_on(on[count - 1], plane, motion);
+    const double rub = plane.friction * dot(force, plane.normal) * slid;
+    return gain(fit, motion) + rub > uphill * fit.weight * dot(fit.shift, fit.shift);
+  }
+
+  // How much further a motion takes a vertex from where it was.
+  PD_HD static double slides_on(const Vertex& vertex, const Plane<double>& plane,
+                                const RigidMotion<double>& motion) {
+    const Vec3<double> after = vertex.slip + tangential(motion.of(vertex.at), plane.normal);
+    return square_root(dot(after, after)) - square_root(dot(vertex.slip, vertex.slip));
   }
 
   PD_HD bool slides(const Vec3<double>& slip) const { return dot(slip, slip) > reach * reach; }
