@@ -315,6 +315,33 @@ def test_landings_are_judged_by_what_their_steps_needed(monkeypatch: pytest.Monk
 
 
 @pytest.mark.usefixtures("on_path")
+def test_tumbles_count_what_rigid_motions_take_elsewhere() -> None:
+    import tumbles
+
+    def row(friction: float, *left: tuple[float, float]) -> dict[str, Any]:
+        own = [{"residual of iterations": residual, "moved": moved} for residual, moved in left]
+        return {"friction": friction, "steps": 8, "left": own}
+
+    assert tumbles.summary([row(0.0), row(2.0, (1e-3, 0.1), (1e-9, 2e-9), (1e-9, 1e-10))]) == {
+        "steps": 16,
+        "steps that iterations leave unsolved": 1,
+        "solved steps that rigid motions take elsewhere": [{"friction": 2.0, "moved": 2e-9}],
+    }
+
+    # what iterations have solved they leave, and rigid motions as well: it slides on its face
+    facts, sim, state = tumbles.random_tumble(np.random.default_rng([11, 2]))
+    before = state.positions[0].numpy(), state.velocities[0].numpy()
+    problem = tumbles.step_problem(sim.scene.values(), *before, sim.time_step)
+    after = sim.time_step * sim(state).velocities[0].detach().numpy()
+    assert tumbles.residual_of(problem, after) <= 1e-8
+    found = tumbles.judge(problem, after)
+    assert found["residual of iterations"] <= 1e-8
+    assert found["moved"] <= 1e-9
+    assert facts["vertices"] == sim.vertices
+    assert tumbles.run_scene(2)["left"] == []
+
+
+@pytest.mark.usefixtures("on_path")
 @pytest.mark.parametrize("option", ["--blocks", "--mesh", "--setup", "--cells", "--youngs", "--contrasts"])
 def test_multilevel_does_not_run_something_else_for_an_option_without_values(
     option: str, capsys: pytest.CaptureFixture[str]
