@@ -328,7 +328,7 @@ def test_tumbles_count_what_rigid_motions_take_elsewhere() -> None:
         "solved steps that rigid motions take elsewhere": [{"friction": 2.0, "moved": 2e-9}],
     }
 
-    # what iterations have solved they leave, and rigid motions as well: it slides on its face
+    # what iterations have solved they leave, and rigid motions as well: it lands on its face
     facts, sim, state = tumbles.random_tumble(np.random.default_rng([11, 2]))
     before = state.positions[0].numpy(), state.velocities[0].numpy()
     problem = tumbles.step_problem(sim.scene.values(), *before, sim.time_step)
