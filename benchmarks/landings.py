@@ -34,7 +34,7 @@ SOFT = 60  # iterations of Chebyshev
 MOST = 700  # vertices
 COUNTS = sorted({round(2.0 ** (k / 4)) for k in range(45)})  # to 2048
 SURE = 1e-4  # of the error, that the converged step itself may have
-SOLVED = 1e-6  # residual of a step that more iterations change no more
+SOLVED = 1e-9  # residual of a step that more iterations change no more
 SEED = 99
 Row = dict[str, Any]
 
