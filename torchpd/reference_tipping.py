@@ -1,13 +1,13 @@
 """How the oracle's components tip or roll on one plane: about one vertex, or the line through two.
 
-Forces that contacts have: outward, in sum within friction's cone, between the two vertices. Torques may balance a
-second time, uphill: no motion adds more energy than it spares friction. Lines of more than two vertices bend, and slips
-along one differ: what is within that is left to the iterations, so that nothing moves once they have converged.
+Forces that contacts have: outward, in sum within friction's cone, between the two vertices. Lines of more than two
+vertices bend, and slips along one differ: what is within that is left to the iterations, so that nothing moves once
+they have converged.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,17 +30,8 @@ NEAR = 1e-3  # of the spread of what lies on the plane: pressure is no further o
 DOUBT = 2.0  # of friction whose direction differs between two vertices, by that difference
 NEWTON = 8  # steps to a balance of torques
 ONWARD = 0.9  # least cosine between a slip before and after
-UPHILL = 1e-9  # of twice the energy of how far it is from its free way: rounding
+UPHILL = 1e-9  # what rounding may add to the energy, of that of the way that it goes
 HALF_TURN = 1e-6  # 4 cos^2(angle / 2), at most, of what counts as half a turn
-
-
-class Trial(NamedTuple):
-    """A motion about one vertex or the line through two, as long as it is found out which."""
-
-    moved: Array  # [n, 3]
-    pushes: bool  # the contact
-    holds: bool  # as a contact can
-    centre: float  # of the push, from the first vertex, by the line to the other
 
 
 class Tipping:
@@ -78,14 +69,13 @@ class Tipping:
         self.pressure = middle + away
         share = 1.0
         for _ in range(ROUNDS - 1):
-            trial = self.about(on, share)
-            moved = trial.moved
+            moved, pushes, holds = self.about(on, share)
             worst, depth, left = self.deepest(moved, self.drop(on))
             if depth >= -(ROUNDED if worst in on else TOUCHING) * self.reach:
                 way = np.asarray(moved - piece.y + max(0.0, -depth) * n)
                 # a first iterate may be out of balance
-                lowers = piece.first and trial.pushes and piece.gain(way) < 0.0
-                if not lowers and (not trial.holds or self.climbs(on, trial)):
+                lowers = piece.first and pushes and piece.gain(way) < 0.0
+                if not lowers and (not holds or self.climbs(on, way)):
                     return None
                 piece.comes = share < 1.0
                 return way
@@ -103,18 +93,15 @@ class Tipping:
                 on = pair
         return None
 
-    def climbs(self, on: list[int], trial: Trial) -> bool:
-        """Whether a motion adds more energy than it spares friction: balances of torques may lie uphill.
-
-        With the push at its end, where it is one of least energy and friction.
-        """
-        piece, n, way = self.piece, self.normal, trial.moved - self.piece.y
-        slips = self.slips[on]
+    def climbs(self, on: list[int], way: Array) -> bool:
+        """Whether a motion [n, 3] adds more energy than it spares friction: balances of torques may lie uphill."""
+        piece, n = self.piece, self.normal
+        slips, (first, line, _) = self.slips[on], self.line(on)
         after = slips + way[on] - np.outer(way[on] @ n, n)
         further = np.linalg.norm(after, axis=1) - np.linalg.norm(slips, axis=1)
-        within = min(max(trial.centre, 0.0), 1.0)
+        within = min(max(float((self.pressure - first) @ line) / max(float(line @ line), 1e-300), 0.0), 1.0)
         slid = (1.0 - within) * further[0] + within * further[-1]
-        rub = self.friction * self.push(trial.moved) * float(slid)
+        rub = self.friction * self.push(piece.y + way) * float(slid)
         return piece.gain(way) + rub > UPHILL * float(piece.weight.sum()) * float(piece.lag @ piece.lag)
 
     def deepest(self, moved: Array, drop: float) -> tuple[int, float, float]:
@@ -165,22 +152,24 @@ class Tipping:
                 best, pair = own, [three[i], three[(i + 1) % 3]]
         return pair
 
-    def about(self, on: list[int], share: float) -> Trial:
-        """If it turns about these vertices, or goes that share of the way."""
+    def about(self, on: list[int], share: float) -> tuple[Array, bool, bool]:
+        """Where it goes if it turns about these vertices [n, 3], or that share of the way.
+
+        And whether the contact pushes then; as contacts can.
+        """
         if self.friction == 0.0:
             slid = self.sliding(on, share, np.zeros(3))
-            return Trial(self.piece.y, pushes=False, holds=False, centre=0.0) if slid is None else slid
+            return (self.piece.y, False, False) if slid is None else slid
         stuck = self.sticking(on, share)
         direction, apart = self.slide(on)
-        if stuck.holds or apart > ALIKE:
+        if stuck[2] or apart > ALIKE:
             return stuck
         if self.rubs(on, direction, apart):
             moved, end = self.pivot(on, share, np.zeros(3))
             push = self.push(moved)
-            centre = self.centre(on, end, push)
-            return Trial(moved, push > 0.0, push > 0.0 and is_between(centre), centre)
+            return moved, push > 0.0, push > 0.0 and self.between(on, end, push)
         slid = self.sliding(on, share, direction)
-        return slid if slid is not None and slid.holds else stuck
+        return slid if slid is not None and slid[2] else stuck
 
     def slide(self, on: list[int]) -> tuple[Array, float]:
         """The way that they slide, and how far apart their directions are: inf where that is not known.
@@ -210,15 +199,14 @@ class Tipping:
         """Of the contact, for the component to be there."""
         return float((self.piece.weight * (moved - self.piece.z)).sum(axis=0) @ self.normal)
 
-    def sticking(self, on: list[int], share: float) -> Trial:
+    def sticking(self, on: list[int], share: float) -> tuple[Array, bool, bool]:
         """Friction takes back how far they slid, within its cone."""
         slips = self.slips[on]
         moved, end = self.pivot(on, share, self.least_slip(slips))
         force, push = (self.piece.weight * (moved - self.piece.z)).sum(axis=0), self.push(moved)
         holds = bool(push > 0.0 and np.linalg.norm(force - push * self.normal) <= self.friction * push)
         holds = holds and bool(np.linalg.norm(slips[0] - slips[-1]) <= self.reach)
-        centre = self.centre(on, end, push)
-        return Trial(moved, push > 0.0, holds and is_between(centre), centre)
+        return moved, push > 0.0, holds and self.between(on, end, push)
 
     def least_slip(self, slips: Array) -> Array:
         """Of the slips between two; none if they differ by as much."""
@@ -227,7 +215,7 @@ class Tipping:
         least = np.asarray(slips[0] + min(max(share, 0.0), 1.0) * way)
         return least if np.linalg.norm(least) > np.linalg.norm(way) else np.zeros(3)
 
-    def sliding(self, on: list[int], share: float, direction: Array) -> Trial | None:
+    def sliding(self, on: list[int], share: float, direction: Array) -> tuple[Array, bool, bool] | None:
         """They go on that way and friction acts against it, or freely; None where torques find no balance."""
         piece, n = self.piece, self.normal
         first, _, axis = self.line(on)
@@ -237,8 +225,7 @@ class Tipping:
             return None
         moved = self.slid(turn, arm, direction, drop)
         push = self.push(moved)
-        centre = self.centre(on, moved, push)
-        holds = push > 0.0 and is_between(centre)
+        holds = push > 0.0 and self.between(on, moved, push)
         if self.friction > 0.0:
             after = self.slips[on[0]] + moved[on[0]] - first
             after -= (after @ n) * n
@@ -247,7 +234,7 @@ class Tipping:
             # of how it rolls and of how it turns about the normal: the line of two vertices stays level
             yaw = np.eye(3) if axis is None else turn_about(n, np.outer(turn @ axis, axis))
             moved = self.slid(part_of(yaw, share) @ part_of(yaw.T @ turn, share), arm, direction, drop)
-        return Trial(moved, push > 0.0, bool(holds), centre)
+        return moved, push > 0.0, bool(holds)
 
     def line(self, on: list[int]) -> tuple[Array, Array, Array | None]:
         """A point, the way to the other, and its direction if there is one."""
@@ -255,13 +242,14 @@ class Tipping:
         way = np.asarray(self.piece.y[on[-1]] - first)
         return first, way, way / np.linalg.norm(way) if len(on) == 2 else None
 
-    def centre(self, on: list[int], moved: Array, push: float) -> float:
-        """Where on the line of two vertices that push at `moved` has its centre: 0 at the first, 1 at the other."""
+    def between(self, on: list[int], moved: Array, push: float) -> bool:
+        """Whether that push at `moved` has its centre between the two vertices of a line."""
         _, way, axis = self.line(on)
-        if axis is None or not push > 0.0:
-            return 0.0
+        if axis is None:
+            return True
         torque = np.cross(moved - moved[on[0]], self.piece.weight * (moved - self.piece.z)).sum(axis=0)
-        return float(np.cross(self.normal, torque) @ way) / (push * float(way @ way))
+        along, length = float(np.cross(self.normal, torque) @ axis) / push, float(np.linalg.norm(way))
+        return -1e-6 * length <= along <= (1.0 + 1e-6) * length
 
     def off(self, on: list[int]) -> Array:
         """How far the centre of pressure, if nothing moves, is off what it turns about [3]."""
@@ -327,10 +315,6 @@ class Tipping:
             if size < 1e-14:
                 break
         return turn if size < 1e-9 else None
-
-
-def is_between(centre: float) -> bool:
-    return -1e-6 <= centre <= 1.0 + 1e-6
 
 
 def _axis(matrix: Array) -> Array:

@@ -2,14 +2,13 @@
 // They stick, where friction can take back how far they slid, or slide on the way that they slid; without friction freely. Then E is
 // least where torques balance: in closed form for those that stick (solver/rigid.h), by Newton's method for those that slide.
 //
-// What pushes a piece must be a force that contacts have: outward, in sum within the cone of friction, and between the two vertices.
-// Torques may balance a second time, uphill: no motion adds more to E than it spares friction. As such forces are what the iterations
-// converge to as well, nothing moves once they have converged. That two vertices which stick may not be able to share the force, where it
-// twists, is left to the iterations. Which they are is found by turns, as in an active set method: first the one that lies furthest to
-// where pressure has its centre, then the one that the turn about it takes deepest; of three the two remain beyond whose line that centre
-// lies. A turn that takes other vertices into a contact goes as far as the first of them, and on from there by another; but those which lie
-// on one already stay there. Before any iteration nothing has slid, friction acts against the way that a piece would slide, and what is out
-// of balance will do if it lowers E.
+// What pushes a piece must be a force that contacts have: outward, in sum within the cone of friction, and between the two vertices. As
+// such forces are what the iterations converge to as well, nothing moves once they have converged; that two vertices which stick may
+// not be able to share the force, where it twists, is left to the iterations. Which they are is found by turns, as in an active set
+// method: first the one that lies furthest to where pressure has its centre, then the one that the turn about it takes deepest; of
+// three the two remain beyond whose line that centre lies. A turn that takes other vertices into a contact goes as far as the first of
+// them, and on from there by another; but those which lie on one already stay there. Before any iteration nothing has slid, friction
+// acts against the way that a piece would slide, and what is out of balance will do if it lowers E.
 //
 // A line of more than two vertices bends, and slips along it differ in direction. What is within that is no reason to move either: a
 // piece does not roll whose pressure, next to the line, is within what touches there, which one more search tells; and with friction
@@ -37,7 +36,7 @@ constexpr double pressure_near = 1e-3;    // how far off it may be, by the sprea
 constexpr double friction_doubt = 2.0;
 constexpr int balance_steps = 8;   // of Newton's method
 constexpr double balanced = 1e-9;  // its last step
-constexpr double uphill = 1e-9;    // of twice E of how far a piece is from its free way: rounding
+constexpr double uphill = 1e-9;    // what rounding may add to E, of that of the way that it goes
 
 // What a search finds: the vertex of the least order; how deep it goes beyond where it is, negative, or how far it lies; its distance
 // from that contact, before and once it has dropped; where it is, and its displacement.
@@ -205,7 +204,7 @@ struct Tipping {
       const Trial trial = turn_about(fit, plane);
       motion = trial.motion;
       if (depth < 0.0) motion.shift = subtract_product(motion.shift, depth, plane.normal);
-      return tips = (trial.holds && !climbs(fit, plane, trial)) ||
+      return tips = (trial.holds && !climbs(fit, plane, motion)) ||
                     (first && trial.pushes && gain(fit, motion) < 0.0);
     }
     bool probes = false;
@@ -230,7 +229,6 @@ struct Tipping {
   struct Trial {
     RigidMotion<double> motion;
     bool pushes, holds;  // the contact; as a contact can
-    double centre;       // of the push, from the first of its vertices, by the line to the other
   };
 
   PD_HD static Vec3<double> read(const double* a) { return {a[0], a[1], a[2]}; }
@@ -285,16 +283,12 @@ struct Tipping {
     return lesser(gap(plane, on[0].at), gap(plane, on[count - 1].at));
   }
 
-  // Where on the line a push has its centre which has that torque about the first vertex: 0 there, 1 at the other.
-  PD_HD double centre_of(const Vec3<double>& normal, const Vec3<double>& torque,
-                         double push) const {
-    if (count < 2) return 0.0;
+  // Whether a torque about the first of two vertices is that of a push between them.
+  PD_HD bool between(const Vec3<double>& normal, const Vec3<double>& torque, double push) const {
+    if (count < 2) return true;
     const Vec3<double> way = on[1].at - on[0].at;
-    return dot(cross(normal, torque), way) / (push * dot(way, way));
-  }
-
-  PD_HD static bool is_between(double centre) {
-    return centre >= -pressure_beyond && centre <= 1.0 + pressure_beyond;
+    const double square = dot(way, way), along = dot(cross(normal, torque), way) / push;
+    return along >= -pressure_beyond * square && along <= (1.0 + pressure_beyond) * square;
   }
 
   PD_COLD Trial turn_about(const RigidFit& fit, const Plane<double>& plane) const {
@@ -327,12 +321,13 @@ struct Tipping {
     return shifted - frobenius(motion.turn, fit.covariance);
   }
 
-  // Whether a motion adds to E more than it spares friction, by more than rounding: balances of torques may lie uphill. With the push at
-  // its end, where it is one of least E and friction.
-  PD_HD bool climbs(const RigidFit& fit, const Plane<double>& plane, const Trial& trial) const {
-    const RigidMotion<double>& motion = trial.motion;
+  // Whether a motion adds to E more than it spares friction, by more than rounding: balances of torques may lie uphill.
+  PD_HD bool climbs(const RigidFit& fit, const Plane<double>& plane,
+                    const RigidMotion<double>& motion) const {
     const Vec3<double> force = fit.weight * (motion.of(fit.center) - fit.shift);
-    const double within = !(trial.centre > 0.0) ? 0.0 : lesser(trial.centre, 1.0);
+    const Vec3<double> way = on[count - 1].at - on[0].at;
+    const double far = dot(pressure - on[0].at, way), square = dot(way, way);
+    const double within = !(far > 0.0) ? 0.0 : far < square ? far / square : 1.0;
     const double slid = (1.0 - within) * slides_on(on[0], plane, motion) +
                         within * slides_on(on[count - 1], plane, motion);
     const double rub = plane.friction * dot(force, plane.normal) * slid;
@@ -404,8 +399,8 @@ struct Tipping {
     const Mat3<double> part = part_of_turn(turn, share);
     const double push = fit.weight * dot(n, back - part * arm - fit.shift);
     const Vec3<double> torque = -axis_of(turned_covariance(covariance, turn));
-    const double centre = centre_of(n, torque, push);
-    return {{part, on[0].at, back}, push > 0.0, push > 0.0 && is_between(centre), centre};
+    const bool holds = push > 0.0 && between(n, torque, push);
+    return {{part, on[0].at, back}, push > 0.0, holds};
   }
 
   // C R^T
@@ -457,8 +452,7 @@ struct Tipping {
     const Vec3<double> at = arm + turn * arm;
     const Vec3<double> torque =
         -axis_of(turned_covariance(fit.covariance, turn)) - push * cross(at, along);
-    const double centre = centre_of(n, torque, push);
-    bool holds = found && push > 0.0 && is_between(centre);
+    bool holds = found && push > 0.0 && between(n, torque, push);
     if (plane.friction > 0.0) {
       const Vec3<double> after = tangential(on[0].slip + turn * arm + shift, n);
       holds = holds && dot(after, way) > slips_onward * square_root(dot(after, after));
@@ -466,8 +460,7 @@ struct Tipping {
     const Mat3<double> part = part_of_slide(turn, n);
     return {{part, fit.center, multiply_add(lift_of(fit, plane, part * arm), along, fit.shift)},
             push > 0.0,
-            holds,
-            centre};
+            holds};
   }
 
   // A share of how it rolls and of how it turns about the normal, so that the line of two vertices stays level.
