@@ -27,6 +27,21 @@ def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("on_path")
+def test_acceleration_counts_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 10 kPa, with 150 iterations at most, by which Jacobi comes to a hundredth and not to a thousandth."""
+    import acceleration
+
+    monkeypatch.setattr(acceleration, "STIFFNESSES", (1e4,))
+    jacobi, *others = acceleration.count_all(150)
+    assert jacobi["solver"] == "Jacobi"
+    assert jacobi["iterations"] == [41, 102, None, None]
+    assert len(others) == 2
+    for row in others:
+        assert row["iterations"] == sorted(row["iterations"])
+        assert row["iterations"][1] < 102 / 3
+
+
+@pytest.mark.usefixtures("on_path")
 def test_acceleration_is_a_ratio_of_iterations() -> None:
     from acceleration import table, with_factors
 
