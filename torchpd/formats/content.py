@@ -1,0 +1,70 @@
+"""What a mesh file holds, before anything is made of it: the value that every reader returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["CELLS", "Cells", "MeshContent", "Reader"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Corners and dimension of each kind of cell, by meshio's names. Corners come first in cells of higher order, so that
+# kinds of higher order (tetra10, hexahedron20, triangle6, ...) are named with their linear kind.
+CELLS = {
+    "vertex": (1, 0),
+    "line": (2, 1),
+    "triangle": (3, 2),
+    "quad": (4, 2),
+    "tetra": (4, 3),
+    "pyramid": (5, 3),
+    "wedge": (6, 3),
+    "hexahedron": (8, 3),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells of one kind, in the order of the file.
+
+    Args:
+        kind: a name of `CELLS`, "polygon", or "polyhedron" or any other name of what is not read further.
+        corners: vertex numbers [n, corners] in the order of VTK (of polygons: all corners, one polygon after another).
+        sizes: of polygons, how many corners each has [n]; None elsewhere.
+        regions: region number of each cell [n], or None.
+        order: polynomial order in the file; nodes beyond the corners are not kept.
+    """
+
+    kind: str
+    corners: Index
+    sizes: Index | None = None
+    regions: Index | None = None
+    order: int = 1
+
+    def __len__(self) -> int:
+        return len(self.corners) if self.sizes is None else len(self.sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshContent:
+    """Points and cells of a file, and sentences about what of the file is not among them.
+
+    Args:
+        points: [N, 3] in the units of the file.
+        cells: blocks of cells, in the order of the file.
+        uvs: texture coordinates of the points [N, 2], or None.
+        notes: what was left out, repaired or assumed, a sentence each: the caller says them in one `MeshWarning`.
+    """
+
+    points: Array
+    cells: list[Cells]
+    uvs: Array | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+Reader = Callable[[Path], MeshContent]
