@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .checks import as_array, check_finite, check_shape
+from .formats.bodies import read_body, read_surface
 from .mesh_checks import (
     MeshWarning,
     Numbers,
@@ -31,16 +32,7 @@ from .mesh_checks import (
     translation,
     warn,
 )
-from .mesh_files import (
-    MESHIO_SUFFIXES,
-    SURFACE_SUFFIXES,
-    cells_of,
-    existing,
-    read_content,
-    regions_of,
-    without_tets,
-    write_tets,
-)
+from .mesh_files import write_tets
 from .quality import MeshQuality, measure_quality
 
 if TYPE_CHECKING:
@@ -122,29 +114,14 @@ class TriMesh:
 
     @classmethod
     def from_file(cls, path: PathLike) -> TriMesh:
-        """Read any surface that trimesh reads (.obj, .ply, .stl, .glb, ...); polygons become triangles.
+        """Read the triangles of a mesh file (.obj, .ply, .stl, .glb, .vtk, ...); quads and polygons become triangles.
 
-        Of a volume mesh (.mesh, .msh, .vtk, .vtu) the triangles are read, through meshio.
+        Of a volume mesh the triangles that it lists are read. What is left out a `MeshWarning` says.
         """
-        import trimesh
-
-        file = existing(path)
-        if file.suffix.lower() in MESHIO_SUFFIXES:
-            content = read_content("TriMesh.from_file", file)
-            points, cells = content.points, cells_of(content)
-            if "triangle" not in cells:
-                raise ValueError(f"TriMesh.from_file: {file.name} holds no triangles")
-            # The vertices inside are no part of the surface: that they are left out is nothing to report.
-            used, numbers = np.unique(cells["triangle"], return_inverse=True)
-            return cls(points[used], numbers.reshape(-1, 3), drop_unreferenced=True, drop_degenerate=True)
-        try:
-            # process=False: vertices keep the order of the file.
-            surface = trimesh.load(file, process=False)
-        except (NotImplementedError, ValueError) as error:
-            raise ValueError(f"TriMesh.from_file cannot read {file.name}: {error}") from error
-        if isinstance(surface, trimesh.Scene) and not surface.geometry:
-            raise ValueError(f"TriMesh.from_file: {file.name} holds no triangles")
-        return cls.from_trimesh(surface)
+        surface = read_surface("TriMesh.from_file", path)
+        if surface.notes:
+            warn(f"TriMesh.from_file: {Path(path).name}: {'; '.join(surface.notes)}")
+        return cls(surface.points, surface.triangles, uvs=surface.uvs, drop_unreferenced=True, drop_degenerate=True)
 
     def to_trimesh(self) -> Any:
         """A trimesh.Trimesh with the same vertices, faces and texture coordinates."""
@@ -298,33 +275,32 @@ class TetMesh:
 
     @classmethod
     def from_file(cls, path: PathLike, *, drop_degenerate: bool = False) -> TetMesh:
-        """Read the tets of a volume mesh (.mesh, .msh, .vtk, .vtu, ...) through meshio.
+        """Read a volume mesh (.mesh, .msh, .vtk, .vtu, .inp, ...).
 
-        Triangles of the file, the outer surface or another one inside, are carried along as `embedding`. Vertices that
-        no tet uses are left out with a `MeshWarning`, and the triangles with them. The physical groups of a .msh, or
-        references of a .mesh, become `regions`.
+        Hexahedra, wedges and pyramids are split into tets that fill them and match across faces; of cells of higher
+        order the corners are kept. Triangles of the file, the outer surface or another one inside, are carried along as
+        `embedding`; quads and polygons are split. Physical groups, references, element sets and attributes become
+        `regions`. What is left out, split or assumed a `MeshWarning` says.
+
+        Raises:
+            ValueError: the file cannot be read, or holds no such cells; with its name, its format and what was met.
         """
-        from .embedding import embed_triangles
+        from .embedding import embed, embed_triangles
 
-        file = existing(path)
-        if file.suffix.lower() in SURFACE_SUFFIXES:
-            raise without_tets(file, ["a surface"])
-        content = read_content("TetMesh.from_file", file)
-        points, cells = content.points, cells_of(content)
-        if "tetra" not in cells:
-            raise without_tets(file, cells)
+        body = read_body("TetMesh.from_file", path)
+        if body.notes:
+            warn(f"TetMesh.from_file: {Path(path).name}: {'; '.join(body.notes)}")
         mesh = cls(
-            points,
-            cells["tetra"],
-            regions=regions_of(content),
-            drop_unreferenced=True,
-            drop_degenerate=drop_degenerate,
+            body.points, body.tets, regions=body.regions, drop_unreferenced=True, drop_degenerate=drop_degenerate
         )
-        triangles = cells.get("triangle", np.empty((0, 3), dtype=np.int64)).astype(np.int64)
-        triangles = triangles[~has_repeated_corner(triangles)]
-        if not len(triangles) or len(mesh.vertices) != len(points):
+        triangles = body.triangles[~has_repeated_corner(body.triangles)]
+        if not len(triangles):
             return mesh
-        return mesh.with_embedding(embed_triangles(mesh, triangles))
+        used = np.unique(body.tets)
+        if len(mesh.vertices) == len(used):
+            return mesh.with_embedding(embed_triangles(mesh, np.searchsorted(used, triangles)))
+        # tets without volume went, and vertices with them, so that some triangles hang on others
+        return mesh.with_embedding(embed(TriMesh(body.points, triangles, drop_unreferenced=True), mesh))
 
     def to_file(self, path: PathLike) -> None:
         """Write in the format of the file's suffix (.mesh, .msh, .vtk, .vtu, ...) through meshio.

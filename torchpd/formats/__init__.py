@@ -1,1 +1,1 @@
-"""Readers of mesh files: every format becomes the same `MeshContent`, from which `TetMesh` and `TriMesh` are made."""
+"""Mesh files: a reader for each format, one guard around all of them, and tets and triangles of any cells."""

@@ -37,7 +37,8 @@ class Cells:
         corners: vertex numbers [n, corners] in the order of VTK (of polygons: all corners, one polygon after another).
         sizes: of polygons, how many corners each has [n]; None elsewhere.
         regions: region number of each cell [n], or None.
-        order: polynomial order in the file; nodes beyond the corners are not kept.
+        order: polynomial order in the file.
+        beyond: of cells of higher order, the nodes beyond the corners [n, k], which no mesh of ours uses, or None.
     """
 
     kind: str
@@ -45,6 +46,7 @@ class Cells:
     sizes: Index | None = None
     regions: Index | None = None
     order: int = 1
+    beyond: Index | None = None
 
     def __len__(self) -> int:
         return len(self.corners) if self.sizes is None else len(self.sizes)

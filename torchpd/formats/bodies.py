@@ -1,0 +1,109 @@
+"""What a mesh file becomes: a body of tets with the surface that it carries, or a surface alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import split
+from .content import Array, Index, MeshContent
+from .guard import PathLike, read
+
+__all__ = ["Body", "Surface", "read_body", "read_surface"]
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Tets of a file, and triangles beside them.
+
+    Args:
+        points: [N, 3]; nodes on the edges of cells of higher order are not among them.
+        tets: point numbers [E, 4].
+        regions: a number for each tet [E], or None.
+        triangles: point numbers [T, 3] of triangles whose corners belong to tets.
+        notes: what is not as in the file, a sentence each.
+    """
+
+    points: Array
+    tets: Index
+    regions: Index | None
+    triangles: Index
+    notes: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of a file [T, 3], their points [N, 3], texture coordinates [N, 2] or None, and notes."""
+
+    points: Array
+    triangles: Index
+    uvs: Array | None
+    notes: list[str]
+
+
+def read_body(owner: str, path: PathLike) -> Body:
+    """Read a body of tets; a `ValueError` where the file holds none."""
+    content = read(owner, path)
+    solid = split.tets_of(content)
+    name = Path(path).name
+    if not len(solid.elements):
+        raise ValueError(_without_tets(owner, name, content))
+    flat = split.triangles_of(content)
+    used = np.zeros(len(solid.points), dtype=bool)
+    used[solid.elements] = True
+    within: NDArray[np.bool_] = np.asarray(used[flat.elements].all(axis=1))
+    notes = [*content.notes, *solid.notes, *flat.notes]
+    if not within.all():
+        outside = int((~within).sum())
+        notes.append(f"{outside} of {len(within)} triangles have corners that belong to no tet, and were left out")
+    # What cells of other kinds use has been said of these; the others are strays, of which the mesh speaks.
+    kept = used | ~_in_cells(content, len(used))
+    number = np.cumsum(kept) - 1
+    return Body(
+        solid.points[kept], number[solid.elements], solid.regions, number[flat.elements[within]].reshape(-1, 3), notes
+    )
+
+
+def read_surface(owner: str, path: PathLike) -> Surface:
+    """Read a surface; a `ValueError` where the file holds no triangle, quad or polygon."""
+    content = read(owner, path)
+    flat = split.triangles_of(content)
+    if not len(flat.elements):
+        raise ValueError(f"{owner}: {Path(path).name} holds no triangles, but {_kinds(content)}")
+    used = np.zeros(len(content.points), dtype=bool)
+    used[flat.elements] = True
+    # The vertices inside of a volume are no part of the surface: that they are left out is nothing to report.
+    kept = used | ~_in_cells(content, len(used))
+    number = np.cumsum(kept) - 1
+    uvs = None if content.uvs is None else content.uvs[kept]
+    return Surface(content.points[kept], number[flat.elements], uvs, [*content.notes, *flat.notes])
+
+
+def _in_cells(content: MeshContent, count: int) -> NDArray[np.bool_]:
+    """Which points a cell of the file uses, as a corner or beyond."""
+    there = np.zeros(count, dtype=bool)
+    for block in content.cells:
+        there[block.corners] = True
+        if block.beyond is not None:
+            there[block.beyond] = True
+    return there
+
+
+def _kinds(content: MeshContent) -> str:
+    counts: dict[str, int] = {}
+    for block in content.cells:
+        counts[block.kind] = counts.get(block.kind, 0) + len(block)
+    return ", ".join(f"{count} of kind {kind}" for kind, count in sorted(counts.items())) or "no cells"
+
+
+def _without_tets(owner: str, name: str, content: MeshContent) -> str:
+    flat = sum(len(block) for block in content.cells if block.kind in ("triangle", "quad", "polygon"))
+    came = f"a surface ({_kinds(content)})" if flat else _kinds(content)
+    fix = "turn a surface into tetrahedra with torchpd.tetrahedralize(path, cells=...)"
+    if not flat:
+        fix = "write it with its cells where it was made"
+    notes = f" ({'; '.join(content.notes)})" if content.notes else ""
+    return f"{owner}: {name} must hold tetrahedra, hexahedra, wedges or pyramids, got {came}{notes}; {fix}"

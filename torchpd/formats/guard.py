@@ -1,0 +1,96 @@
+"""The one place where a mesh file is opened: whatever its reader runs into becomes an error in words."""
+
+from __future__ import annotations
+
+import io
+import os
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+
+from .content import MeshContent
+from .registry import FORMATS, Format
+
+__all__ = ["PathLike", "existing", "read"]
+
+PathLike = str | os.PathLike[str]
+
+_ENDINGS = "the file's name must end in .mesh, .msh, .vtk or .vtu, or as another format that torchpd reads"
+
+
+def existing(path: PathLike) -> Path:
+    """The path of a file that is there; otherwise a `FileNotFoundError`."""
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"no such mesh file: {file}")
+    return file
+
+
+def read(owner: str, path: PathLike) -> MeshContent:
+    """Read points and cells of a mesh file.
+
+    Args:
+        owner: who asks, with which the errors begin.
+        path: the file; the suffix of its name says in which format it is.
+
+    Raises:
+        FileNotFoundError: there is no such file, or one that belongs to it is missing.
+        ModuleNotFoundError: the format needs a package that is not installed.
+        ValueError: anything else, with the name of the file, its format and what was met.
+    """
+    file = existing(path)
+    kind = FORMATS.get(file.suffix.lower())
+    if kind is None:
+        known = " ".join(sorted(FORMATS))
+        raise ValueError(f"{owner} cannot read {file.name}: {_ENDINGS} ({known})")
+    failure = f"{owner} cannot read {file.name} ({kind.name})"
+    if not file.stat().st_size:
+        raise ValueError(f"{failure}: the file is empty; write it again")
+    said = io.StringIO()
+    try:
+        # Libraries print what is wrong with a file, and some exit the process.
+        with redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            content = kind.read(file)
+            _check(content)
+            return content
+    except ModuleNotFoundError as error:
+        needed = f"its format needs the package {error.name}; pip install {error.name}"
+        raise ModuleNotFoundError(f"{failure}: {needed}", name=error.name) from error
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{failure}: {error}") from error
+    except PermissionError:
+        raise
+    # SystemExit and the panics of compiled libraries are no `Exception`
+    except BaseException as error:
+        if isinstance(error, (KeyboardInterrupt, GeneratorExit)):
+            raise
+        raise ValueError(f"{failure}: {_words(error, said.getvalue(), kind)}") from error
+
+
+def _check(content: MeshContent) -> None:
+    """Every cell must name points of the file."""
+    for block in content.cells:
+        outside = (block.corners < 0) | (block.corners >= len(content.points))
+        if outside.any():
+            number = int(block.corners[outside][0])
+            raise ValueError(
+                f"a {block.kind} names point {number} (counted from 0), but the file holds {len(content.points)} points"
+            )
+
+
+def _words(error: BaseException, said: str, kind: Format) -> str:
+    """What a reader met, as one line."""
+    told = " ".join(said.split()).removeprefix("Error: ")
+    words = " ".join(str(error).split())
+    if isinstance(error, ValueError) and words:
+        return f"{words} ({told})" if told and told not in words else words
+    if isinstance(error, MemoryError):
+        words = f"its reader asks for more memory than there is ({words})" if words else "its reader ran out of memory"
+    elif isinstance(error, RecursionError):
+        words = "it is nested too deeply"
+    elif not told:
+        words = f"its reader stopped with {type(error).__name__}: {words}" if words else type(error).__name__
+    else:
+        words = told
+    return f"{words}; is the file complete, and is it {kind.name}?"
