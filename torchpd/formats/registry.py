@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from . import surfaces, through_meshio
+from . import gmsh, isaac, medit, surfaces, tetgen, through_meshio, vtk, vtk_xml
 from .content import Reader
 
 __all__ = ["FORMATS", "Format"]
@@ -23,6 +23,17 @@ class Format(NamedTuple):
 
 
 FORMATS: dict[str, Format] = {
+    ".ele": Format("TetGen", tetgen.read),
+    ".mesh": Format("Medit", medit.read),
+    ".meshb": Format("Medit binary", medit.read),
+    ".msh": Format("Gmsh", gmsh.read),
+    ".node": Format("TetGen", tetgen.read),
+    ".pvtp": Format("VTK XML", vtk_xml.read),
+    ".pvtu": Format("VTK XML", vtk_xml.read),
+    ".tet": Format("Isaac Gym", isaac.read),
+    ".vtk": Format("VTK legacy", vtk.read),
+    ".vtp": Format("VTK XML", vtk_xml.read),
+    ".vtu": Format("VTK XML", vtk_xml.read),
     **{suffix: Format(name, through_meshio.read) for suffix, name in through_meshio.NAMES.items()},
     **{suffix: Format(name, surfaces.read) for suffix, name in surfaces.NAMES.items()},
 }
