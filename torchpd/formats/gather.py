@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,15 +29,14 @@ def block(kind: str, nodes: Index, regions: Index | None = None) -> Cells:
     return Cells(kind, nodes[:, :count], None, regions, 1 if beyond is None else 2, beyond)
 
 
-def blocks_of(kinds: list[str], rows: list[Iterable[int]], regions: list[int] | None = None) -> list[Cells]:
+def blocks_of(kinds: list[str], rows: Sequence[Sequence[int]], regions: list[int] | None = None) -> list[Cells]:
     """Blocks of cells that come one by one, each with its kind and its nodes: one block for each kind and length."""
     groups: dict[tuple[str, int], list[int]] = {}
-    full = [list(row) for row in rows]
-    for number, (kind, row) in enumerate(zip(kinds, full, strict=True)):
+    for number, (kind, row) in enumerate(zip(kinds, rows, strict=True)):
         groups.setdefault((kind, len(row)), []).append(number)
     blocks = []
     for (kind, length), numbers in groups.items():
-        nodes = np.array([full[n] for n in numbers], dtype=np.int64).reshape(len(numbers), length)
+        nodes = np.array([rows[n] for n in numbers], dtype=np.int64).reshape(len(numbers), length)
         marks = None if regions is None else np.array([regions[n] for n in numbers], dtype=np.int64)
         if kind in CELLS:
             blocks.append(block(kind, nodes, marks))

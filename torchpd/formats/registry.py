@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from . import gmsh, isaac, medit, surfaces, tetgen, through_meshio, vtk, vtk_xml
+from . import abaqus, avs, gmsh, isaac, medit, nastran, surfaces, tecplot, tetgen, through_meshio, vtk, vtk_xml
 from .content import Reader
 
 __all__ = ["FORMATS", "Format"]
@@ -23,6 +23,13 @@ class Format(NamedTuple):
 
 
 FORMATS: dict[str, Format] = {
+    ".bdf": Format("Nastran", nastran.read),
+    ".fem": Format("Nastran", nastran.read),
+    ".nas": Format("Nastran", nastran.read),
+    ".dat": Format("Tecplot", tecplot.read),
+    ".tec": Format("Tecplot", tecplot.read),
+    ".avs": Format("AVS-UCD", avs.read),
+    ".inp": Format("Abaqus", abaqus.read),
     ".ele": Format("TetGen", tetgen.read),
     ".mesh": Format("Medit", medit.read),
     ".meshb": Format("Medit binary", medit.read),

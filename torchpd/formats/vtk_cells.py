@@ -72,8 +72,8 @@ def content_of(pieces: list[Piece]) -> MeshContent:
     for piece, marks in zip(pieces, regions, strict=True):
         outside = (piece.nodes < 0) | (piece.nodes >= len(piece.points))
         if outside.any():
-            number = int(piece.nodes[outside][0])
-            raise ValueError(f"cells name point {number}, but there are {len(piece.points)} (counted from 0)")
+            wrong = int(piece.nodes[outside][0])
+            raise ValueError(f"cells name point {wrong}, but there are {len(piece.points)} (counted from 0)")
         cells += _blocks(piece, marks, first)
         first += len(piece.points)
     points = np.concatenate([piece.points for piece in pieces]) if pieces else np.empty((0, 3))
