@@ -140,7 +140,9 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, capfd: pytest.Capture
     with pytest.raises(ValueError, match=r"cannot read broken\.mesh \(Medit\): it declares 8 Vertices"):
         TetMesh.from_file(tmp_path / "broken.mesh")
     (tmp_path / "hello.mesh").write_text("hello\n")
-    with pytest.raises(ValueError, match=r"cannot read hello\.mesh \(Medit\): it must begin with MeshVersionFormatted, got 'hello'"):
+    with pytest.raises(
+        ValueError, match=r"cannot read hello\.mesh \(Medit\): it must begin with MeshVersionFormatted, got 'hello'"
+    ):
         TetMesh.from_file(tmp_path / "hello.mesh")
     assert capfd.readouterr() == ("", "")
     (tmp_path / "what.xyz").write_text("0 0 0")

@@ -8,6 +8,8 @@ import warnings
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+import numpy as np
+
 from .content import MeshContent
 from .registry import FORMATS, Format
 
@@ -69,7 +71,10 @@ def read(owner: str, path: PathLike) -> MeshContent:
 
 
 def _check(content: MeshContent) -> None:
-    """Every cell must name points of the file."""
+    """Points must be finite, and every cell must name points of the file."""
+    bad = np.flatnonzero(~np.isfinite(content.points).all(axis=1))
+    if len(bad):
+        raise ValueError(f"point {bad[0]} (counted from 0) must be finite, got {content.points[bad[0]].tolist()}")
     for block in content.cells:
         outside = (block.corners < 0) | (block.corners >= len(content.points))
         if outside.any():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -53,11 +52,12 @@ def _starts(data: bytes) -> Index:
 
 def parse(text: bytes, dtype: Any, what: str) -> NDArray[Any]:
     """All numbers of a text; exponents may be Fortran's (1.0D+00)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    try:
         values = np.fromstring(text, dtype=dtype, sep=" ")
-    if len(values) == len(_starts(text)):
-        return values
+        if len(values) == len(_starts(text)):
+            return values
+    except ValueError:  # newer versions of NumPy; older ones return the numbers before the first word
+        pass
     tokens = text.split()
     try:
         return np.array([token.replace(b"D", b"E").replace(b"d", b"e") for token in tokens], dtype=dtype)

@@ -79,13 +79,17 @@ def _cut_ears(points: Array, ring: Index) -> Index | None:
     across = np.eye(3)[np.abs(normal).argmin()]
     x = np.cross(across, normal) / np.linalg.norm(np.cross(across, normal))
     flat = places @ np.column_stack([x, np.cross(normal, x)])
-    left, triangles = list(range(len(ring))), []
+    left, triangles, ear = list(range(len(ring))), [], 0
     while len(left) > 3:
-        ear = next((k for k in range(len(left)) if _is_ear(flat, left, k)), None)
-        if ear is None:
+        # go on beside the last one
+        turns = ((ear + k - 1) % len(left) for k in range(len(left)))
+        ear = next((k for k in turns if _is_ear(flat, left, k)), -1)
+        if ear < 0:
             return None
         triangles.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
         del left[ear]
+    if _turn(*flat[left]) < 0:
+        return None
     triangles.append(left)
     return np.asarray(ring[np.array(triangles)])
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from .content import CELLS, Array, Cells, Index, MeshContent
 from .polygons import Wrong, triangulate
@@ -140,7 +141,22 @@ def _left_out(content: MeshContent) -> list[str]:
         and not any(block is other for other in known)
         and not (block.kind in ("line", "vertex") and used[block.corners].all())
     ]
-    return [f"{_say(count, kind)} left out" for kind, count in _counts(others).items()]
+    notes = []
+    for kind, count in _counts(others).items():
+        volume = sum(_hulls(content.points, block) for block in others if block.kind == kind)
+        notes.append(f"{_say(count, kind)} left out" + (f", {volume:.4g} m^3" if volume else ""))
+    return notes
+
+
+def _hulls(points: Array, block: Cells) -> float:
+    """The volume of cells of any shape: that of the convex hull of their corners."""
+    if block.sizes is None:
+        return 0.0
+    total = 0.0
+    for corners in np.split(block.corners, np.cumsum(block.sizes)[:-1]):
+        if np.linalg.matrix_rank(points[corners] - points[corners[:1]]) == 3:
+            total += float(ConvexHull(points[corners]).volume)
+    return total
 
 
 def _choose_diagonals(blocks: list[Cells]) -> list[Index]:
