@@ -101,7 +101,8 @@ class Text:
 
     def words(self, count: int, what: str) -> bytes:
         """The text of the next words."""
-        check_room(count, 2, len(self.data) - self.at + 1, what)
+        if not 0 <= 2 * count <= len(self.data) - self.at + 1:
+            raise ValueError(f"{what} should be {count} numbers, but {len(self.data) - self.at} bytes are left")
         begin, found, chunk = self.at, 0, 32 * count + 64
         while found < count:
             if self.at >= len(self.data):
@@ -137,7 +138,9 @@ class Binary:
     def take(self, dtype: Any, count: int, what: str) -> NDArray[Any]:
         """The next numbers or records of any type."""
         kind = np.dtype(dtype)
-        check_room(count, kind.itemsize, len(self.data) - self.at, what)
+        if not 0 <= count * kind.itemsize <= len(self.data) - self.at:
+            left = len(self.data) - self.at
+            raise ValueError(f"{what} should be {count} times {kind.itemsize} bytes, but {left} bytes are left")
         values = np.frombuffer(self.data, kind, count, self.at)
         self.at += count * kind.itemsize
         return values
