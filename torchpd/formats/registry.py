@@ -4,7 +4,26 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from . import abaqus, avs, gmsh, isaac, medit, nastran, surfaces, tecplot, tetgen, through_meshio, vtk, vtk_xml
+from . import (
+    abaqus,
+    avs,
+    dolfin,
+    flac3d,
+    gmsh,
+    isaac,
+    kratos,
+    medit,
+    nastran,
+    netgen,
+    su2,
+    surfaces,
+    tecplot,
+    tetgen,
+    through_meshio,
+    ugrid,
+    vtk,
+    vtk_xml,
+)
 from .content import Reader
 
 __all__ = ["FORMATS", "Format"]
@@ -23,6 +42,12 @@ class Format(NamedTuple):
 
 
 FORMATS: dict[str, Format] = {
+    ".f3grid": Format("FLAC3D", flac3d.read),
+    ".mdpa": Format("Kratos", kratos.read),
+    ".su2": Format("SU2", su2.read),
+    ".ugrid": Format("UGRID", ugrid.read),
+    ".vol": Format("Netgen", netgen.read),
+    ".xml": Format("DOLFIN XML", dolfin.read),
     ".bdf": Format("Nastran", nastran.read),
     ".fem": Format("Nastran", nastran.read),
     ".nas": Format("Nastran", nastran.read),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from .content import CELLS, Cells, Index, MeshContent
+from .gather import block, in_space
+from .regions import choose
 
 __all__ = ["NAMES", "read"]
 
@@ -18,42 +21,80 @@ NAMES = {
     ".e": "Exodus",
     ".ex2": "Exodus",
     ".exo": "Exodus",
-    ".f3grid": "FLAC3D",
     ".h5m": "MOAB",
     ".hmf": "HMF",
-    ".mdpa": "Kratos",
     ".med": "MED",
     ".post": "Permas",
-    ".su2": "SU2",
-    ".ugrid": "UGRID",
-    ".vol": "Netgen",
     ".xdmf": "XDMF",
     ".xmf": "XDMF",
-    ".xml": "DOLFIN XML",
 }
+
+
+# Formats whose blocks of elements are what others call regions.
+_BLOCKS = {".e", ".ex2", ".exo"}
+_TETRA_4 = 10  # CGNS
 
 
 def read(path: Path) -> MeshContent:
     """Read a file with meshio."""
     import meshio
 
-    return content_of(meshio.read(path))
+    if path.suffix.lower() == ".msh":  # Gmsh's, but for a reader of its own
+        with path.open("rb", buffering=0) as raw:
+            return content_of(meshio.read(_Ending(raw), file_format="ansys"))
+    if path.suffix.lower() == ".cgns":
+        _check_cgns(path)
+    return content_of(meshio.read(path), by_block=path.suffix.lower() in _BLOCKS)
 
 
-def content_of(mesh: Any) -> MeshContent:
-    """Points, cells and regions of a `meshio.Mesh`."""
-    points = np.asarray(mesh.points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] not in (2, 3):
-        raise ValueError(f"points must have two or three coordinates, got an array {list(points.shape)}")
-    if points.shape[1] == 2:
-        points = np.column_stack([points, np.zeros(len(points))])
+def _check_cgns(path: Path) -> None:
+    """Refuse files with more than the one section of cells that meshio reads."""
+    import h5py
+
+    found: list[str] = []
+    with h5py.File(path) as file:
+        label = {b"Zone_t": "zone", b"Elements_t": "section of cells"}
+        file.visititems(lambda name, item: found.append(label.get(bytes(item.attrs.get("label", b"")), "")))
+        section = file.get("Base/Zone1/GridElements/ data")
+        if section is not None and int(section[0]) != _TETRA_4:
+            raise ValueError(f"its cells must be tetrahedra of four nodes (TETRA_4), got type {int(section[0])} of CGNS")
+    for kind in ("zone", "section of cells"):
+        if found.count(kind) > 1:
+            raise ValueError(f"it holds {found.count(kind)} {kind}s, of which one would be read; write them one by one")
+
+
+class _Ending(io.BufferedReader):
+    """A file that says when a reader goes on behind its end, where meshio's wait for a bracket that never comes."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        if not data and size:
+            raise EOFError("the file ends too early")
+        return data
+
+
+def content_of(mesh: Any, *, by_block: bool = False) -> MeshContent:
+    """Points, cells and regions of a `meshio.Mesh`; blocks of cells are regions where there are no others."""
+    notes: list[str] = []
+    chosen = choose((name for name, parts in mesh.cell_data.items() if all(map(_is_whole, parts))), notes)
     cells = []
-    for number, block in enumerate(mesh.cells):
-        if not len(block.data):
+    for number, part in enumerate(mesh.cells):
+        if not len(part.data):
             continue
-        regions = _regions(mesh.cell_data, number)
-        cells.append(_cells(block.type, block.data, regions))
-    return MeshContent(points, cells)
+        regions = None
+        if chosen is not None:
+            regions = np.asarray(mesh.cell_data[chosen][number]).astype(np.int64).reshape(-1)
+        elif by_block and len(mesh.cells) > 1:
+            regions = np.full(len(part.data), number + 1)
+        cells.append(_cells(part.type, part.data, regions))
+    if chosen is None and by_block and len(mesh.cells) > 1:
+        notes.append("regions are the blocks of elements, counted from 1")
+    return MeshContent(in_space(mesh.points), cells, notes=notes)
+
+
+def _is_whole(values: Any) -> bool:
+    array = np.asarray(values)
+    return bool(array.dtype.kind in "iu" and array.size == len(array))
 
 
 def _cells(kind: str, nodes: Any, regions: Index | None) -> Cells:
@@ -62,13 +103,4 @@ def _cells(kind: str, nodes: Any, regions: Index | None) -> Cells:
         sizes = np.array([len(row) for row in nodes], dtype=np.int64)
         corners = np.concatenate([np.asarray(row).reshape(-1) for row in nodes]).astype(np.int64)
         return Cells(name, corners, sizes, regions)
-    nodes = np.asarray(nodes).astype(np.int64)
-    count = CELLS[name][0]
-    return Cells(name, nodes[:, :count], None, regions, 1 if nodes.shape[1] == count else 2, nodes[:, count:])
-
-
-def _regions(data: dict[str, Any], number: int) -> Index | None:
-    for name in ("gmsh:physical", "medit:ref"):
-        if name in data:
-            return np.asarray(data[name][number]).astype(np.int64)
-    return None
+    return block(name, np.asarray(nodes).astype(np.int64).reshape(len(nodes), -1), regions)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .content import CELLS, Array, Cells, Index, MeshContent
 from .gather import block
+from .regions import choose
 
 __all__ = ["Piece", "content_of", "offsets_of"]
 
@@ -37,12 +38,6 @@ _KINDS: dict[int, str] = {
 }
 _PIXELS = {8: [0, 1, 3, 2], 11: [0, 1, 3, 2, 4, 5, 7, 6]}  # corners that count along the axes
 _STRIP = 6
-# Arrays of cells that are known to name regions, the best first.
-_REGIONS = [
-    *("gmsh:physical", "medit:ref", "materialids", "material_ids", "materialid", "material", "region", "regions"),
-    *("regionid", "region_id", "physicalids", "physical", "cellentityids", "elementblockids", "label", "labels"),
-    *("part_id", "partid", "domain", "subdomain", "attribute", "attributes", "gmsh:geometrical"),
-]
 
 
 @dataclass(eq=False)
@@ -141,14 +136,9 @@ def _regions(pieces: list[Piece], notes: list[str]) -> list[Index | None]:
         for name, values in piece.data.items()
         if not name.lower().startswith("vtk") and len(values) == len(piece.types) and _is_whole(values)
     }
-    known = [name for wanted in _REGIONS for name in sorted(names) if name.lower() == wanted]
-    if not known and len(names) > 1:
-        notes.append(f"no regions: several arrays of cells hold integers ({', '.join(sorted(names))})")
-    chosen = known[0] if known else next(iter(names)) if len(names) == 1 else None
+    chosen = choose(names, notes)
     if chosen is None:
         return [None for _ in pieces]
-    if not known:
-        notes.append(f"regions are the array {chosen!r}, the only one of the cells that holds integers")
     return [
         piece.data[chosen].astype(np.int64)
         if chosen in piece.data and len(piece.data[chosen]) == len(piece.types)
