@@ -134,7 +134,8 @@ def test_cells_of_nastran_go_on_in_the_next_line(tmp_path: Path) -> None:
     lines = [f"GRID,{n},,{x}.,{y}.,{z}." for n, (x, y, z) in enumerate(points, 1)]
     cells = ["CHEXA   1       1       1       2       3       4       5       6       +A", "+A      7       8"]
     (tmp_path / "a.nas").write_text("\n".join([*lines, *cells]))
-    assert volume(TetMesh.from_file(tmp_path / "a.nas")) == pytest.approx(1.0)
+    with pytest.warns(MeshWarning, match="1 hexahedron became 6 tets"):
+        assert volume(TetMesh.from_file(tmp_path / "a.nas")) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
@@ -189,3 +190,60 @@ def test_zones_of_tecplot_that_are_not_read_are_refused(tmp_path: Path, zone: st
     (tmp_path / "a.dat").write_text("VARIABLES = X, Y, Z\n" + zone)
     with pytest.raises(ValueError, match=rf"cannot read a\.dat \(Tecplot\): .*{words}"):
         TetMesh.from_file(tmp_path / "a.dat")
+
+
+# Others, each with the two tets and regions 7 and 8 where it has any:
+
+PLAIN = "".join(f"{x} {y} {z}\n" for x, y, z in POINTS.tolist())
+NUMBERED = NODES.replace(",", " ")
+OTHERS = {
+    "a.su2": "% made by hand\nNDIME= 3\nNELEM= 2\n10 0 1 2 3 0\n10 1 2 3 4 1\nNPOIN= 5\n"
+    + PLAIN
+    + "NMARK= 1\nMARKER_TAG= wall\nMARKER_ELEMS= 1\n5 0 1 2\n",
+    "a.ugrid": "5 1 0 2 0 0 0\n" + PLAIN + "1 2 3\n4\n1 2 3 4\n2 3 4 5\n",
+    "a.vol": "mesh3d\ndimension\n3\ngeomtype\n0\nsurfaceelements\n1\n1 1 1 0 3 1 2 3\n"
+    "volumeelements\n2\n7 4 1 3 2 4\n8 4 2 4 3 5\npoints\n5\n" + PLAIN + "materials\n1\n7 soft\nendmesh\n",
+    "a.f3grid": "* made by hand\n"
+    + "".join(f"G {row}\n" for row in NUMBERED.splitlines())
+    + "Z T4 1 1 2 3 4\nZ T4 2 2 3 4 5\nF T3 1 1 2 3\n"
+    + 'ZGROUP "a" SLOT 1\n' * 2
+    + "1\nZGROUP 'b c' SLOT 1\n2\n",
+    "a.mdpa": "Begin Nodes\n" + NUMBERED + "End Nodes\nBegin Elements SmallDisplacementElement3D4N// of solids\n"
+    "1 7 1 2 3 4\n2 8 2 3 4 5\nEnd Elements\nBegin Conditions SurfaceCondition3D3N\n1 0 1 2 3\nEnd Conditions\n",
+    "a.xml": '<dolfin><mesh celltype="tetrahedron" dim="3"><vertices size="5">'
+    + "".join(f'<vertex index="{n}" x="{x}" y="{y}" z="{z}"/>' for n, (x, y, z) in enumerate(POINTS.tolist()))
+    + '</vertices><cells size="2"><tetrahedron index="1" v0="1" v1="2" v2="3" v3="4"/>'
+    '<tetrahedron index="0" v0="0" v1="1" v2="2" v3="3"/></cells></mesh></dolfin>',
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*regions:torchpd.MeshWarning")
+@pytest.mark.parametrize("name", sorted(OTHERS))
+def test_other_formats(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(OTHERS[name])
+    mesh = TetMesh.from_file(tmp_path / name)
+    np.testing.assert_array_equal(mesh.vertices, POINTS)
+    assert np.sort(mesh.tets).tolist() == [[0, 1, 2, 3], [1, 2, 3, 4]]
+    assert mesh.flipped == 0
+    assert (mesh.embedding is None) == (name == "a.xml")
+    regions = {"a.vol": [7, 8], "a.mdpa": [7, 8], "a.f3grid": [1, 2]}.get(name)
+    assert (None if mesh.regions is None else mesh.regions.tolist()) == regions
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "words"),
+    [
+        ("a.su2", "NELEM= 2", "NELEM= 3", "declares 3 cells, but 'NPOIN= 5' comes among them"),
+        ("a.su2", "NDIME= 3", "NZONE= 2\nNDIME= 3", "holds 2 zones"),
+        ("a.ugrid", "5 1 0 2", "5 1 0 3", "tetra should be 12 numbers"),
+        ("a.vol", "volumeelements\n2", "volumeelements\n3", "declares 3 volumeelements"),
+        ("a.vol", "endmesh\n", "", "cut off"),
+        ("a.mdpa", "End Conditions\n", "", "block Conditions has no end"),
+        ("a.xml", 'cells size="2"', 'cells size="3"', "declares 3 entries <tetrahedron>, but 2 come"),
+        ("a.xml", 'index="1" v0', 'index="0" v0', "indices of <tetrahedron>"),
+    ],
+)
+def test_counts_of_other_formats_are_compared(tmp_path: Path, name: str, old: str, new: str, words: str) -> None:
+    (tmp_path / name).write_text(OTHERS[name].replace(old, new))
+    with pytest.raises(ValueError, match=rf"cannot read {name} \(.*\): .*{words}"):
+        TetMesh.from_file(tmp_path / name)

@@ -31,7 +31,7 @@ def read(path: Path) -> MeshContent:
     """Read text or, where it holds bytes, what meshio makes of them."""
     if b"\0" in path.read_bytes()[:8]:
         return through_meshio.read(path)
-    numbers, points, kinds, nodes, zones = [], [], list[str](), list[list[int]](), list[int]()
+    numbers, points, kinds, nodes, zones = list[int](), list[str](), list[str](), list[list[int]](), list[int]()
     groups: dict[str, list[int]] = {}
     members: list[int] | None = None
     for line in text_of(path).split("\n"):
@@ -41,7 +41,7 @@ def read(path: Path) -> MeshContent:
             continue
         if key == "G":
             numbers.append(int(fields[1]))
-            points.append(parse(" ".join(fields[2:5]).encode(), np.float64, "points").tolist())
+            points.append(" ".join(fields[2:5]))
         elif key in ("Z", "F"):
             kind, order = _KINDS.get(fields[1].upper(), ("", []))
             if len(fields) != 4 + max(order, default=0):
@@ -60,4 +60,5 @@ def read(path: Path) -> MeshContent:
     marks = [region.get(zone, 0) for zone in zones] if region else None
     cells = [replace(b, corners=place(b.corners)) for b in blocks_of(kinds, nodes, marks)]
     notes = [f"regions are numbers of groups: {', '.join(f'{k} is {name}' for k, name in enumerate(groups, 1))}"]
-    return MeshContent(np.array(points, dtype=np.float64).reshape(-1, 3), cells, notes=notes if groups else [])
+    table = parse("\n".join(points).encode(), np.float64, "grid points").reshape(-1, 3)
+    return MeshContent(table, cells, notes=notes if groups else [])

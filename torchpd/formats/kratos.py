@@ -35,7 +35,7 @@ _FLATS = {1: "vertex", 2: "line", 3: "triangle", 6: "triangle", 4: "quad", 8: "q
 
 def read(path: Path) -> MeshContent:
     """Read all blocks of nodes and cells."""
-    numbers, points, kinds, nodes, regions = [], [], list[str](), list[list[int]](), list[int]()
+    rows, kinds, nodes, regions = list[str](), list[str](), list[list[int]](), list[int]()
     stack: list[list[str]] = []
     for line in lines_of(path, "//"):
         fields = line.split()
@@ -45,26 +45,25 @@ def read(path: Path) -> MeshContent:
             if not stack or stack.pop()[0] != " ".join(fields[1:2]):
                 raise ValueError(f"{line[:40]!r} must end the block that is open")
         elif stack and stack[-1][0] == "Nodes":
-            row = parse(" ".join(fields[:4]).encode(), np.float64, "nodes").tolist()
-            if len(row) != 4:
+            if len(fields) != 4:
                 raise ValueError(f"a node must be number, x, y and z, got {line[:40]!r}")
-            numbers.append(int(row[0]))
-            points.append(row[1:])
+            rows.append(line)
         elif stack and stack[-1][0] in ("Elements", "Conditions", "Geometries"):
             bare = stack[-1][0] == "Geometries"  # without properties
-            row = parse(" ".join(fields).encode(), np.int64, stack[-1][0]).tolist()
+            row = [int(field) for field in fields]
             own = row[1 if bare else 2 :]
             kinds.append(_kind(stack[-1], len(own)))
             nodes.append(own)
             regions.append(0 if bare or len(row) < 2 else row[1])
     if stack:
         raise ValueError(f"block {stack[-1][0]} has no end: the file was cut off")
-    place = Numbering(np.array(numbers, dtype=np.int64))
+    table = parse("\n".join(rows).encode(), np.float64, "nodes").reshape(-1, 4)
+    place = Numbering(table[:, 0].astype(np.int64))
     cells = [
         replace(b, corners=place(b.corners), beyond=None if b.beyond is None else place(b.beyond))
         for b in blocks_of(kinds, nodes, regions if any(regions) else None)
     ]
-    return MeshContent(np.array(points, dtype=np.float64).reshape(-1, 3), cells)
+    return MeshContent(table[:, 1:], cells)
 
 
 def _kind(head: list[str], count: int) -> str:

@@ -56,11 +56,12 @@ def _check_cgns(path: Path) -> None:
         label = {b"Zone_t": "zone", b"Elements_t": "section of cells"}
         file.visititems(lambda name, item: found.append(label.get(bytes(item.attrs.get("label", b"")), "")))
         section = file.get("Base/Zone1/GridElements/ data")
-        if section is not None and int(section[0]) != _TETRA_4:
-            raise ValueError(f"its cells must be tetrahedra of four nodes (TETRA_4), got type {int(section[0])} of CGNS")
-    for kind in ("zone", "section of cells"):
-        if found.count(kind) > 1:
-            raise ValueError(f"it holds {found.count(kind)} {kind}s, of which one would be read; write them one by one")
+        kind = _TETRA_4 if section is None else int(section[0])
+        if kind != _TETRA_4:
+            raise ValueError(f"its cells must be tetrahedra of four nodes (TETRA_4), got type {kind} of CGNS")
+    for name in ("zone", "section of cells"):
+        if found.count(name) > 1:
+            raise ValueError(f"it holds {found.count(name)} {name}s, of which one would be read; write them one by one")
 
 
 class _Ending(io.BufferedReader):
