@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, cast
 import torch
 from torch import Tensor
 
-from .adjoint import AdjointCall, step_gradient
+from .adjoint import step_gradient
 from .capture import CapturedStep
 from .checks import check_like, check_whole
 from .material import MATERIAL_ROWS, environments_of_material
-from .model import Model
 from .ops import INFO_WIDTH, refuse_tangents
+from .readable import Readable
+from .readouts import checked_call
 from .rollout import PerStep, Rollout, roll
 from .solvers import Solver
 from .state import Info, State, Track
@@ -29,7 +30,7 @@ __all__ = ["Simulator", "Targets"]
 _ops = torch.ops.torchpd
 
 
-class Simulator(Model):
+class Simulator(Readable):
     """Steps a scene through time by implicit Euler, solved approximately by projective dynamics.
 
     The values that training may change are parameters (without gradient until asked), for all environments or, with a
@@ -337,7 +338,7 @@ class Simulator(Model):
     ) -> Tensor:
         """Gradient of the objective of a step at some positions [B, V, 3] [N]: what a solve brings to zero.
 
-        Contacts do not enter: where one holds a vertex, its reaction remains. Hard pins have none.
+        Contacts do not enter: where one holds a vertex, its force remains, see `contact_forces`. Hard pins have none.
 
         Args:
             state: where the step starts.
@@ -345,12 +346,7 @@ class Simulator(Model):
             forces: as in `forward`.
             targets: as in `forward`.
         """
-        forces = self.check_state(state, forces=forces)
-        before, positions = self.positions_of(state), self.positions_of(after, "after")
-        check_like("after", positions, before, "m")
-        material = self.material_at(targets, state[0].shape[0])
-        call = AdjointCall(before, state[1], forces, positions, material, list(self.plan.arrays), self.time_step)
-        return step_gradient(call)
+        return step_gradient(checked_call(self, state, after, forces, targets))
 
     # ---- files
 

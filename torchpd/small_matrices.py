@@ -1,11 +1,14 @@
-"""Small matrices that keep their precision: within autocast torch's own products are rounded, there and back."""
+"""Small matrices and vectors that keep their precision: within autocast torch's own products are rounded.
+
+Sums go term by term: the order in which a reduction adds may depend on the batch.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-__all__ = ["inverse", "product"]
+__all__ = ["dot", "inverse", "length", "product", "root"]
 
 
 def product(A: Tensor, B: Tensor) -> Tensor:
@@ -20,5 +23,21 @@ def inverse(A: Tensor) -> Tensor:
     """Of well-conditioned matrices [..., 3, 3], by Cramer's rule."""
     a, b, c = A.unbind(-1)
     rows = [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)]
-    result: Tensor = torch.stack(rows, dim=-2) / (a * rows[0]).sum(-1)[..., None, None]
+    result: Tensor = torch.stack(rows, dim=-2) / dot(a, rows[0])[..., None, None]
     return result
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Of vectors [..., 3]."""
+    x, y, z = (a * b).unbind(-1)
+    return x + y + z
+
+
+def root(squared: Tensor) -> Tensor:
+    """Square root whose derivative at zero is zero."""
+    return torch.where(squared > 0.0, torch.where(squared > 0.0, squared, 1.0).sqrt(), squared)
+
+
+def length(a: Tensor) -> Tensor:
+    """Of vectors [..., 3], with derivative zero at zero."""
+    return root(dot(a, a))

@@ -1,0 +1,386 @@
+"""Forces of contacts and pins against what statics says of them, and against the momentum of a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from cases import box
+from runs import noise, small
+from scipy.optimize import nnls
+from torch import Tensor
+
+import torchpd as pd
+from torchpd.readouts import _Contacts, _split
+
+SIDE = 0.2  # m, of the cube
+MESH = pd.TetMesh(*box((SIDE, SIDE, SIDE), (2, 2, 2)))
+G = 9.81
+
+
+def cube(*parts: Any, youngs: float = 1e5, iterations: int = 400, **options: Any) -> tuple[pd.Simulator, pd.Solid]:
+    solid = pd.Solid(MESH, youngs=youngs, density=1000.0)
+    given = {"dtype": torch.float64, "progress": False, **options}
+    return pd.Simulator(pd.Scene(solid, *parts), 1 / 60, iterations, **given), solid
+
+
+def settled(sim: pd.Simulator, steps: int = 200, batch: int = 1) -> tuple[pd.State, pd.State]:
+    """The last step of a rollout."""
+    state = sim.rollout(sim.rest_state(batch), steps).state()
+    return state, sim(state)
+
+
+def weight(sim: pd.Simulator) -> float:
+    return G * float(sim.masses.sum())
+
+
+def tilted(degrees: float) -> pd.Gravity:
+    """The gravity that a body feels on an incline, with the ground along x and z."""
+    angle = np.deg2rad(degrees)
+    return pd.Gravity((G * np.sin(angle), -G * np.cos(angle), 0.0))
+
+
+# ---- contacts
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_cube_at_rest_presses_by_its_weight(dtype: torch.dtype) -> None:
+    ground = pd.Ground(friction=0.5)
+    sim, solid = cube(pd.Gravity(), ground, pd.Damping(5.0), dtype=dtype)
+    state, after = settled(sim)
+    contacts = sim.contact_forces(state, after)
+    mg, bottom = weight(sim), sim.rest_positions[:, 1] == 0.0
+    # what the step leaves of the momentum, and float32 of the elastic forces
+    error = 1e-9 * mg if dtype == torch.float64 else 1e-3 * mg
+    one = contacts.colliders[ground]
+    assert torch.equal(one.touches[0], bottom)
+    assert float(contacts.residual.norm()) <= error
+    for wrench in (contacts.bodies[solid], one.bodies[solid]):
+        assert wrench.force[0].tolist() == pytest.approx([0.0, mg, 0.0], abs=error)
+        assert wrench.torque[0].tolist() == pytest.approx([0.0] * 3, abs=error * SIDE)
+    assert torch.equal(contacts.force, one.force)
+    assert float(one.push.sum()) == pytest.approx(mg, abs=error)
+    assert not bool(one.force[0, ~bottom].any())
+
+
+def test_torque_is_about_a_named_point() -> None:
+    sim, solid = cube(pd.Gravity(), pd.Ground(), pd.Damping(5.0))
+    state, after = settled(sim, batch=2)
+    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    wrench = sim.contact_forces(state, after, about=points).bodies[solid]
+    center = after.positions.mul(sim.masses[:, None]).sum(1) / sim.masses.sum()
+    expected = torch.linalg.cross(center - points, wrench.force)
+    torch.testing.assert_close(wrench.torque, expected, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(sim.contact_forces(state, after).bodies[solid].about, center, rtol=1e-12, atol=0.0)
+    assert torch.equal(sim.contact_forces(state, after, about=points[0]).bodies[solid].torque[0], wrench.torque[0])
+
+
+def test_an_incline_that_holds() -> None:
+    """tan 20 degrees < friction: normal m g cos, tangential m g sin uphill."""
+    ground = pd.Ground(friction=0.8)
+    sim, solid = cube(tilted(20.0), ground, pd.Damping(5.0))
+    state, after = settled(sim)
+    one = sim.contact_forces(state, after).colliders[ground]
+    mg, angle = weight(sim), np.deg2rad(20.0)
+    assert float(one.push.sum()) == pytest.approx(mg * np.cos(angle), rel=1e-6)
+    assert one.friction.sum(1)[0].tolist() == pytest.approx([-mg * np.sin(angle), 0.0, 0.0], abs=1e-6 * mg)
+    assert bool((one.friction.norm(dim=-1) <= 0.8 * one.push * (1 + 1e-12)).all())
+
+
+def test_sliding_friction_is_friction_times_push() -> None:
+    """On 30 degrees with friction 0.2: at every vertex against the slip, and at its bound."""
+    ground = pd.Ground(friction=0.2)
+    sim, _ = cube(tilted(30.0), ground)
+    state, after = settled(sim, 120)
+    contacts = sim.contact_forces(state, after)
+    one = contacts.colliders[ground]
+    slip = after.positions - state.positions
+    assert int(one.touches.sum()) == 9
+    push, friction, slip = one.push[one.touches], one.friction[one.touches], slip[one.touches]
+    assert bool((slip[:, 0] > 0.0).all())
+    expected = -0.2 * push[:, None] * slip / slip.norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(friction, expected, rtol=0.0, atol=1e-6 * weight(sim))
+    assert float(contacts.residual.norm()) <= 1e-6 * weight(sim)
+
+
+def test_a_sphere_pushes_along_its_normals() -> None:
+    """It carries the weight; smooth, every force points away from its centre."""
+    ball = pd.Sphere((SIDE / 2, -0.5, SIDE / 2), 0.5)
+    sim, solid = cube(pd.Gravity(), ball, youngs=2e4)
+    state = sim.rest_state()
+    for _ in range(40):  # symmetric, so that it stays on top; velocities are taken away
+        state = pd.State(sim(state).positions, torch.zeros_like(state.velocities))
+    after = sim(state)
+    contacts = sim.contact_forces(state, after)
+    one = contacts.colliders[ball]
+    touched = one.touches[0]
+    assert 1 <= int(touched.sum()) < 9
+    away = after.positions[0, touched] - sim.spheres[0, :3]
+    forces = one.force[0, touched]
+    assert float(torch.linalg.cross(away, forces).abs().max()) <= 1e-12
+    assert bool(((away * forces).sum(-1) > 0.0).all())
+    balance(sim, solid, state, after)
+
+
+def balance(
+    sim: pd.Simulator, solid: pd.Solid, state: pd.State, after: pd.State, forces: Tensor | None = None
+) -> None:
+    """All forces together are the change of momentum, at any iterate, but for rounding."""
+    contacts, pins = sim.contact_forces(state, after, forces), sim.reactions(state, after, forces)
+    moved = sim.masses[:, None] * (after.positions - state.positions) / sim.time_step
+    change = (moved - sim.masses[:, None] * state.velocities) / sim.time_step
+    given = sim.masses[:, None] * sim.gravity - sim.damping * moved + (0.0 if forces is None else forces)
+    total = (contacts.residual + pins.on_vertices + given).sum(1) + contacts.bodies[solid].force
+    scale = float(change.abs().sum() + given.abs().sum() + sim.gradient(after).abs().sum())
+    torch.testing.assert_close(total, change.sum(1), rtol=0.0, atol=30 * 2.0**-53 * scale)
+
+
+@pytest.mark.parametrize("iterations", [1, 30])
+def test_all_forces_are_the_change_of_momentum(iterations: int) -> None:
+    """Of landings on ground and ball with pins and forces, solved or not."""
+    sim, state = small(torch.float64, iterations=iterations)
+    forces = noise(state.positions, 5)
+    after = sim(state, forces)
+    contacts = sim.contact_forces(state, after, forces)
+    assert any(bool(one.touches.any()) for one in contacts.colliders.values())
+    balance(sim, sim.scene.solids[0], state, after, forces)
+
+
+def test_a_corner_is_split_by_its_normals() -> None:
+    """Smooth floor and wall carry what gravity has along each; the edge has both."""
+    floor, wall = pd.Ground(), pd.Ground(normal=(1.0, 0.0, 0.0))
+    sim, solid = cube(pd.Gravity((-3.0, -9.0, 0.0)), floor, wall, pd.Damping(5.0))
+    state, after = settled(sim)
+    contacts = sim.contact_forces(state, after)
+    mass = float(sim.masses.sum())
+    for ground, expected, axis in ((floor, [0.0, 9.0 * mass, 0.0], 1), (wall, [3.0 * mass, 0.0, 0.0], 0)):
+        one = contacts.colliders[ground]
+        assert one.bodies[solid].force[0].tolist() == pytest.approx(expected, abs=1e-6 * mass)
+        assert torch.equal(one.touches[0], sim.rest_positions[:, axis] == 0.0)
+    assert int((contacts.colliders[floor].touches & contacts.colliders[wall].touches).sum()) == 3
+
+
+def test_colliders_that_nothing_touches_do_not_matter() -> None:
+    """Beside four of them, and a copy of the floor: only three contacts of a vertex are looked at."""
+    floor, wall = pd.Ground(), pd.Ground(normal=(1.0, 0.0, 0.0))
+    gravity = pd.Gravity((-3.0, -9.0, 0.0))
+    far = [pd.Ground(normal=(-1.0, 0.0, 0.0), height=-9.0), pd.Sphere((5.0, 5.0, 5.0), 1.0), pd.Ground(height=-1.0)]
+    sim, _ = cube(gravity, floor, wall)
+    more, _ = cube(gravity, far[0], floor, far[1], wall, far[2])
+    state, after = settled(sim, 20)
+    few, many = sim.contact_forces(state, after), more.contact_forces(state, after)
+    for ground in (floor, wall):
+        assert torch.equal(few.colliders[ground].force, many.colliders[ground].force)
+        assert torch.equal(few.colliders[ground].touches, many.colliders[ground].touches)
+    assert not any(bool(many.colliders[part].force.any()) for part in far)  # type: ignore[index]
+    assert torch.equal(few.residual, many.residual)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_split_is_the_least_squares_one(count: int) -> None:
+    """Nonnegative least squares by scipy, of forces within the cone of the normals and outside of it."""
+    rng = np.random.default_rng(count)
+    normals = rng.standard_normal((40, count, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    force = rng.standard_normal((40, 3))
+    force[:20] = np.einsum("vk,vkx->vx", rng.uniform(0.1, 1.0, (20, count)), normals[:20])
+    expected = np.array([nnls(n.T, f)[0] for n, f in zip(normals, force, strict=True)])
+    contacts = _Contacts(
+        torch.from_numpy(normals).movedim(0, 1)[None], -torch.ones(1, count, 40).double(), torch.zeros(1, count, 40)
+    )
+    pushes, friction, active = _split(contacts, torch.from_numpy(force)[None], torch.ones(40).double())
+    assert pushes[0].T.numpy() == pytest.approx(expected, abs=1e-10)
+    assert torch.equal(active, pushes > 0.0)
+    assert not bool(friction.any())
+
+
+def test_friction_is_shared_at_a_corner() -> None:
+    """Along the edge of two planes, in proportion to friction times push, and no more than both together."""
+    normals = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]).double()
+    force = torch.tensor([[3.0, 2.0, 0.5], [3.0, 2.0, 5.0]]).double()[None]
+    friction = torch.tensor([0.3, 0.2]).double()[None, :, None].expand(1, 2, 2)
+    contacts = _Contacts(normals[None, :, None].expand(1, 2, 2, 3), -torch.ones(1, 2, 2).double(), friction)
+    pushes, along, _ = _split(contacts, force, torch.ones(2).double())
+    assert pushes[0, :, 0].tolist() == pytest.approx([2.0, 3.0])
+    assert along[0, :, 0].tolist() == pytest.approx(np.array([[0.0, 0.0, 0.25], [0.0, 0.0, 0.25]]))
+    assert along[0, :, 1].tolist() == pytest.approx(np.array([[0.0, 0.0, 0.6], [0.0, 0.0, 0.6]]))
+
+
+def test_without_colliders_everything_is_residual() -> None:
+    sim, solid = cube(pd.Gravity(), iterations=2)
+    state = sim.rest_state(2)
+    state.velocities[..., 0] = state.positions[..., 1]
+    after = sim(state)
+    contacts = sim.contact_forces(state, after)
+    assert contacts.colliders == {}
+    assert torch.equal(contacts.residual, sim.step_gradient(state, after))
+    assert not bool(contacts.force.any())
+    assert contacts.bodies[solid].force.shape == (2, 3)
+    reactions = sim.reactions(state, after)
+    assert reactions.pins == {}
+    assert reactions.force.shape == (2, 0, 3)
+
+
+# ---- pins
+
+
+@pytest.mark.parametrize("stiffness", [None, 1e4])
+def test_what_hangs_pulls_by_its_weight(stiffness: float | None) -> None:
+    mesh_top = MESH.vertices[:, 1] == SIDE
+    solid = pd.Solid(MESH, youngs=1e5, density=1000.0)
+    left, right = (
+        pd.Pin(solid, mesh_top & side, stiffness)
+        for side in (MESH.vertices[:, 0] < SIDE / 3, MESH.vertices[:, 0] > SIDE / 3)
+    )
+    scene = pd.Scene(solid, left, right, pd.Gravity(), pd.Damping(5.0))
+    sim = pd.Simulator(scene, 1 / 60, 400, dtype=torch.float64)
+    state, after = settled(sim)
+    reactions = sim.reactions(state, after)
+    mg = weight(sim)
+    assert reactions.force.sum(1)[0].tolist() == pytest.approx([0.0, mg, 0.0], abs=1e-6 * mg)
+    assert torch.equal(reactions.on_vertices[:, left.vertices], reactions.pins[left].force)
+    held = reactions.pins[left].wrench.force[0] + reactions.pins[right].wrench.force[0]
+    torch.testing.assert_close(held, reactions.force.sum(1)[0])
+    torque = reactions.pins[left].wrench.torque + reactions.pins[right].wrench.torque
+    assert float(torque.abs().max()) <= 1e-6 * mg * SIDE  # about the centre of mass
+    if stiffness is not None:
+        expected = stiffness * (sim.pin_targets - after.positions[:, [*left.vertices, *right.vertices]])
+        torch.testing.assert_close(reactions.force, expected, rtol=0.0, atol=1e-12 * mg)
+    assert float(sim.contact_forces(state, after).residual.norm()) <= 1e-6 * mg
+
+
+def test_a_clamped_end_holds_force_and_moment() -> None:
+    """Statics of the bent beam: the weight, and its moment about the clamp."""
+    mesh = pd.TetMesh(*box((0.4, 0.1, 0.1), (8, 2, 2)))
+    solid = pd.Solid(mesh, youngs=2e5, density=1000.0)
+    pin = pd.Pin(solid, mesh.vertices[:, 0] == 0.0)
+    scene = pd.Scene(solid, pin, pd.Gravity(), pd.Damping(20.0))
+    sim = pd.Simulator(scene, 1 / 60, solver=pd.Multilevel(), iterations=30, dtype=torch.float64)
+    state, after = settled(sim, 250)
+    clamp = torch.tensor([0.0, 0.05, 0.05], dtype=torch.float64)
+    wrench = sim.reactions(state, after, about=clamp).pins[pin].wrench
+    mg = weight(sim)
+    center = (after.positions[0] * sim.masses[:, None]).sum(0) / sim.masses.sum()
+    up = torch.tensor([0.0, mg, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(wrench.force[0], up, rtol=0.0, atol=1e-5 * mg)
+    torch.testing.assert_close(wrench.torque[0], torch.linalg.cross(center - clamp, up), rtol=0.0, atol=1e-6 * mg)
+    assert float(wrench.torque[0, 2]) > 0.19 * mg
+
+
+def test_a_hard_pin_takes_what_a_contact_would() -> None:
+    ground = pd.Ground(height=0.01)
+    solid = pd.Solid(MESH, youngs=1e5, density=1000.0)
+    pin = pd.Pin(solid, MESH.vertices[:, 1] == 0.0)
+    sim = pd.Simulator(pd.Scene(solid, pin, pd.Gravity(), ground), 1 / 60, 300, dtype=torch.float64)
+    state, after = settled(sim, 100)
+    assert not bool(sim.contact_forces(state, after).colliders[ground].force[:, pin.vertices].any())
+    assert float(sim.reactions(state, after).force[..., 1].sum()) == pytest.approx(weight(sim), rel=1e-3)
+
+
+# ---- of all
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_batches_do_not_matter(dtype: torch.dtype) -> None:
+    sim, state = small(dtype, batch=3)
+    after = sim(state)
+    together = leaves(sim, state, after)
+    for item in range(3):
+        one, next_one = (pd.State(*(array[item : item + 1].clone() for array in of)) for of in (state, after))
+        for name, (alone, all_) in enumerate(zip(leaves(sim, one, next_one), together, strict=True)):
+            assert torch.equal(alone, all_[item : item + 1]), name
+
+
+def leaves(sim: pd.Simulator, state: pd.State, after: pd.State) -> list[Tensor]:
+    tree = sim.contact_forces(state, after), sim.reactions(state, after), sim.stress(after)
+    return [leaf.nan_to_num(7.0) for leaf in torch.utils._pytree.tree_leaves(tree)]
+
+
+def test_gradients_by_finite_differences() -> None:
+    """Of all forces by everything that they depend on, at a step that slides and sticks on ground and ball."""
+    sim, state = small(torch.float64, batch=2, iterations=60)
+    sim.set_material(friction=torch.tensor([0.5, 0.2]))
+    after = sim(state)
+    names = ["stiffness", "masses", "gravity", "damping", "pin_targets", "planes", "spheres"]
+    touched = [one.touches for one in sim.contact_forces(state, after).colliders.values()]
+    assert all(bool(mask.any()) for mask in touched)
+
+    def read(x: Tensor, v: Tensor, end: Tensor, *material: Tensor) -> tuple[Tensor, ...]:
+        arrays = dict(zip(names, material, strict=True))
+        contacts = called(sim, arrays, "contact_forces", pd.State(x, v), end)
+        pins = called(sim, arrays, "reactions", pd.State(x, v), end)
+        wrenches = [wrench for one in contacts.colliders.values() for wrench in one.bodies.values()]
+        pulls = [one.wrench.torque for one in pins.pins.values()]
+        pushes = [one.push for one in contacts.colliders.values()]
+        return contacts.force, contacts.residual, pins.force, *pulls, *pushes, *(w.torque for w in wrenches)
+
+    inputs = [*state, after.positions, *(getattr(sim, name) for name in names)]
+    inputs = [value.detach().clone().requires_grad_() for value in inputs]
+    outputs = read(*inputs)
+    gen = torch.Generator().manual_seed(0)
+    weights = [torch.randn(out.shape, generator=gen, dtype=torch.float64) for out in outputs]
+    loss = lambda values: sum((w * out).sum() for w, out in zip(weights, read(*values), strict=True))  # noqa: E731
+    gradients = torch.autograd.grad(loss(inputs), inputs)
+    for number, gradient in enumerate(gradients):
+        direction = torch.randn(gradient.shape, generator=gen, dtype=torch.float64)
+        value = inputs[number].detach()
+        step = 1e-6 * float(value.abs().max() + 1e-3)
+        ends = [
+            [*inputs[:number], value + sign * step * direction, *inputs[number + 1 :]] for sign in (1.0, -1.0)
+        ]
+        with torch.no_grad():
+            difference = float(loss(ends[0]) - loss(ends[1])) / (2 * step)
+        expected = float((gradient * direction).sum())
+        assert difference == pytest.approx(expected, rel=1e-5, abs=1e-7), number
+
+
+class Caller(torch.nn.Module):
+    """Calls a method of a simulator, for `functional_call`."""
+
+    def __init__(self, sim: pd.Simulator) -> None:
+        super().__init__()
+        self.sim = sim
+
+    def forward(self, name: str, *arguments: Any) -> Any:
+        return getattr(self.sim, name)(*arguments)
+
+
+def called(sim: pd.Simulator, arrays: dict[str, Tensor], name: str, *arguments: Any) -> Any:
+    """A method with other material."""
+    material = {f"sim.{key}": value for key, value in arrays.items()}
+    return torch.func.functional_call(Caller(sim), material, (name, *arguments))
+
+
+REFUSED: dict[str, tuple[Callable[[pd.Simulator, pd.State], Any], type[Exception], str]] = {
+    "no tensor": (lambda sim, s: sim.contact_forces(s, s, about=(0.0, 0.0, 0.0)), TypeError, "about .* tuple"),
+    "precision": (lambda sim, s: sim.reactions(s, s, about=torch.zeros(3)), TypeError, "about .* torch.float32"),
+    "shape": (lambda sim, s: sim.reactions(s, s, about=torch.zeros(2, 3).double()), ValueError, r"about .* \[2, 3\]"),
+    "after": (lambda sim, s: sim.contact_forces(s, sim.rest_state(2)), ValueError, r"after .* \[2, "),
+    "forces": (lambda sim, s: sim.contact_forces(s, s, forces=s.positions[:, :1]), ValueError, "forces"),
+    "stress": (lambda sim, s: sim.stress(s.positions[:, :1]), ValueError, "state must be"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_refused(case: str) -> None:
+    sim, state = small(torch.float64, batch=1)
+    call, kind, words = REFUSED[case]
+    with pytest.raises(kind, match=words):
+        call(sim, state)
+
+
+def test_targets_and_forces_are_those_of_the_step() -> None:
+    """A ball that a target moves up lifts the cube: with its place the step balances, without it the ball is far."""
+    ball = pd.Sphere((SIDE / 2, -1.2, SIDE / 2), 1.0, friction=0.8)
+    sim, solid = cube(pd.Gravity(), ball)
+    state, targets = sim.rest_state(), {ball: torch.tensor([SIDE / 2, -1.0, SIDE / 2]).double()}
+    pull = torch.zeros_like(state.positions)
+    pull[..., 1] = -1.0
+    after = sim(state, pull, targets)
+    there, elsewhere = sim.contact_forces(state, after, pull, targets), sim.contact_forces(state, after, pull)
+    assert float(there.residual.norm()) <= 1e-6 * float(there.force.norm())
+    assert float(there.bodies[solid].force[0, 1]) > 0.0
+    assert not bool(elsewhere.force.any())

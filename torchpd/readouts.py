@@ -1,0 +1,332 @@
+"""Forces of contacts and pins in a step.
+
+At a solved step the gradient of its objective without pins, g, is what contacts and pins put on the vertices [N]:
+
+    g = m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - forces + elastic gradient = contacts + pins.
+
+Pins. A hard one puts g on its vertex, a soft one k (target - x'); r = g - pins is left for the contacts.
+
+Contacts. The normals n_k of at most three colliders act on a vertex, those with the smallest gaps. Their pushes p_k
+minimise |r - sum_k p_k n_k|, where each that pushes has p_k > 0 and gap_k < p_k / D: an iteration without it would end
+inside (D: diagonal of the step; see csrc/solver/adjoint.h). Several together have p_k = m_k . r with the m_k dual to
+their normals, as in csrc/solver/contact_gradients.h. The rest t is tangential to all of them. Colliders share it in
+proportion to their friction mu_k p_k, and take no more than that together (Coulomb). So at a corner normals come first:
+friction gets no force that a normal can give. What contacts do not take is the residual, forces that nothing balances.
+
+Sums over vertices are those of a fixed binary tree, so that an environment has the same bits in every batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .adjoint import AdjointCall, step_gradient
+from .checks import check_like, in_full
+from .diagonal import named_material, pinned_vertices, step_diagonal
+from .effects import Ground, Pin, Solid, Sphere
+from .material import MATERIAL_ROWS
+from .small_matrices import dot, inverse, length, product
+from .state import State
+from .targets import Targets
+
+if TYPE_CHECKING:
+    from .model import Model
+
+__all__ = [
+    "ContactForce",
+    "ContactForces",
+    "PinForce",
+    "Reactions",
+    "Wrench",
+    "checked_call",
+    "contact_forces",
+    "reactions",
+]
+
+_SPANNED = 1e-6  # as in csrc/effects/contact.h: Gram determinant from which normals count as independent
+_PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
+
+
+class Wrench(NamedTuple):
+    """Sum of forces on vertices, and their torque."""
+
+    force: Tensor  # [B, 3] N
+    torque: Tensor  # [B, 3] N m, sum of (x' - about) x force
+    about: Tensor  # [B, 3] m, the point that the torque is about
+
+
+class ContactForce(NamedTuple):
+    """What one collider does to the vertices in a step; zero where it does not push."""
+
+    force: Tensor  # [B, V, 3] N, on the vertices: normal part and friction
+    friction: Tensor  # [B, V, 3] N, its tangential part
+    push: Tensor  # [B, V] N, size of its normal part
+    touches: Tensor  # [B, V] bool, whether it pushes
+    bodies: dict[Solid, Wrench]  # sum and torque on each body
+
+
+class ContactForces(NamedTuple):
+    """What contacts do to the vertices in a step, see `Simulator.contact_forces`."""
+
+    force: Tensor  # [B, V, 3] N, of all colliders together, on the vertices
+    residual: Tensor  # [B, V, 3] N, what no contact and no pin balances; zero at a solved step
+    bodies: dict[Solid, Wrench]  # sum and torque of all colliders on each body
+    colliders: dict[Ground | Sphere, ContactForce]  # empty without colliders
+
+
+class PinForce(NamedTuple):
+    """What one pin does to its vertices."""
+
+    force: Tensor  # [B, p, 3] N, on the vertices, in the order of `Pin.vertices`
+    wrench: Wrench  # sum and torque
+
+
+class Reactions(NamedTuple):
+    """What pins do to their vertices in a step, see `Simulator.reactions`."""
+
+    force: Tensor  # [B, P, 3] N, on the pinned vertices, in the order of `pin_targets`
+    on_vertices: Tensor  # [B, V, 3] N, the same on all vertices, zero on those without a pin
+    pins: dict[Pin, PinForce]  # by pin; empty without pins
+
+
+def checked_call(
+    sim: Model, state: State, after: State | Tensor, forces: Tensor | None, targets: Targets | None
+) -> AdjointCall:
+    """The step from a state to the positions `after`, all arguments checked."""
+    forces = sim.check_state(state, forces=forces)
+    before, positions = sim.positions_of(state), sim.positions_of(after, "after")
+    check_like("after", positions, before, "m")
+    material = sim.material_at(targets, len(before))
+    return AdjointCall(before, state[1], forces, positions, material, list(sim.plan.arrays), sim.time_step)
+
+
+# ---- sums
+
+
+def _tree_sum(values: Tensor) -> Tensor:
+    """Sum over vertices of [..., n, k] by a binary tree: the same order whatever stands in front."""
+    if values.shape[-2] == 0:
+        return values.sum(-2)
+    while (count := values.shape[-2]) > 1:
+        half = count // 2
+        pairs = values[..., :half, :] + values[..., half : 2 * half, :]
+        values = torch.cat([pairs, values[..., 2 * half :, :]], dim=-2) if count % 2 else pairs
+    return values[..., 0, :]
+
+
+class _Body(NamedTuple):
+    """Where a body's vertices are, and the point that torques on them are about."""
+
+    rows: slice
+    positions: Tensor  # [B, n, 3] m
+    about: Tensor  # [B, 3] m
+
+
+def _bodies(sim: Model, positions: Tensor, masses: Tensor, about: Tensor | None) -> dict[Solid, _Body]:
+    found: dict[Solid, _Body] = {}
+    point = None if about is None else _checked_point(about, positions)
+    for solid in sim.scene.solids:
+        rows = sim.scene.vertex_range(solid)
+        own, weights = positions[:, rows], masses[..., rows, None]
+        center = _tree_sum(weights * own) / _tree_sum(weights) if point is None else point
+        found[solid] = _Body(rows, own, center)
+    return found
+
+
+def _checked_point(about: Tensor, positions: Tensor) -> Tensor:
+    if not isinstance(about, Tensor):
+        raise TypeError(
+            f"about must be a point [3] or [B, 3] as a tensor of {positions.dtype} [m], or None for the centre of mass "
+            f"of each body, got {type(about).__name__}; torch.tensor(..., dtype=sim.dtype, device=sim.device) makes one"
+        )
+    batch = len(positions)
+    point: Tensor = in_full(about, positions)
+    if point.dtype != positions.dtype or point.device != positions.device:
+        raise TypeError(f"about must be {positions.dtype} on {positions.device}, got {point.dtype} on {point.device}")
+    if point.shape not in ((3,), (1, 3), (batch, 3)):
+        raise ValueError(f"about must be a point [3] or [{batch}, 3] [m], got {list(point.shape)}")
+    return point.expand(batch, 3)
+
+
+def _wrench(forces: Tensor, positions: Tensor, about: Tensor) -> Wrench:
+    """Of forces [B, ..., n, 3] on vertices at positions [B, n, 3]."""
+    front = (len(positions), *[1] * (forces.dim() - 3))
+    arms = (positions - about[:, None]).reshape(*front, -1, 3)
+    torque = _tree_sum(torch.linalg.cross(arms.expand_as(forces), forces))
+    return Wrench(_tree_sum(forces), torque, about)
+
+
+# ---- pins
+
+
+def _pin_forces(call: AdjointCall) -> tuple[Tensor, Tensor]:
+    """Forces of pins [B, P, 3], and r [B, V, 3], what they leave of the gradient; exactly zero at hard ones."""
+    material = named_material(call.material)
+    free = list(call.material)
+    free[_PIN_STIFFNESS] = torch.zeros_like(free[_PIN_STIFFNESS])
+    gradient = step_gradient(replace(call, material=free))
+    pins = pinned_vertices(call.plan)
+    springs = material["pin_stiffness"].unsqueeze(-1)
+    hard = torch.isinf(springs)
+    pulled = torch.where(hard, 0.0, springs) * (material["pin_targets"] - call.after[:, pins])
+    forces = torch.where(hard, gradient[:, pins], pulled)
+    return forces, gradient.index_add(1, pins, -forces)
+
+
+def reactions(sim: Model, call: AdjointCall, about: Tensor | None) -> Reactions:
+    """What `Simulator.reactions` does, for a checked call."""
+    forces, _ = _pin_forces(call)
+    vertices = pinned_vertices(call.plan)
+    on_vertices = torch.zeros_like(call.after).index_add(1, vertices, forces)
+    bodies = _bodies(sim, call.after, named_material(call.material)["masses"], about)
+    pins: dict[Pin, PinForce] = {}
+    for pin in sim.scene.pins:
+        rows = sim.scene.pin_range(pin)
+        own = forces[:, rows]
+        pins[pin] = PinForce(own, _wrench(own, call.after[:, vertices[rows]], bodies[pin.solid].about))
+    return Reactions(forces, on_vertices, pins)
+
+
+# ---- contacts
+
+
+class _Contacts(NamedTuple):
+    """Colliders as vertices meet them: grounds, then spheres."""
+
+    normals: Tensor  # [B, K, V, 3]
+    gaps: Tensor  # [B, K, V] m
+    friction: Tensor  # [B, K, V]
+
+
+def _contacts(call: AdjointCall) -> _Contacts:
+    material = named_material(call.material)
+    x = call.after[:, None]
+    planes, spheres = (material[name].unsqueeze(-2) for name in ("planes", "spheres"))
+    offsets = x - spheres[..., :3]
+    distances = length(offsets)
+    away = offsets / torch.where(distances > 0.0, distances, 1.0).unsqueeze(-1)
+    # of a gap: what rounding may make of zero
+    rounding = 4.0 * torch.finfo(x.dtype).eps * length(x)
+    plane_gaps = dot(planes[..., :3], x) - planes[..., 3] - rounding
+    sphere_gaps = distances - spheres[..., 3] - rounding
+    rows = zip((planes, spheres), (planes[..., :3], away), (plane_gaps, sphere_gaps), strict=True)
+    parts = [(n.expand(*gap.shape, 3), gap, part[..., 4].expand_as(gap)) for part, n, gap in rows]
+    return _Contacts(*(torch.cat(pair, dim=1) for pair in zip(*parts, strict=True)))
+
+
+def _pushes(normals: Tensor, force: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
+    """Pushes [B, M, V] of the active contacts, M <= 3, that fit the force [B, V, 3] best, and their Gram determinant.
+
+    N N^T p = N r, with a row of the identity for a contact that is not active.
+    """
+    count = normals.shape[1]
+    chosen = torch.where(active.unsqueeze(-1), normals, 0.0)
+    right = dot(chosen, force[:, None])
+    if count == 1:
+        return right, torch.ones_like(right[:, 0])
+    missing = 3 - count
+    chosen = torch.nn.functional.pad(chosen, (0, 0, 0, 0, 0, missing)).movedim(1, 2)  # [B, V, 3, 3]
+    idle = torch.nn.functional.pad(~active, (0, 0, 0, missing), value=True).movedim(1, 2)
+    gram = product(chosen, chosen.mT) + torch.diag_embed(idle.to(force.dtype))
+    a, b, c = gram.unbind(-1)
+    right = torch.nn.functional.pad(right, (0, 0, 0, missing)).movedim(1, 2).unsqueeze(-1)
+    return product(inverse(gram), right).squeeze(-1).movedim(2, 1)[:, :count], dot(a, torch.linalg.cross(b, c))
+
+
+@torch.no_grad()
+def _active(contacts: _Contacts, force: Tensor, diagonal: Tensor) -> Tensor:
+    """Which contacts push [B, M, V]: of the sets in which all do, the one that leaves least of the force."""
+    normals, gaps, _ = contacts
+    count = normals.shape[1]
+    best = torch.zeros_like(gaps, dtype=torch.bool)
+    least = dot(force, force)
+    numbers = torch.arange(count, device=force.device)[:, None]
+    for size in range(1, count + 1):
+        for members in combinations(range(count), size):
+            mask = torch.stack([numbers == member for member in members]).any(0)
+            pushes, independent = _pushes(normals, force, mask.expand_as(gaps))
+            acts = (pushes > 0.0) & (diagonal[..., None, :] * gaps < pushes)
+            left = force - _added(pushes.unsqueeze(-1) * normals)
+            error = dot(left, left)
+            better = (acts | ~mask).all(1) & (independent > _SPANNED) & (error < least)
+            best = torch.where(better[:, None], mask, best)
+            least = torch.where(better, error, least)
+    return best
+
+
+def _nearest_three(contacts: _Contacts) -> tuple[_Contacts, Tensor | None]:
+    """The contacts with the smallest gaps, and their numbers [B, 3, V] where there were more."""
+    if contacts.gaps.shape[1] <= 3:
+        return contacts, None
+    numbers = contacts.gaps.detach().sort(dim=1, stable=True).indices[:, :3]
+    normals = contacts.normals.gather(1, numbers.unsqueeze(-1).expand(-1, -1, -1, 3))
+    return _Contacts(normals, contacts.gaps.gather(1, numbers), contacts.friction.gather(1, numbers)), numbers
+
+
+def _split(contacts: _Contacts, force: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pushes [B, K, V], friction [B, K, V, 3] and which contacts push [B, K, V], by the rule of this module."""
+    count = contacts.gaps.shape[1]
+    near, numbers = _nearest_three(contacts)
+    active = _active(near, force, diagonal)
+    pushes = torch.where(active, _pushes(near.normals, force, active)[0], 0.0)
+    tangential = force - _added(pushes.unsqueeze(-1) * near.normals)
+    bounds = near.friction * pushes
+    bound, size = _added(bounds.unsqueeze(-1)).squeeze(-1), length(tangential)
+    share = torch.maximum(bound, size)
+    share = bounds / torch.where(share > 0.0, share, 1.0)[:, None]
+    friction = share.unsqueeze(-1) * tangential[:, None]
+    if numbers is None:
+        return pushes, friction, active
+    of_all = pushes.new_zeros((len(force), count, force.shape[1]))
+    wide = numbers.unsqueeze(-1).expand_as(friction)
+    return (
+        of_all.scatter(1, numbers, pushes),
+        of_all.unsqueeze(-1).repeat(1, 1, 1, 3).scatter(1, wide, friction),
+        torch.zeros_like(of_all, dtype=torch.bool).scatter(1, numbers, active),
+    )
+
+
+def _added(values: Tensor) -> Tensor:
+    """Sum over contacts of [B, M, V, k], one after another."""
+    total = torch.zeros_like(values[:, 0])
+    for one in values.unbind(1):
+        total = total + one
+    return total
+
+
+def contact_forces(sim: Model, call: AdjointCall, about: Tensor | None) -> ContactForces:
+    """What `Simulator.contact_forces` does, for a checked call."""
+    _, force = _pin_forces(call)
+    colliders: Sequence[Ground | Sphere] = (*sim.scene.grounds, *sim.scene.spheres)
+    bodies = _bodies(sim, call.after, named_material(call.material)["masses"], about)
+    if not colliders:
+        none = torch.zeros_like(force)
+        return ContactForces(none, force, _on_bodies(none, bodies), {})
+    contacts = _contacts(call)
+    with torch.no_grad():
+        diagonal = step_diagonal(call.plan, call.material, call.time_step)[1]
+    pushes, friction, active = _split(contacts, force, diagonal)
+    forces = pushes.unsqueeze(-1) * contacts.normals + friction
+    total = _added(forces)
+    wrenches = _on_bodies(forces, bodies)
+    found = {
+        part: ContactForce(
+            forces[:, k],
+            friction[:, k],
+            pushes[:, k],
+            active[:, k],
+            {solid: Wrench(all_.force[:, k], all_.torque[:, k], all_.about) for solid, all_ in wrenches.items()},
+        )
+        for k, part in enumerate(colliders)
+    }
+    return ContactForces(total, force - total, _on_bodies(total, bodies), found)
+
+
+def _on_bodies(forces: Tensor, bodies: dict[Solid, _Body]) -> dict[Solid, Wrench]:
+    return {solid: _wrench(forces[..., body.rows, :], body.positions, body.about) for solid, body in bodies.items()}

@@ -1,0 +1,81 @@
+"""Stress and strain of every tetrahedron.
+
+The energy of a tetrahedron is w V / 2 |F - R|^2, w Young's modulus, F its deformation gradient and R the nearest
+rotation (see `Solid`). So the first Piola-Kirchhoff stress is P = dE/dF / V = w (F - R), and Cauchy's is
+
+    sigma = P F^T / det F = w (F F^T - R F^T) / det F.
+
+Both are constant in a tetrahedron. The material has Poisson ratio 0. Where a tetrahedron is partly full (`mesh.fill`)
+the stress is that of its average material.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .ops import nearest_rotation
+from .scene import Scene
+from .small_matrices import dot, product, root
+
+__all__ = ["Stress", "stress"]
+
+
+class Stress(NamedTuple):
+    """Stress and strain of every tetrahedron, see `Simulator.stress`. Stresses are NaN where `inverted`."""
+
+    cauchy: Tensor  # [B, E, 3, 3] Pa, symmetric
+    von_mises: Tensor  # [B, E] Pa, sqrt(3 / 2 s : s), s the deviator of `cauchy`
+    strain: Tensor  # [B, E, 3, 3], Green's, (F^T F - 1) / 2
+    inverted: Tensor  # [B, E] bool, whether det F > 0 fails
+
+
+class _Rest(NamedTuple):
+    """What stress needs of the rest shape."""
+
+    tets: Tensor  # [E, 4]
+    inverse_edges: Tensor  # [E, 3, 3] 1/m
+
+
+# compiled scenes do not change; a copy to a GPU would wait for it
+_REST: WeakKeyDictionary[Scene, dict[tuple[torch.device, torch.dtype], _Rest]] = WeakKeyDictionary()
+
+
+def _rest(scene: Scene, device: torch.device, dtype: torch.dtype) -> _Rest:
+    kept = _REST.setdefault(scene, {})
+    if (device, dtype) not in kept:
+        starts = [scene.vertex_range(solid).start for solid in scene.solids]
+        tets = np.concatenate([s.mesh.tets + start for s, start in zip(scene.solids, starts, strict=True)])
+        corners = np.concatenate([solid.mesh.vertices for solid in scene.solids])[tets]
+        edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+        inverse_edges = torch.from_numpy(np.linalg.inv(edges)).to(device, dtype)
+        kept[device, dtype] = _Rest(torch.from_numpy(tets).to(device), inverse_edges)
+    return kept[device, dtype]
+
+
+def stress(scene: Scene, positions: Tensor, stiffness: Tensor) -> Stress:
+    """What `Simulator.stress` does, for checked positions [B, V, 3] and stiffness [E] or [B, E]."""
+    rest = _rest(scene, positions.device, positions.dtype)
+    corners = positions[:, rest.tets]
+    F = product((corners[:, :, 1:] - corners[:, :, :1]).mT, rest.inverse_edges)
+    identity = torch.eye(3, dtype=F.dtype, device=F.device)
+    strain = 0.5 * (product(F.mT, F) - identity)
+    a, b, c = F.unbind(-1)
+    determinant = dot(a, torch.linalg.cross(b, c))
+    inverted = ~(determinant.detach() > 0.0)
+    # no NaN reaches the derivatives of the others
+    lost = inverted[..., None, None]
+    F = torch.where(lost, identity, F)
+    scale = stiffness / torch.where(inverted, 1.0, determinant)
+    cauchy = scale[..., None, None] * product(F - nearest_rotation(F), F.mT)
+    cauchy = 0.5 * (cauchy + cauchy.mT)  # but for rounding it is symmetric
+    xx, yy, zz = cauchy.diagonal(dim1=-2, dim2=-1).unbind(-1)
+    shear = torch.stack((cauchy[..., 0, 1], cauchy[..., 1, 2], cauchy[..., 2, 0]), dim=-1)
+    squared = 0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3.0 * dot(shear, shear)
+    return Stress(
+        torch.where(lost, torch.nan, cauchy), torch.where(inverted, torch.nan, root(squared)), strain, inverted
+    )
