@@ -81,7 +81,7 @@ def test_torque_is_about_a_named_point() -> None:
 def test_an_incline_that_holds() -> None:
     """tan 20 degrees < friction: normal m g cos, tangential m g sin uphill."""
     ground = pd.Ground(friction=0.8)
-    sim, solid = cube(tilted(20.0), ground, pd.Damping(5.0))
+    sim, _ = cube(tilted(20.0), ground, pd.Damping(5.0))
     state, after = settled(sim)
     one = sim.contact_forces(state, after).colliders[ground]
     mg, angle = weight(sim), np.deg2rad(20.0)
@@ -125,9 +125,7 @@ def test_a_sphere_pushes_along_its_normals() -> None:
     balance(sim, solid, state, after)
 
 
-def balance(
-    sim: pd.Simulator, solid: pd.Solid, state: pd.State, after: pd.State, forces: Tensor | None = None
-) -> None:
+def balance(sim: pd.Simulator, solid: pd.Solid, state: pd.State, after: pd.State, forces: Tensor | None = None) -> None:
     """All forces together are the change of momentum, at any iterate, but for rounding."""
     contacts, pins = sim.contact_forces(state, after, forces), sim.reactions(state, after, forces)
     moved = sim.masses[:, None] * (after.positions - state.positions) / sim.time_step
@@ -328,9 +326,7 @@ def test_gradients_by_finite_differences() -> None:
         direction = torch.randn(gradient.shape, generator=gen, dtype=torch.float64)
         value = inputs[number].detach()
         step = 1e-6 * float(value.abs().max() + 1e-3)
-        ends = [
-            [*inputs[:number], value + sign * step * direction, *inputs[number + 1 :]] for sign in (1.0, -1.0)
-        ]
+        ends = [[*inputs[:number], value + sign * step * direction, *inputs[number + 1 :]] for sign in (1.0, -1.0)]
         with torch.no_grad():
             difference = float(loss(ends[0]) - loss(ends[1])) / (2 * step)
         expected = float((gradient * direction).sum())

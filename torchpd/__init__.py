@@ -30,9 +30,11 @@ if load_extension()[0] is not None:
     from .plan import Plan, compile_plan
     from .quadric_transport import QuadricTransport
     from .quadrics import Quadrics
+    from .readouts import ContactForces, Reactions
     from .rigid_pieces import RigidPieces
     from .simulator import Simulator
     from .spectrum import estimate_rho
+    from .stress import Stress
 else:  # meshes, scenes and the doctor work without it
 
     def __getattr__(name: str) -> Any:
@@ -44,6 +46,7 @@ else:  # meshes, scenes and the doctor work without it
 __all__ = [
     "CapturedStep",
     "Chebyshev",
+    "ContactForces",
     "Damping",
     "Embedding",
     "FitReport",
@@ -67,12 +70,14 @@ __all__ = [
     "Plan",
     "QuadricTransport",
     "Quadrics",
+    "Reactions",
     "RigidPieces",
     "Scene",
     "Simulator",
     "Solid",
     "Sphere",
     "State",
+    "Stress",
     "TetMesh",
     "Track",
     "TriMesh",

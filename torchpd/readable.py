@@ -11,7 +11,7 @@ from torch import Tensor
 from .model import Model
 from .readouts import ContactForces, Reactions, checked_call, contact_forces, reactions
 from .state import State
-from .stress import Stress, stress
+from .stress import Stress, stress, vertex_average
 from .targets import Targets
 from .vtu import States, write_vtu
 
@@ -89,6 +89,20 @@ class Readable(Model):
             state: a `State`, or positions [B, V, 3].
         """
         return stress(self.scene, self.positions_of(state), self.stiffness)
+
+    def vertex_average(self, values: Tensor) -> Tensor:
+        """Average at every vertex of what its tetrahedra have, weighted by their rest volumes. Differentiable.
+
+        For colours and contours of a field that jumps between tetrahedra, such as `stress(state).von_mises`. A vertex
+        of an inverted tetrahedron, whose stress is NaN, has NaN.
+
+        Args:
+            values: of tetrahedra [B, E, ...].
+
+        Returns:
+            [B, V, ...], in the unit of the values.
+        """
+        return vertex_average(self.scene, values, self.rest_positions)
 
     def write_vtu(
         self,

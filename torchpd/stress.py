@@ -22,7 +22,7 @@ from .ops import nearest_rotation
 from .scene import Scene
 from .small_matrices import dot, product, root
 
-__all__ = ["Stress", "stress"]
+__all__ = ["Stress", "stress", "vertex_average"]
 
 
 class Stress(NamedTuple):
@@ -35,10 +35,13 @@ class Stress(NamedTuple):
 
 
 class _Rest(NamedTuple):
-    """What stress needs of the rest shape."""
+    """What read-outs need of the rest shape."""
 
     tets: Tensor  # [E, 4]
     inverse_edges: Tensor  # [E, 3, 3] 1/m
+    order: Tensor  # [4 E] tetrahedra of each vertex, vertex after vertex
+    counts: Tensor  # [V] how many each has
+    shares: Tensor  # [4 E] share of each in the volume of those of its vertex
 
 
 # compiled scenes do not change; a copy to a GPU would wait for it
@@ -50,10 +53,18 @@ def _rest(scene: Scene, device: torch.device, dtype: torch.dtype) -> _Rest:
     if (device, dtype) not in kept:
         starts = [scene.vertex_range(solid).start for solid in scene.solids]
         tets = np.concatenate([s.mesh.tets + start for s, start in zip(scene.solids, starts, strict=True)])
-        corners = np.concatenate([solid.mesh.vertices for solid in scene.solids])[tets]
+        positions = np.concatenate([solid.mesh.vertices for solid in scene.solids])
+        corners = positions[tets]
         edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-        inverse_edges = torch.from_numpy(np.linalg.inv(edges)).to(device, dtype)
-        kept[device, dtype] = _Rest(torch.from_numpy(tets).to(device), inverse_edges)
+        order = np.argsort(tets.reshape(-1), kind="stable")
+        vertex, tet = tets.reshape(-1)[order], order // 4
+        volumes = np.linalg.det(edges)[tet]
+        shares = volumes / np.bincount(vertex, weights=volumes, minlength=len(positions))[vertex]
+        counts = np.bincount(vertex, minlength=len(positions))
+        whole = (torch.from_numpy(array).to(device) for array in (tets, tet, counts))
+        real = (torch.from_numpy(array).to(device, dtype) for array in (np.linalg.inv(edges), shares))
+        (corner, tet_of, count), (inverse_edges, share) = whole, real
+        kept[device, dtype] = _Rest(corner, inverse_edges, tet_of, count, share)
     return kept[device, dtype]
 
 
@@ -79,3 +90,23 @@ def stress(scene: Scene, positions: Tensor, stiffness: Tensor) -> Stress:
     return Stress(
         torch.where(lost, torch.nan, cauchy), torch.where(inverted, torch.nan, root(squared)), strain, inverted
     )
+
+
+def vertex_average(scene: Scene, values: Tensor, like: Tensor) -> Tensor:
+    """What `Simulator.vertex_average` does, in the precision and on the device of `like`."""
+    if not isinstance(values, Tensor):
+        raise TypeError(f"vertex_average: values must be a tensor [B, E, ...], got {type(values).__name__}")
+    if values.dtype != like.dtype or values.device != like.device:
+        raise TypeError(
+            f"vertex_average: values must be {like.dtype} on {like.device} like the simulator, got {values.dtype} on "
+            f"{values.device}"
+        )
+    rest = _rest(scene, like.device, like.dtype)
+    if values.dim() < 2 or values.shape[1] != len(rest.tets):
+        raise ValueError(f"vertex_average: values must be [B, {len(rest.tets)}, ...], got {list(values.shape)}")
+    rows = values.flatten(2) if values.dim() > 2 else values.unsqueeze(-1)
+    # the terms of a vertex are added one after another
+    terms = (rows[:, rest.order] * rest.shares[:, None]).movedim(0, 1)
+    total = torch.segment_reduce(terms.flatten(1), "sum", lengths=rest.counts, axis=0, unsafe=True)
+    means: Tensor = total.unflatten(1, terms.shape[1:]).movedim(0, 1)
+    return means.reshape(len(values), -1, *values.shape[2:])
