@@ -75,6 +75,9 @@ def calls_of(sim: pd.Simulator, state: pd.State) -> dict[str, Calls]:
         "energy": lambda: sim.energy(state),
         "gradient": lambda: sim.gradient(state.positions),
         "residual": lambda: sim.step_gradient(state, state.positions, forces, sim.pin_targets),
+        "contacts": lambda: sim.contact_forces(state, state.positions, forces, goals),
+        "reactions": lambda: sim.reactions(state, state.positions, forces, goals),
+        "stress": lambda: sim.vertex_average(sim.stress(state).cauchy),
     }
     return {"steps": steps, "rollouts": rollouts, "others": others}
 

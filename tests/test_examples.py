@@ -125,3 +125,19 @@ def test_learn_from_images(run, tmp_path: Path) -> None:
     assert all(end < 0.6 * begin for end, begin in zip(last[1:4], first[1:4], strict=True))
     assert last[4] < first[4]
     assert imageio.imread(out).shape == (3 * 24, 4 * 24, 3)
+
+
+def test_read_forces(run, tmp_path: Path) -> None:
+    text = run("read_forces.py", "--out", str(tmp_path / "end.pvd"))
+    (weight,), (ball, vertices), (clamp, moment) = (
+        numbers(text, pattern)
+        for pattern in (r"weight (\S+) N", r"ball +(\S+) N on (\d+)", r"clamp +(\S+) N, moment (\S+) N m")
+    )
+    assert weight == pytest.approx(1000.0 * 0.5 * 0.1**2 * 9.81, abs=1e-3)
+    # at rest but for a thousandth; the ball lies at four fifths of the beam, more or less
+    assert ball + clamp == pytest.approx(weight, rel=1e-3)
+    assert moment == pytest.approx(0.25 * weight - 0.4 * ball, abs=0.02 * weight)
+    assert vertices >= 1
+    (unbalanced,) = numbers(text, r"not balanced: (\S+) N")
+    assert unbalanced < 1e-6 * weight
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["end.pvd", *(f"end_{n:04}.vtu" for n in range(12))]

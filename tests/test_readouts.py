@@ -380,3 +380,20 @@ def test_targets_and_forces_are_those_of_the_step() -> None:
     assert float(there.residual.norm()) <= 1e-6 * float(there.force.norm())
     assert float(there.bodies[solid].force[0, 1]) > 0.0
     assert not bool(elsewhere.force.any())
+
+
+def test_compiled_and_within_autocast_they_are_the_same() -> None:
+    sim, state = small(torch.float64, batch=2)
+    after = sim(state)
+
+    def read(state: pd.State, after: pd.State) -> list[Tensor]:
+        contacts, pins = sim.contact_forces(state, after), sim.reactions(state, after)
+        wrenches = [wrench.torque for wrench in contacts.bodies.values()]
+        averages = sim.vertex_average(sim.stress(after).strain)
+        return [contacts.force, *wrenches, pins.on_vertices, averages]
+
+    expected = read(state, after)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert all(map(torch.equal, read(state, after), expected))
+    compiled = torch.compile(read, backend="eager", fullgraph=True)(state, after)
+    assert all(map(torch.equal, compiled, expected))

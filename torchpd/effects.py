@@ -39,7 +39,7 @@ class _Part:
 
 
 class _Key(_Part):
-    """Parts that `targets` name: frozen, but not by `dataclass(frozen=True)`.
+    """Parts that are keys, of `targets` and read-outs: frozen, but not by `dataclass(frozen=True)`.
 
     torch.compile hashes a key of that kind by its fields, arrays here, whatever `eq` says.
     """
@@ -62,8 +62,8 @@ def _per_element(name: str, value: ArrayLike, count: int, *, unit: str) -> Array
     return array
 
 
-@dataclass(frozen=True, eq=False)
-class Solid(_Part):
+@dataclass(eq=False)
+class Solid(_Key):
     """An elastic body: tetrahedra that resist every departure from their rest shape.
 
     Energy per tetrahedron, with F the deformation gradient and R its nearest rotation:
@@ -155,8 +155,8 @@ class Gravity(_Part):
         _set(self, vector=check_vector("Gravity.vector", vector))
 
 
-@dataclass(frozen=True, eq=False)
-class Ground(_Part):
+@dataclass(eq=False)
+class Ground(_Key):
     """A plane that vertices cannot pass: normal . x >= height, with Coulomb friction.
 
     Contacts act one after another: in the wedge of two planes that are not at right angles a vertex ends somewhat
