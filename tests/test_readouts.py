@@ -161,6 +161,25 @@ def test_a_corner_is_split_by_its_normals() -> None:
     assert int((contacts.colliders[floor].touches & contacts.colliders[wall].touches).sum()) == 3
 
 
+@pytest.mark.parametrize("degrees", [20.0, 30.0, 60.0, 75.0])
+def test_a_groove_holds_the_edge(degrees: float) -> None:
+    """Of planes whose normals lean by so much: the edge hovers in a flat one, and in a steep one the cube rocks."""
+    lean, turn = np.deg2rad(degrees), np.deg2rad(45.0)
+    x, y, z = MESH.vertices.T
+    turned = np.stack([np.cos(turn) * (x - y), np.sin(turn) * (x + y) + 0.05, z], axis=1)
+    solid = pd.Solid(pd.TetMesh(turned, MESH.tets), youngs=1e5, density=1000.0)
+    planes = [pd.Ground(normal=(side * np.sin(lean), np.cos(lean), 0.0)) for side in (1.0, -1.0)]
+    scene = pd.Scene(solid, *planes, pd.Gravity(), pd.Damping(5.0))
+    sim = pd.Simulator(scene, 1 / 60, 400, dtype=torch.float64, progress=False)
+    state, after = settled(sim)
+    contacts = sim.contact_forces(state, after)
+    assert float(contacts.residual.sum(1).norm()) <= 1e-2 * weight(sim)
+    for one in contacts.colliders.values():
+        assert bool(one.touches.any())
+        assert not bool(one.friction.any())
+    balance(sim, solid, state, after)
+
+
 def test_colliders_that_nothing_touches_do_not_matter() -> None:
     """Beside four of them, and a copy of the floor: only three contacts of a vertex are looked at."""
     floor, wall = pd.Ground(), pd.Ground(normal=(1.0, 0.0, 0.0))
@@ -397,3 +416,35 @@ def test_compiled_and_within_autocast_they_are_the_same() -> None:
         assert all(map(torch.equal, read(state, after), expected))
     compiled = torch.compile(read, backend="eager", fullgraph=True)(state, after)
     assert all(map(torch.equal, compiled, expected))
+
+
+def test_gradients_through_the_step() -> None:
+    """Of contact forces by stiffness and friction, the step that leads there included: a cube that slides."""
+    ground = pd.Ground(friction=0.3)
+    sim, _ = cube(pd.Gravity((4.0, -9.0, 0.0)), ground, iterations=2000)
+    state = sim.rollout(sim.rest_state(), 7).state()
+    weights = noise(state.positions, 2)
+
+    def read(stiffness: Tensor, friction: Tensor) -> Tensor:
+        planes = torch.cat([sim.planes[:, :4], friction.reshape(1, 1)], dim=1)
+        arrays = {"stiffness": stiffness, "planes": planes}
+        after = torch.func.functional_call(sim, arrays, (state,))
+        return (weights * called(sim, arrays, "contact_forces", state, after).colliders[ground].force).sum()
+
+    inputs = [sim.stiffness.detach().clone().requires_grad_(), torch.tensor(0.3).double().requires_grad_()]
+    gradients = torch.autograd.grad(read(*inputs), inputs)
+    directions = [inputs[0].detach() * noise(inputs[0], 3), torch.tensor(1.0).double()]
+    for number, (gradient, direction) in enumerate(zip(gradients, directions, strict=True)):
+        step = 1e-5 * direction
+        ends = [[*inputs[:number], inputs[number] + move, *inputs[number + 1 :]] for move in (step, -step)]
+        with torch.no_grad():
+            difference = float(read(*ends[0]) - read(*ends[1])) / 2e-5
+        assert difference == pytest.approx(float((gradient * direction).sum()), rel=1e-5)
+
+
+def test_no_environment() -> None:
+    sim, _ = small(torch.float64)
+    none = sim.rest_state(0)
+    assert sim.contact_forces(none, none).force.shape == (0, sim.vertices, 3)
+    assert sim.reactions(none, none).on_vertices.shape == (0, sim.vertices, 3)
+    assert sim.vertex_average(sim.stress(none).cauchy).shape == (0, sim.vertices, 3, 3)

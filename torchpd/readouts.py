@@ -7,11 +7,13 @@ At a solved step the gradient of its objective without pins, g, is what contacts
 Pins. A hard one puts g on its vertex, a soft one k (target - x'); r = g - pins is left for the contacts.
 
 Contacts. The normals n_k of at most three colliders act on a vertex, those with the smallest gaps. Their pushes p_k
-minimise |r - sum_k p_k n_k|, where each that pushes has p_k > 0 and gap_k < p_k / D: an iteration without it would end
-inside (D: diagonal of the step; see csrc/solver/adjoint.h). Several together have p_k = m_k . r with the m_k dual to
-their normals, as in csrc/solver/contact_gradients.h. The rest t is tangential to all of them. Colliders share it in
-proportion to their friction mu_k p_k, and take no more than that together (Coulomb). So at a corner normals come first:
-friction gets no force that a normal can give. What contacts do not take is the residual, forces that nothing balances.
+minimise |r - sum_k p_k n_k|, where each that pushes has p_k > 0 and gap_k < 4 max(p_k, n_k . r) / D: an iteration
+without it, or without any, might end inside. D is the diagonal of the step, and 4 bounds relaxation times acceleration,
+both below 2. Only where planes meet at flat angles are gaps of pushing contacts that large (see `Ground`). Several
+together have p_k = m_k . r with the m_k dual to their normals, as in csrc/solver/contact_gradients.h. The rest t is
+tangential to all of them. Colliders share it in proportion to their friction mu_k p_k, and take no more than that
+together (Coulomb). So at a corner normals come first: friction gets no force that a normal can give. What contacts do
+not take is the residual, forces that nothing balances.
 
 Sums over vertices are those of a fixed binary tree, so that an environment has the same bits in every batch.
 """
@@ -50,6 +52,7 @@ __all__ = [
 ]
 
 _SPANNED = 1e-6  # as in csrc/effects/contact.h: Gram determinant from which normals count as independent
+_FASTEST = 4.0  # bounds an iteration's relaxation times acceleration, both below 2
 _PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
 
 
@@ -156,8 +159,7 @@ def _checked_point(about: Tensor, positions: Tensor) -> Tensor:
 
 def _wrench(forces: Tensor, positions: Tensor, about: Tensor) -> Wrench:
     """Of forces [B, ..., n, 3] on vertices at positions [B, n, 3]."""
-    front = (len(positions), *[1] * (forces.dim() - 3))
-    arms = (positions - about[:, None]).reshape(*front, -1, 3)
+    arms = (positions - about[:, None]).reshape(len(positions), *[1] * (forces.dim() - 3), *positions.shape[1:])
     torque = _tree_sum(torch.linalg.cross(arms.expand_as(forces), forces))
     return Wrench(_tree_sum(forces), torque, about)
 
@@ -211,11 +213,8 @@ def _contacts(call: AdjointCall) -> _Contacts:
     offsets = x - spheres[..., :3]
     distances = length(offsets)
     away = offsets / torch.where(distances > 0.0, distances, 1.0).unsqueeze(-1)
-    # of a gap: what rounding may make of zero
-    rounding = 4.0 * torch.finfo(x.dtype).eps * length(x)
-    plane_gaps = dot(planes[..., :3], x) - planes[..., 3] - rounding
-    sphere_gaps = distances - spheres[..., 3] - rounding
-    rows = zip((planes, spheres), (planes[..., :3], away), (plane_gaps, sphere_gaps), strict=True)
+    gaps = dot(planes[..., :3], x) - planes[..., 3], distances - spheres[..., 3]
+    rows = zip((planes, spheres), (planes[..., :3], away), gaps, strict=True)
     parts = [(n.expand(*gap.shape, 3), gap, part[..., 4].expand_as(gap)) for part, n, gap in rows]
     return _Contacts(*(torch.cat(pair, dim=1) for pair in zip(*parts, strict=True)))
 
@@ -251,7 +250,8 @@ def _active(contacts: _Contacts, force: Tensor, diagonal: Tensor) -> Tensor:
         for members in combinations(range(count), size):
             mask = torch.stack([numbers == member for member in members]).any(0)
             pushes, independent = _pushes(normals, force, mask.expand_as(gaps))
-            acts = (pushes > 0.0) & (diagonal[..., None, :] * gaps < pushes)
+            reach = _FASTEST * torch.maximum(pushes, dot(normals, force[:, None])) / diagonal[..., None, :]
+            acts = (pushes > 0.0) & (gaps < reach)
             left = force - _added(pushes.unsqueeze(-1) * normals)
             error = dot(left, left)
             better = (acts | ~mask).all(1) & (independent > _SPANNED) & (error < least)

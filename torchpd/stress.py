@@ -109,4 +109,4 @@ def vertex_average(scene: Scene, values: Tensor, like: Tensor) -> Tensor:
     terms = (rows[:, rest.order] * rest.shares[:, None]).movedim(0, 1)
     total = torch.segment_reduce(terms.flatten(1), "sum", lengths=rest.counts, axis=0, unsafe=True)
     means: Tensor = total.unflatten(1, terms.shape[1:]).movedim(0, 1)
-    return means.reshape(len(values), -1, *values.shape[2:])
+    return means.reshape(len(values), len(rest.counts), *values.shape[2:])
