@@ -1,0 +1,75 @@
+"""Files that an earlier version wrote load for good, and step to the positions that it recorded."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import torchpd as pd
+
+FILES = Path(__file__).parent / "fixtures"
+ROUNDING = 1e-6  # m: some units in the last place of a float32 near 0.3 m, times the steps
+
+
+@pytest.fixture(scope="module")
+def steps() -> Any:
+    return torch.load(FILES / "steps.pt", weights_only=True)
+
+
+def scene() -> pd.Scene:
+    """That of fixtures/make.py, made anew."""
+    box = pd.shapes.box((0.3, 0.1, 0.1), (6, 2, 2))
+    body, along = pd.Solid(box, youngs=3e4), box.vertices[:, 0]
+    hard = pd.Pin(body, np.flatnonzero(along < along.min() + 1e-6))
+    soft = pd.Pin(body, np.flatnonzero(along > along.max() - 1e-6)[:4], stiffness=50.0)
+    return pd.Scene(body, hard, soft, pd.Gravity(), pd.Ground(-0.4, friction=0.3), pd.Damping(0.1))
+
+
+def from_state_dict() -> pd.Simulator:
+    sim = pd.Simulator(scene(), 1 / 60, iterations=16)
+    sim.load_state_dict(torch.load(FILES / "state_dict.pt", weights_only=True))
+    return sim
+
+
+def from_file() -> pd.Simulator:
+    return pd.Simulator.load(FILES / "simulation.safetensors")
+
+
+@pytest.mark.parametrize("load", [from_state_dict, from_file])
+def test_a_simulator_of_an_earlier_version_takes_its_steps(load: Any, steps: Any) -> None:
+    sim = load()
+    with torch.no_grad():
+        after = sim(steps["start"])
+        track = sim.rollout(sim.rest_state(), 6, 2)
+    for ours, theirs in ((after.positions, steps["after"].positions), (track.positions, steps["track"].positions)):
+        torch.testing.assert_close(ours, theirs, rtol=0.0, atol=ROUNDING)
+    # its two environments differ in a spring, and nine pins are hard
+    assert not torch.equal(after.positions[0], after.positions[1])
+    springs = dict(zip(pd.material.MATERIAL_ROWS, sim.material(), strict=True))["pin_stiffness"]
+    assert springs.isinf().sum(1).tolist() == [9, 9]
+    assert sim.pin_stiffness.detach()[:, 9:].tolist() == [[50.0, 50.0, 50.0, 50.0], [50.0, 50.0, 50.0, 20.0]]
+
+
+def test_what_an_earlier_version_learned_is_learned() -> None:
+    assert from_file().stiffness.requires_grad
+    assert not from_file().masses.requires_grad
+
+
+def test_states_and_their_companions_load(steps: Any) -> None:
+    start, info, track = pickle.loads((FILES / "steps.pickle").read_bytes())
+    for loaded in (start, steps["start"]):
+        assert isinstance(loaded, pd.State)
+        assert loaded.positions.shape == (2, 63, 3)
+    for loaded in (info, steps["info"]):
+        assert isinstance(loaded, pd.Info)
+        assert loaded.iterations.tolist() == [16, 16]
+        assert not loaded.converged.any()
+    for loaded in (track, steps["track"]):
+        assert isinstance(loaded, pd.Track)
+        assert torch.equal(loaded.state(0).positions, start.positions)
+        assert loaded.info.residual.shape == (3, 2)
