@@ -12,7 +12,7 @@ from runs import simulate, simulator, small_case
 import torchpd as pd
 from torchpd import model, placing
 from torchpd.gpu import H100
-from torchpd.material import material_of
+from torchpd.material import in_order, material_of
 from torchpd.plan import Plan, compile_plan
 from torchpd.regimes import choose_plan
 
@@ -37,7 +37,7 @@ def on_gpu(monkeypatch: pytest.MonkeyPatch) -> pd.Simulator:
     monkeypatch.setattr(pd.Simulator, "device", GPU)
     values = sim.scene.values()
     # the ops would want the plan where the simulator says that it is
-    plan, arrays = compile_plan(values, progress=False), list(material_of(values, torch.float32).values())
+    plan, arrays = compile_plan(values, progress=False), in_order(material_of(values, torch.float32))
     reference = placing.reference_of(plan, arrays, 1 / 60)
     monkeypatch.setattr(placing, "reference_of", lambda *_: reference)
     return sim

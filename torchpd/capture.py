@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from .material import MATERIAL_ROWS
+from .material import named_arrays
 from .ops import INFO_WIDTH
 from .state import Info, State
 from .targets import Targets
@@ -50,12 +50,12 @@ class CapturedStep:
                 '.to("cuda"), or call step_ or rollout, which do the same on every device'
             )
         self.state = state
-        self._sim, self._plan = sim, sim.plan
+        self._sim = sim
         rows = (len(state[0]), INFO_WIDTH)
         self._rows = torch.empty(rows, dtype=torch.float64, device=sim.device) if report else None
         # the graph knows addresses only: what lies there has to live as long as it does
         own = dict(targets) if isinstance(targets, Mapping) else targets
-        self._alive = ([getattr(sim, name).detach() for name in MATERIAL_ROWS], forces, own, start)
+        self._alive = ([array.detach() for array in named_arrays(sim).values()], forces, own, start)
 
         def run(moved: State) -> None:
             sim.step_(moved, forces, targets, start, info=self._rows)
@@ -66,6 +66,7 @@ class CapturedStep:
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
                 run(State(state[0].clone(), state[1].clone()))
+            self._plan = sim.plan  # which a first step may have replaced
             torch.cuda.current_stream().wait_stream(stream)
             self._graph = torch.cuda.CUDAGraph()
             # torch's own stream for recording is of one device for good

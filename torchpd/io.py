@@ -24,18 +24,22 @@ from .automatic import Choice
 from .checks import check_has_values, check_target_file
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .embedding import Embedding
+from .material import named_arrays
 from .mesh import TetMesh, TriMesh
 from .mesh_checks import store
 from .multilevel import precondition_plan, reference_of_levels
 from .scene import Part, Scene
 from .simulator import Simulator
 from .solvers import Chebyshev, Jacobi, Multilevel, Solver
-from .tables import MATERIAL_TABLE
 from .version import __version__
 
 __all__ = ["FORMAT_VERSION", "load_simulation", "save_simulation"]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+# of format 1, whose hard pins have inf for stiffness
+_FIRST_ARRAYS = (
+    "stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets", "planes", "spheres",
+)  # fmt: skip
 _KEY = "torchpd"  # of the metadata, beside which others may write theirs
 _KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in (Solid, Pin, Gravity, Ground, Sphere, Damping)}
 _SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel)}
@@ -61,7 +65,7 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         tensors.update(_tensors(f"mesh.{number}", _mesh_arrays(mesh)))
     for number, part in enumerate(sim.scene.parts):
         tensors.update(_tensors(f"part.{number}", _part_arrays(part)))
-    material = dict(zip((name for name, *_ in MATERIAL_TABLE), sim.material(), strict=True))
+    material = named_arrays(sim)
     tensors.update({f"material.{name}": value.detach().cpu().contiguous() for name, value in material.items()})
     if isinstance(sim.solver, Multilevel):
         reference = zip(_REFERENCE, reference_of_levels(sim.plan.arrays), strict=True)
@@ -80,6 +84,7 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         "choice": None if sim.choice is None else dataclasses.asdict(sim.choice),
         "meshes": [{"flipped": mesh.flipped} for mesh in meshes],
         "parts": [_part_record(part, sim.scene, meshes) for part in sim.scene.parts],
+        "material": list(material),
         "trained": [name for name, value in material.items() if value.requires_grad],
     }
     save_file(tensors, target, metadata={_KEY: json.dumps(record)})
@@ -216,7 +221,8 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
         kernel=record.get("kernel", "auto"),  # files of before there was a choice
         batch=record.get("batch", former if former > 1 else None),
     )
-    sim.set_material(**{name: tensors[f"material.{name}"] for name, *_ in MATERIAL_TABLE})
+    # the scene's values stay where a file has none
+    sim.set_material(**{name: tensors[f"material.{name}"] for name in record.get("material", _FIRST_ARRAYS)})
     for name in record["trained"]:
         getattr(sim, name).requires_grad_()
     if isinstance(sim.solver, Multilevel):

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .pins import PIN_HARD, hold_exactly, split_springs
 from .scene import SceneValues
 from .tables import MATERIAL_TABLE
 
@@ -17,18 +18,24 @@ if TYPE_CHECKING:
     from .model import Model
 
 __all__ = [
+    "ARRAYS",
     "MATERIAL_ROWS",
     "PARTS_OF_ROWS",
     "check_array",
     "check_batches",
+    "check_hard",
     "check_material",
     "environments_of_material",
+    "dims_of",
     "fingerprint",
+    "in_order",
     "material_of",
+    "named_arrays",
     "real_tensor",
 ]
 
 MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
+ARRAYS = (*MATERIAL_ROWS, PIN_HARD)  # what `set_material` replaces
 # What users look for by the names of scenes.
 PARTS_OF_ROWS = {
     "density": "masses are of vertices [kg], a density times their share of volume",
@@ -39,7 +46,7 @@ _UNIT_SLACK = 1e-4  # of the length of a plane's normal: float32 rounding and a 
 
 
 def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
-    """The arrays of a scene in the precision of the simulation, checked after rounding to it."""
+    """What `named_arrays` gives, of a scene, in the precision of the simulation, checked after rounding to it."""
     spheres = np.pad(values.spheres, ((0, 0), (0, 3)))  # at rest
     material = {
         name: torch.tensor(spheres if name == "spheres" else getattr(values, name), dtype=dtype)
@@ -52,7 +59,24 @@ def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
         )
     for name, tensor in material.items():
         check_material("Simulator", name, tensor)
+    material["pin_stiffness"], material[PIN_HARD] = split_springs(material["pin_stiffness"])
     return material
+
+
+def dims_of(name: str) -> int:
+    """Dimensions of an array that all environments share."""
+    return 1 if name == PIN_HARD else MATERIAL_ROWS[name].dims
+
+
+def named_arrays(sim: Model) -> dict[str, Tensor]:
+    """The arrays as the simulator keeps them: those that training may change, and which pins are hard."""
+    return {name: getattr(sim, name) for name in ARRAYS}
+
+
+def in_order(arrays: Mapping[str, Tensor]) -> list[Tensor]:
+    """The rows of the material as the ops take them, of what `named_arrays` gives."""
+    held = {"pin_stiffness": hold_exactly(arrays["pin_stiffness"], arrays[PIN_HARD])}
+    return [held.get(name, arrays[name]) for name in MATERIAL_ROWS]
 
 
 def _require(good: Tensor, name: str, contract: str, tensor: Tensor) -> None:
@@ -68,7 +92,7 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
     """Refuse values that no step can work with; shapes are the caller's to check."""
     full = f"{owner}: {name}"
     if name == "pin_stiffness":
-        _require(tensor > 0, full, "positive, inf for pins that hold exactly,", tensor)
+        _require(tensor >= 0, full, ">= 0, inf for pins that hold exactly,", tensor)
         return
     _require(tensor.isfinite(), full, "finite", tensor)
     if name in ("stiffness", "masses"):
@@ -114,6 +138,26 @@ def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Te
     return tensor.contiguous()
 
 
+def check_hard(owner: str, value: Tensor | bool, own: Tensor) -> Tensor:
+    """What is to replace the mask of hard pins `own` of a simulator, on its device."""
+    try:
+        tensor = torch.as_tensor(value, device=None if isinstance(value, Tensor) else "cpu")
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{owner}: {PIN_HARD} must be a bool or a bool tensor, got {value!r}") from None
+    if tensor.dtype != torch.bool:
+        raise TypeError(f"{owner}: {PIN_HARD} must be bool, whether each pin is hard, got {tensor.dtype}")
+    tensor = tensor.to(own.device)
+    shape = own.shape[-1:]
+    if tensor.dim() == 0 or (tensor.dim() == 2 and tensor.shape[-1] == 1):
+        tensor = tensor.expand(*tensor.shape[:-1], *shape)
+    if tensor.dim() > 2 or tensor.shape[-1:] != shape:
+        raise ValueError(
+            f"{owner}: {PIN_HARD} must be one bool, {list(shape)}, [B, 1] or [B, {shape[0]}], got {list(tensor.shape)}; pins of "
+            f"the scene: {shape[0]}"
+        )
+    return tensor.contiguous()
+
+
 def fingerprint(arrays: Iterable[Tensor]) -> str:
     """Of shapes and bits: another one where any number differs. Brings the arrays to the CPU."""
     found = hashlib.blake2b(digest_size=16)
@@ -126,9 +170,9 @@ def fingerprint(arrays: Iterable[Tensor]) -> str:
 def check_batches(owner: str, new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None:
     """Refuse arrays of different numbers of environments; those without a batch, or with one of 1, serve any number."""
     first: tuple[int, str] | None = None
-    for name in MATERIAL_ROWS:
+    for name in ARRAYS:
         array, stays = new.get(name, kept[name]), "" if name in new else " (kept)"
-        count = len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1
+        count = len(array) if array.dim() > dims_of(name) else 1
         if count == 0:
             raise ValueError(f"{owner}: {name} must be of at least one environment, got {list(array.shape)}")
         if first is not None and count not in (1, first[0]):
@@ -142,5 +186,4 @@ def check_batches(owner: str, new: Mapping[str, Tensor], kept: Mapping[str, Tens
 
 def environments_of_material(sim: Model) -> int:
     """How many environments the material of a simulator has numbers for; 1 where all share them."""
-    arrays = {name: getattr(sim, name) for name in MATERIAL_ROWS}
-    return max(len(array) if array.dim() > MATERIAL_ROWS[name].dims else 1 for name, array in arrays.items())
+    return max(len(array) if array.dim() > dims_of(name) else 1 for name, array in named_arrays(sim).items())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -11,20 +11,23 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
 from .checks import check_has_values
-from .material import MATERIAL_ROWS, PARTS_OF_ROWS, check_array, check_batches
+from .diagonal import named_material
+from .material import ARRAYS, PARTS_OF_ROWS, check_array, check_batches, check_hard, dims_of, in_order, named_arrays
 from .material_parts import COLUMNS, whole_arrays
 from .multilevel import has_levels, has_strangers
 from .parametrized import invert, parametrization
-from .placing import plan_for_solver
+from .pins import PIN_HARD, split_springs
+from .placing import is_recording, loosened_plan, plan_for_solver
 from .plan import Plan
 from .warn import warn_user
+from .written import plain_tensor
 
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_keys", "check_kinds", "check_originals", "check_saved", "ordinary", "replace_material"]
+__all__ = ["check_keys", "check_originals", "load_material", "look_at_pins", "ordinary", "replace_material"]
 
-_OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness")  # what decides how many iterations a step takes
+_OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)  # what decides how many iterations a step takes
 
 
 @contextmanager
@@ -41,11 +44,12 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
     """What `set_material` and loading do, for whom errors name; `anew`: new parameters, nothing is written over."""
     check_has_values(owner, sim.device)
     for name in arrays:
-        if name not in MATERIAL_ROWS and name not in COLUMNS:
-            names = ", ".join([*MATERIAL_ROWS, *COLUMNS])
+        if name not in ARRAYS and name not in COLUMNS:
+            names = ", ".join([*ARRAYS, *COLUMNS])
             part_of = f"; {PARTS_OF_ROWS[name]}" if name in PARTS_OF_ROWS else ""
             raise TypeError(f"{owner}: no array {name!r}; there are {names}{part_of}")
     arrays = whole_arrays(sim, owner, arrays)
+    hard = arrays.pop(PIN_HARD, None)
     checked = {name: check_array(owner, name, value, getattr(sim, name)) for name, value in arrays.items()}
     for name, value in arrays.items():
         if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
@@ -53,7 +57,11 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
                 f"{owner} copies the numbers of {name}, so no gradient gets to what they were made of: give "
                 f'it to calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it'
             )
-    check_batches(owner, checked, dict(zip(MATERIAL_ROWS, sim.material(), strict=True)))
+    if hard is not None:
+        checked[PIN_HARD] = check_hard(owner, hard, sim.pin_hard)
+    check_batches(owner, checked, named_arrays(sim))
+    if "pin_stiffness" in checked:
+        checked |= _pins_apart(sim, owner, checked["pin_stiffness"], checked.get(PIN_HARD))
     with ordinary():
         originals = {}
         for name in [name for name in checked if is_parametrized(sim, name)]:
@@ -61,7 +69,7 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
         parameters = {
             name: nn.Parameter(tensor.clone(), requires_grad=getattr(sim, name).requires_grad)
             for name, tensor in checked.items()
-            if anew or tensor.shape != getattr(sim, name).shape
+            if name != PIN_HARD and (anew or tensor.shape != getattr(sim, name).shape)
         }
         reshaped = [name for name, tensor in checked.items() if tensor.shape != getattr(sim, name).shape]
         # before anything is replaced, because it may fail
@@ -73,10 +81,12 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
                 parametrization(sim, name).original.copy_(originals[name])
             elif name in parameters:
                 setattr(sim, name, parameters[name])
+            elif name == PIN_HARD and (anew or tensor.shape != sim.pin_hard.shape):
+                sim.pin_hard = tensor.clone()
             else:
                 getattr(sim, name).copy_(tensor)
-    sim._written.remember_pins(sim.pin_stiffness)
     sim.plan = plan
+    look_at_pins(sim, wait=True)
     if any(name in checked for name in _OF_THE_RATE):
         sim.judge_iterations(owner)
     if learned := [name for name in reshaped if name in parameters and parameters[name].requires_grad]:
@@ -86,22 +96,80 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
         )
 
 
+def _pins_apart(sim: Model, owner: str, springs: Tensor, hard: Tensor | None) -> dict[str, Tensor]:
+    """Springs as they are stored, and which pins are hard: those given as inf, or those that `hard` says."""
+    stored, infinite = split_springs(springs)
+    if hard is not None:
+        _refuse_pins(
+            f"{owner}: pin_stiffness is inf, which holds exactly, where {PIN_HARD} is False", infinite & ~hard
+        )
+        return {"pin_stiffness": stored, PIN_HARD: hard}
+    was = sim.pin_hard
+    if was.dim() == 2 and was.shape != springs.shape:
+        was = was.any(0)
+    # what sim.pin_stiffness has there: who scales that must not let go unawares
+    _refuse_pins(
+        f"{owner}: pin_stiffness is 0 for pins that are hard, and does not say whether these are let go: give inf to "
+        f"hold on, {PIN_HARD}=False to let go, or {PIN_HARD} of every pin",
+        was & (springs == 0.0),
+    )
+    return {"pin_stiffness": stored, PIN_HARD: infinite}
+
+
+def _refuse_pins(fault: str, bad: Tensor) -> None:
+    if bool(bad.any()):
+        places = bad.nonzero()
+        raise ValueError(f"{fault}; at {places[0].tolist()} ({len(places)} in all)")
+
+
 def _plan_with(sim: Model, arrays: dict[str, Tensor]) -> Plan:
     """The plan that serves the material with some arrays replaced."""
-    if not has_levels(sim.plan.arrays) or "pin_stiffness" not in arrays:
+    if "pin_stiffness" not in arrays and PIN_HARD not in arrays:
         return sim.plan
+    own = named_arrays(sim)
+    now, was = in_order(own | arrays), in_order(own)
+    plan = loosened_plan(sim, sim.pinned.loose(arrays.get(PIN_HARD, sim.pin_hard).cpu().numpy()))
+    if not has_levels(plan.arrays):
+        return plan
     # what is held belongs to the structure of a preconditioner
-    held = _held_everywhere(sim.pin_stiffness), _held_everywhere(arrays["pin_stiffness"])
-    material = [arrays.get(name, getattr(sim, name)) for name in MATERIAL_ROWS]
-    if torch.equal(*held) and not has_strangers(sim.plan, material, sim.time_step):
-        return sim.plan
-    return plan_for_solver(sim, material)
+    held = _held_everywhere(was), _held_everywhere(now)
+    if torch.equal(*held) and not has_strangers(plan, now, sim.time_step):
+        return plan
+    return plan_for_solver(sim, now, plan)
 
 
-def _held_everywhere(pin_stiffness: Tensor) -> Tensor:
+def _held_everywhere(material: list[Tensor]) -> Tensor:
     """Whether each pin holds exactly in all environments [P]."""
-    hard = pin_stiffness.isinf()
+    hard = named_material(material)["pin_stiffness"].isinf()
     return hard.all(0) if hard.dim() == 2 else hard
+
+
+def look_at_pins(sim: Model, *, wait: bool = False) -> bool:
+    """Whether pins may be hard. Pieces that the mask has let go since it was looked at get rigid motions.
+
+    A step reads the mask, for which it would await a GPU, only after somebody has written to it while the plan clamps a
+    piece; with `wait` it is read whatever the plan does.
+    """
+    hard = sim.pin_hard
+    if not hard.shape[-1]:
+        return False
+    if torch.compiler.is_compiling():
+        return True
+    seen, loose = sim._seen_pins, sim.plan.loose
+    if seen.holds(hard):
+        return seen.found
+    plain = plain_tensor(hard)
+    if not wait and (loose is None or bool(loose.all())):
+        return True
+    if plain is None or plain.is_meta or is_recording(plain.device):
+        return True
+    mask = plain.cpu().numpy()
+    with ordinary():
+        sim.plan = loosened_plan(sim, sim.pinned.loose(mask))
+    found = bool(mask.any())
+    if plain is hard:
+        seen.remember(hard, found)
+    return found
 
 
 def check_kinds(sim: Model, owner: str, arrays: Mapping[str, Any]) -> None:
@@ -115,12 +183,44 @@ def check_kinds(sim: Model, owner: str, arrays: Mapping[str, Any]) -> None:
             )
 
 
+def load_material(
+    sim: Model, state_dict: dict[str, Any], prefix: str, rest: tuple[Any, ...], load: Callable[..., None]
+) -> None:
+    """Check values, and take arrays of every environment where a simulator had shared ones; then `load`, torch's way."""
+    local_metadata, *_, errors = rest
+    assign = bool(local_metadata.get("assign_to_params_buffers", False))
+    owner = f"{type(sim).__name__}.load_state_dict"
+    arrays = {n: state_dict[prefix + n] for n in ARRAYS if prefix + n in state_dict}
+    try:
+        with torch.no_grad():
+            check_saved(owner, arrays)
+            if assign:
+                check_kinds(sim, owner, arrays)
+            replace_material(sim, owner, arrays, anew=assign)
+    except (TypeError, ValueError) as error:
+        if not prefix:
+            raise
+        errors.append(f"{prefix.removesuffix('.')}: {error}")
+        return
+    # older ones say by inf which pins are hard
+    older = PIN_HARD not in arrays
+    if older:
+        state_dict[prefix + PIN_HARD] = sim.pin_hard
+        if "pin_stiffness" in arrays:
+            state_dict[prefix + "pin_stiffness"] = sim.pin_stiffness.detach()
+    load(state_dict, prefix, *rest)
+    if older and is_parametrized(sim, "pin_stiffness"):
+        with torch.no_grad():
+            replace_material(sim, owner, {"pin_stiffness": sim.pin_stiffness})
+    look_at_pins(sim, wait=True)
+
+
 def check_saved(owner: str, arrays: Mapping[str, Any]) -> None:
     """Refuse what `set_material` would stretch, and torch refuses after arrays before it are written."""
     for name, array in arrays.items():
         if not isinstance(array, Tensor):
             raise TypeError(f"{owner}: {name} must be a tensor, got {type(array).__name__}")
-        dims = MATERIAL_ROWS[name].dims
+        dims = dims_of(name)
         if array.dim() < dims:
             raise ValueError(f"{owner}: {name} must have {dims} or {dims + 1} dimensions, got {list(array.shape)}")
 
@@ -152,7 +252,8 @@ def check_keys(sim: Model, state_dict: Mapping[str, Any], *, strict: bool) -> No
         faults = [
             f"{fault} key(s) in state_dict: {', '.join(map(repr, keys))}"
             for fault, keys in (
-                ("Missing", [key for key in wanted if key not in state_dict]),
+                # which pins are hard older ones say by inf
+                ("Missing", [key for key in wanted if key not in (*state_dict, PIN_HARD)]),
                 ("Unexpected", [key for key in state_dict if key not in wanted]),
             )
             if keys

@@ -13,17 +13,18 @@ from .automatic import AIM, Choice, choose_solver
 from .checks import check_has_values, check_whole
 from .forecast import FAR_TOO_FEW, warn_of_few_iterations
 from .material import MATERIAL_ROWS, material_of
-from .material_changes import check_keys, check_kinds, check_originals, check_saved, ordinary, replace_material
+from .material_changes import check_keys, check_originals, load_material, look_at_pins, ordinary, replace_material
 from .model_checks import check_batch, check_state, check_time_step, check_tolerance, positions_of
 from .multilevel import has_levels
-from .placing import check_wanted_device, move_plan, plan_anew, plan_for_solver, plan_on
+from .pins import PIN_HARD, hold_exactly
+from .placing import check_wanted_device, is_recording, move_plan, plan_anew, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
 from .solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Multilevel, Solver, check_solver
 from .state import State
 from .targets import Anchors, Targets
-from .written import Written
+from .written import Seen
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -47,6 +48,7 @@ class Model(nn.Module):
     gravity: Tensor
     damping: Tensor
     pin_stiffness: Tensor
+    pin_hard: Tensor
     pin_targets: Tensor
     planes: Tensor
     spheres: Tensor
@@ -81,13 +83,16 @@ class Model(nn.Module):
         self.progress = progress
         values = scene.values()
         self.anchors = Anchors(scene)
-        self._written = Written()
+        self.pinned = values.pinned
+        self._seen_rest, self._seen_pins = Seen(), Seen()
         with ordinary():
             self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
             self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
-            for name, value in material_of(values, dtype).items():
-                self.register_parameter(name, nn.Parameter(value, requires_grad=False))
-        self._written.remember_pins(self.pin_stiffness)
+            arrays = material_of(values, dtype)
+            for name in MATERIAL_ROWS:
+                self.register_parameter(name, nn.Parameter(arrays[name], requires_grad=False))
+            self.register_buffer(PIN_HARD, arrays[PIN_HARD])
+        look_at_pins(self, wait=True)
         self.choice: Choice | None = None  # of "auto"
         if _is_auto(solver):
             self._choose_solver(None if iterations is None else self.iterations)
@@ -164,7 +169,7 @@ class Model(nn.Module):
         self._time_step = check_time_step(time_step, self.dtype)
         shortest, longest = self._judged_steps
         # where it changes in every step hardly any change shall cost more than to ask
-        if not (shortest <= self._time_step <= longest or _recording(self.device)):
+        if not (shortest <= self._time_step <= longest or is_recording(self.device)):
             self.judge_iterations("time_step")
 
     @property
@@ -266,8 +271,13 @@ class Model(nn.Module):
             self.plan = plan_for_solver(self, self.material())
 
     def material(self) -> list[Tensor]:
-        """The differentiable arrays in the order of the ops, contiguous whatever a call or a parametrization gives."""
+        """The differentiable arrays in the order of the ops, contiguous whatever a call or a parametrization gives.
+
+        Springs of pins that are hard are inf here.
+        """
         arrays = [getattr(self, name) for name in MATERIAL_ROWS]
+        if look_at_pins(self):
+            arrays[_PIN_STIFFNESS] = hold_exactly(arrays[_PIN_STIFFNESS], self.pin_hard)
         # to ask takes far less than contiguous(), which is 6 of the 40 us of a tiny step
         return [array if array.is_contiguous() else array.contiguous() for array in arrays]
 
@@ -312,23 +322,7 @@ class Model(nn.Module):
         return super().load_state_dict(state_dict, strict, assign)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        """Checks values, and takes arrays of every environment where this simulator had shared ones."""
-        local_metadata, errors = rest[0], rest[-1]
-        assign = bool(local_metadata.get("assign_to_params_buffers", False))
-        owner = f"{type(self).__name__}.load_state_dict"
-        arrays = {n: state_dict[prefix + n] for n in MATERIAL_ROWS if prefix + n in state_dict}
-        try:
-            with torch.no_grad():
-                check_saved(owner, arrays)
-                if assign:
-                    check_kinds(self, owner, arrays)
-                replace_material(self, owner, arrays, anew=assign)
-        except (TypeError, ValueError) as error:
-            if not prefix:
-                raise
-            errors.append(f"{prefix.removesuffix('.')}: {error}")
-            return
-        super()._load_from_state_dict(state_dict, prefix, *rest)
+        load_material(self, state_dict, prefix, rest, super()._load_from_state_dict)
 
     def check_state(self, state: State, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:
         """Refuse what is no state, one of another precision or device, velocities and forces unlike its positions.
@@ -355,7 +349,6 @@ class Model(nn.Module):
     def material_at(self, targets: Targets | None, batch: int, *, fix: str = "") -> list[Tensor]:
         """The material with pins and spheres where `targets` puts them; `fix` ends errors about targets that do not."""
         material = self.material()
-        self._written.check_pins(material[_PIN_STIFFNESS])
         if targets is None:
             return material
         pins, spheres = self.anchors.place(
@@ -393,12 +386,8 @@ class Model(nn.Module):
                 # the material may have been trained, and keeps the digits it has
                 positions = self.scene.values().rest_positions
                 self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
+        look_at_pins(self, wait=True)
         return self
-
-
-def _recording(device: torch.device) -> bool:
-    """Whether torch.compile or a CUDA graph is looking on, which can wait for no value."""
-    return torch.compiler.is_compiling() or (device.type == "cuda" and torch.cuda.is_current_stream_capturing())
 
 
 def _is_auto(solver: object) -> bool:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .checks import check_like, check_whole, in_full, of_each
 from .state import State
+from .written import check_rest
 
 if TYPE_CHECKING:
     from .model import Model
@@ -98,7 +99,7 @@ def positions_of(sim: Model, state: State | Tensor, name: str) -> Tensor:
 
 def _check_kind(sim: Model, name: str, positions: Tensor) -> None:
     own = sim.rest_positions
-    sim._written.check_rest(own, sim.scene)
+    check_rest(sim._seen_rest, own, sim.scene)
     if positions.dtype != own.dtype or positions.device != own.device:
         raise TypeError(
             f"{name} must be {own.dtype} on {own.device} like the simulator, got {positions.dtype} on "

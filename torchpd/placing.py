@@ -3,23 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from . import _C
 from .gpu import free_memory, properties_of, refuse_full_memory, seen_devices, step_bytes, why_not
-from .material import environments_of_material, material_of
+from .material import environments_of_material, in_order, material_of
 from .multilevel import precondition_plan, reference_of, reference_of_levels, without_levels
-from .plan import Plan, compile_plan
+from .plan import Plan, compile_plan, with_loose_pieces
 from .regimes import choose_plan
 from .solvers import Multilevel
 
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_wanted_device", "find_device", "move_plan", "plan_anew", "plan_for_solver", "plan_on"]
+__all__ = [
+    "check_wanted_device",
+    "find_device",
+    "is_recording",
+    "loosened_plan",
+    "move_plan",
+    "plan_anew",
+    "plan_for_solver",
+    "plan_on",
+]
+
+Pieces = NDArray[np.bool_]
 
 
 def _reason(device: torch.device | None = None) -> str:
@@ -67,9 +81,13 @@ def _same_plan(source: torch.device, target: torch.device) -> bool:
     return source == target or properties_of(source) == properties_of(target)
 
 
-def _compile(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
+def _compile(sim: Model, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
     """The scene's plan for a device and the solver, on the CPU, without what the solver prepares."""
     values = sim.scene.values()
+    # "meta" does not know which pins are hard
+    if loose is None and sim.device.type != "meta":
+        loose = values.pinned.loose(sim.pin_hard.cpu().numpy())
+    values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
         return compile_plan(values, dtype=dtype, progress=sim.progress)
     levels = isinstance(sim.solver, Multilevel)
@@ -77,10 +95,10 @@ def _compile(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
     return choose_plan(values, dtype, gpu, sim.kernel, levels=levels, batch=sim.batch, progress=sim.progress)
 
 
-def plan_for_solver(sim: Model, material: Sequence[Tensor]) -> Plan:
-    """The plan of a simulator for its solver, where it is, with what the solver prepares of a material."""
+def plan_for_solver(sim: Model, material: Sequence[Tensor], plan: Plan | None = None) -> Plan:
+    """The plan of a simulator, or the one given, for its solver, with what the solver prepares of a material."""
     wants = isinstance(sim.solver, Multilevel)
-    plan = without_levels(sim.plan)
+    plan = without_levels(sim.plan if plan is None else plan)
     # kernels of a GPU want other patches for a multilevel solver than for the others
     if plan.kernel is not None and wants != plan.for_levels:
         plan = _compile(sim, sim.dtype, sim.device)
@@ -88,6 +106,17 @@ def plan_for_solver(sim: Model, material: Sequence[Tensor]) -> Plan:
         reference = reference_of(sim.plan, material, sim.time_step)
         plan = precondition_plan(plan, sim.scene.values(), *reference, progress=sim.progress)
     return move_plan(sim, plan, sim.device)
+
+
+def loosened_plan(sim: Model, loose: Pieces) -> Plan:
+    """The plan of a simulator where these pieces can move rigidly too; its own where they can already."""
+    before = sim.plan.loose
+    if before is None or bool((before | ~loose).all()):
+        return sim.plan
+    loose = before | loose
+    if sim.plan.kernel is None:
+        return with_loose_pieces(sim.plan, replace(sim.scene.values(), loose=loose))
+    return move_plan(sim, plan_anew(sim, sim.dtype, sim.device, loose), sim.device)
 
 
 def move_plan(sim: Model, plan: Plan, device: torch.device, material: int = 0) -> Plan:
@@ -100,14 +129,19 @@ def move_plan(sim: Model, plan: Plan, device: torch.device, material: int = 0) -
     return plan.to(device)
 
 
-def plan_anew(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
-    """The plan of a simulator for a precision and a device, on the CPU."""
-    plan = _compile(sim, dtype, device)
+def is_recording(device: torch.device) -> bool:
+    """Whether torch.compile or a CUDA graph is looking on, which can wait for no value."""
+    return torch.compiler.is_compiling() or (device.type == "cuda" and torch.cuda.is_current_stream_capturing())
+
+
+def plan_anew(sim: Model, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
+    """The plan of a simulator for a precision and a device, on the CPU; `loose`: its pieces that can move rigidly."""
+    plan = _compile(sim, dtype, device, loose)
     if not isinstance(sim.solver, Multilevel):
         return plan
     # what M was made of goes along, as into a file; coming from "meta" the values are lost
     if sim.device.type == "meta":
-        arrays = list(material_of(sim.scene.values(), sim.dtype).values())
+        arrays = in_order(material_of(sim.scene.values(), sim.dtype))
         source = compile_plan(sim.scene.values(), dtype=sim.dtype, progress=False)
         reference = reference_of(source, arrays, sim.time_step)
     else:

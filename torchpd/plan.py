@@ -18,11 +18,22 @@ from .checks import tensor_of
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, PLAN_TABLE, PlanRow
 
-__all__ = ["KERNELS", "Plan", "any_of", "compile_plan", "compiling", "internal_numbers", "kernel_of", "loose_pieces"]
+__all__ = [
+    "KERNELS",
+    "Plan",
+    "any_of",
+    "compile_plan",
+    "compiling",
+    "internal_numbers",
+    "kernel_of",
+    "loose_pieces",
+    "with_loose_pieces",
+]
 
 _WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
 # by their number in the `sizes` of a GPU's plan
 KERNELS = ("block", "cluster", "grid", "stream")
+_SIZE_GROUPS = 3  # as in csrc/plan/views.h
 
 
 def kernel_of(arrays: Sequence[Tensor]) -> str:
@@ -37,7 +48,8 @@ class Plan:
 
     The CPU and GPUs have a table each, which that of a multilevel preconditioner may follow. `why` says in words why a
     GPU's plan is for the kernel that it is for; `for_levels`: its patches are those of a multilevel solver, and `many`
-    those for so many environments that each has few multiprocessors.
+    those for so many environments that each has few multiprocessors. `loose`: whether each connected piece of the scene
+    is one that a step moves rigidly, None where nobody says; what hard pins clamp is not.
     """
 
     arrays: tuple[Tensor, ...]
@@ -45,6 +57,7 @@ class Plan:
     why: str = ""
     for_levels: bool = False
     many: bool = False
+    loose: NDArray[np.bool_] | None = None
 
     def __getattr__(self, name: str) -> Tensor:
         for number, row in enumerate(self.table):
@@ -135,24 +148,22 @@ def any_of(names: Sequence[str]) -> str:
 
 
 def loose_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Number of the piece that each vertex belongs to and that can move rigidly (-1: it cannot), and each one's size.
-
-    Soft pins leave a connected piece all rigid motions, hard ones turns where they lie at a point or along a line.
-    """
-    pieces = int(values.component.max()) + 1
-    loose = np.ones(pieces, dtype=bool)
-    hard = values.pin_vertices[np.isinf(values.pin_stiffness)]
-    points, of = values.rest_positions[hard], values.component[hard]
-    count = np.maximum(np.bincount(of, minlength=pieces), 1)[:, None]
-    mean = np.stack([np.bincount(of, weights=axis, minlength=pieces) for axis in points.T], axis=1) / count
-    arms = points - mean[of]
-    spread = np.zeros((pieces, 3, 3))
-    np.add.at(spread, of, arms[:, :, None] * arms[:, None, :])
-    size = np.linalg.eigvalsh(spread)
-    loose[size[:, 1] > 1e-8 * size[:, 2]] = False
-    number = np.where(loose, np.cumsum(loose) - 1, -1)
+    """Number of the piece that each vertex belongs to and that can move rigidly (-1: it cannot), and each one's size."""
+    number = np.where(values.loose, np.cumsum(values.loose) - 1, -1)
     group = number[values.component].astype(np.int32)
-    return group, np.bincount(group[group >= 0], minlength=int(loose.sum())).astype(np.int32)
+    return group, np.bincount(group[group >= 0], minlength=int(values.loose.sum())).astype(np.int32)
+
+
+def with_loose_pieces(plan: Plan, values: SceneValues) -> Plan:
+    """The plan of a CPU where other pieces of the scene can move rigidly."""
+    if plan.kernel is not None:
+        raise ValueError("with_loose_pieces: a GPU's plan has its pieces in other arrays; compile it anew")
+    group, group_size = (tensor_of(array) for array in loose_pieces(values))
+    sizes = plan.sizes.clone()
+    sizes[_SIZE_GROUPS] = len(group_size)
+    new = {"vertex_group": group[plan.vertex_order.long()], "group_size": group_size, "sizes": sizes}
+    arrays = tuple(new.get(row.name, array) for row, array in zip(plan.table, plan.arrays, strict=True))
+    return replace(plan, arrays=arrays, loose=values.loose)
 
 
 def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
@@ -200,4 +211,4 @@ def compile_plan(
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
     arrays["sizes"] = _sizes(arrays, tets)
     tensors = (tensor_of(arrays[row.name]) for row in PLAN_TABLE)
-    return Plan(tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors))
+    return Plan(tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors), loose=values.loose)

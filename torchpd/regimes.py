@@ -112,7 +112,7 @@ class _Scene(NamedTuple):
     def plan(self, kernel: str, patches: int) -> Plan:
         number = KERNELS.index(kernel)
         arrays = compile_device_plan(self.values, patches, number, self.dtype, progress=self.progress)
-        return Plan(arrays, DEVICE_PLAN_TABLE)
+        return Plan(arrays, DEVICE_PLAN_TABLE, loose=self.values.loose)
 
     def shared_bytes(self, plan: Plan) -> int:
         return most_shared_bytes(plan, len(self.values.planes), len(self.values.spheres))

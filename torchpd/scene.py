@@ -11,6 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from .pins import PinnedPieces
 
 __all__ = ["Part", "Scene", "SceneValues"]
 
@@ -36,6 +37,8 @@ class SceneValues:
     spheres: Array  # [S, 5] center, radius, friction
     damping: float  # 1/s
     component: Index  # [V] number of the connected piece of mesh that a vertex belongs to
+    pinned: PinnedPieces  # where pins hold them
+    loose: NDArray[np.bool_]  # [pieces] whether hard pins leave a piece rigid motions
 
 
 # What contacts and pins hold are vertices of tets that are partly empty: far softer ones would be squashed flat, and a
@@ -151,21 +154,26 @@ class Scene:
         density = np.concatenate([_filled(solid, solid.density) for solid in self.solids])
         pin_vertices = self._pinned()
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
+        stiffness = np.concatenate([np.zeros(0), *springs])
+        masses, component = _lumped_masses(positions, tets, density), _components(len(positions), tets)
+        pinned = PinnedPieces.of(positions, masses, component, pin_vertices)
         gravity, damping = self._all(Gravity), self._all(Damping)
         return SceneValues(
             rest_positions=positions,
             tets=tets,
             stiffness=np.concatenate([_filled(solid, solid.youngs, _LEAST_RESISTANCE) for solid in self.solids]),
             density=density,
-            masses=_lumped_masses(positions, tets, density),
+            masses=masses,
             pin_vertices=pin_vertices,
-            pin_stiffness=np.concatenate([np.zeros(0), *springs]),
+            pin_stiffness=stiffness,
             pin_targets=positions[pin_vertices],
             gravity=gravity[0].vector if gravity else np.zeros(3),
             planes=np.array([[*g.normal, g.height, g.friction] for g in self.grounds]).reshape(-1, 5),
             spheres=np.array([[*s.center, s.radius, s.friction] for s in self.spheres]).reshape(-1, 5),
             damping=damping[0].rate if damping else 0.0,
-            component=_components(len(positions), tets),
+            component=component,
+            pinned=pinned,
+            loose=pinned.loose(np.isinf(stiffness)),
         )
 
     def __repr__(self) -> str:

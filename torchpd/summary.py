@@ -90,12 +90,7 @@ def _effect_lines(sim: Simulator) -> list[str]:
         lines.append(
             "fill: stiffness and masses are those of the material times how full tetrahedra are (mesh.fill), unless set"
         )
-    hard = sum(len(pin.vertices) for pin in scene.pins if pin.stiffness is None)
-    soft = sum(len(pin.vertices) for pin in scene.pins) - hard
-    if hard:
-        lines.append(f"hard pins: {hard} vertices that do not move: nothing per iteration")
-    if soft:
-        lines.append(f"soft pins: {soft} springs, {_FOLDED}")
+    lines += _pin_lines(sim)
     if bool((sim.gravity != 0).any()):
         lines.append(f"gravity: {_FOLDED}")
     if bool((sim.damping != 0).any()):
@@ -104,6 +99,20 @@ def _effect_lines(sim: Simulator) -> list[str]:
         lines.append(f"grounds: {len(scene.grounds)}, one projection a vertex and iteration each")
     if scene.spheres:
         lines.append(f"spheres: {len(scene.spheres)}, one projection a vertex and iteration each")
+    return lines
+
+
+def _pin_lines(sim: Simulator) -> list[str]:
+    """Hard pins and springs: those of every environment first."""
+    rows = sim.pin_hard.reshape(-1, sim.pin_hard.shape[-1])
+    always, ever = int(rows.all(0).sum()), int(rows.any(0).sum())
+    lines = []
+    if always:
+        lines.append(f"hard pins: {always} vertices that do not move: nothing per iteration")
+    if ever > always:
+        lines.append(f"pins that are hard in some environments: {ever - always}, springs in the others")
+    if soft := rows.shape[1] - ever:
+        lines.append(f"soft pins: {soft} springs, {_FOLDED}")
     return lines
 
 

@@ -27,8 +27,9 @@ from .checks import check_has_values, check_scalar, check_whole
 from .contenders import safe_solvers
 from .diagonal import step_diagonal
 from .forecast import has_friction
-from .material import MATERIAL_ROWS, fingerprint
+from .material import MATERIAL_ROWS, dims_of, fingerprint, named_arrays
 from .parametrized import plain_copy
+from .pins import PIN_HARD
 from .promise import Promise, Trial
 from .solvers import Chebyshev, Multilevel, Solver
 from .state import State
@@ -288,10 +289,12 @@ def _left(rough: State, before: State, after: State, time_step: float) -> float:
 def _of_environments(sim: Simulator, items: list[int], batch: int) -> Simulator:
     """The simulator for some environments of a batch: material that each has its own of is picked."""
     own = {
-        name: getattr(sim, name).detach()[items]
-        for name, row in MATERIAL_ROWS.items()
-        if getattr(sim, name).dim() > row.dims and len(getattr(sim, name)) == batch
+        name: array.detach()[items]
+        for name, array in named_arrays(sim).items()
+        if array.dim() > dims_of(name) and len(array) == batch
     }
+    if "pin_stiffness" in own:
+        own.setdefault(PIN_HARD, sim.pin_hard)
     picked = plain_copy(sim)
     picked.named_iterations = True  # those of the study are the study's to judge
     picked.set_material(**own)

@@ -1,8 +1,7 @@
-"""What others have written into a simulator where no step would see it."""
+"""What others have written into a simulator since it looked last: a step takes 0.3 us to know."""
 
 from __future__ import annotations
 
-from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,77 +11,65 @@ from torch import Tensor, nn
 if TYPE_CHECKING:
     from .scene import Scene
 
-__all__ = ["Written"]
+__all__ = ["Seen", "check_rest", "plain_tensor"]
 
 _ANOTHER_SHAPE = "and for another shape make a Simulator of another mesh"
 
 
-class Written:
-    """Looks at rest shape and hard pins where they were written to since it looked last: a step takes 0.5 us to know.
-
-    On the CPU alone: to look means to wait for a GPU. Not at what torch traces or maps, either.
-    """
+class Seen:
+    """A tensor and its version when somebody looked at it, and what was found. A copy of it has seen nothing."""
 
     def __init__(self) -> None:
-        self._rest: Tensor | None = None
-        self._rest_version = self._pins_version = -1
-        self._pins: Tensor | None = None
-        self._hard: Tensor | None = None  # where pins held exactly [P] or [B, P]
+        self._tensor: Tensor | None = None
+        self._version = -1
+        self.found = False
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Written:
-        """A copy has arrays of its own, but the same pins are hard."""
-        copied = Written()
-        copied._hard = deepcopy(self._hard, memo)
-        return copied
+    def __deepcopy__(self, memo: dict[int, Any]) -> Seen:
+        return Seen()
 
-    def __reduce__(self) -> tuple[type[Written], tuple[()]]:
-        return Written, ()
+    def __reduce__(self) -> tuple[type[Seen], tuple[()]]:
+        return Seen, ()
 
-    def remember_pins(self, stiffness: Tensor) -> None:
-        """These are checked."""
-        if _can_be_read(stiffness):
-            self._pins, self._pins_version = stiffness, stiffness._version
-            self._hard = stiffness.detach().isinf()
+    def holds(self, tensor: Tensor) -> bool:
+        """Whether this is the tensor, and nobody has written into it."""
+        return tensor is self._tensor and tensor._version == self._version
 
-    def check_pins(self, stiffness: Tensor) -> None:
-        """Refuse NaN where there was inf, of which averages and weight decay make it.
-
-        Any other NaN belongs to its environment, whose residual tells.
-        """
-        if torch.compiler.is_compiling() or (stiffness is self._pins and stiffness._version == self._pins_version):
-            return
-        if type(stiffness) is not nn.Parameter or not _can_be_read(stiffness):
-            return
-        hard = self._hard
-        if hard is not None and hard.shape == stiffness.shape and bool((stiffness.isnan() & hard).any()):
-            raise ValueError(
-                "pin_stiffness of pins that hold exactly was inf and has become NaN, as weight decay and the averages "
-                "of torch.optim.swa_utils make of it: give optimisers only what is learned, AveragedModel an avg_fn "
-                'that keeps inf (docs/limits.md, "Material that is learned"), and set_material(pin_stiffness=...) '
-                "what was there"
-            )
-        self.remember_pins(stiffness)
-
-    def check_rest(self, positions: Tensor, scene: Scene) -> None:
-        """Refuse a rest shape that is learned or changed: steps have the one that was compiled."""
-        if positions.requires_grad and torch.is_grad_enabled():
-            raise ValueError(
-                "rest_positions requires a gradient, but the rest shape is compiled into the plan and gets none: "
-                f"requires_grad_(False), {_ANOTHER_SHAPE}"
-            )
-        if torch.compiler.is_compiling() or (positions is self._rest and positions._version == self._rest_version):
-            return
-        if not _can_be_read(positions):
-            return
-        own = np.concatenate([solid.mesh.vertices for solid in scene.solids])
-        if not torch.equal(positions, torch.tensor(own, dtype=positions.dtype, device="cpu")):
-            raise ValueError(
-                "rest_positions are not those of the scene, but steps have the rest shape that was compiled from it: "
-                f"write back what was there, {_ANOTHER_SHAPE}"
-            )
-        self._rest, self._rest_version = positions, positions._version
+    def remember(self, tensor: Tensor, found: bool = True) -> None:
+        if not tensor.is_inference():  # those count no versions
+            self._tensor, self._version, self.found = tensor, tensor._version, found
 
 
-def _can_be_read(array: Tensor) -> bool:
-    plain = type(array) in (Tensor, nn.Parameter) and array.device.type == "cpu" and not array.is_inference()
-    return plain and not torch._C._functorch.is_functorch_wrapped_tensor(array)
+def check_rest(seen: Seen, positions: Tensor, scene: Scene) -> None:
+    """Refuse a rest shape that is learned or, on the CPU, changed: steps have the one that was compiled."""
+    if positions.requires_grad and torch.is_grad_enabled():
+        raise ValueError(
+            "rest_positions requires a gradient, but the rest shape is compiled into the plan and gets none: "
+            f"requires_grad_(False), {_ANOTHER_SHAPE}"
+        )
+    if torch.compiler.is_compiling() or seen.holds(positions):
+        return
+    # to look at a GPU's means to wait for it
+    if positions.device.type != "cpu" or positions.is_inference() or plain_tensor(positions) is not positions:
+        return
+    own = np.concatenate([solid.mesh.vertices for solid in scene.solids])
+    if not torch.equal(positions, torch.tensor(own, dtype=positions.dtype, device="cpu")):
+        raise ValueError(
+            "rest_positions are not those of the scene, but steps have the rest shape that was compiled from it: "
+            f"write back what was there, {_ANOTHER_SHAPE}"
+        )
+    seen.remember(positions)
+
+
+def plain_tensor(tensor: Tensor) -> Tensor | None:
+    """The tensor itself or, where torch maps it, that of all its places, mapped dimensions first; None of a subclass."""
+    functorch = torch._C._functorch
+    mapped = []
+    while functorch.is_functorch_wrapped_tensor(tensor):
+        mapped.append(functorch.maybe_get_bdim(tensor))
+        tensor = functorch.get_unwrapped(tensor)
+    if type(tensor) not in (Tensor, nn.Parameter):
+        return None
+    places = [place for place in reversed(mapped) if place >= 0]
+    for moved, place in enumerate(places):
+        tensor = tensor.movedim(moved + place, 0)
+    return tensor
