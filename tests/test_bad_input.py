@@ -13,6 +13,7 @@ from small_scene import call_step, numbers, small_simulator
 from torch import Tensor
 
 import torchpd as pd
+from torchpd.material import MATERIAL_ROWS
 
 ops = torch.ops.torchpd
 PATCHES, MOST_SLOTS = 5, 8  # in the order of PlanSize
@@ -25,9 +26,8 @@ def sim() -> pd.Simulator:
 
 def replaced(arrays: list[Tensor], name: str, value: Tensor, sim: pd.Simulator) -> list[Tensor]:
     """Material or plan with one array exchanged."""
-    own = getattr(sim, name, None)
-    own = getattr(sim.plan, name) if own is None else own
-    return [value if array is own else array for array in arrays]
+    number = [*MATERIAL_ROWS].index(name) if name in MATERIAL_ROWS else [row.name for row in sim.plan.table].index(name)
+    return [*arrays[:number], value, *arrays[number + 1 :]]
 
 
 def twice(x: Tensor) -> Tensor:

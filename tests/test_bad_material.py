@@ -9,6 +9,7 @@ import torch
 from small_scene import body, scene, small_simulator
 
 import torchpd as pd
+from torchpd.material import named_arrays
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,22 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
         (
             {"pin_stiffness": 0.0},
             ValueError,
-            "pin_stiffness must be positive, inf for pins that hold exactly, .*, got 0",
+            r"pin_stiffness is 0 for pins that are hard, .* pin_hard=False to let go.*; at \[0\] \(2 in all\)",
+        ),
+        ({"pin_stiffness": -1.0}, ValueError, "pin_stiffness must be >= 0, inf for pins that hold exactly, .*, got -1"),
+        ({"pin_stiffness": math.nan}, ValueError, "pin_stiffness must be >= 0, inf for pins that hold .*, got nan"),
+        (
+            {"pin_stiffness": math.inf, "pin_hard": [True, False, True]},
+            ValueError,
+            r"pin_stiffness is inf, which holds exactly, where pin_hard is False; at \[1\] \(1 in all\)",
+        ),
+        ({"pin_hard": 1.0}, TypeError, r"pin_hard must be bool, whether each pin is hard, got torch\.float32"),
+        ({"pin_hard": "yes"}, TypeError, "pin_hard must be a bool or a bool tensor, got 'yes'"),
+        ({"pin_hard": [True, False]}, ValueError, r"pin_hard must be one bool, \[3\], .* got \[2\]; pins of the"),
+        (
+            {"pin_hard": torch.ones(2, 3) > 0, "masses": torch.ones(3, 27)},
+            ValueError,
+            "arrays must be of one number of environments.* of 3 environments in masses, of 2 in pin_hard",
         ),
         ({"gravity": (0.0, math.nan, 0.0)}, ValueError, "gravity must be finite .*, got nan"),
         ({"damping": -1.0}, ValueError, r"damping must be >= 0 in torch\.float32, got -1\.0$"),
@@ -126,10 +142,10 @@ def test_batches_of_the_material_must_agree() -> None:
             r"of 2 environments in gravity, of 3 in planes",
         ),
     ):
-        before = sim.material()
+        before = named_arrays(sim)
         with pytest.raises(ValueError, match=message):
             sim.set_material(**arrays)
-        assert all(one is other for one, other in zip(before, sim.material(), strict=True))
+        assert all(before[name] is array for name, array in named_arrays(sim).items())
     sim.set_material(**batch("stiffness", 2))
     with pytest.raises(ValueError, match=r"of 2 environments in stiffness \(kept\), of 3 in masses"):
         sim.set_material(**batch("masses", 3))

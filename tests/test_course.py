@@ -21,9 +21,9 @@ def test_it_is_that_of_the_reference(dtype: torch.dtype, device: torch.device) -
     ball = pd.Sphere((0.2, -0.06, 0.05), 0.1, friction=0.5)
     contacts = (pd.Ground(-0.01, normal=(0.1, 1.0, 0.0), friction=0.4), pd.Ground(-0.35, normal=(-1.0, 0.0, 0.0)), ball)
     sim = pd.Simulator(pd.Scene(body, held, sprung, *contacts, pd.Gravity()), H, dtype=dtype, progress=False)
-    stiffness = sim.pin_stiffness.detach().repeat(3, 1)
-    stiffness[1, :4] = 10.0
-    sim.set_material(pin_stiffness=stiffness)
+    stiffness, hard = sim.pin_stiffness.detach().repeat(3, 1), sim.pin_hard.repeat(3, 1)
+    stiffness[1, :4], hard[1, :4] = 10.0, False
+    sim.set_material(pin_stiffness=stiffness, pin_hard=hard)
     sim.to(device)
     generator = torch.Generator().manual_seed(0)
     state = sim.rest_state(3)

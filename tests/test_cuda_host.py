@@ -14,6 +14,7 @@ from on_gpu import DTYPES, GPU, KERNELS, host_waits, poll, small_on_gpu
 from runs import noise, small
 
 import torchpd as pd
+from torchpd.pins import hold_exactly
 
 require_gpu()
 
@@ -37,7 +38,7 @@ def give_everything(sim: pd.Simulator, batch: int = 3) -> None:
         masses=sim.masses * factor.flip(0)[:, None],
         gravity=sim.gravity * factor[:, None],
         damping=sim.damping * factor,
-        pin_stiffness=sim.pin_stiffness * factor[:, None],
+        pin_stiffness=hold_exactly(sim.pin_stiffness * factor[:, None], sim.pin_hard),
         pin_targets=sim.pin_targets + 0.01 * factor[:, None, None],
         planes=sim.planes.expand(batch, -1, -1),
         spheres=sim.spheres.expand(batch, -1, -1),

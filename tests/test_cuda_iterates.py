@@ -35,6 +35,7 @@ from test_same_iterates import RESTARTS, SOLVERS, in_a_corner, restarting, stirr
 
 import torchpd as pd
 from torchpd import regimes
+from torchpd.pins import hold_exactly
 from torchpd.reference import StepProblem, nearest_rotation_fast
 from torchpd.reference_solvers import Iterates
 
@@ -406,7 +407,7 @@ def test_material_of_each_environment(kernel: str, precision: str) -> None:
         "masses": own["masses"] * factor.flip(0)[:, None],
         "gravity": own["gravity"] + shift,
         "damping": own["damping"] * factor,
-        "pin_stiffness": own["pin_stiffness"] * factor[:, None],
+        "pin_stiffness": hold_exactly(own["pin_stiffness"] * factor[:, None], own["pin_hard"]),
         "pin_targets": own["pin_targets"] + shift[:, None],
         "planes": own["planes"] + factor[:, None, None] * torch.tensor([0, 0, 0, 0.01, 0.1]).to(dtype),
         "spheres": own["spheres"] + factor[:, None, None] * torch.tensor([0.01, 0, 0, 0.02, 0.1, 0.5, 0, 0]).to(dtype),

@@ -18,6 +18,7 @@ from runs import simulator
 
 import torchpd as pd
 from torchpd.extension import load_extension
+from torchpd.pins import hold_exactly
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -141,7 +142,7 @@ def test_material_of_an_environment_is_that_of_its_own_simulator(
         "masses": sim.masses * factor.flip(0)[:, None],
         "gravity": sim.gravity + shift,
         "damping": sim.damping * factor,
-        "pin_stiffness": sim.pin_stiffness * factor[:, None],
+        "pin_stiffness": hold_exactly(sim.pin_stiffness * factor[:, None], sim.pin_hard),
         "pin_targets": sim.pin_targets + shift[:, None],
         "planes": sim.planes + factor[:, None, None] * torch.tensor([0, 0, 0, 0.01, 0.1]).to(sim.planes),
         "spheres": sim.spheres + factor[:, None, None] * torch.tensor([0.01, 0, 0, 0.02, 0.1, 0, 0, 0]).to(sim.spheres),

@@ -15,6 +15,7 @@ from cases import box
 from runs import moving, same_bits, simulate
 
 import torchpd as pd
+from torchpd.material import named_arrays
 from torchpd.placing import check_wanted_device
 from torchpd.plan import KERNELS
 from torchpd.solvers import Solver
@@ -52,7 +53,7 @@ def test_state_dict_restores_the_material(dtype: torch.dtype, device: torch.devi
     other.load_state_dict(copy.deepcopy(trained.state_dict()))
     assert same_bits(trained(state), other(state))
     assert set(trained.state_dict()) == {
-        "stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets", "planes", "spheres",
+        "stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_hard", "pin_targets", "planes", "spheres",
     }  # fmt: skip
 
 
@@ -60,7 +61,8 @@ def test_state_dict_restores_the_material(dtype: torch.dtype, device: torch.devi
 def test_a_state_dict_with_other_names_changes_nothing(change: str) -> None:
     sim, trained = simulate(torch.float32), simulate(torch.float32)
     trained.set_material(stiffness=trained.stiffness.expand(2, -1) * 0.3, damping=2.0)
-    parameters, before = sim.material(), [array.clone() for array in sim.material()]
+    parameters = list(named_arrays(sim).values())
+    before = [array.clone() for array in parameters]
     missing, unexpected = ["pin_targets"] * (change != "unexpected"), ["youngs"] * (change != "missing")
     wrong = {name: value for name, value in trained.state_dict().items() if name not in missing}
     wrong |= {name: torch.ones(3) for name in unexpected}
@@ -68,8 +70,8 @@ def test_a_state_dict_with_other_names_changes_nothing(change: str) -> None:
         sim.load_state_dict(wrong)
     assert ("Missing key(s) in state_dict: 'pin_targets'" in str(refusal.value)) == bool(missing)
     assert ("Unexpected key(s) in state_dict: 'youngs'" in str(refusal.value)) == bool(unexpected)
-    assert all(one is other for one, other in zip(parameters, sim.material(), strict=True))
-    assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
+    assert all(one is other for one, other in zip(parameters, named_arrays(sim).values(), strict=True))
+    assert all(torch.equal(one, other) for one, other in zip(before, parameters, strict=True))
     # those that are there, where that is asked for
     left = sim.load_state_dict(wrong, strict=False)
     assert (left.missing_keys, left.unexpected_keys) == (missing, unexpected)

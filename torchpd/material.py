@@ -25,8 +25,8 @@ __all__ = [
     "check_batches",
     "check_hard",
     "check_material",
-    "environments_of_material",
     "dims_of",
+    "environments_of_material",
     "fingerprint",
     "in_order",
     "material_of",
@@ -138,10 +138,10 @@ def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Te
     return tensor.contiguous()
 
 
-def check_hard(owner: str, value: Tensor | bool, own: Tensor) -> Tensor:
+def check_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
     """What is to replace the mask of hard pins `own` of a simulator, on its device."""
     try:
-        tensor = torch.as_tensor(value, device=None if isinstance(value, Tensor) else "cpu")
+        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{owner}: {PIN_HARD} must be a bool or a bool tensor, got {value!r}") from None
     if tensor.dtype != torch.bool:
@@ -152,8 +152,8 @@ def check_hard(owner: str, value: Tensor | bool, own: Tensor) -> Tensor:
         tensor = tensor.expand(*tensor.shape[:-1], *shape)
     if tensor.dim() > 2 or tensor.shape[-1:] != shape:
         raise ValueError(
-            f"{owner}: {PIN_HARD} must be one bool, {list(shape)}, [B, 1] or [B, {shape[0]}], got {list(tensor.shape)}; pins of "
-            f"the scene: {shape[0]}"
+            f"{owner}: {PIN_HARD} must be one bool, {list(shape)}, [B, 1] or [B, {shape[0]}], got "
+            f"{list(tensor.shape)}; pins of the scene: {shape[0]}"
         )
     return tensor.contiguous()
 

@@ -17,17 +17,18 @@ from .material_parts import COLUMNS, whole_arrays
 from .multilevel import has_levels, has_strangers
 from .parametrized import invert, parametrization
 from .pins import PIN_HARD, split_springs
-from .placing import is_recording, loosened_plan, plan_for_solver
+from .placing import is_recording, loosened_plan, plan_for_solver, plan_that_holds
 from .plan import Plan
 from .warn import warn_user
-from .written import plain_tensor
+from .written import has_numbers, plain_tensor
 
 if TYPE_CHECKING:
     from .model import Model
 
 __all__ = ["check_keys", "check_originals", "load_material", "look_at_pins", "ordinary", "replace_material"]
 
-_OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)  # what decides how many iterations a step takes
+# what decides how many iterations a step takes
+_OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)
 
 
 @contextmanager
@@ -49,7 +50,7 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
             part_of = f"; {PARTS_OF_ROWS[name]}" if name in PARTS_OF_ROWS else ""
             raise TypeError(f"{owner}: no array {name!r}; there are {names}{part_of}")
     arrays = whole_arrays(sim, owner, arrays)
-    hard = arrays.pop(PIN_HARD, None)
+    hard: Tensor | float | None = arrays.pop(PIN_HARD, None)
     checked = {name: check_array(owner, name, value, getattr(sim, name)) for name, value in arrays.items()}
     for name, value in arrays.items():
         if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
@@ -100,9 +101,7 @@ def _pins_apart(sim: Model, owner: str, springs: Tensor, hard: Tensor | None) ->
     """Springs as they are stored, and which pins are hard: those given as inf, or those that `hard` says."""
     stored, infinite = split_springs(springs)
     if hard is not None:
-        _refuse_pins(
-            f"{owner}: pin_stiffness is inf, which holds exactly, where {PIN_HARD} is False", infinite & ~hard
-        )
+        _refuse_pins(f"{owner}: pin_stiffness is inf, which holds exactly, where {PIN_HARD} is False", infinite & ~hard)
         return {"pin_stiffness": stored, PIN_HARD: hard}
     was = sim.pin_hard
     if was.dim() == 2 and was.shape != springs.shape:
@@ -145,10 +144,10 @@ def _held_everywhere(material: list[Tensor]) -> Tensor:
 
 
 def look_at_pins(sim: Model, *, wait: bool = False) -> bool:
-    """Whether pins may be hard. Pieces that the mask has let go since it was looked at get rigid motions.
+    """Whether pins may be hard. The plan follows a mask that lets more go than it knows of.
 
-    A step reads the mask, for which it would await a GPU, only after somebody has written to it while the plan clamps a
-    piece; with `wait` it is read whatever the plan does.
+    Pieces get rigid motions then, and a preconditioner no longer holds what it held. A step reads the mask, for which
+    it awaits a GPU, only after somebody has written to it, and not where the plan holds nothing; with `wait` always.
     """
     hard = sim.pin_hard
     if not hard.shape[-1]:
@@ -159,13 +158,14 @@ def look_at_pins(sim: Model, *, wait: bool = False) -> bool:
     if seen.holds(hard):
         return seen.found
     plain = plain_tensor(hard)
-    if not wait and (loose is None or bool(loose.all())):
+    if not wait and (loose is None or bool(loose.all())) and not has_levels(sim.plan.arrays):
         return True
-    if plain is None or plain.is_meta or is_recording(plain.device):
+    if not has_numbers(plain) or is_recording(plain.device):
         return True
-    mask = plain.cpu().numpy()
+    mask = plain.cpu().reshape(-1, plain.shape[-1])
     with ordinary():
-        sim.plan = loosened_plan(sim, sim.pinned.loose(mask))
+        plan = loosened_plan(sim, sim.pinned.loose(mask.numpy()))
+        sim.plan = plan_that_holds(sim, plan, mask.all(0).to(sim.device))
     found = bool(mask.any())
     if plain is hard:
         seen.remember(hard, found)
@@ -186,7 +186,10 @@ def check_kinds(sim: Model, owner: str, arrays: Mapping[str, Any]) -> None:
 def load_material(
     sim: Model, state_dict: dict[str, Any], prefix: str, rest: tuple[Any, ...], load: Callable[..., None]
 ) -> None:
-    """Check values, and take arrays of every environment where a simulator had shared ones; then `load`, torch's way."""
+    """Check values, and take arrays of every environment where a simulator had shared ones; then `load` as torch does.
+
+    Takes the arguments of `Module._load_from_state_dict`.
+    """
     local_metadata, *_, errors = rest
     assign = bool(local_metadata.get("assign_to_params_buffers", False))
     owner = f"{type(sim).__name__}.load_state_dict"
@@ -196,6 +199,8 @@ def load_material(
             check_saved(owner, arrays)
             if assign:
                 check_kinds(sim, owner, arrays)
+            elif PIN_HARD in arrays:
+                arrays[PIN_HARD] = arrays[PIN_HARD].bool()  # as torch converts the others
             replace_material(sim, owner, arrays, anew=assign)
     except (TypeError, ValueError) as error:
         if not prefix:

@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import _C
+from .diagonal import pinned_vertices
 from .gpu import free_memory, properties_of, refuse_full_memory, seen_devices, step_bytes, why_not
 from .material import environments_of_material, in_order, material_of
-from .multilevel import precondition_plan, reference_of, reference_of_levels, without_levels
+from .multilevel import has_levels, precondition_plan, reference_of, reference_of_levels, without_levels
 from .plan import Plan, compile_plan, with_loose_pieces
 from .regimes import choose_plan
 from .solvers import Multilevel
+from .written import plain_tensor
 
 if TYPE_CHECKING:
     from .model import Model
@@ -31,6 +33,7 @@ __all__ = [
     "plan_anew",
     "plan_for_solver",
     "plan_on",
+    "plan_that_holds",
 ]
 
 Pieces = NDArray[np.bool_]
@@ -117,6 +120,25 @@ def loosened_plan(sim: Model, loose: Pieces) -> Plan:
     if sim.plan.kernel is None:
         return with_loose_pieces(sim.plan, replace(sim.scene.values(), loose=loose))
     return move_plan(sim, plan_anew(sim, sim.dtype, sim.device, loose), sim.device)
+
+
+def plan_that_holds(sim: Model, plan: Plan, hard: Tensor) -> Plan:
+    """The plan whose preconditioner, if it has one, holds no pin but those that are hard in every environment [P].
+
+    It is made of what the one before was made of, but for the pins that are let go: held by it they would not move.
+    """
+    if not has_levels(plan.arrays):
+        return plan
+    stiffness, inertia = reference_of_levels(plan.arrays)
+    freed = pinned_vertices(plan.arrays)[~hard]
+    freed = freed[inertia[freed].isinf()]
+    if not len(freed):
+        return plan
+    masses, damping = (plain_tensor(array.detach()) for array in (sim.masses, sim.damping))
+    drag = 1.0 + damping.max() * sim.time_step
+    inertia[freed] = masses.reshape(-1, plan.vertices).amax(0)[freed] / sim.time_step**2 * drag
+    plan = precondition_plan(plan, sim.scene.values(), stiffness, inertia, progress=sim.progress)
+    return move_plan(sim, plan, sim.device)
 
 
 def move_plan(sim: Model, plan: Plan, device: torch.device, material: int = 0) -> Plan:

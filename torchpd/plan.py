@@ -148,7 +148,7 @@ def any_of(names: Sequence[str]) -> str:
 
 
 def loose_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Number of the piece that each vertex belongs to and that can move rigidly (-1: it cannot), and each one's size."""
+    """Number of the piece that each vertex moves rigidly with (-1: none), and how many vertices each one has."""
     number = np.where(values.loose, np.cumsum(values.loose) - 1, -1)
     group = number[values.component].astype(np.int32)
     return group, np.bincount(group[group >= 0], minlength=int(values.loose.sum())).astype(np.int32)

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 __all__ = ["RigidPieces"]
 
 _NOISE = {torch.float32: 1e-5, torch.float64: 1e-12}  # of an energy by rounding, as in csrc/solver/outer.h
-_MADE_OF = ("stiffness", "masses", "damping", "pin_stiffness", "pin_hard")  # what the pieces and their functions depend on
+# what the pieces and their functions depend on
+_MADE_OF = ("stiffness", "masses", "damping", "pin_stiffness", "pin_hard")
 
 
 class RigidPieces:

@@ -104,7 +104,7 @@ def _effect_lines(sim: Simulator) -> list[str]:
 
 def _pin_lines(sim: Simulator) -> list[str]:
     """Hard pins and springs: those of every environment first."""
-    rows = sim.pin_hard.reshape(-1, sim.pin_hard.shape[-1])
+    rows = sim.pin_hard.expand(1, -1) if sim.pin_hard.dim() == 1 else sim.pin_hard
     always, ever = int(rows.all(0).sum()), int(rows.any(0).sum())
     lines = []
     if always:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 if TYPE_CHECKING:
     from .scene import Scene
 
-__all__ = ["Seen", "check_rest", "plain_tensor"]
+__all__ = ["Seen", "check_rest", "has_numbers", "plain_tensor"]
 
 _ANOTHER_SHAPE = "and for another shape make a Simulator of another mesh"
 
@@ -49,7 +49,8 @@ def check_rest(seen: Seen, positions: Tensor, scene: Scene) -> None:
     if torch.compiler.is_compiling() or seen.holds(positions):
         return
     # to look at a GPU's means to wait for it
-    if positions.device.type != "cpu" or positions.is_inference() or plain_tensor(positions) is not positions:
+    readable = positions.device.type == "cpu" and has_numbers(positions) and plain_tensor(positions) is positions
+    if not readable or positions.is_inference():
         return
     own = np.concatenate([solid.mesh.vertices for solid in scene.solids])
     if not torch.equal(positions, torch.tensor(own, dtype=positions.dtype, device="cpu")):
@@ -60,16 +61,18 @@ def check_rest(seen: Seen, positions: Tensor, scene: Scene) -> None:
     seen.remember(positions)
 
 
-def plain_tensor(tensor: Tensor) -> Tensor | None:
-    """The tensor itself or, where torch maps it, that of all its places, mapped dimensions first; None of a subclass."""
+def plain_tensor(tensor: Tensor) -> Tensor:
+    """The tensor itself or, where torch maps it, the whole one, mapped dimensions first."""
     functorch = torch._C._functorch
     mapped = []
     while functorch.is_functorch_wrapped_tensor(tensor):
         mapped.append(functorch.maybe_get_bdim(tensor))
         tensor = functorch.get_unwrapped(tensor)
-    if type(tensor) not in (Tensor, nn.Parameter):
-        return None
-    places = [place for place in reversed(mapped) if place >= 0]
-    for moved, place in enumerate(places):
+    for moved, place in enumerate(place for place in reversed(mapped) if place >= 0):
         tensor = tensor.movedim(moved + place, 0)
     return tensor
+
+
+def has_numbers(tensor: Tensor) -> bool:
+    """Whether the numbers of a tensor can be read: not of a subclass, nor on "meta"."""
+    return type(tensor) in (Tensor, nn.Parameter) and not tensor.is_meta
