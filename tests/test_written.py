@@ -57,8 +57,8 @@ def test_weight_decay_and_averages_leave_hard_pins_hard(learn: Callable[[pd.Simu
     for way in ways(learned, state):
         way()
     after = learned(state).positions
-    assert torch.equal(after[0, :3], sim.rest_positions[:3])
-    assert not torch.equal(after[0, 3:], sim.rest_positions[3:])
+    assert torch.equal(after[0, :3], learned.pin_targets[:3])
+    assert float((after[0, 3:] - sim.rest_positions[3:])[:, 1].mean()) < -1e-4
 
 
 def test_an_average_is_of_what_was_learned() -> None:
