@@ -26,7 +26,7 @@ class CapturedStep:
     material with `sim.pin_targets.copy_(...)` or, in the same shape, `sim.set_material(...)`. Settings (time step,
     iterations, tolerance), the batch, and the material that was there, where `set_material` with another batch or
     `load_state_dict(assign=True)` makes new parameters, stay those of the recording; capture again to change them, and
-    where `set_material` prepares the solver anew: a replay refuses then.
+    where `set_material` prepares the solver anew, or first lets a body go that pins clamped: a replay refuses then.
 
         step = sim.capture(state, forces)
         for _ in range(100):
@@ -78,7 +78,7 @@ class CapturedStep:
         if self._sim.plan is not self._plan:
             raise RuntimeError(
                 "replay: the simulator has another plan than when the step was captured (another solver, kernel or "
-                "device, or a preconditioner made anew): capture it again"
+                "device, a preconditioner made anew, or a body that pins no longer clamp): capture it again"
             )
         self._graph.replay()
 

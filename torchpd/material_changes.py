@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -16,16 +16,24 @@ from .material import ARRAYS, PARTS_OF_ROWS, check_array, check_batches, check_h
 from .material_parts import COLUMNS, whole_arrays
 from .multilevel import has_levels, has_strangers
 from .parametrized import invert, parametrization
-from .pins import PIN_HARD, split_springs
+from .pins import PIN_HARD, hold_exactly, split_springs
 from .placing import is_recording, loosened_plan, plan_for_solver, plan_that_holds
 from .plan import Plan
 from .warn import warn_user
-from .written import has_numbers, plain_tensor
+from .written import Seen, has_numbers, plain_tensor
 
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["check_keys", "check_originals", "load_material", "look_at_pins", "ordinary", "replace_material"]
+__all__ = [
+    "check_keys",
+    "check_originals",
+    "held_springs",
+    "load_material",
+    "ordinary",
+    "read_pins",
+    "replace_material",
+]
 
 # what decides how many iterations a step takes
 _OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)
@@ -87,7 +95,7 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
             else:
                 getattr(sim, name).copy_(tensor)
     sim.plan = plan
-    look_at_pins(sim, wait=True)
+    read_pins(sim)
     if any(name in checked for name in _OF_THE_RATE):
         sim.judge_iterations(owner)
     if learned := [name for name in reshaped if name in parameters and parameters[name].requires_grad]:
@@ -143,32 +151,60 @@ def _held_everywhere(material: list[Tensor]) -> Tensor:
     return hard.all(0) if hard.dim() == 2 else hard
 
 
-def look_at_pins(sim: Model, *, wait: bool = False) -> bool:
-    """Whether pins may be hard. The plan follows a mask that lets more go than it knows of.
+class _Found(NamedTuple):
+    """What somebody found who looked at the mask of hard pins."""
+
+    some: bool  # whether any pin may be hard
+    springs: Tensor | None = None  # where all are hard: springs, whatever their numbers,
+    held: Tensor | None = None  # as the ops take them
+
+
+def held_springs(sim: Model, springs: Tensor) -> Tensor:
+    """`pin_stiffness` as the ops take it: inf where a pin is hard. The plan follows what `pin_hard` lets go."""
+    hard = sim._buffers[PIN_HARD]  # nn.Module.__getattr__ takes as long as all the rest
+    assert hard is not None
+    if torch.compiler.is_compiling():
+        return hold_exactly(springs, hard)
+    seen = sim._seen_pins
+    some, known, held = seen.found if seen.holds(hard) else _look_at_pins(sim, springs, hard)
+    if not some:
+        return springs
+    learned = springs.requires_grad and torch.is_grad_enabled()
+    # what a CUDA graph records shall see later masks
+    if known is not springs or held is None or learned or (springs.is_cuda and is_recording(springs.device)):
+        return hold_exactly(springs, hard)
+    return held
+
+
+def read_pins(sim: Model) -> None:
+    """What later steps need of pins, after these were set or moved: then no step has to wait for a GPU."""
+    sim._seen_pins = Seen()
+    if sim.anchors.pinned:
+        with ordinary():
+            _look_at_pins(sim, sim.pin_stiffness, sim.pin_hard, wait=True)
+
+
+def _look_at_pins(sim: Model, springs: Tensor, hard: Tensor, *, wait: bool = False) -> _Found:
+    """Let the plan follow a mask that lets more go than it knows of, and remember what was found.
 
     Pieces get rigid motions then, and a preconditioner no longer holds what it held. A step reads the mask, for which
     it awaits a GPU, only after somebody has written to it, and not where the plan holds nothing; with `wait` always.
     """
-    hard = sim.pin_hard
-    if not hard.shape[-1]:
-        return False
-    if torch.compiler.is_compiling():
-        return True
-    seen, loose = sim._seen_pins, sim.plan.loose
-    if seen.holds(hard):
-        return seen.found
-    plain = plain_tensor(hard)
+    loose, plain = sim.plan.loose, plain_tensor(hard)
     if not wait and (loose is None or bool(loose.all())) and not has_levels(sim.plan.arrays):
-        return True
+        return _Found(some=True)
     if not has_numbers(plain) or is_recording(plain.device):
-        return True
+        return _Found(some=True)
     mask = plain.cpu().reshape(-1, plain.shape[-1])
+    found = _Found(some=bool(mask.any()))
     with ordinary():
         plan = loosened_plan(sim, sim.pinned.loose(mask.numpy()))
         sim.plan = plan_that_holds(sim, plan, mask.all(0).to(sim.device))
-    found = bool(mask.any())
+        # streams wait for what sets the material, but not for what another one has made in a step
+        if plain is hard and type(springs) is nn.Parameter and bool(mask.all()) and (wait or not hard.is_cuda):
+            found = _Found(True, springs, hold_exactly(springs, hard))
     if plain is hard:
-        seen.remember(hard, found)
+        sim._seen_pins.remember(hard, found)
     return found
 
 
@@ -217,7 +253,7 @@ def load_material(
     if older and is_parametrized(sim, "pin_stiffness"):
         with torch.no_grad():
             replace_material(sim, owner, {"pin_stiffness": sim.pin_stiffness})
-    look_at_pins(sim, wait=True)
+    read_pins(sim)
 
 
 def check_saved(owner: str, arrays: Mapping[str, Any]) -> None:

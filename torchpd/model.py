@@ -13,10 +13,18 @@ from .automatic import AIM, Choice, choose_solver
 from .checks import check_has_values, check_whole
 from .forecast import FAR_TOO_FEW, warn_of_few_iterations
 from .material import MATERIAL_ROWS, material_of
-from .material_changes import check_keys, check_originals, load_material, look_at_pins, ordinary, replace_material
+from .material_changes import (
+    check_keys,
+    check_originals,
+    held_springs,
+    load_material,
+    ordinary,
+    read_pins,
+    replace_material,
+)
 from .model_checks import check_batch, check_state, check_time_step, check_tolerance, positions_of
 from .multilevel import has_levels
-from .pins import PIN_HARD, hold_exactly
+from .pins import PIN_HARD
 from .placing import check_wanted_device, is_recording, move_plan, plan_anew, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
@@ -92,7 +100,7 @@ class Model(nn.Module):
             for name in MATERIAL_ROWS:
                 self.register_parameter(name, nn.Parameter(arrays[name], requires_grad=False))
             self.register_buffer(PIN_HARD, arrays[PIN_HARD])
-        look_at_pins(self, wait=True)
+        read_pins(self)
         self.choice: Choice | None = None  # of "auto"
         if _is_auto(solver):
             self._choose_solver(None if iterations is None else self.iterations)
@@ -276,8 +284,8 @@ class Model(nn.Module):
         Springs of pins that are hard are inf here.
         """
         arrays = [getattr(self, name) for name in MATERIAL_ROWS]
-        if look_at_pins(self):
-            arrays[_PIN_STIFFNESS] = hold_exactly(arrays[_PIN_STIFFNESS], self.pin_hard)
+        if self.anchors.pinned:
+            arrays[_PIN_STIFFNESS] = held_springs(self, arrays[_PIN_STIFFNESS])
         # to ask takes far less than contiguous(), which is 6 of the 40 us of a tiny step
         return [array if array.is_contiguous() else array.contiguous() for array in arrays]
 
@@ -295,6 +303,14 @@ class Model(nn.Module):
         says: for that `torch.func.functional_call` gives the simulator other arrays for one call, and a parametrization
         (`torch.nn.utils.parametrize`) for all. One that is there is written to through its `right_inverse`.
 
+        Pins are let go and grasped again by `pin_hard`, one bool, [P], [B, 1] or [B, P]: a pin that is not hard is a
+        spring of its `pin_stiffness`, and of 0 N/m nothing. A `pin_stiffness` without `pin_hard` says that too: inf is
+        hard and stored as 0, any other number is a spring; 0 for a pin that is hard is refused, as it does not say
+        whether that is let go.
+
+            sim.set_material(pin_hard=holds[:, None])                     # [B] bool: some environments let go
+            sim.set_material(pin_hard=True, pin_targets=where)            # grasp at [B, P, 3] m
+
         Args:
             arrays: by name, see `Simulator`; one number is for all elements, vertices or pins of `stiffness`, `masses`
                 or `pin_stiffness`. It counts as it is: where tetrahedra are partly full (`mesh.fill`) multiply
@@ -302,7 +318,8 @@ class Model(nn.Module):
                 `spheres`: `friction` [C + S] of grounds, then spheres, `height` [C] and `radius` [S] in m, each also
                 one number, or [B, 1] for all of an environment. Shapes and values are checked here, once, and that
                 batches agree with each other and with those of the arrays that stay. Pins that hold others, or much
-                harder, make the matrix of `Multilevel` anew, see `prepare_solver`; a captured step wants to be captured
+                harder, make the matrix of `Multilevel` anew, see `prepare_solver`. A body that hard pins clamped, and
+                no longer do in some environment, makes the plan anew, on a GPU as `to` does. Capture a captured step
                 again then. Where the default iterations, or those of "auto", become far too few an `UnsolvedWarning`
                 says so, once.
         """
@@ -386,7 +403,7 @@ class Model(nn.Module):
                 # the material may have been trained, and keeps the digits it has
                 positions = self.scene.values().rest_positions
                 self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
-        look_at_pins(self, wait=True)
+        read_pins(self)
         return self
 
 

@@ -158,7 +158,9 @@ class Multilevel:
     friction the first two, three times, because unsettled normal forces lead astray. "lbfgs" and "momentum" know
     nothing of contacts; with friction "lbfgs" gives way at once.
     M is made of the material when the simulator is, see `Simulator.prepare_solver`; an environment that differs gets
-    M / s, s its largest ratio of inertia or stiffness to that material. `Info.rho` says how unlike the two are.
+    M / s, s its largest ratio of inertia or stiffness to that material. `Info.rho` says how unlike the two are. M holds
+    what hard pins hold in every environment. Where one holds more, its step is right but slower: M leaves these
+    vertices to the diagonal.
 
     Args:
         outer: "lbfgs" corrects M by the last eight steps, "momentum" (no inner products) extrapolates. "corotated", the

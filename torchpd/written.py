@@ -17,12 +17,12 @@ _ANOTHER_SHAPE = "and for another shape make a Simulator of another mesh"
 
 
 class Seen:
-    """A tensor and its version when somebody looked at it, and what was found. A copy of it has seen nothing."""
+    """A tensor, its version when somebody looked at it, and what was found. A copy of this has seen nothing."""
 
     def __init__(self) -> None:
         self._tensor: Tensor | None = None
         self._version = -1
-        self.found = False
+        self.found: Any = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Seen:
         return Seen()
@@ -31,10 +31,10 @@ class Seen:
         return Seen, ()
 
     def holds(self, tensor: Tensor) -> bool:
-        """Whether this is the tensor, and nobody has written into it."""
+        """Whether this is the tensor, and nobody has written into it since, but through `.data`."""
         return tensor is self._tensor and tensor._version == self._version
 
-    def remember(self, tensor: Tensor, found: bool = True) -> None:
+    def remember(self, tensor: Tensor, found: Any = None) -> None:
         if not tensor.is_inference():  # those count no versions
             self._tensor, self._version, self.found = tensor, tensor._version, found
 
