@@ -52,6 +52,9 @@ def test_a_simulator_of_an_earlier_version_takes_its_steps(load: Any, steps: Any
     assert not torch.equal(after.positions[0], after.positions[1])
     springs = dict(zip(pd.material.MATERIAL_ROWS, sim.material(), strict=True))["pin_stiffness"]
     assert springs.isinf().sum(1).tolist() == [9, 9]
+    # which is said by a mask now
+    assert sim.pin_hard.sum(1).tolist() == [9, 9]
+    assert not sim.pin_stiffness[:, :9].any()
     assert sim.pin_stiffness.detach()[:, 9:].tolist() == [[50.0, 50.0, 50.0, 50.0], [50.0, 50.0, 50.0, 20.0]]
 
 

@@ -82,6 +82,24 @@ def test_a_batch_whose_plan_does_not_fit_is_refused(on_gpu: pd.Simulator, monkey
     assert (sim.plan, sim.batch) == (plan, None)
 
 
+def test_a_body_that_is_let_go_gets_a_plan_once(on_gpu: pd.Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A compiled one, which has to fit; otherwise the simulator is what it was."""
+    sim, plan = on_gpu, on_gpu.plan
+    assert plan.size("pieces") == 0
+    asked = bytes_asked_for(lambda: sim.set_material(pin_hard=False), monkeypatch)
+    assert sim.plan is plan
+    assert sim.pin_hard.any()
+    monkeypatch.setattr(placing, "free_memory", lambda _: asked)
+    monkeypatch.setattr(Plan, "to", lambda self, device: self)
+    sim.set_material(pin_hard=False)
+    free = sim.plan
+    assert free.size("pieces") == 1
+    assert asked == free.bytes + STEP
+    sim.set_material(pin_hard=True)
+    sim.set_material(pin_hard=torch.zeros(3, len(sim.pin_hard), dtype=torch.bool))
+    assert sim.plan is free
+
+
 def test_what_moves_to_a_gpu_has_to_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plan, material, and a step of the batch it is for."""
     monkeypatch.setattr(placing, "properties_of", lambda _: H100)

@@ -200,6 +200,10 @@ def test_gradients_of_springs_and_targets_where_masks_differ() -> None:
     (kept,) = torch.autograd.grad((weights * sim(state).positions).sum(), sim.pin_stiffness)
     assert torch.equal(kept, found[0])
     assert bool((found[0][mask.all(0)] == 0.0).all())
+    sim.set_material(pin_hard=True)
+    (none,) = torch.autograd.grad((weights * sim(state).positions).sum(), sim.pin_stiffness)
+    assert not none.any()
+    sim.set_material(pin_hard=mask)
     for number, size in ((0, 1e-2), (1, 1e-5)):
         direction = torch.randn(own[number].shape, dtype=sim.dtype, generator=torch.Generator().manual_seed(3))
         ends = []

@@ -199,7 +199,7 @@ def _look_at_pins(sim: Model, springs: Tensor, hard: Tensor, *, wait: bool = Fal
     found = _Found(some=bool(mask.any()))
     with ordinary():
         plan = loosened_plan(sim, sim.pinned.loose(mask.numpy()))
-        sim.plan = plan_that_holds(sim, plan, mask.all(0).to(sim.device))
+        sim.plan = plan_that_holds(sim, plan, mask.all(0))
         # streams wait for what sets the material, but not for what another one has made in a step
         if plain is hard and type(springs) is nn.Parameter and bool(mask.all()) and (wait or not hard.is_cuda):
             found = _Found(True, springs, hold_exactly(springs, hard))

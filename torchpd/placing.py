@@ -130,7 +130,7 @@ def plan_that_holds(sim: Model, plan: Plan, hard: Tensor) -> Plan:
     if not has_levels(plan.arrays):
         return plan
     stiffness, inertia = reference_of_levels(plan.arrays)
-    freed = pinned_vertices(plan.arrays)[~hard]
+    freed = pinned_vertices(plan.arrays)[~hard.to(plan.device)]
     freed = freed[inertia[freed].isinf()]
     if not len(freed):
         return plan
