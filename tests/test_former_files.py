@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.nn.utils.parametrize import register_parametrization
 
 import torchpd as pd
 
@@ -56,6 +57,38 @@ def test_a_simulator_of_an_earlier_version_takes_its_steps(load: Any, steps: Any
     assert sim.pin_hard.sum(1).tolist() == [9, 9]
     assert not sim.pin_stiffness[:, :9].any()
     assert sim.pin_stiffness.detach()[:, 9:].tolist() == [[50.0, 50.0, 50.0, 50.0], [50.0, 50.0, 50.0, 20.0]]
+
+
+class Exp(torch.nn.Module):
+    """A stiffness by its logarithm."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x.exp()
+
+    def right_inverse(self, x: torch.Tensor) -> torch.Tensor:
+        return x.log()
+
+
+@pytest.mark.parametrize("assign", [False, True])
+@pytest.mark.parametrize("parametrized", [False, True])
+def test_numbers_of_an_earlier_version_say_by_inf_which_pins_are_hard(assign: bool, parametrized: bool) -> None:
+    """As a part of another module, too; strictly, though they know of no mask."""
+    parent = torch.nn.Module()
+    parent.sim = sim = pd.Simulator(scene(), 1 / 60, iterations=16)
+    springs = torch.tensor([torch.inf, *range(1, 13)])
+    name = "sim.pin_stiffness"
+    if parametrized:
+        register_parametrization(sim, "pin_stiffness", Exp())
+        name, numbers = "sim.parametrizations.pin_stiffness.original", springs.log()
+    else:
+        numbers = springs
+    older = {key: array for key, array in parent.state_dict().items() if key != "sim.pin_hard"} | {name: numbers}
+    parent.load_state_dict(older, assign=assign)
+    assert sim.pin_hard.tolist() == [True] + [False] * 12
+    torch.testing.assert_close(sim.pin_stiffness.detach(), torch.tensor([0.0, *range(1, 13)]))
+    assert all(array.isfinite().all() for array in sim.material()[:4])
+    sim.set_material(pin_hard=False)
+    assert not sim.material()[4].isinf().any()
 
 
 def test_what_an_earlier_version_learned_is_learned() -> None:

@@ -15,7 +15,7 @@ from .diagonal import named_material
 from .material import ARRAYS, PARTS_OF_ROWS, check_array, check_batches, check_hard, dims_of, in_order, named_arrays
 from .material_parts import COLUMNS, whole_arrays
 from .multilevel import has_levels, has_strangers
-from .parametrized import invert, parametrization
+from .parametrized import invert, make, parametrization
 from .pins import PIN_HARD, hold_exactly, split_springs
 from .placing import is_recording, loosened_plan, plan_for_solver, plan_that_holds
 from .plan import Plan
@@ -230,8 +230,13 @@ def load_material(
     assign = bool(local_metadata.get("assign_to_params_buffers", False))
     owner = f"{type(sim).__name__}.load_state_dict"
     arrays = {n: state_dict[prefix + n] for n in ARRAYS if prefix + n in state_dict}
+    # older ones say by inf which pins are hard
+    older, original = PIN_HARD not in arrays, f"{prefix}parametrizations.pin_stiffness.original"
     try:
         with torch.no_grad():
+            if older and original in state_dict and is_parametrized(sim, "pin_stiffness"):
+                made = make(sim, "pin_stiffness", state_dict[original])
+                arrays |= {"pin_stiffness": made} if bool(made.isinf().any()) else {PIN_HARD: made.isinf()}
             check_saved(owner, arrays)
             if assign:
                 check_kinds(sim, owner, arrays)
@@ -243,16 +248,13 @@ def load_material(
             raise
         errors.append(f"{prefix.removesuffix('.')}: {error}")
         return
-    # older ones say by inf which pins are hard
-    older = PIN_HARD not in arrays
     if older:
         state_dict[prefix + PIN_HARD] = sim.pin_hard
-        if "pin_stiffness" in arrays:
+        if "pin_stiffness" in arrays and is_parametrized(sim, "pin_stiffness"):
+            state_dict[original] = parametrization(sim, "pin_stiffness").original.detach()
+        elif "pin_stiffness" in arrays:
             state_dict[prefix + "pin_stiffness"] = sim.pin_stiffness.detach()
     load(state_dict, prefix, *rest)
-    if older and is_parametrized(sim, "pin_stiffness"):
-        with torch.no_grad():
-            replace_material(sim, owner, {"pin_stiffness": sim.pin_stiffness})
     read_pins(sim)
 
 

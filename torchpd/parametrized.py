@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import ParametrizationList, is_parametrized, type_before_parametrizations
 
-__all__ = ["invert", "parametrization", "plain_copy"]
+__all__ = ["invert", "make", "parametrization", "plain_copy"]
 
 _Module = TypeVar("_Module", bound=nn.Module)
 
@@ -18,6 +18,14 @@ def parametrization(module: nn.Module, name: str) -> ParametrizationList:
     """What makes a parametrized array."""
     found: ParametrizationList = module.parametrizations[name]  # type: ignore[index, assignment]
     return found
+
+
+def make(module: nn.Module, name: str, original: Tensor) -> Tensor:
+    """What a parametrization makes of another original than its own."""
+    steps: list[Any] = list(parametrization(module, name))
+    for one in steps:
+        original = one(original)
+    return original
 
 
 def invert(owner: str, module: nn.Module, name: str, wanted: Tensor) -> tuple[Tensor, Tensor]:
@@ -42,9 +50,7 @@ def invert(owner: str, module: nn.Module, name: str, wanted: Tensor) -> tuple[Te
     original = wanted.clone()
     for one in reversed(steps):
         original = one.right_inverse(original)
-    made: Tensor = original
-    for one in steps:
-        made = one(made)
+    made = make(module, name, original)
     fits = original.shape == makes.original.shape and made.shape == shape
     if not (fits and torch.allclose(made, wanted, rtol=1e-3, atol=0.0, equal_nan=True)):
         raise ValueError(
