@@ -135,7 +135,7 @@ def _plan_with(sim: Model, arrays: dict[str, Tensor]) -> Plan:
         return sim.plan
     own = named_arrays(sim)
     now, was = in_order(own | arrays), in_order(own)
-    plan = loosened_plan(sim, sim.pinned.loose(arrays.get(PIN_HARD, sim.pin_hard).cpu().numpy()))
+    plan = loosened_plan(sim, arrays.get(PIN_HARD, sim.pin_hard))
     if not has_levels(plan.arrays):
         return plan
     # what is held belongs to the structure of a preconditioner
@@ -198,7 +198,7 @@ def _look_at_pins(sim: Model, springs: Tensor, hard: Tensor, *, wait: bool = Fal
     mask = plain.cpu().reshape(-1, plain.shape[-1])
     found = _Found(some=bool(mask.any()))
     with ordinary():
-        plan = loosened_plan(sim, sim.pinned.loose(mask.numpy()))
+        plan = loosened_plan(sim, mask)
         sim.plan = plan_that_holds(sim, plan, mask.all(0))
         # streams wait for what sets the material, but not for what another one has made in a step
         if plain is hard and type(springs) is nn.Parameter and bool(mask.all()) and (wait or not hard.is_cuda):

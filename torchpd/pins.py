@@ -64,7 +64,10 @@ class PinnedPieces:
         if not len(self.points):
             return loose
         held, of = np.unique(self.piece, return_inverse=True)
-        rows = np.unique(hard.reshape(-1, len(self.points)), axis=0)
+        rows = hard.reshape(-1, len(self.points))
+        # each mask once; np.unique compares pin by pin
+        distinct = {row.tobytes(): number for number, row in enumerate(np.packbits(rows, axis=1))}
+        rows = rows[list(distinct.values())]
         middle = np.stack([np.bincount(of, weights=axis) for axis in self.points.T], axis=1) / np.bincount(of)[:, None]
         arms = self.points - middle[of]
         # 1, arm and arm arm^T of each pin, to be summed over those of a piece that are hard

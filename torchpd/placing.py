@@ -111,12 +111,14 @@ def plan_for_solver(sim: Model, material: Sequence[Tensor], plan: Plan | None = 
     return move_plan(sim, plan, sim.device)
 
 
-def loosened_plan(sim: Model, loose: Pieces) -> Plan:
-    """The plan of a simulator where these pieces can move rigidly too; its own where they can already."""
+def loosened_plan(sim: Model, hard: Tensor) -> Plan:
+    """The plan of a simulator where pieces that a mask [P] or [B, P] lets go move rigidly too; its own if they do."""
     before = sim.plan.loose
-    if before is None or bool((before | ~loose).all()):
+    if before is None or bool(before.all()):
         return sim.plan
-    loose = before | loose
+    loose = before | sim.pinned.loose(hard.cpu().numpy())
+    if bool((loose == before).all()):
+        return sim.plan
     if sim.plan.kernel is None:
         return with_loose_pieces(sim.plan, replace(sim.scene.values(), loose=loose))
     return move_plan(sim, plan_anew(sim, sim.dtype, sim.device, loose), sim.device)
