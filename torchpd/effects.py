@@ -102,6 +102,8 @@ class Solid(_Key):
 class Pin(_Key):
     """Holds vertices of a solid at targets: at their rest positions, or where `targets` of a step puts them.
 
+    `Simulator.set_material(pin_hard=...)` lets hard ones go, and holds by them again.
+
     Args:
         solid: the body whose vertices are held.
         vertices: vertex numbers of that body [P], or a boolean mask over all of its vertices.
