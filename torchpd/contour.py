@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from .lattice import Lattice
-from .mesh import TET_FACES, TriMesh
+from .mesh import TriMesh
+from .mesh_faces import TET_FACES
 
 __all__ = ["contour"]
 

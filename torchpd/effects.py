@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .checks import as_array, check_finite, check_positive, check_scalar, check_shape, check_vector
 from .mesh import TetMesh
+from .mesh_checks import warn
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -23,6 +24,9 @@ __all__ = ["Damping", "Gravity", "Ground", "Pin", "Solid", "Sphere"]
 
 Array = NDArray[np.float64]
 ArrayLike = float | Sequence[float] | Array | torch.Tensor
+
+# Bodies are rarely meant to be shorter or longer [m]: their meshes are in other units.
+_SHORTEST, _LONGEST = 1e-3, 50.0
 
 
 def _set(part: object, **values: Any) -> None:
@@ -62,6 +66,17 @@ def _per_element(name: str, value: ArrayLike, count: int, *, unit: str) -> Array
     return array
 
 
+def _report_size(mesh: TetMesh) -> None:
+    """Warn of a body whose longest side hardly is in metres."""
+    length = float(np.ptp(mesh.vertices, axis=0).max())
+    if not _SHORTEST <= length <= _LONGEST:
+        fix = "(0.001) if these are millimetres" if length > _LONGEST else "(1000) if these were divided by 1000"
+        warn(
+            f"Solid: the mesh is {length:.4g} m long, where bodies of {_SHORTEST:g} to {_LONGEST:g} m are expected. "
+            f"Coordinates are in metres: pass mesh.scaled{fix}"
+        )
+
+
 @dataclass(eq=False)
 class Solid(_Key):
     """An elastic body: tetrahedra that resist every departure from their rest shape.
@@ -74,7 +89,7 @@ class Solid(_Key):
     2009, for embedded surfaces).
 
     Args:
-        mesh: the rest shape.
+        mesh: the rest shape, in metres; a `MeshWarning` tells of one that is longer than 50 m or shorter than 1 mm.
         youngs: Young's modulus [Pa], a scalar or one value per tetrahedron, positive.
         density: [kg/m^3], a scalar or one value per tetrahedron, positive.
     """
@@ -89,6 +104,7 @@ class Solid(_Key):
                 f"Solid: mesh must be a TetMesh, got {type(mesh).__name__}; "
                 "turn a surface into tetrahedra with torchpd.tetrahedralize(surface, cells=...)"
             )
+        _report_size(mesh)
         count = len(mesh.tets)
         _set(
             self,

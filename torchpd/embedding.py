@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .mesh import TetMesh, TriMesh
+from .mesh_checks import has_repeated_corner, warn
 from .quality import shape_gradients
 
-__all__ = ["Embedding", "embed", "embed_triangles"]
+__all__ = ["Embedding", "embed", "embed_kept", "embed_triangles"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -91,6 +92,10 @@ class Embedding:
             vertex_count=self.vertex_count,
         )
 
+    def renumbered(self, tets: Index, vertex_count: int) -> Embedding:
+        """The embedding in a mesh of the same tets [E, 4], with other vertex numbers."""
+        return Embedding(self.surface, self.tets, self.weights, tets[self.tets], vertex_count)
+
     def __repr__(self) -> str:
         return f"Embedding({self.surface} in {self.vertex_count} mesh vertices)"
 
@@ -105,7 +110,8 @@ def _weights(points: Array, origins: Array, gradients: Array) -> Array:
 def embed(surface: TriMesh, mesh: TetMesh) -> Embedding:
     """Embed a surface in any tetrahedral mesh: each vertex in the tet that contains it, or else the least distant one.
 
-    A vertex outside of the mesh is extrapolated, with negative weights.
+    A vertex outside of the mesh is extrapolated, with negative weights. Where one is farther outside than its tet is
+    long, a `MeshWarning` says how far: a small strain of that tet moves it by more than the strain.
     """
     for name, value, kind in (("surface", surface, TriMesh), ("mesh", mesh, TetMesh)):
         if not isinstance(value, kind):
@@ -129,7 +135,22 @@ def embed(surface: TriMesh, mesh: TetMesh) -> Embedding:
     order = np.lexsort((tets, -depth, which))
     best = order[np.unique(which[order], return_index=True)[1]]
     chosen = tets[best]
+    _report_far(corners[chosen], np.maximum(-depth[best], 0.0))
     return Embedding(surface, chosen, weights[best], mesh.tets[chosen], len(mesh.vertices))
+
+
+def _report_far(corners: Array, distance: Array) -> None:
+    """Warn of surface vertices that lie farther outside of their tets [n, 4, 3] than these are long."""
+    ends = np.array([(a, b) for a in range(4) for b in range(a)])
+    cells = distance / np.linalg.norm(corners[:, ends[:, 0]] - corners[:, ends[:, 1]], axis=2).max(axis=1)
+    far = int((cells > 1.0).sum())
+    if far:
+        worst = int(cells.argmax())
+        warn(
+            f"embed: {far} of {len(cells)} surface vertices lie farther outside of the mesh than a cell is long, up to "
+            f"{cells[worst]:.3g} cells ({distance[worst]:.3g} m): their motion is extrapolated. Move or scale the "
+            "surface onto the mesh, surface.transformed(matrix), or use a mesh that reaches around it"
+        )
 
 
 def embed_triangles(mesh: TetMesh, triangles: Index) -> Embedding:
@@ -138,3 +159,29 @@ def embed_triangles(mesh: TetMesh, triangles: Index) -> Embedding:
     surface = TriMesh(mesh.vertices[used], numbers.reshape(-1, 3))
     tets, corner = np.divmod(np.unique(mesh.tets.reshape(-1), return_index=True)[1][used], 4)
     return Embedding(surface, tets, np.eye(4)[corner], mesh.tets[tets], len(mesh.vertices))
+
+
+def embed_kept(mesh: TetMesh, triangles: Index) -> Embedding | None:
+    """The surface of triangles whose corners are vertices as they were given to `TetMesh`, before some were left out.
+
+    A `MeshWarning` says how many triangles are left out, with a corner that is not in the mesh, or naming one twice.
+
+    Args:
+        mesh: with `kept`, the numbers that its vertices had.
+        triangles: those numbers [T, 3].
+
+    Returns:
+        The embedding, or None where no triangle is left.
+    """
+    corners = np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
+    numbers = np.full(int(max(corners.max(initial=0), mesh.kept.max())) + 1, -1)
+    numbers[mesh.kept] = np.arange(len(mesh.kept))
+    corners = numbers[corners]
+    bare = (corners < 0).any(axis=1)
+    twice = has_repeated_corner(corners) & ~bare
+    total = len(corners)
+    for bad, fault in ((bare, "have a corner that no tet uses"), (twice, "name a vertex twice")):
+        if bad.any():
+            warn(f"TetMesh: {int(bad.sum())} of {total} triangles of the surface {fault} and were left out")
+    corners = corners[~(bare | twice)]
+    return embed_triangles(mesh, corners) if len(corners) else None

@@ -18,7 +18,8 @@ from scipy.spatial import cKDTree
 
 from .lattice import Lattice, candidates, split_long
 from .mesh import TriMesh
-from .mesh_checks import find_repeated, warn
+from .mesh_checks import find_repeated
+from .mesh_faces import numbered
 
 __all__ = ["LEAST_FILL", "Parts", "inside_share", "parts_of"]
 
@@ -36,8 +37,6 @@ _SAMPLES = 6
 _THIN = 1e-3
 # The nearest vertices that may count as one with a vertex: the others are reached through these.
 _COPIES = 7
-# A sheet of fewer triangles may be meant.
-_FEW = 100
 # Rounding of a covered length.
 _TIE = 1e-3
 # Samples in work at a time, and small triangles, to bound memory.
@@ -53,7 +52,9 @@ class Parts:
     part: Index  # [T] the part of each
     oriented: Mask  # [P] whether the triangles of a part are all wound alike
     sheets: Array  # [S, 3, 3] m, of parts that are left open
-    caps: Array  # [C, 3, 3] m, those among `triangles` that are not the surface's
+    caps: Array  # [C, 3, 3] m, the last of `triangles`: cones over holes, an apex each
+    own: int  # the first of `triangles`, which are the surface's
+    open_edges: tuple[int, int]  # edges that stay open where seams are closed, and all edges
 
 
 class _Edges(NamedTuple):
@@ -70,7 +71,7 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     count as one, since files repeat vertices along seams, not always to the bit: strips of triangles close the seams.
     Pieces of which most edges are still open then are sheets. Of triangles that come on both sides one counts.
     """
-    same = _numbered(surface.vertices)
+    same = numbered(surface.vertices)
     triangles = surface.triangles[_single(surface.triangles, same)]
     part = _connected(triangles, same)
     edges = _edges(triangles, same)
@@ -81,15 +82,14 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     corners = surface.vertices[triangles]
     none = np.empty((0, 3, 3))
     if not rest.any():
-        return Parts(corners, part, oriented, none, none)
+        return Parts(corners, part, oriented, none, none, len(corners), (0, len(edges.open)))
     places, near = _welded(surface.vertices, same, _edges(triangles[rest], same), tolerance)
     loose = triangles[rest][_single(triangles[rest], near)]
+    beside = int(closed[part[edges.triangle]].sum())
     own, edges = _connected(loose, near), _edges(loose, near)
     count = int(own.max()) + 1
     gaps = np.bincount(own[edges.triangle[edges.open]], minlength=count)
     torn = 2 * gaps > np.bincount(own[edges.triangle], minlength=count)
-    if fill_holes:
-        _report_torn(int(torn[own].sum()), len(surface.triangles), tolerance)
     whole = ~torn if fill_holes else gaps == 0
     strips, strip_of = _strips(surface.vertices, places, _edges(loose, same), own)
     cones, cone_of = _cones(places, near, edges, own)
@@ -103,17 +103,9 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
         oriented=np.append(oriented, np.zeros(count, dtype=bool)),
         sheets=corners[~inner],
         caps=cones,
+        own=int((~rest).sum() + inner.sum()),
+        open_edges=(int(edges.open.sum()), beside + len(edges.open)),
     )
-
-
-def _report_torn(count: int, total: int, tolerance: float) -> None:
-    if count > _FEW:
-        warn(
-            f"tetrahedralize: {count} of {total} triangles hang together in pieces of which most edges are open, which "
-            "do not tell inside from outside: the mesh is full where they pass, which is too heavy, and may be hollow. "
-            f"Corners less than {tolerance:.3g} m and half an edge apart count as one: repair the surface where they "
-            "are farther apart, or use fewer cells"
-        )
 
 
 def _single(triangles: Index, same: Index) -> Mask:
@@ -165,15 +157,6 @@ def _strips(vertices: Array, places: Array, edges: _Edges, part: Index) -> tuple
     strips = np.concatenate([np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)])
     wide = np.concatenate([(b != d).any(axis=1), (a != c).any(axis=1)])
     return strips[wide], np.tile(of, 2)[wide]
-
-
-def _numbered(rows: Array) -> Index:
-    """The same number for equal rows [n, 3]."""
-    order = np.lexsort(rows.T)
-    new = np.append(True, (rows[order[1:]] != rows[order[:-1]]).any(axis=1))[: len(rows)]
-    numbers = np.empty(len(rows), dtype=np.int64)
-    numbers[order] = np.cumsum(new) - 1
-    return numbers
 
 
 def _connected(triangles: Index, same: Index) -> Index:
@@ -232,8 +215,8 @@ class _Intervals(NamedTuple):
         return _Intervals(self.line[chosen], self.start[chosen], self.stop[chosen], self.part[chosen])
 
 
-def inside_share(lattice: Lattice, parts: Parts, walls: Mask) -> tuple[NDArray[np.float32], Array]:
-    """The share of each wall tet [axis, i, j, k, edge] that lies inside, and all triangles that enclose nothing."""
+def inside_share(lattice: Lattice, parts: Parts, walls: Mask) -> tuple[NDArray[np.float32], Mask]:
+    """The share of each wall tet [axis, i, j, k, edge] that lies inside, and which parts enclose a volume [P]."""
     pieces, parents = split_long(lattice.coordinates(parts.triangles))
     part = parts.part[parents]
     samples = np.array(lattice.shape) * _SAMPLES
@@ -256,7 +239,7 @@ def inside_share(lattice: Lattice, parts: Parts, walls: Mask) -> tuple[NDArray[n
             for side in (0, 1):  # a tet is numbered after the lower of its two cubes
                 i, j, k = (cubes - (1 - side) * (np.arange(3) == axis)).T
                 share[axis, i, j, k] += halves[:, axis, side]
-    return share, np.concatenate([parts.sheets, parts.triangles[~solid[parts.part]]])
+    return share, np.asarray(solid)
 
 
 def _intervals(triangles: Array, part: Index, oriented: Mask, axis: int, samples: Index) -> _Intervals:

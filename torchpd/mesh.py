@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import as_array, check_finite, check_shape
+from .checks import as_array, check_finite, check_scalar, check_shape
 from .formats.bodies import read_body, read_surface
 from .mesh_checks import (
     MeshWarning,
@@ -21,17 +21,17 @@ from .mesh_checks import (
     affine,
     check_elements,
     check_points,
+    clean_tets,
     compact,
     determinants,
-    find_repeated,
     has_repeated_corner,
-    is_flat,
     refuse,
     scaling,
     store,
     translation,
     warn,
 )
+from .mesh_faces import ROUNDING, TET_FACES, match_faces, merge_near, report_faces
 from .mesh_files import write_tets
 from .quality import MeshQuality, measure_quality
 
@@ -43,9 +43,6 @@ __all__ = ["MeshWarning", "TetMesh", "TriMesh"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 PathLike = str | os.PathLike[str]
-
-# Face k lies opposite corner k; seen from outside its corners run counter-clockwise when the tet has positive volume.
-TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -166,39 +163,15 @@ class TriMesh:
         return f"TriMesh({len(self.vertices)} vertices, {len(self.triangles)} triangles{uvs})"
 
 
-def match_faces(tets: Index) -> tuple[Index, NDArray[np.bool_]]:
-    """All 4 E faces (4 e + k is face k of tet e), equal ones side by side, and where a new one begins."""
-    faces = np.sort(tets[:, TET_FACES].reshape(-1, 3), axis=1)
-    order = np.lexsort((faces[:, 2], faces[:, 0] * (int(tets.max()) + 1) + faces[:, 1]))
-    faces = faces[order]
-    begins = np.ones(len(faces), dtype=bool)
-    begins[1:] = (faces[1:] != faces[:-1]).any(axis=1)
-    return order, begins
-
-
-def _check_fill(value: Numbers, count: int) -> Array:
-    fill = as_array("TetMesh.fill", value, np.float64)
-    check_shape("TetMesh.fill", fill, (count,), "the share of each tet that is material")
-    bad = np.flatnonzero(~((fill > 0.0) & (fill <= 1.0)))
-    if bad.size:
-        raise ValueError(f"TetMesh.fill must lie in (0, 1], got {fill[bad[0]]} at {int(bad[0])} ({bad.size} in all)")
-    return fill
-
-
-def _check_regions(value: Numbers, count: int) -> Index:
-    regions = as_array("TetMesh.regions", value)
-    check_shape("TetMesh.regions", regions, (count,), "the region of each tet")
-    if regions.dtype.kind not in "iu":
-        raise TypeError(f"TetMesh.regions must hold integers, got {regions.dtype}")
-    return np.asarray(regions, dtype=np.int64)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class TetMesh:
     """A tetrahedral mesh. Every tet has positive volume: det(x1 - x0, x2 - x0, x3 - x0) > 0.
 
     Tets that come with the opposite winding are turned (their last two corners change places), which is reported by a
-    `MeshWarning` and counted in `flipped`.
+    `MeshWarning` and counted in `flipped`. Others tell of tets that meet as hardly any body does: inner faces with both
+    tets on one side (a folded mesh), faces of three tets, faces that lie on one another without common vertices, see
+    `merged`, and faces that lie on faces with other corners. Pieces that lie apart are no fault: `quality()` counts
+    them.
 
     Arrays are NumPy's and read-only: `torch.tensor(mesh.vertices)` copies them without a warning, where
     `torch.from_numpy` gives one.
@@ -210,7 +183,8 @@ class TetMesh:
             reaches beyond its surface. `Solid` multiplies density and Young's modulus by it.
         regions: a whole number for each tet [E], what it belongs to, or None. A material of each is
             `Solid(mesh, youngs=np.where(mesh.regions == 2, 1e6, 1e5))`.
-        drop_unreferenced: leave out vertices that no tet uses (otherwise an error).
+        drop_unreferenced: leave out vertices that no tet uses (otherwise an error); `kept` [V] has the numbers of the
+            others among those that were given.
         drop_degenerate: leave out tets whose volume is zero within rounding, that name a vertex twice, or that came
             before (otherwise an error).
     """
@@ -220,6 +194,7 @@ class TetMesh:
     fill: Array | None
     regions: Index | None
     embedding: Embedding | None
+    kept: Index
     flipped: int
 
     def __init__(
@@ -232,46 +207,11 @@ class TetMesh:
         drop_unreferenced: bool = False,
         drop_degenerate: bool = False,
     ) -> None:
-        points = check_points("TetMesh.vertices", vertices)
-        elements = check_elements("TetMesh.tets", tets, 4, len(points))
-        shares = None if fill is None else _check_fill(fill, len(elements))
-        groups = None if regions is None else _check_regions(regions, len(elements))
-        fix = "pass drop_degenerate=True to leave them out"
-        if not drop_degenerate:
-            refuse("TetMesh.tets", has_repeated_corner(elements), elements, "corners must differ", fix)
-        with np.errstate(over="ignore", invalid="ignore"):
-            signed = determinants(points, elements)
-            flat = is_flat(points, elements, signed)
-        twice, first = find_repeated(elements)
-        if drop_degenerate and (flat.any() or twice.any()):
-            for bad, fault in ((flat, "have no volume"), (twice & ~flat, "come twice")):
-                if bad.any():
-                    warn(f"TetMesh: {int(bad.sum())} of {len(bad)} tets {fault} and were left out")
-            kept = ~(flat | twice)
-            shares = None if shares is None else shares[kept]
-            groups = None if groups is None else groups[kept]
-            elements, signed, flat, twice = elements[kept], signed[kept], flat[kept], twice[kept]
-            if not len(elements):
-                raise ValueError("TetMesh.tets: no tet has a volume; are all vertices in one plane?")
-        refuse("TetMesh.tets", flat, elements, "volumes must not vanish (compared with rounding of the vertices)", fix)
-        if twice.any():
-            again = f"every tet must come once (that at {first} comes again, with a volume of its own)"
-            refuse("TetMesh.tets", twice, elements, again, fix)
-        inverted = signed < 0
-        flipped = int(inverted.sum())
-        if flipped:
-            elements[inverted] = elements[inverted][:, [0, 1, 3, 2]]
-            warn(f"TetMesh: {flipped} of {len(elements)} tets had inverted winding and were turned")
-        used, elements = compact("TetMesh", elements, len(points), drop=drop_unreferenced)
-        store(
-            self,
-            vertices=points[used],
-            tets=elements,
-            fill=shares,
-            regions=groups,
-            embedding=None,
-            flipped=flipped,
+        fields = clean_tets(
+            vertices, tets, fill, regions, drop_unreferenced=drop_unreferenced, drop_degenerate=drop_degenerate
         )
+        store(self, **fields, embedding=None)
+        report_faces(self.vertices, self.tets)
 
     @classmethod
     def from_file(cls, path: PathLike, *, drop_degenerate: bool = False) -> TetMesh:
@@ -349,12 +289,45 @@ class TetMesh:
         store(mesh, **(vars(self) | {"embedding": embedding}))
         return mesh
 
+    def merged(self, tolerance: float | None = None, *, drop_degenerate: bool = False) -> TetMesh:
+        """The mesh with vertices at the same place made one, the first of them, so that tets that meet there share it.
+
+        Args:
+            tolerance: vertices that hang together by distances up to this [m] become one; None is 4.8e-7 of the
+                diagonal of the bounding box, a few roundings of float32.
+            drop_degenerate: as for a new mesh: leave out tets that lose their volume, or that come twice.
+
+        Raises:
+            ValueError: tets that lose their volume, or that come twice.
+        """
+        reach = ROUNDING * float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+        if tolerance is not None:
+            reach = check_scalar("TetMesh.merged: tolerance", tolerance, minimum=0.0)
+        kept, numbers = np.unique(merge_near(self.vertices, reach), return_inverse=True)
+        mesh = TetMesh(
+            self.vertices[kept],
+            numbers[self.tets],
+            fill=self.fill,
+            regions=self.regions,
+            drop_unreferenced=True,
+            drop_degenerate=drop_degenerate,
+        )
+        if self.embedding is None:
+            return mesh
+        if np.array_equal(mesh.kept[mesh.tets], numbers[self.tets]):
+            return mesh.with_embedding(self.embedding.renumbered(mesh.tets, len(mesh.vertices)))
+        from .embedding import embed
+
+        return mesh.with_embedding(embed(self.embedding.surface, mesh))
+
     def transformed(self, matrix: Numbers) -> TetMesh:
         """The mesh and its embedded surface under x -> A x + b, from a 3x3 or 4x4 matrix; it may reflect."""
         linear, offset = affine("TetMesh.transformed: matrix", matrix)
         # A reflection inverts every tet: two corners change places, and with them their weights.
         corners = [0, 1, 3, 2] if np.linalg.det(linear) < 0 else [0, 1, 2, 3]
-        mesh = TetMesh(self.vertices @ linear.T + offset, self.tets[:, corners], fill=self.fill, regions=self.regions)
+        mesh: TetMesh = object.__new__(TetMesh)
+        moved = clean_tets(self.vertices @ linear.T + offset, self.tets[:, corners], self.fill, self.regions)
+        store(mesh, **moved, embedding=None)
         if self.embedding is None:
             return mesh
         return mesh.with_embedding(self.embedding.transformed(matrix, corners))

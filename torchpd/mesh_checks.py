@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,12 @@ __all__ = [
     "Numbers",
     "affine",
     "check_elements",
+    "check_fill",
     "check_points",
+    "check_regions",
+    "clean_tets",
     "compact",
+    "corner_words",
     "determinants",
     "find_repeated",
     "has_repeated_corner",
@@ -38,7 +43,7 @@ _ROUNDOFF = float(np.finfo(np.float64).eps) / 2
 
 
 class MeshWarning(UserWarning):
-    """A mesh was repaired on its way in; the message says what was done and how often."""
+    """A mesh was repaired on its way in, or is hardly what was meant; the message says what, how often, and the fix."""
 
 
 def warn(message: str) -> None:
@@ -85,8 +90,17 @@ def check_elements(name: str, value: Numbers, corners: int, count: int) -> Index
 
 
 def has_repeated_corner(elements: Index) -> NDArray[np.bool_]:
-    ordered = np.sort(elements, axis=1)
-    return np.asarray((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
+    corners = elements.T
+    equal = np.zeros(len(elements), dtype=bool)
+    for a, b in combinations(range(len(corners)), 2):
+        equal |= corners[a] == corners[b]
+    return equal
+
+
+def corner_words(elements: Index) -> NDArray[np.uint64]:
+    """A random word for each vertex, at every corner [E, corners]: sums of them are equal where corners are."""
+    words = np.random.default_rng(0).integers(0, 2**63, int(elements.max()) + 1, dtype=np.uint64)
+    return np.asarray(words[elements])
 
 
 def find_repeated(tets: Index) -> tuple[NDArray[np.bool_], int]:
@@ -94,8 +108,8 @@ def find_repeated(tets: Index) -> tuple[NDArray[np.bool_], int]:
 
     Equal tets have equal sums of random words, one a vertex; only where two sums are equal the corners are compared.
     """
-    words = np.random.default_rng(0).integers(0, 2**63, int(tets.max()) + 1, dtype=np.uint64)
-    sums = words[tets].sum(axis=1, dtype=np.uint64)
+    words = corner_words(tets)
+    sums = sum(words[:, k] for k in range(1, words.shape[1])) + words[:, 0]
     repeated = np.zeros(len(tets), dtype=bool)
     ordered = np.sort(sums)
     equal = ordered[1:][ordered[1:] == ordered[:-1]]
@@ -166,6 +180,74 @@ def compact(owner: str, elements: Index, count: int, *, drop: bool) -> tuple[Ind
         )
     warn(f"{owner}: {lost} of {count} vertices belong to no element and were left out; the others are renumbered")
     return kept, (np.cumsum(used) - 1)[elements]
+
+
+def check_fill(value: Numbers, count: int) -> Array:
+    fill = as_array("TetMesh.fill", value, np.float64)
+    check_shape("TetMesh.fill", fill, (count,), "the share of each tet that is material")
+    bad = np.flatnonzero(~((fill > 0.0) & (fill <= 1.0)))
+    if bad.size:
+        raise ValueError(f"TetMesh.fill must lie in (0, 1], got {fill[bad[0]]} at {int(bad[0])} ({bad.size} in all)")
+    return fill
+
+
+def check_regions(value: Numbers, count: int) -> Index:
+    regions = as_array("TetMesh.regions", value)
+    check_shape("TetMesh.regions", regions, (count,), "the region of each tet")
+    if regions.dtype.kind not in "iu":
+        raise TypeError(f"TetMesh.regions must hold integers, got {regions.dtype}")
+    return np.asarray(regions, dtype=np.int64)
+
+
+def clean_tets(
+    vertices: Numbers,
+    tets: Numbers,
+    fill: Numbers | None,
+    regions: Numbers | None,
+    *,
+    drop_unreferenced: bool = False,
+    drop_degenerate: bool = False,
+) -> dict[str, Any]:
+    """Fields of a `TetMesh`, checked, its tets all of positive volume: see there."""
+    points = check_points("TetMesh.vertices", vertices)
+    elements = check_elements("TetMesh.tets", tets, 4, len(points))
+    shares = None if fill is None else check_fill(fill, len(elements))
+    groups = None if regions is None else check_regions(regions, len(elements))
+    fix = "pass drop_degenerate=True to leave them out"
+    if not drop_degenerate:
+        refuse("TetMesh.tets", has_repeated_corner(elements), elements, "corners must differ", fix)
+    with np.errstate(over="ignore", invalid="ignore"):
+        signed = determinants(points, elements)
+        flat = is_flat(points, elements, signed)
+    twice, first = find_repeated(elements)
+    if drop_degenerate and (flat.any() or twice.any()):
+        for bad, fault in ((flat, "have no volume"), (twice & ~flat, "come twice")):
+            if bad.any():
+                warn(f"TetMesh: {int(bad.sum())} of {len(bad)} tets {fault} and were left out")
+        kept = ~(flat | twice)
+        shares = None if shares is None else shares[kept]
+        groups = None if groups is None else groups[kept]
+        elements, signed, flat, twice = elements[kept], signed[kept], flat[kept], twice[kept]
+        if not len(elements):
+            raise ValueError("TetMesh.tets: no tet has a volume; are all vertices in one plane?")
+    refuse("TetMesh.tets", flat, elements, "volumes must not vanish (compared with rounding of the vertices)", fix)
+    if twice.any():
+        again = f"every tet must come once (that at {first} comes again, with a volume of its own)"
+        refuse("TetMesh.tets", twice, elements, again, fix)
+    inverted = signed < 0
+    flipped = int(inverted.sum())
+    if flipped:
+        elements[inverted] = elements[inverted][:, [0, 1, 3, 2]]
+        warn(f"TetMesh: {flipped} of {len(elements)} tets had inverted winding and were turned")
+    used, elements = compact("TetMesh", elements, len(points), drop=drop_unreferenced)
+    return {
+        "vertices": points[used],
+        "tets": elements,
+        "fill": shares,
+        "regions": groups,
+        "kept": used,
+        "flipped": flipped,
+    }
 
 
 def affine(name: str, matrix: Numbers) -> tuple[Array, Array]:

@@ -22,7 +22,7 @@ from .material_changes import (
     read_pins,
     replace_material,
 )
-from .model_checks import check_batch, check_state, check_time_step, check_tolerance, positions_of
+from .model_checks import check_batch, check_state, check_time_step, check_tolerance, positions_of, report_resolution
 from .multilevel import has_levels
 from .pins import PIN_HARD
 from .placing import check_wanted_device, is_recording, move_plan, plan_anew, plan_for_solver, plan_on
@@ -90,6 +90,7 @@ class Model(nn.Module):
         self._batch = check_batch(batch)
         self.progress = progress
         values = scene.values()
+        report_resolution(values, dtype)
         self.anchors = Anchors(scene)
         self.pinned = values.pinned
         self._seen_rest, self._seen_pins = Seen(), Seen()
@@ -401,8 +402,9 @@ class Model(nn.Module):
             self.plan = plan
             if loses_positions:
                 # the material may have been trained, and keeps the digits it has
-                positions = self.scene.values().rest_positions
-                self.rest_positions = torch.tensor(positions, dtype=wanted.dtype, device=wanted.device)
+                values = self.scene.values()
+                report_resolution(values, wanted.dtype)
+                self.rest_positions = torch.tensor(values.rest_positions, dtype=wanted.dtype, device=wanted.device)
         read_pins(self)
         return self
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from functools import reduce
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,20 +13,54 @@ from torch import Tensor
 
 from .checks import check_like, check_whole, in_full, of_each
 from .state import State
+from .warn import warn_user
 from .written import check_rest
 
 if TYPE_CHECKING:
     from .model import Model
+    from .scene import SceneValues
 
-__all__ = ["check_batch", "check_positive_number", "check_state", "check_time_step", "check_tolerance", "positions_of"]
+__all__ = [
+    "check_batch",
+    "check_positive_number",
+    "check_state",
+    "check_time_step",
+    "check_tolerance",
+    "positions_of",
+    "report_resolution",
+]
 
 
+_COARSEST = 1e-4  # of an edge: what positions are resolved to
 _LONGEST_STEP = {torch.float32: 1e12, torch.float64: 1e100}  # s
 
 
 def check_batch(batch: int | None) -> int | None:
     """Environments that a step will have, where they are known."""
     return None if batch is None else check_whole("batch", batch, minimum=1)
+
+
+def report_resolution(values: SceneValues, dtype: torch.dtype) -> None:
+    """Warn of tets so far from the origin that the next float32 is farther away than 1e-4 of their shortest edge.
+
+    Rest shapes are compiled in float64: strains of that size push a body that starts at rest.
+    """
+    if dtype != torch.float32:
+        return
+    corners = [values.rest_positions[values.tets[:, a]] for a in range(4)]
+    edges = (one - other for one, other in combinations(corners, 2))
+    shortest = np.sqrt(reduce(np.minimum, (np.einsum("ij,ij->i", edge, edge) for edge in edges)))
+    farthest = np.abs(values.rest_positions).max(axis=1)[values.tets].max(axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows has no resolution
+        steps = np.nan_to_num(np.spacing(farthest.astype(np.float32)) / shortest, nan=np.inf)
+    worst = int(steps.argmax())
+    if steps[worst] > _COARSEST:
+        warn_user(
+            f"Simulator: {farthest[worst]:.4g} m from the origin float32 resolves positions to "
+            f"{steps[worst] * shortest[worst]:.2g} m, which is {steps[worst]:.2g} of the shortest edge of a tet there "
+            f"({int((steps > _COARSEST).sum())} of {len(steps)} tets have more than {_COARSEST:g}): bodies at rest "
+            "move. Move the scene to the origin, mesh.translated(...), or pass dtype=torch.float64"
+        )
 
 
 def check_positive_number(name: str, value: float, unit: str) -> float:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+
+from .mesh_faces import count_pieces
 
 __all__ = ["MeshQuality", "element_bounds", "measure_quality", "shape_gradients", "smallest_dihedral"]
 
@@ -95,13 +95,6 @@ def smallest_dihedral(vertices: Array, tets: Index) -> float:
     return float(_dihedral_angles(_unit(gradients)).min())
 
 
-def _count_pieces(tets: Index) -> int:
-    count = int(tets.max()) + 1
-    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].reshape(-1)
-    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
-    return int(connected_components(graph, directed=False, return_labels=False))
-
-
 def measure_quality(vertices: Array, tets: Index, fill: Array | None = None) -> MeshQuality:
     """Measure every tet of a valid mesh."""
     gradients, volumes = shape_gradients(vertices, tets)
@@ -113,5 +106,5 @@ def measure_quality(vertices: Array, tets: Index, fill: Array | None = None) -> 
         max_dihedral=angles.max(axis=1),
         element_bounds=element_bounds(normals),
         fill=fill,
-        pieces=_count_pieces(tets),
+        pieces=count_pieces(tets),
     )

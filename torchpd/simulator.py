@@ -57,7 +57,8 @@ class Simulator(Readable):
             tolerance; `print(sim)` says why, an `UnsolvedWarning` where that will not do. It chooses anew when the
             simulator moves to another device, for another `kernel` or `batch`, and in `prepare_solver`, which an
             `UnsolvedWarning` asks for where a change of material or time step makes the old choice leave 1e-2 or more.
-        dtype: precision, torch.float32 or torch.float64.
+        dtype: precision, torch.float32 or torch.float64. A warning tells where float32 resolves rest positions to more
+            than 1e-4 of an edge. States that lie farther from the origin are not looked at, which would wait for a GPU.
         tolerance: an environment stops iterating when |x - x*| is about tolerance |x - s| or less, s being where
             inertia, forces and springs alone would take the vertices, so that |x - s| is what elasticity and contacts
             do, or what gravity does if that is more; 0 never. The error is judged by the changes of iterations and by

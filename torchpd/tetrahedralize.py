@@ -16,9 +16,11 @@ from tqdm import tqdm
 
 from .checks import check_scalar
 from .embedding import Embedding, embed
-from .fill import LEAST_FILL, inside_share, parts_of
+from .fill import LEAST_FILL, Parts, inside_share, parts_of
 from .lattice import Lattice
-from .mesh import TET_FACES, TetMesh, TriMesh, match_faces
+from .mesh import TetMesh, TriMesh
+from .mesh_checks import warn
+from .mesh_faces import TET_FACES, match_faces
 
 __all__ = ["tetrahedralize"]
 
@@ -45,9 +47,9 @@ def tetrahedralize(
     body-centred cubic lattice that the surface reaches into or encloses. All tets are alike and well shaped; the mesh
     reaches beyond the surface by up to one cell, and parts less than about a cell apart grow together. Cavities are
     filled. Corners at open edges that are less than a quarter of a cell apart, and less than half of their edges, count
-    as one; triangles that come from both sides count once; holes are closed by cones. What is torn beyond that tells no
-    inside: a `MeshWarning` reports it. Parts of the mesh that would hang together by an edge or a vertex alone are
-    separated there.
+    as one; triangles that come from both sides count once; holes are closed by cones, which a `MeshWarning` reports.
+    What encloses nothing, a sheet or what is torn beyond that, has no inside: another one says so. Parts of the mesh
+    that would hang together by an edge or a vertex alone are separated there.
 
     Of its volume, `mesh.fill` says which share of each tet lies inside of the surface. `Solid` multiplies density and
     Young's modulus by it, so that a body weighs what the surface encloses (to 2 % and less; 3 % where it is about one
@@ -106,7 +108,10 @@ def _fill_lattice(surface: TriMesh, lattice: Lattice, *, progress: bool, fill_ho
     if len(parts.caps):
         walls |= lattice.touched(parts.caps)
     inner = lattice.enclosed(walls)
-    share, sheets = inside_share(lattice, parts, walls)
+    share, solid = inside_share(lattice, parts, walls)
+    if fill_holes:
+        _report_open(parts, solid, _SEAM * lattice.spacing)
+    sheets = np.concatenate([parts.sheets, parts.triangles[~solid[parts.part]]])
     # Around a sheet, which has no inside, the tets that it passes are the body.
     whole = inner | lattice.touched(sheets) if len(sheets) else inner
     share[whole] = 1.0
@@ -121,6 +126,37 @@ def _fill_lattice(surface: TriMesh, lattice: Lattice, *, progress: bool, fill_ho
     mesh = TetMesh(vertices[source], tets, fill=np.clip(share.reshape(-1)[chosen], LEAST_FILL, 1.0))
     carriers = np.searchsorted(chosen, numbers)
     return mesh.with_embedding(Embedding(surface, carriers, weights, mesh.tets[carriers], len(mesh.vertices)))
+
+
+def _report_open(parts: Parts, solid: NDArray[np.bool_], tolerance: float) -> None:
+    """Warn of sheets, which enclose nothing, and of holes that were closed.
+
+    Args:
+        parts: of a surface whose holes are closed.
+        solid: which of them enclose a volume [P].
+        tolerance: of `parts_of` [m].
+    """
+    total = parts.own + len(parts.sheets)
+    sheets = len(parts.sheets) + int((~solid[parts.part[: parts.own]]).sum())
+    count, edges = parts.open_edges
+    of_edges = f"{count} of {edges} edges ({100.0 * count / max(edges, 1):.2g} %) belong to one triangle only"
+    if sheets:
+        warn(
+            f"tetrahedralize: {sheets} of {total} triangles are a sheet, open or flat, which encloses nothing; "
+            f"{of_edges}. The mesh is full where they pass, about a cell thick, and heavier than a thin sheet. To fill "
+            f"an inside, close the surface: corners less than {tolerance:.3g} m and half an edge apart count as one, so "
+            "repair what is farther apart, or use fewer cells"
+        )
+    sides = parts.triangles[:, 1:] - parts.triangles[:, :1]
+    area = np.where(solid[parts.part], np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1), 0.0)
+    cones = area[len(area) - len(parts.caps) :]
+    if cones.any():
+        holes = len(np.unique(parts.caps[cones > 0, 2], axis=0))
+        warn(
+            f"tetrahedralize: the surface is open; {of_edges}. Cones over its holes ({holes}) close it, "
+            f"{100.0 * cones.sum() / area.sum():.2g} % of the area around the inside. Close the surface, or pass "
+            "fill_holes=False for a shell"
+        )
 
 
 def _split_hinges(tets: Index) -> tuple[Index, Index]:
