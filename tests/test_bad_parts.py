@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -87,3 +88,47 @@ def test_short_floats_are_numbers_too(kind: torch.dtype) -> None:
     assert pd.Solid(solid.mesh, torch.tensor(1024.0, dtype=kind)).youngs.tolist() == [1024.0] * 48
     grid = torch.tensor(solid.mesh.vertices * 40, dtype=kind)  # 0, 4, 8
     assert np.array_equal(pd.TetMesh(grid, solid.mesh.tets).vertices, grid.double().numpy())
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        (50.1, r"50\.1 m long, .* of 0\.001 to 50 m .* mesh\.scaled\(0\.001\) if these are millimetres"),
+        (9.9e-4, r"0\.00099 m long, .* mesh\.scaled\(1000\) if"),
+    ],
+)
+def test_bodies_that_are_hardly_in_metres_are_said(size: float, words: str) -> None:
+    mesh = pd.shapes.single_tet().scaled(size / np.ptp(pd.shapes.single_tet().vertices, axis=0).max())
+    with pytest.warns(pd.MeshWarning, match=f"Solid: the mesh is {words}") as said:
+        pd.Solid(mesh, 1e5)
+    assert said[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for factor in (0.99, 1.02):
+            inside = mesh.scaled(factor)
+            if 1e-3 <= factor * size <= 50.0:
+                pd.Solid(inside, 1e5)
+        pd.Solid(mesh.translated((1e4, 0.0, 0.0)).scaled(1.0 / size), 1e5)
+
+
+def test_positions_that_float32_cannot_resolve_are_said() -> None:
+    """Next to 1e6 float32 goes by 1/16, next to 500 by 3.1e-5, which is 6.1e-5 of an edge of 1/2."""
+
+    def scene(offset: float) -> pd.Scene:
+        return pd.Scene(
+            pd.Solid(body().mesh.scaled(1.0 / np.ptp(body().mesh.vertices)).translated((0, offset, 0)), 1e5)
+        )
+
+    words = r"Simulator: 1e\+06 m from the origin .* to 0\.062 m, which is 0\.12 of the shortest .* \(48 of 48 tets"
+    with pytest.warns(UserWarning, match=words) as said:
+        pd.Simulator(scene(1e6))
+    assert said[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pd.Simulator(scene(500.0))
+        sim = pd.Simulator(scene(1e6), dtype=torch.float64)
+    with pytest.warns(UserWarning, match=words):
+        sim.to(torch.float32)
+    # of two bodies the one that is far away; a large one near the origin has edges as large
+    with pytest.warns(UserWarning, match=r"\(48 of 96 tets"):
+        pd.Simulator(pd.Scene(*scene(0.0).parts, *scene(1e6).parts))

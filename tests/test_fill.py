@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -188,6 +190,46 @@ def test_what_is_torn_to_pieces_is_a_sheet_and_reported() -> None:
         mesh = pd.tetrahedralize(shreds, cells=20)
     assert np.all(fill_of(mesh) == 1.0)
     assert whole.volume() < filled(mesh) < 1.2 * whole.volume()  # a layer of half a cell, 1/20 of the radius
+
+
+def sheet(bend: float) -> pd.TriMesh:
+    """A square of 8 by 8 squares, bent to a part of a cylinder: 32 of its 208 edges are open."""
+    x, y = np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 9)], indexing="ij")
+    corner = (9 * np.arange(8)[:, None] + np.arange(8)).reshape(-1, 1)
+    triangles = np.concatenate([corner + [0, 9, 1], corner + [1, 9, 10]])
+    return pd.TriMesh(np.stack([x, bend * (0.25 - x**2), y], axis=-1).reshape(-1, 3), triangles)
+
+
+def test_sheets_are_named_however_few_their_triangles_are() -> None:
+    two = pd.TriMesh(sheet(0.0).vertices[[0, 8, 72, 80]], [[0, 2, 1], [1, 2, 3]])
+    flat = sheet(0.0)
+    both = pd.TriMesh(flat.vertices, np.concatenate([flat.triangles, flat.triangles[:, ::-1]]))
+    for surface, count, edges in (
+        (two, "2 of 2 triangles", r"4 of 5 edges \(80 %\)"),
+        (flat, "128 of 128 triangles", r"32 of 208 edges \(15\.4 %\)"),
+        (both, "128 of 128 triangles", r"32 of 208 edges \(15\.4 %\)"),
+        (joined(ball(2).translated((0.0, 2.0, 0.0)), flat), "128 of 448 triangles", r"32 of 688 edges \(4\.65 %\)"),
+    ):
+        with pytest.warns(pd.MeshWarning) as said:
+            pd.tetrahedralize(surface, cells=6)
+        (message,) = [str(warning.message) for warning in said]
+        assert re.search(rf"{count} are a sheet, open or flat, which encloses nothing; {edges} belong to one", message)
+
+
+def test_holes_that_were_closed_are_counted() -> None:
+    """A cube without one face lacks a sixth of its area, and a diagonal of its 18 edges."""
+    cube = block(1.0, 1.0, 1.0)
+    tub = pd.TriMesh(cube.vertices, cube.triangles[(cube.vertices[cube.triangles][:, :, 1] < 0.4).any(axis=1)])
+    with pytest.warns(
+        pd.MeshWarning, match=r"4 of 17 edges \(23\.5 %\) .* its holes \(1\) close it, 16\.7 % of the area"
+    ):
+        pd.tetrahedralize(tub, cells=8)
+    surfaces = ball(2), pd.shapes.octopus(cells=16), block(1.0, 1.0, 0.02), soup(ball(2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for closed in surfaces:
+            pd.tetrahedralize(closed, cells=8)
+        pd.tetrahedralize(sheet(0.4), cells=8, fill_holes=False)  # a shell, as asked for
 
 
 def test_parts_that_overlap_count_once_and_cavities_are_filled() -> None:

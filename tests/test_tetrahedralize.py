@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import types
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,13 @@ import torch
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mesh_cases import jittered_box
 from scipy.optimize import linprog
 
 from torchpd import shapes
-from torchpd.embedding import Embedding, embed
+from torchpd.embedding import Embedding, _outside, embed
 from torchpd.lattice import Lattice, _overlaps
-from torchpd.mesh import TetMesh, TriMesh
+from torchpd.mesh import MeshWarning, TetMesh, TriMesh
 from torchpd.tetrahedralize import _split_hinges, tetrahedralize
 
 
@@ -296,6 +298,41 @@ def test_any_surface_embeds_in_any_mesh() -> None:
     embedding = embed(outside, mesh)
     np.testing.assert_allclose(embedding.apply(mesh.vertices), outside.vertices, atol=1e-12)
     assert embedding.weights.min() < 0
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_surfaces_far_outside_are_said_in_cells(scale: float) -> None:
+    """The edges of a box of cubes are at most the diagonals, sqrt(3) / 4 long."""
+    mesh = shapes.box((1.0, 1.0, 1.0), (4, 4, 4)).scaled(scale)
+    triangle = TriMesh(scale * np.array([[0.5, 0.5, 0.9], [0.4, 0.5, 1.4], [0.6, 0.5, 1.4]]), [[0, 1, 2]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        embed(triangle, mesh)  # 0.92 cells
+    with pytest.warns(MeshWarning, match=r"embed: 2 of 3 surface vertices .* up to 2\.08 cells \(0\.\d+ m\)") as said:
+        embed(triangle.translated((0.0, 0.0, 0.5 * scale)), mesh)
+    assert f"({0.9 * scale:.3g} m)" in str(said[0].message)
+    assert said[0].filename == __file__
+    # in millimetres, where the mesh is in metres
+    with pytest.warns(MeshWarning, match=r"3 of 3 surface vertices"):
+        embed(triangle.scaled(1000.0), mesh)
+
+
+def test_points_outside_go_to_the_nearest_tet() -> None:
+    """The distances are those to the surface of the mesh, by another program."""
+    mesh = jittered_box()
+    rng = np.random.default_rng(2)
+    points = mesh.bounds.mean(axis=0) + rng.normal(size=(300, 3)) * [1.0, 0.8, 0.6]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        embedding = embed(TriMesh(points, np.arange(300).reshape(-1, 3)), mesh)
+    out = embedding.weights.min(axis=1) < 0.0
+    assert 200 < out.sum() < 300
+    faces = mesh.vertices[mesh.boundary()]
+    everyone = np.repeat(points[out], len(faces), axis=0)
+    closest = trimesh.triangles.closest_point(np.tile(faces, (out.sum(), 1, 1)), everyone)
+    exact = np.linalg.norm(closest - everyone, axis=1).reshape(out.sum(), -1).min(axis=1)
+    own = mesh.vertices[embedding.corners[out]]
+    np.testing.assert_allclose(_outside(points[out], own), exact, rtol=1e-12)
 
 
 def test_an_embedding_of_the_wrong_size_is_refused() -> None:

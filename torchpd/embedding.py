@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, combinations
 from typing import Any, overload
 
 import numpy as np
@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from .mesh import TetMesh, TriMesh
 from .mesh_checks import has_repeated_corner, warn
+from .mesh_faces import TET_FACES
 from .quality import shape_gradients
 
 __all__ = ["Embedding", "embed", "embed_kept", "embed_triangles"]
@@ -23,6 +24,8 @@ Index = NDArray[np.int64]
 
 # How many of the nearest tets compete for a point that lies in none.
 _NEAREST = 32
+# Points in work at a time, to bound memory.
+_CHUNK = 100_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -129,19 +132,58 @@ def embed(surface: TriMesh, mesh: TetMesh) -> Embedding:
     near = cKDTree(centres).query(points, k=min(_NEAREST, len(centres)))[1].reshape(len(points), -1)
     which = np.concatenate([which, np.repeat(np.arange(len(points)), near.shape[1])])
     tets = np.concatenate([tets, near.reshape(-1)])
-    # The signed distance to the plane of face a is w_a / |grad N_a|: the best tet has the largest minimum over a.
+    # The signed distance to the plane of face a is w_a / |grad N_a|. A tet contains the point where the least over a is
+    # not negative, and else is at least as far away as that.
     weights = _weights(points[which], corners[tets, 0], gradients[tets])
     depth = (weights / np.linalg.norm(gradients[tets], axis=2)).min(axis=1)
-    order = np.lexsort((tets, -depth, which))
+    distance = _distances(points, which, corners, tets, weights, depth)
+    order = np.lexsort((tets, -depth, distance, which))
     best = order[np.unique(which[order], return_index=True)[1]]
     chosen = tets[best]
-    _report_far(corners[chosen], np.maximum(-depth[best], 0.0))
+    _report_far(corners[chosen], distance[best])
     return Embedding(surface, chosen, weights[best], mesh.tets[chosen], len(mesh.vertices))
+
+
+def _distances(points: Array, which: Index, corners: Array, tets: Index, weights: Array, depth: Array) -> Array:
+    """Distance [P] of points `which` to `tets`, 0 inside; inf where another tet is sure to be nearer to the point."""
+    inside = np.clip(weights, 0.0, None)
+    inside /= inside.sum(axis=1, keepdims=True)
+    most = np.linalg.norm(points[which] - np.einsum("pa,pak->pk", inside, corners[tets]), axis=1)
+    nearest = np.full(len(points), np.inf)
+    np.minimum.at(nearest, which, np.where(depth >= 0.0, 0.0, most))
+    distance = np.where(depth >= 0.0, 0.0, np.inf)
+    open_to = np.flatnonzero((depth < 0.0) & (-depth <= nearest[which] * (1.0 + 1e-9)))
+    for start in range(0, len(open_to), _CHUNK):
+        pairs = open_to[start : start + _CHUNK]
+        distance[pairs] = _outside(points[which[pairs]], corners[tets[pairs]])
+    return distance
+
+
+def _outside(points: Array, corners: Array) -> Array:
+    """Distance of points [P, 3] to the surfaces of tets [P, 4, 3]: to an edge, or to a face straight below."""
+    distance = np.full(len(points), np.inf)
+    for a, b in combinations(range(4), 2):
+        edge, away = corners[:, b] - corners[:, a], points - corners[:, a]
+        along = np.clip(_dot(edge, away) / _dot(edge, edge), 0.0, 1.0)
+        np.minimum(distance, np.linalg.norm(away - along[:, None] * edge, axis=1), out=distance)
+    for face in TET_FACES:
+        a, b, c = (corners[:, corner] for corner in face)
+        normal = np.cross(b - a, c - a)
+        above = np.ones(len(points), dtype=bool)
+        for start, end in ((a, b), (b, c), (c, a)):
+            above &= _dot(np.cross(normal, end - start), points - start) >= 0.0
+        height = np.abs(_dot(points - a, normal)) / np.linalg.norm(normal, axis=1)
+        np.minimum(distance, height, out=distance, where=above)
+    return distance
+
+
+def _dot(one: Array, other: Array) -> Array:
+    return np.asarray(np.einsum("pk,pk->p", one, other))
 
 
 def _report_far(corners: Array, distance: Array) -> None:
     """Warn of surface vertices that lie farther outside of their tets [n, 4, 3] than these are long."""
-    ends = np.array([(a, b) for a in range(4) for b in range(a)])
+    ends = np.array(list(combinations(range(4), 2)))
     cells = distance / np.linalg.norm(corners[:, ends[:, 0]] - corners[:, ends[:, 1]], axis=2).max(axis=1)
     far = int((cells > 1.0).sum())
     if far:

@@ -225,9 +225,9 @@ def count_pieces(tets: Index) -> int:
 
 def _report_unmerged(count: str, tets: Index, first: Index, tolerance: float) -> None:
     warn(
-        f"TetMesh: {count} outer faces lie on one another with vertices of their own, and nothing joins the tets there: "
-        f"the mesh is in {count_pieces(tets)} pieces. mesh.merged() makes one of vertices at the same place, within "
-        f"{tolerance:.2g} m, which leaves {count_pieces(first[tets])}"
+        f"TetMesh: {count} outer faces lie on one another with vertices of their own, so nothing joins the tets "
+        f"there: the mesh is in {count_pieces(tets)} pieces. mesh.merged() makes one of vertices at the same place, "
+        f"within {tolerance:.2g} m, which leaves {count_pieces(first[tets])}"
     )
 
 

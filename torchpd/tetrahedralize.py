@@ -139,12 +139,12 @@ def _report_open(parts: Parts, solid: NDArray[np.bool_], tolerance: float) -> No
     total = parts.own + len(parts.sheets)
     sheets = len(parts.sheets) + int((~solid[parts.part[: parts.own]]).sum())
     count, edges = parts.open_edges
-    of_edges = f"{count} of {edges} edges ({100.0 * count / max(edges, 1):.2g} %) belong to one triangle only"
+    of_edges = f"{count} of {edges} edges ({100.0 * count / max(edges, 1):.3g} %) belong to one triangle only"
     if sheets:
         warn(
             f"tetrahedralize: {sheets} of {total} triangles are a sheet, open or flat, which encloses nothing; "
             f"{of_edges}. The mesh is full where they pass, about a cell thick, and heavier than a thin sheet. To fill "
-            f"an inside, close the surface: corners less than {tolerance:.3g} m and half an edge apart count as one, so "
+            f"an inside, close the surface: corners less than {tolerance:.3g} m and half an edge apart count as one; "
             "repair what is farther apart, or use fewer cells"
         )
     sides = parts.triangles[:, 1:] - parts.triangles[:, :1]
@@ -154,7 +154,7 @@ def _report_open(parts: Parts, solid: NDArray[np.bool_], tolerance: float) -> No
         holes = len(np.unique(parts.caps[cones > 0, 2], axis=0))
         warn(
             f"tetrahedralize: the surface is open; {of_edges}. Cones over its holes ({holes}) close it, "
-            f"{100.0 * cones.sum() / area.sum():.2g} % of the area around the inside. Close the surface, or pass "
+            f"{100.0 * cones.sum() / area.sum():.3g} % of the area around the inside. Close the surface, or pass "
             "fill_holes=False for a shell"
         )
 
