@@ -116,6 +116,7 @@ def test_extreme_eigenvalues_with_the_diagonal_of_the_plan() -> None:
     assert extreme_eigenvalues(problem, sim, weighted=False) == pytest.approx(KNOWN_SPECTRUM, rel=1e-2)
 
 
+@pytest.mark.filterwarnings("ignore:TetMesh")
 @pytest.mark.parametrize("jitter", [0.0, 0.2, 0.35])
 def test_weighted_diagonal_of_the_plan_bounds_the_matrix(jitter: float) -> None:
     mesh = beam_mesh(jitter=jitter)

@@ -121,6 +121,7 @@ def test_winding_and_shared_vertices_do_not_matter() -> None:
     np.testing.assert_allclose(fill_of(one), fill_of(other), atol=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:tetrahedralize")
 @pytest.mark.parametrize(("noise", "cells"), [(1e-3, 20), (8e-3, 20), (8e-3, 40), (1e-5, 10)])
 def test_cracks_do_not_empty_a_body(noise: float, cells: int) -> None:
     surface = ball()
@@ -241,6 +242,7 @@ def test_parts_that_overlap_count_once_and_cavities_are_filled() -> None:
     assert filled(pd.tetrahedralize(hollow, cells=12)) == pytest.approx(1.0, rel=1e-3)
 
 
+@pytest.mark.filterwarnings("ignore:tetrahedralize")
 def test_a_hole_is_closed_by_its_cap_or_leaves_a_shell() -> None:
     whole = ball(4)
     upper = whole.vertices[whole.triangles].mean(axis=1)[:, 2] > 0.0
@@ -250,6 +252,7 @@ def test_a_hole_is_closed_by_its_cap_or_leaves_a_shell() -> None:
     assert np.all(fill_of(pd.tetrahedralize(bowl, cells=16, fill_holes=False)) == 1.0)
 
 
+@pytest.mark.filterwarnings("ignore:tetrahedralize")
 @pytest.mark.parametrize("both_sides", [False, True])
 def test_what_encloses_nothing_is_a_body_of_full_tets(both_sides: bool) -> None:
     sheet = [[0, 1, 2], [1, 3, 2]]

@@ -147,6 +147,7 @@ def test_a_soup_gives_the_same_mesh_as_the_surface_it_came_from() -> None:
     assert len(np.unique(boundary)) - len(edges) + len(boundary) == 0
 
 
+@pytest.mark.filterwarnings("ignore:(tetrahedralize|embed)")
 def test_holes_are_filled_unless_asked_not_to() -> None:
     surface = ball()
     centres = surface.vertices[surface.triangles].mean(axis=1)
@@ -180,6 +181,7 @@ def test_cavities_are_filled() -> None:
     assert contains(tetrahedralize(both, cells=20), np.zeros((1, 3))).all()
 
 
+@pytest.mark.filterwarnings("ignore:(tetrahedralize|embed)")
 @pytest.mark.parametrize(
     "corners",
     [
@@ -214,6 +216,7 @@ def test_parts_that_touch_in_a_point_or_an_edge_come_apart() -> None:
     np.testing.assert_array_equal(source, np.unique(tets))
 
 
+@pytest.mark.filterwarnings("ignore:(tetrahedralize|embed)")
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 12))
 def test_every_random_soup_is_carried_to_rounding(seed: int, cells: int) -> None:
@@ -269,6 +272,7 @@ def test_tensors_keep_their_type_batch_and_gradient(dtype: torch.dtype) -> None:
     np.testing.assert_allclose(array, moved.detach().numpy(), atol=tolerance)
 
 
+@pytest.mark.filterwarnings("ignore:(tetrahedralize|embed)")
 def test_gradients_agree_with_differences() -> None:
     mesh = tetrahedralize(TriMesh([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]), cells=1)
     positions = torch.tensor(mesh.vertices, requires_grad=True)

@@ -167,12 +167,12 @@ def _outside(points: Array, corners: Array) -> Array:
         along = np.clip(_dot(edge, away) / _dot(edge, edge), 0.0, 1.0)
         np.minimum(distance, np.linalg.norm(away - along[:, None] * edge, axis=1), out=distance)
     for face in TET_FACES:
-        a, b, c = (corners[:, corner] for corner in face)
-        normal = np.cross(b - a, c - a)
+        p, q, r = (corners[:, corner] for corner in face)
+        normal = np.cross(q - p, r - p)
         above = np.ones(len(points), dtype=bool)
-        for start, end in ((a, b), (b, c), (c, a)):
+        for start, end in ((p, q), (q, r), (r, p)):
             above &= _dot(np.cross(normal, end - start), points - start) >= 0.0
-        height = np.abs(_dot(points - a, normal)) / np.linalg.norm(normal, axis=1)
+        height = np.abs(_dot(points - p, normal)) / np.linalg.norm(normal, axis=1)
         np.minimum(distance, height, out=distance, where=above)
     return distance
 

@@ -25,7 +25,7 @@ from .checks import check_has_values, check_target_file
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .embedding import Embedding
 from .material import named_arrays
-from .mesh import TetMesh, TriMesh
+from .mesh import TetMesh, TriMesh, trusted
 from .mesh_checks import store
 from .multilevel import precondition_plan, reference_of_levels
 from .scene import Part, Scene
@@ -245,7 +245,7 @@ def _mesh(number: int, record: Record, tensors: _Tensors) -> TetMesh:
     fill, regions = (
         tensors.array(f"{prefix}.{name}") if tensors.has(f"{prefix}.{name}") else None for name in ("fill", "regions")
     )
-    mesh = TetMesh(tensors.array(f"{prefix}.vertices"), tensors.array(f"{prefix}.tets"), fill=fill, regions=regions)
+    mesh = trusted(tensors.array(f"{prefix}.vertices"), tensors.array(f"{prefix}.tets"), fill, regions)
     # what was turned when the mesh was made is not inverted any more
     store(mesh, flipped=record["flipped"])
     if not tensors.has(f"{prefix}.embedding.tets"):

@@ -325,9 +325,7 @@ class TetMesh:
         linear, offset = affine("TetMesh.transformed: matrix", matrix)
         # A reflection inverts every tet: two corners change places, and with them their weights.
         corners = [0, 1, 3, 2] if np.linalg.det(linear) < 0 else [0, 1, 2, 3]
-        mesh: TetMesh = object.__new__(TetMesh)
-        moved = clean_tets(self.vertices @ linear.T + offset, self.tets[:, corners], self.fill, self.regions)
-        store(mesh, **moved, embedding=None)
+        mesh = trusted(self.vertices @ linear.T + offset, self.tets[:, corners], self.fill, self.regions)
         if self.embedding is None:
             return mesh
         return mesh.with_embedding(self.embedding.transformed(matrix, corners))
@@ -347,3 +345,10 @@ class TetMesh:
             volumes = determinants(self.vertices, self.tets)
             filled = f", {float((self.fill * volumes).sum() / volumes.sum()):.0%} filled"
         return f"TetMesh({len(self.vertices)} vertices, {len(self.tets)} tets{filled}{carried})"
+
+
+def trusted(vertices: Numbers, tets: Numbers, fill: Numbers | None = None, regions: Numbers | None = None) -> TetMesh:
+    """A mesh whose tets may meet as they do: of those that were looked at before, or that torchpd lets overlap."""
+    mesh: TetMesh = object.__new__(TetMesh)
+    store(mesh, **clean_tets(vertices, tets, fill, regions), embedding=None)
+    return mesh

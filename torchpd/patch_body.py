@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .checks import as_array, check_finite, check_positive, check_scalar, check_shape
 from .effects import ArrayLike, Solid
-from .mesh import TetMesh
+from .mesh import trusted
 from .mesh_checks import store
 from .patch_constraints import Constraints, prisms, skeleton
 from .patch_transport import FrameMode, PatchTransport
@@ -88,7 +88,7 @@ class PatchBody(Solid):
         own = made.patch >= 0
         st = np.where(own, constants[np.where(own, made.patch, 0)], constants.mean())
         # overlaps and gaps between the constraints of a skeleton are no matter of mass
-        super().__init__(TetMesh(made.points, made.tets), 2.0 * st, mass / made.share)
+        super().__init__(trusted(made.points, made.tets), 2.0 * st, mass / made.share)
         rest = torch.as_tensor(made.points, dtype=patches.vertices.dtype, device=patches.vertices.device)
         store(self, patches=patches, apex=apex, apexes=len(made.points) - len(patches.vertices), patch_of=made.patch)
         chosen = None if apex == "prism" else torch.as_tensor(made.tets[:count, 3] - len(patches.vertices))
