@@ -311,6 +311,16 @@ def test_a_folded_mesh_is_said_with_its_volumes(place: tuple[float, float, float
     assert int(folds[1]) == ((np.bincount(number.reshape(-1)) == 2) & (signs == 0)).sum()
 
 
+def test_a_mesh_without_a_surface_is_folded() -> None:
+    """The five tets of five points: every face has two."""
+    vertices = np.vstack([np.eye(3), np.zeros((1, 3)), [[0.2, 0.3, 0.1]]])
+    tets = np.array([np.delete(np.arange(5), k) for k in range(5)])
+    turned_over, folded = said(lambda: TetMesh(vertices, tets))
+    assert "had inverted winding" in turned_over
+    assert "of 10 inner faces have both of their tets on one side" in folded
+    assert "add up to 0.3333 m^3, but enclose" in folded
+
+
 def test_tets_that_are_all_wound_the_other_way_are_only_turned() -> None:
     for cells in ((BOX.vertices, BOX.tets), ring()):
         messages = said(lambda: TetMesh(cells[0], cells[1][:, [1, 0, 2, 3]]))  # noqa: B023

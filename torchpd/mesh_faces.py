@@ -81,9 +81,11 @@ def sort_faces(tets: Index) -> Faces:
         w = words[block]
         sums = (w[:, 0] + w[:, 1]) + (w[:, 2] + w[:, 3])
         keys[block] |= ((sums[:, None] - w) & upper) | (_is_odd(tets[block]).astype(np.uint64) << bits)
-    keys = np.sort(keys.reshape(-1))
+    keys = keys.reshape(-1)
+    keys.sort()
     # Two orientations of a face differ in the lowest bit that is left.
-    step = (keys[1:] ^ keys[:-1]) >> bits
+    step = keys[1:] ^ keys[:-1]
+    step >>= bits
     begins = np.append(True, step > one)
     ends = np.append(begins[1:], True)
     opposed = np.append((step == one) & begins[:-1] & ends[1:], False)
@@ -155,9 +157,11 @@ def report_faces(points: Array, tets: Index) -> None:
         )
     if faces.folded:
         _report_folded(points, tets, faces)
+    if not len(faces.lone):
+        return
     # Relative to the box, so that no size overflows.
-    low = points.min(axis=0)
-    size = float(np.linalg.norm(points.max(axis=0) - low))
+    low, high = (np.array([reduce(column) for column in points.T]) for reduce in (np.min, np.max))
+    size = float(np.linalg.norm(high - low))
     at_boundary = np.zeros(len(points), dtype=bool)
     at_boundary[_corners(tets, faces.lone)] = True
     vertices = np.flatnonzero(at_boundary)
@@ -259,13 +263,14 @@ class _Boundary(NamedTuple):
         return int((self.lie_on_others() | self.reach_into_others()).sum())
 
     def lie_on_others(self) -> Mask:
-        """Whether the middle of one lies on another, within rounding: both count."""
+        """Whether the middle of one lies on another that looks the other way, within rounding: both count."""
         sides = self.corners[:, [1, 2, 0]] - self.corners
         inwards = np.cross(self.normals[:, None], sides / np.linalg.norm(sides, axis=2, keepdims=True))
         centres = self.corners.mean(axis=1)
         found = np.zeros(len(centres), dtype=bool)
         for pairs in _near(centres, np.linalg.norm(self.corners - centres[:, None], axis=2).max(axis=1)):
-            face, other = pairs.T
+            one, two = pairs[np.einsum("ij,ij->i", self.normals[pairs[:, 0]], self.normals[pairs[:, 1]]) < 0.0].T
+            face, other = np.append(one, two), np.append(two, one)
             away = centres[other] - self.corners[face, 0]
             on = np.abs(np.einsum("ij,ij->i", away, self.normals[face])) <= ROUNDING
             face, other = face[on], other[on]
@@ -306,15 +311,13 @@ class _Boundary(NamedTuple):
 
 
 def _near(centres: Array, radii: Array) -> Iterator[Index]:
-    """Pairs [n, 2] of a ball and the centre of another in it, of no larger one: by powers of two of the radii."""
+    """Pairs [n, 2] of balls, once each, of which one holds the centre of the other: by powers of two of the radii."""
     octaves = np.frexp(radii)[1]
     for octave in np.unique(octaves):
         large, small = np.flatnonzero(octaves == octave), np.flatnonzero(octaves < octave)
         tree, reach = cKDTree(centres[large]), float(radii[large].max()) * (1.0 + 1e-3)
         pairs = large[tree.query_pairs(reach, output_type="ndarray")]
-        for start in range(0, len(pairs), _CHUNK):
-            yield pairs[start : start + _CHUNK]
-            yield pairs[start : start + _CHUNK, ::-1]
+        yield from (pairs[start : start + _CHUNK] for start in range(0, len(pairs), _CHUNK))
         for start in range(0, len(small), _CHUNK):
             chunk = small[start : start + _CHUNK]
             found = tree.sparse_distance_matrix(cKDTree(centres[chunk]), reach, output_type="ndarray")
