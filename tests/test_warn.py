@@ -18,6 +18,7 @@ import torchpd as pd
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 ONE_MORE = np.vstack([[[9.0, 9.0, 9.0]], CORNERS])
+LOOSE = np.vstack([CORNERS, CORNERS * [1.0, 1.0, -1.0]])
 BALL = trimesh.creation.icosphere(subdivisions=1)
 
 
@@ -68,6 +69,11 @@ CALLS: dict[str, Callable[[], object]] = {
     "surface": lambda: pd.tetrahedralize(
         trimesh.Trimesh(BALL.vertices, [*BALL.faces, [0, 0, 1]], process=False), cells=3
     ),
+    "unmerged": lambda: pd.TetMesh(LOOSE, [[0, 1, 2, 3], [4, 6, 5, 7]]),
+    "sheet": lambda: pd.tetrahedralize(pd.TriMesh(CORNERS[:3], [[0, 1, 2]]), cells=2),
+    "outside": lambda: pd.embed(pd.TriMesh(CORNERS[:3] + 5.0, [[0, 1, 2]]), pd.shapes.single_tet()),
+    "large": lambda: pd.Solid(pd.shapes.single_tet(100.0), 1e5),
+    "far away": lambda: pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet().translated((1e5, 0.0, 0.0)), 1e5))),
     "few iterations": lambda: pd.Simulator(pd.Scene(pd.Solid(pd.shapes.box((2.0, 0.1, 0.1), (40, 2, 2)), 1e8)), 1 / 30),
     "copied": copied,
     "described": described,
