@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .mesh import TetMesh, TriMesh
-from .mesh_checks import has_repeated_corner, warn
+from .mesh_checks import warn
 from .mesh_faces import TET_FACES
 from .quality import shape_gradients
 
-__all__ = ["Embedding", "embed", "embed_kept", "embed_triangles"]
+__all__ = ["Embedding", "embed", "embed_triangles"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -201,29 +201,3 @@ def embed_triangles(mesh: TetMesh, triangles: Index) -> Embedding:
     surface = TriMesh(mesh.vertices[used], numbers.reshape(-1, 3))
     tets, corner = np.divmod(np.unique(mesh.tets.reshape(-1), return_index=True)[1][used], 4)
     return Embedding(surface, tets, np.eye(4)[corner], mesh.tets[tets], len(mesh.vertices))
-
-
-def embed_kept(mesh: TetMesh, triangles: Index) -> Embedding | None:
-    """The surface of triangles whose corners are vertices as they were given to `TetMesh`, before some were left out.
-
-    A `MeshWarning` says how many triangles are left out, with a corner that is not in the mesh, or naming one twice.
-
-    Args:
-        mesh: with `kept`, the numbers that its vertices had.
-        triangles: those numbers [T, 3].
-
-    Returns:
-        The embedding, or None where no triangle is left.
-    """
-    corners = np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
-    numbers = np.full(int(max(corners.max(initial=0), mesh.kept.max())) + 1, -1)
-    numbers[mesh.kept] = np.arange(len(mesh.kept))
-    corners = numbers[corners]
-    bare = (corners < 0).any(axis=1)
-    twice = has_repeated_corner(corners) & ~bare
-    total = len(corners)
-    for bad, fault in ((bare, "have a corner that no tet uses"), (twice, "name a vertex twice")):
-        if bad.any():
-            warn(f"TetMesh: {int(bad.sum())} of {total} triangles of the surface {fault} and were left out")
-    corners = corners[~(bare | twice)]
-    return embed_triangles(mesh, corners) if len(corners) else None

@@ -183,8 +183,7 @@ class TetMesh:
             reaches beyond its surface. `Solid` multiplies density and Young's modulus by it.
         regions: a whole number for each tet [E], what it belongs to, or None. A material of each is
             `Solid(mesh, youngs=np.where(mesh.regions == 2, 1e6, 1e5))`.
-        drop_unreferenced: leave out vertices that no tet uses (otherwise an error); `kept` [V] has the numbers of the
-            others among those that were given.
+        drop_unreferenced: leave out vertices that no tet uses (otherwise an error).
         drop_degenerate: leave out tets whose volume is zero within rounding, that name a vertex twice, or that came
             before (otherwise an error).
     """
@@ -194,7 +193,6 @@ class TetMesh:
     fill: Array | None
     regions: Index | None
     embedding: Embedding | None
-    kept: Index
     flipped: int
 
     def __init__(
@@ -314,7 +312,7 @@ class TetMesh:
         )
         if self.embedding is None:
             return mesh
-        if np.array_equal(mesh.kept[mesh.tets], numbers[self.tets]):
+        if len(mesh.tets) == len(self.tets) and not mesh.flipped:
             return mesh.with_embedding(self.embedding.renumbered(mesh.tets, len(mesh.vertices)))
         from .embedding import embed
 

@@ -245,7 +245,6 @@ def clean_tets(
         "tets": elements,
         "fill": shares,
         "regions": groups,
-        "kept": used,
         "flipped": flipped,
     }
 

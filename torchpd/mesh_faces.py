@@ -75,13 +75,13 @@ def sort_faces(tets: Index) -> Faces:
     bits = np.uint64(int(tets.size - 1).bit_length())
     one = np.uint64(1)
     upper = ~((one << (bits + one)) - one)
-    keys = np.arange(tets.size, dtype=np.uint64).reshape(-1, 4)
+    keys = np.arange(tets.size, dtype=np.uint64)
+    by_tet = keys.reshape(-1, 4)
     for start in range(0, len(tets), _CHUNK):
         block = slice(start, start + _CHUNK)
         w = words[block]
         sums = (w[:, 0] + w[:, 1]) + (w[:, 2] + w[:, 3])
-        keys[block] |= ((sums[:, None] - w) & upper) | (_is_odd(tets[block]).astype(np.uint64) << bits)
-    keys = keys.reshape(-1)
+        by_tet[block] |= ((sums[:, None] - w) & upper) | (_is_odd(tets[block]).astype(np.uint64) << bits)
     keys.sort()
     # Two orientations of a face differ in the lowest bit that is left.
     step = keys[1:] ^ keys[:-1]
