@@ -109,6 +109,10 @@ def test_bodies_that_are_hardly_in_metres_are_said(size: float, words: str) -> N
             if 1e-3 <= factor * size <= 50.0:
                 pd.Solid(inside, 1e5)
         pd.Solid(mesh.translated((1e4, 0.0, 0.0)).scaled(1.0 / size), 1e5)
+        # the length of each piece counts, not how far apart they are
+        one = mesh.scaled(1.0 / size)
+        apart = np.vstack([one.vertices, one.vertices + 60.0])
+        pd.Solid(pd.TetMesh(apart, [[0, 1, 2, 3], [4, 5, 6, 7]]), 1e5)
 
 
 def test_positions_that_float32_cannot_resolve_are_said() -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from .checks import as_array, check_finite, check_positive, check_scalar, check_shape, check_vector
 from .mesh import TetMesh
 from .mesh_checks import warn
+from .mesh_faces import pieces_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -66,9 +67,22 @@ def _per_element(name: str, value: ArrayLike, count: int, *, unit: str) -> Array
     return array
 
 
+def _longest_side(mesh: TetMesh) -> float:
+    """Of the boxes around the pieces of a mesh [m]; of the box around all of them where that is no long one."""
+    points = mesh.vertices
+    length = float(np.ptp(points, axis=0).max())
+    if length <= _LONGEST:
+        return length
+    piece = pieces_of(mesh.tets)
+    order = np.argsort(piece, kind="stable")
+    starts = np.flatnonzero(np.diff(piece[order], prepend=-1))
+    sides = np.maximum.reduceat(points[order], starts) - np.minimum.reduceat(points[order], starts)
+    return float(sides.max())
+
+
 def _report_size(mesh: TetMesh) -> None:
     """Warn of a body whose longest side hardly is in metres."""
-    length = float(np.ptp(mesh.vertices, axis=0).max())
+    length = _longest_side(mesh)
     if not _SHORTEST <= length <= _LONGEST:
         fix = "(0.001) if these are millimetres" if length > _LONGEST else "(1000) if these were divided by 1000"
         warn(

@@ -13,7 +13,16 @@ from scipy.spatial import cKDTree
 
 from .mesh_checks import corner_words, determinants, has_repeated_corner, warn
 
-__all__ = ["ROUNDING", "TET_FACES", "count_pieces", "match_faces", "merge_near", "numbered", "report_faces"]
+__all__ = [
+    "ROUNDING",
+    "TET_FACES",
+    "count_pieces",
+    "match_faces",
+    "merge_near",
+    "numbered",
+    "pieces_of",
+    "report_faces",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -218,13 +227,17 @@ def _enclosed(points: Array, tets: Index) -> float | None:
     return float(np.abs(np.bincount(np.minimum(here, mirrored), weights=signed)).sum())
 
 
-def count_pieces(tets: Index) -> int:
-    """How many pieces hang together by vertices."""
+def pieces_of(tets: Index) -> Index:
+    """A number for each vertex [V]: equal where vertices hang together by tets."""
     count = int(tets.max()) + 1
     rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].reshape(-1)
     graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
-    label = connected_components(graph, directed=False)[1]
-    return len(np.unique(label[tets[:, 0]]))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def count_pieces(tets: Index) -> int:
+    """How many pieces hang together by vertices."""
+    return len(np.unique(pieces_of(tets)[tets[:, 0]]))
 
 
 def _report_unmerged(count: str, tets: Index, first: Index, tolerance: float) -> None:
