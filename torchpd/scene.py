@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from .mesh_faces import pieces_of
 from .pins import PinnedPieces
 
 __all__ = ["Part", "Scene", "SceneValues"]
@@ -57,12 +56,6 @@ def _lumped_masses(positions: Array, tets: Index, density: Array) -> Array:
     share = density * np.linalg.det(edges) / 24.0
     masses = np.bincount(tets.reshape(-1), weights=np.repeat(share, 4), minlength=len(positions))
     return masses.astype(np.float64, copy=False)
-
-
-def _components(count: int, tets: Index) -> Index:
-    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].reshape(-1)
-    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _no_part(part: object) -> TypeError:
@@ -155,7 +148,7 @@ class Scene:
         pin_vertices = self._pinned()
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         stiffness = np.concatenate([np.zeros(0), *springs])
-        masses, component = _lumped_masses(positions, tets, density), _components(len(positions), tets)
+        masses, component = _lumped_masses(positions, tets, density), pieces_of(tets)
         pinned = PinnedPieces.of(positions, masses, component, pin_vertices)
         gravity, damping = self._all(Gravity), self._all(Damping)
         return SceneValues(
