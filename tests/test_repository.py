@@ -10,11 +10,12 @@ import re
 from pathlib import Path
 
 import pytest
+from setuptools import find_packages
 
 import torchpd
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGE_FILES = sorted((ROOT / "torchpd").glob("*.py"))
+PACKAGE_FILES = sorted((ROOT / "torchpd").rglob("*.py"))
 PLACEHOLDERS = re.compile(r"\b(" + "|".join(["TO" + "DO", "FIX" + "ME", "raise NotImplemented" + "Error"]) + r")\b")
 TEXT_SUFFIXES = {".py", ".pyi", ".h", ".cuh", ".cpp", ".cu", ".inl", ".def", ".md", ".toml"}
 TEXT_FOLDERS = ("torchpd", "csrc", "tests", "examples", "benchmarks", "tools")
@@ -45,14 +46,23 @@ def test_public_names_exist_and_are_documented() -> None:
             assert value.__doc__, f"torchpd.{name} has no docstring"
 
 
-@pytest.mark.parametrize("path", PACKAGE_FILES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", PACKAGE_FILES, ids=lambda path: path.relative_to(ROOT / "torchpd").as_posix())
 def test_module_is_documented_and_lists_its_names(path: Path) -> None:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     assert ast.get_docstring(tree), f"{path.name} has no docstring"
     if path.stem == "__main__":
         return
-    module = importlib.import_module("torchpd" if path.stem == "__init__" else f"torchpd.{path.stem}")
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    module = importlib.import_module(".".join(parts[: len(parts) - (path.stem == "__init__")]))
     assert [name for name in module.__all__ if not hasattr(module, name)] == []
+
+
+def test_every_package_is_installed() -> None:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    found = re.search(r"^\[tool\.setuptools\.packages\.find\]\ninclude = (.*)$", text, re.MULTILINE)
+    assert found is not None
+    there = {".".join(path.parent.relative_to(ROOT).parts) for path in PACKAGE_FILES}
+    assert set(find_packages(str(ROOT), include=ast.literal_eval(found.group(1)))) == there
 
 
 def test_types_of_the_extension_name_what_it_has() -> None:

@@ -63,11 +63,24 @@ def test_instances_of_abaqus_stand_where_they_are_put(tmp_path: Path) -> None:
     assert mesh.regions.tolist() == [1, 1, 2, 2]
 
 
+def test_instances_of_abaqus_may_hold_the_mesh_themselves(tmp_path: Path) -> None:
+    own = "*NODE\n" + NODES + TETS + "*ELSET, ELSET=e\n2\n"
+    text = "*PART, NAME=p\n*END PART\n*ASSEMBLY, NAME=all\n"
+    for name, x in (("one", 0), ("two", 5)):
+        text += f"*INSTANCE, NAME={name}, PART=p\n{x}.\n{own}*END INSTANCE\n"
+    with pytest.warns(MeshWarning, match=r"1 is one\.E, 2 is two\.E") as said:
+        mesh = abaqus(tmp_path, text + "*ELEMENT, TYPE=CONN3D2\n1, one.1, two.1\n*END ASSEMBLY\n")
+    assert "1 lines of elements of type CONN3D2, which join instances, left out" in str(said[0].message)
+    assert mesh.bounds.tolist() == [[0, 0, 0], [6, 1, 1]]
+    assert mesh.regions is not None
+    assert mesh.regions.tolist() == [0, 1, 0, 2]
+
+
 def test_sets_of_abaqus_are_regions(tmp_path: Path) -> None:
     sets = "*ELSET, ELSET=Soft, GENERATE\n1, 1, 1\n*ELSET, ELSET=rest\n2\n*ELSET, ELSET=Hard\nREST\n"
     sets += "*ELSET, ELSET=all\n1,2\n"
     sections = "*SOLID SECTION, ELSET=HARD, MATERIAL=m\n1.\n*SOLID SECTION, ELSET=soft, MATERIAL=n\n"
-    with pytest.warns(MeshWarning, match="1 is HARD, 2 is SOFT"):
+    with pytest.warns(MeshWarning, match="sets that are no regions left out: REST, ALL; .*1 is HARD, 2 is SOFT"):
         mesh = abaqus(tmp_path, "*NODE\n" + NODES + TETS + sets + sections)
     assert mesh.regions is not None
     assert mesh.regions.tolist() == [2, 1]

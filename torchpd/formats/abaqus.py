@@ -34,37 +34,44 @@ def read(path: Path) -> MeshContent:
         return avs.read(path)
     parts: dict[str, Part] = {"": Part("")}
     places: list[Place] = []
-    part, place, notes = parts[""], None, list[str]()
-    within = False  # the assembly
+    part, notes = parts[""], list[str]()
+    joins = False  # in the assembly, outside of its instances
     for keyword in _keywords(text):
         name, options = keyword.name, keyword.options
         _refuse(keyword)
         if name == "PART":
             part = parts.setdefault(options.get("NAME", "").upper(), Part(options.get("NAME", "")))
-        elif name in ("END PART", "END INSTANCE"):
-            part, place = parts[""], None
-        elif name == "ASSEMBLY":
-            within = True
-        elif name == "END ASSEMBLY":
-            within = False
+        elif name == "END PART":
+            part = parts[""]
+        elif name in ("ASSEMBLY", "END INSTANCE", "END ASSEMBLY"):
+            part, joins = parts[""], name != "END ASSEMBLY"
         elif name == "INSTANCE":
             key = options.get("PART", "").upper()
             if key not in parts:
                 raise ValueError(f"*INSTANCE names part {options.get('PART', '')!r}, which does not come before it")
-            place = Place.of(options.get("NAME", ""), parts[key], keyword.lines)
-            places.append(place)
-        elif name == "NODE" and not (within and place is None):
-            read_nodes(part if place is None else place.part, keyword.lines, options)
-        elif name == "ELEMENT" and within and place is None:
-            count, kind = len(keyword.lines), options.get("TYPE", "?")
-            notes.append(f"{count} lines of elements of type {kind}, which join instances, left out")
+            places.append(Place.of(options.get("NAME", ""), parts[key], keyword.lines))
+            part, joins = places[-1].part, False
+        elif joins:
+            notes += _of_assembly(keyword)
+        elif name == "NODE":
+            read_nodes(part, keyword.lines)
         elif name == "ELEMENT":
-            read_elements(part if place is None else place.part, keyword.lines, options)
-        elif name == "ELSET" and not within:
+            read_elements(part, keyword.lines, options)
+        elif name == "ELSET":
             read_set(part, keyword.lines, options)
         elif name == "SOLID SECTION":
-            (part if place is None else place.part).sections.append(options.get("ELSET", "").upper())
+            part.sections.append(options.get("ELSET", "").upper())
     return content_of(list(parts.values()), places, notes)
+
+
+def _of_assembly(keyword: Keyword) -> list[str]:
+    """What is lost of a keyword of the assembly: nodes there are points of reference, of no body."""
+    if keyword.name == "ELEMENT":
+        kind = keyword.options.get("TYPE", "?")
+        return [f"{len(keyword.lines)} lines of elements of type {kind}, which join instances, left out"]
+    if keyword.name == "ELSET" and "INTERNAL" not in keyword.options:
+        return [f"set {keyword.options.get('ELSET', '')!r} of the assembly left out"]
+    return []
 
 
 def _keywords(text: str) -> list[Keyword]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,9 +43,10 @@ class Place:
     """An instance of a part: x -> rotation x + offset."""
 
     name: str
-    part: Part
+    part: Part  # a copy: an instance may add nodes and elements of its own
     rotation: Array
     offset: Array
+    source: str = ""  # the name of the part
 
     @classmethod
     def of(cls, name: str, part: Part, lines: list[str]) -> Place:
@@ -65,7 +67,7 @@ class Place:
             # Rodrigues' formula; the axis stands in the assembly, so that the part is moved before it turns.
             rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
             offset = rotation @ (offset - start) + start
-        return cls(name, part, rotation, offset)
+        return cls(name, deepcopy(part), rotation, offset, part.name)
 
 
 def _reals(line: str) -> Array:
@@ -78,7 +80,7 @@ def _whole(text: str, what: str) -> Index:
     return np.asarray(parse(text.replace(",", " ").encode(), np.int64, what), dtype=np.int64)
 
 
-def read_nodes(part: Part, lines: list[str], options: dict[str, str]) -> None:
+def read_nodes(part: Part, lines: list[str]) -> None:
     """Rows of number, x, y, z; directions behind them are no part of the mesh."""
     if not lines:
         return
@@ -164,8 +166,8 @@ def _members(part: Part, name: str, above: tuple[str, ...] = ()) -> list[Index]:
 
 def content_of(parts: list[Part], places: list[Place], notes: list[str]) -> MeshContent:
     """All parts where their instances stand; without instances, each as it is."""
-    used = {id(place.part) for place in places}
-    lost = [part for part in parts if part.elements and id(part) not in used]
+    used = {place.source for place in places}
+    lost = [part for part in parts if part.elements and part.name not in used]
     if places:
         notes += [f"part {part.name!r}, of which there is no instance, left out" for part in lost]
     else:
@@ -193,13 +195,16 @@ def content_of(parts: list[Part], places: list[Place], notes: list[str]) -> Mesh
                 cells.append(block(kind, numbering(nodes) + first, marks))
             else:
                 cells.append(Cells(kind, numbering(nodes).reshape(-1) + first, np.full(len(nodes), nodes.shape[1])))
+        more = [name for name in part.sets if name not in chosen and not name.startswith("_")]
+        if more:
+            notes.append(f"sets that are no regions left out: {', '.join(more[:8])}{' ...' if len(more) > 8 else ''}")
         if regions.several:
             notes.append(f"{regions.several} elements belong to several sets, of which the first is their region")
         points.append(own @ place.rotation.T + place.offset)
         first += len(own)
     if names:
         notes.append(f"regions are numbers of sets: {', '.join(f'{k + 1} is {name}' for k, name in enumerate(names))}")
-    return MeshContent(np.concatenate(points), cells, notes=notes)
+    return MeshContent(np.concatenate(points), cells, notes=list(dict.fromkeys(notes)))
 
 
 class _Regions:

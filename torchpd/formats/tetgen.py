@@ -37,9 +37,11 @@ def read(path: Path) -> MeshContent:
     regions = _whole(rows[:, 1 + corners], notes) if rows.shape[1] > 1 + corners else None
     cells: list[Cells] = [block("tetra", place(_whole(rows[:, 1 : 1 + corners], [])), regions)]
     if beside[".face"].is_file() and beside[".face"].stat().st_size:
-        _, faces = _table(beside[".face"], "faces")
-        if faces.shape[1] >= 4:
+        try:
+            _, faces = _table(beside[".face"], "faces")
             cells.append(block("triangle", place(_whole(faces[:, 1:4], []))))
+        except ValueError as error:
+            notes.append(f"{beside['.face'].name} could not be read ({error})")
     return MeshContent(table[:, 1:4], cells, notes=notes)
 
 

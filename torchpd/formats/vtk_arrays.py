@@ -44,7 +44,7 @@ class Document:
             self.appended = data[head.end() : end]
             data = data[: head.end() - 1] + data[end:]
         try:
-            self.root = ElementTree.fromstring(data)
+            self.root = ElementTree.fromstring(data.lstrip())
         except ElementTree.ParseError as error:
             raise ValueError(f"it is no complete XML document: {error}") from None
         if self.root.tag != "VTKFile":
