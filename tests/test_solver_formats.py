@@ -51,13 +51,13 @@ PART = "*PART, NAME={}\n*NODE\n" + NODES + TETS + "{}*END PART\n"
 def test_instances_of_abaqus_stand_where_they_are_put(tmp_path: Path) -> None:
     places = (
         "*ASSEMBLY, NAME=all\n*INSTANCE, NAME=one, PART=a\n*END INSTANCE\n"
-        "*INSTANCE, NAME=two, PART=A\n10., 0., 0.\n10., 0., 0., 10., 0., 1., 90.\n*END INSTANCE\n"
+        "*INSTANCE, NAME=two, PART=A\n10., 0., 0.\n9., 0., 0., 9., 0., 1., 90.\n*END INSTANCE\n"
         "*NODE\n1, 9., 9., 9.\n*NSET, NSET=ref\n1\n*ELSET, ELSET=e, INSTANCE=one\n1\n*END ASSEMBLY\n"
     )
     with pytest.warns(MeshWarning, match="part 'b', of which there is no instance.*1 is one, 2 is two"):
         mesh = abaqus(tmp_path, PART.format("a", "") + PART.format("b", "") + places)
-    # moved by 10 along x, then turned by 90 degrees about the vertical through its origin
-    turned = POINTS @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + [10, 0, 0]
+    # moved by 10 along x, then turned by 90 degrees about the vertical through x = 9
+    turned = POINTS @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + [9, 1, 0]
     np.testing.assert_allclose(mesh.vertices, np.concatenate([POINTS, turned]), atol=1e-14)
     assert mesh.regions is not None
     assert mesh.regions.tolist() == [1, 1, 2, 2]

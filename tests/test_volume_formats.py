@@ -150,6 +150,15 @@ def test_gmsh_counts_are_compared(tmp_path: Path, elements: str, words: str) -> 
         TetMesh.from_file(tmp_path / "a.msh")
 
 
+def test_gmsh_4_counts_are_compared(tmp_path: Path) -> None:
+    nodes = "$Nodes\n1 4 1 4\n3 1 0 4\n1\n2\n3\n4\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n$EndNodes\n"
+    for wrong in (nodes.replace("1 4 1 4", "1 5 1 4"), nodes):
+        text = f"$MeshFormat\n4.1 0 8\n$EndMeshFormat\n{wrong}$Elements\n1 2 1 2\n3 1 4 1\n1 1 2 3 4\n$EndElements\n"
+        (tmp_path / "a.msh").write_text(text)
+        with pytest.raises(ValueError, match=r"a\.msh \(Gmsh\): it declares (5 nodes, but 4|2 elements, but 1) come"):
+            TetMesh.from_file(tmp_path / "a.msh")
+
+
 # VTK:
 
 
@@ -346,6 +355,11 @@ def test_medit(tmp_path: Path) -> None:
     regions = tets_in(tmp_path / "a.mesh").regions
     assert regions is not None
     assert regions.tolist() == [7, 8]
+    (tmp_path / "a.mesh").write_text(text.replace("Tetrahedra\n2", "Tetrahedra\n1"))
+    with pytest.raises(
+        ValueError, match=r"a\.mesh \(Medit\): Tetrahedra should be 1 rows of 5 numbers, but 5 more come"
+    ):
+        TetMesh.from_file(tmp_path / "a.mesh")
     (tmp_path / "b.mesh").write_text("MFEM mesh v1.0\n")
     with pytest.raises(ValueError, match=r"b\.mesh .*MeshVersionFormatted, got 'MFEM'"):
         TetMesh.from_file(tmp_path / "b.mesh")
