@@ -42,13 +42,13 @@ def read(path: Path) -> MeshContent:
     if path.suffix.lower() == ".msh":  # Gmsh's, but for a reader of its own
         with path.open("rb", buffering=0) as raw:
             return content_of(meshio.read(_Ending(raw), file_format="ansys"))
-    if path.suffix.lower() == ".cgns":
-        _check_cgns(path)
+    if path.suffix.lower() in (".cgns", ".hmf"):
+        _check_sections(path)
     return content_of(meshio.read(path), by_block=path.suffix.lower() in _BLOCKS)
 
 
-def _check_cgns(path: Path) -> None:
-    """Refuse files with more than the one section of cells that meshio reads."""
+def _check_sections(path: Path) -> None:
+    """Refuse files with more than the one section of cells, of one kind in an .hmf, that meshio reads."""
     import h5py
 
     found: list[str] = []
@@ -59,9 +59,12 @@ def _check_cgns(path: Path) -> None:
         kind = _TETRA_4 if section is None else int(section[0])
         if kind != _TETRA_4:
             raise ValueError(f"its cells must be tetrahedra of four nodes (TETRA_4), got type {kind} of CGNS")
-    for name in ("zone", "section of cells"):
-        if found.count(name) > 1:
-            raise ValueError(f"it holds {found.count(name)} {name}s, of which one would be read; write them one by one")
+        cells = [item.attrs.get("TopologyType") for item in file.get("domain/grid", {}).values()]
+    named = {name: found.count(name) for name in ("zone", "section of cells")}
+    named["topology of one type"] = max((cells.count(kind) for kind in cells if kind is not None), default=0)
+    for name, count in named.items():
+        if count > 1:
+            raise ValueError(f"it holds {count} times a {name}, of which one would be read; write them one by one")
 
 
 class _Ending(io.BufferedReader):
@@ -90,6 +93,10 @@ def content_of(mesh: Any, *, by_block: bool = False) -> MeshContent:
         cells.append(_cells(part.type, part.data, regions))
     if chosen is None and by_block and len(mesh.cells) > 1:
         notes.append("regions are the blocks of elements, counted from 1")
+    names = getattr(mesh, "cell_tags", None)  # of MED
+    if chosen == "cell_tags" and names:
+        told = ", ".join(f"{number} is {' and '.join(map(str, groups))}" for number, groups in names.items())
+        notes.append(f"regions keep their numbers, not their names: {told}")
     return MeshContent(in_space(mesh.points), cells, notes=notes)
 
 
