@@ -223,6 +223,10 @@ OTHERS = {
     + "1\nZGROUP 'b c' SLOT 1\n2\n",
     "a.mdpa": "Begin Nodes\n" + NUMBERED + "End Nodes\nBegin Elements SmallDisplacementElement3D4N// of solids\n"
     "1 7 1 2 3 4\n2 8 2 3 4 5\nEnd Elements\nBegin Conditions SurfaceCondition3D3N\n1 0 1 2 3\nEnd Conditions\n",
+    "a.dato": "! made by hand\n$ENTER COMPONENT NAME=a\n$STRUCTURE\n$COOR\n"
+    + NUMBERED
+    + "$ELEMENT TYPE=TET4 ESET=one\n1 1 2 3 4\n$ELEMENT TYPE=TET4 ESET=two\n2 2 3 &\n& 4 5\n"
+    "$ELEMENT TYPE=SHELL3\n3 1 2 3\n$NSET NAME=all\n1 2\n$END STRUCTURE\n$EXIT COMPONENT\n$FIN\n",
     "a.xml": '<dolfin><mesh celltype="tetrahedron" dim="3"><vertices size="5">'
     + "".join(f'<vertex index="{n}" x="{x}" y="{y}" z="{z}"/>' for n, (x, y, z) in enumerate(POINTS.tolist()))
     + '</vertices><cells size="2"><tetrahedron index="1" v0="1" v1="2" v2="3" v3="4"/>'
@@ -239,19 +243,32 @@ def test_other_formats(tmp_path: Path, name: str) -> None:
     assert np.sort(mesh.tets).tolist() == [[0, 1, 2, 3], [1, 2, 3, 4]]
     assert mesh.flipped == 0
     assert (mesh.embedding is None) == (name == "a.xml")
-    regions = {"a.vol": [7, 8], "a.mdpa": [7, 8], "a.f3grid": [1, 2]}.get(name)
+    regions = {"a.vol": [7, 8], "a.mdpa": [7, 8], "a.f3grid": [1, 2], "a.dato": [1, 2]}.get(name)
     assert (None if mesh.regions is None else mesh.regions.tolist()) == regions
+
+
+def test_corners_of_permas_stand_between_nodes_on_edges(tmp_path: Path) -> None:
+    rows = ["0 0 0", "1 0 0", "2 0 0", "1 1 0", "0 2 0", "0 1 0", "0 0 1", "1 0 1", "0 1 1", "0 0 2"]
+    text = "$COOR\n" + "".join(f"{n} {row}\n" for n, row in enumerate(rows, 1))
+    (tmp_path / "a.dato").write_text(text + "$ELEMENT TYPE=TET10\n1 1 2 3 4 5 6 7 8 9 10\n")
+    with pytest.warns(MeshWarning, match="1 tetra of higher order: corners kept") as said:
+        assert volume(TetMesh.from_file(tmp_path / "a.dato")) == pytest.approx(8 / 6)
+    assert len(said) == 1
 
 
 @pytest.mark.parametrize(
     ("name", "old", "new", "words"),
     [
         ("a.su2", "NELEM= 2", "NELEM= 3", "declares 3 cells, but 'NPOIN= 5' comes among them"),
+        ("a.su2", "NMARK= 1", "NMARK= 2", "declares 2 markers, but 1 come"),
+        ("a.dato", "$EXIT COMPONENT\n", "", "cut off"),
         ("a.su2", "NDIME= 3", "NZONE= 2\nNDIME= 3", "holds 2 zones"),
         ("a.ugrid", "5 1 0 2", "5 1 0 3", "tetra should be 12 numbers"),
         ("a.vol", "volumeelements\n2", "volumeelements\n3", "declares 3 volumeelements"),
         ("a.vol", "endmesh\n", "", "cut off"),
         ("a.mdpa", "End Conditions\n", "", "block Conditions has no end"),
+        ("a.dato", "2 2 3 &", "2 2 &", "TET4 must have 5 numbers each, but 4 come"),
+        ("a.dato", "TYPE=TET4", "TYPE=HEXE20", "type 'HEXE20' are not read"),
         ("a.xml", 'cells size="2"', 'cells size="3"', "declares 3 entries <tetrahedron>, but 2 come"),
         ("a.xml", 'index="1" v0', 'index="0" v0', "indices of <tetrahedron>"),
     ],

@@ -360,6 +360,9 @@ def test_medit(tmp_path: Path) -> None:
         ValueError, match=r"a\.mesh \(Medit\): Tetrahedra should be 1 rows of 5 numbers, but 5 more come"
     ):
         TetMesh.from_file(tmp_path / "a.mesh")
+    (tmp_path / "a.mesh").write_text(text.partition("Ridges")[0])
+    with pytest.warns(MeshWarning, match="no End comes: was the file cut off"):
+        tets_in(tmp_path / "a.mesh")
     (tmp_path / "b.mesh").write_text("MFEM mesh v1.0\n")
     with pytest.raises(ValueError, match=r"b\.mesh .*MeshVersionFormatted, got 'MFEM'"):
         TetMesh.from_file(tmp_path / "b.mesh")

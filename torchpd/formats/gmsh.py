@@ -50,8 +50,8 @@ def read(path: Path) -> MeshContent:
         if not name.startswith("$"):
             raise ValueError(f"a section must begin with $, got {name[:40]!r}")
         at = _read_section(file, name[1:], data, text.at)
-    if not file.points:
-        raise ValueError("it has no section $Nodes")
+    if not file.points or not file.elements:
+        raise ValueError("it must hold sections $Nodes and $Elements (one of them is missing or empty)")
     return _content(file)
 
 

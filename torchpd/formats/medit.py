@@ -41,13 +41,14 @@ _VERTICES, _END, _DIMENSION = 4, 54, 3
 
 def read(path: Path) -> MeshContent:
     """Read text or, from a .meshb, bytes."""
-    points, cells = _read_binary(path.read_bytes()) if path.suffix.lower() == ".meshb" else _read_text(path)
+    binary = path.suffix.lower() == ".meshb"
+    points, cells, ended = _read_binary(path.read_bytes()) if binary else _read_text(path)
     if points is None:
         raise ValueError("it has no Vertices")
-    return MeshContent(in_space(points), cells)
+    return MeshContent(in_space(points), cells, notes=[] if ended else ["no End comes: was the file cut off?"])
 
 
-def _read_text(path: Path) -> tuple[Array | None, list[Cells]]:
+def _read_text(path: Path) -> tuple[Array | None, list[Cells], bool]:
     text = re.sub(r"#[^\n]*", "", text_of(path))
     parts = re.split(r"(?m)(?<![^\s])([A-Za-z][A-Za-z0-9_]*)(?!\S)", re.sub(r"\"[^\"]*\"", " ", text))
     if parts[0].strip():
@@ -58,7 +59,7 @@ def _read_text(path: Path) -> tuple[Array | None, list[Cells]]:
     for key, body in zip(parts[1::2], parts[2::2], strict=True):
         name, numbers = key.lower(), Text(body.encode())
         if name == "end":
-            break
+            return points, cells, True
         if name == "dimension":
             dimension = int(numbers.ints(1, key)[0])
             if dimension not in (2, 3):
@@ -69,7 +70,7 @@ def _read_text(path: Path) -> tuple[Array | None, list[Cells]]:
             kind, nodes = _CELLS[name]
             rows = _rows(numbers, nodes + 1, key).astype(np.int64)
             cells.append(block(kind, rows[:, :nodes] - 1, rows[:, nodes]))
-    return points, cells
+    return points, cells, False
 
 
 def _rows(numbers: Text, width: int, key: str) -> Array:
@@ -82,7 +83,7 @@ def _rows(numbers: Text, width: int, key: str) -> Array:
     return rows
 
 
-def _read_binary(data: bytes) -> tuple[Array | None, list[Cells]]:
+def _read_binary(data: bytes) -> tuple[Array | None, list[Cells], bool]:
     order = {b"\x01\x00\x00\x00": "<", b"\x00\x00\x00\x01": ">"}.get(data[:4])
     if order is None:
         raise ValueError("it must begin with the number 1 in four bytes")
@@ -95,7 +96,7 @@ def _read_binary(data: bytes) -> tuple[Array | None, list[Cells]]:
     while True:
         code = int(numbers.take(order + "i4", 1, "fields")[0])
         if code == _END:
-            return points, cells
+            return points, cells, True
         following = int(numbers.take(place, 1, "places of fields")[0])
         begin = numbers.at
         if code == _DIMENSION:
@@ -111,8 +112,8 @@ def _read_binary(data: bytes) -> tuple[Array | None, list[Cells]]:
             count = int(numbers.ints(1, kind)[0])
             rows = numbers.ints(count * (nodes + 1), kind).reshape(count, nodes + 1)
             cells.append(block(kind, rows[:, :nodes] - 1, rows[:, nodes]))
-        if following == 0:
-            return points, cells
+        if following == 0:  # the last field, as after which some write no end
+            return points, cells, True
         if not begin <= following <= len(data):
             raise ValueError(f"a field should end at byte {following}, beyond the {len(data)} bytes of the file")
         numbers.at = following

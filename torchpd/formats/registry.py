@@ -15,6 +15,7 @@ from . import (
     medit,
     nastran,
     netgen,
+    permas,
     su2,
     surfaces,
     tecplot,
@@ -42,6 +43,8 @@ class Format(NamedTuple):
 
 
 FORMATS: dict[str, Format] = {
+    ".dato": Format("Permas", permas.read),
+    ".post": Format("Permas", permas.read),
     ".f3grid": Format("FLAC3D", flac3d.read),
     ".mdpa": Format("Kratos", kratos.read),
     ".su2": Format("SU2", su2.read),

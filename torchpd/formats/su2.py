@@ -30,13 +30,13 @@ def read(path: Path) -> MeshContent:
     """Read one zone; a file of several is refused."""
     lines = lines_of(path, "%")
     dimension, points, kinds, nodes = 3, None, list[str](), list[list[int]]()
-    at = 0
+    at, declared, markers = 0, 0, 0
     while at < len(lines):
         key, equals, value = (part.strip() for part in lines[at].partition("="))
         at += 1
         if not equals:
             continue
-        if key.upper() in ("NELEM", "NPOIN", "MARKER_ELEMS", "NZONE", "NDIME"):
+        if key.upper() in ("NELEM", "NPOIN", "MARKER_ELEMS", "NMARK", "NZONE", "NDIME"):
             count = int(parse(value.split()[0].encode() if value else b"x", np.int64, key)[0])
         if key.upper() == "NZONE" and count > 1:
             raise ValueError(f"it holds {count} zones, which are not put together; write them one by one")
@@ -44,12 +44,15 @@ def read(path: Path) -> MeshContent:
             dimension = count
             if dimension not in (2, 3):
                 raise ValueError(f"NDIME must be 2 or 3, got {dimension}")
+        elif key.upper() == "NMARK":
+            declared = count
         elif key.upper() == "NPOIN":
             rows = _rows(lines, at, count, "points")
             text = "\n".join(" ".join(row.split()[:dimension]) for row in rows).encode()
             points = parse(text, np.float64, "points").reshape(count, dimension)
             at += count
         elif key.upper() in ("NELEM", "MARKER_ELEMS"):
+            markers += key.upper() == "MARKER_ELEMS"
             for row in _rows(lines, at, count, "cells"):
                 numbers = [int(word) for word in row.split()]
                 kind, corners = _KINDS.get(numbers[0], ("", 0))
@@ -58,6 +61,8 @@ def read(path: Path) -> MeshContent:
                 kinds.append(kind)
                 nodes.append(numbers[1 : 1 + corners])
             at += count
+    if markers != declared:
+        raise ValueError(f"it declares {declared} markers, but {markers} come")
     if points is None:
         raise ValueError("it has no NPOIN")
     return MeshContent(in_space(points), blocks_of(kinds, nodes))

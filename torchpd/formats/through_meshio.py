@@ -17,14 +17,12 @@ __all__ = ["NAMES", "read"]
 
 NAMES = {
     ".cgns": "CGNS",
-    ".dato": "Permas",
     ".e": "Exodus",
     ".ex2": "Exodus",
     ".exo": "Exodus",
     ".h5m": "MOAB",
     ".hmf": "HMF",
     ".med": "MED",
-    ".post": "Permas",
     ".xdmf": "XDMF",
     ".xmf": "XDMF",
 }
