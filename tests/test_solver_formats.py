@@ -101,6 +101,7 @@ def test_sets_of_abaqus_are_regions(tmp_path: Path) -> None:
         ("*ELEMENT, TYPE=C3D4\n3, 1, 2, 3\n", "C3D4 must have 4 nodes, but 4 numbers come"),
         ("*ELEMENT, TYPE=C3D4\n3, 1, 2, 3, 9\n", "name node 9, which does not come"),
         ("*NODE\n5, 0, 0, 0\n", "node 5 comes twice"),
+        ("*PART, NAME=p\n", r"\*PART has no \*END PART: the file was cut off"),
         ("*INSTANCE, NAME=i, PART=p\n", "names part 'p', which does not come"),
     ],
 )

@@ -35,10 +35,15 @@ def read(path: Path) -> MeshContent:
     parts: dict[str, Part] = {"": Part("")}
     places: list[Place] = []
     part, notes = parts[""], list[str]()
+    open_blocks = list[str]()
     joins = False  # in the assembly, outside of its instances
     for keyword in _keywords(text):
         name, options = keyword.name, keyword.options
         _refuse(keyword)
+        if name in ("PART", "ASSEMBLY", "INSTANCE"):
+            open_blocks.append(name)
+        elif name.startswith("END ") and open_blocks[-1:] == [name[4:]]:
+            open_blocks.pop()
         if name == "PART":
             part = parts.setdefault(options.get("NAME", "").upper(), Part(options.get("NAME", "")))
         elif name == "END PART":
@@ -61,6 +66,8 @@ def read(path: Path) -> MeshContent:
             read_set(part, keyword.lines, options)
         elif name == "SOLID SECTION":
             part.sections.append(options.get("ELSET", "").upper())
+    if open_blocks:
+        raise ValueError(f"*{open_blocks[-1]} has no *END {open_blocks[-1]}: the file was cut off")
     return content_of(list(parts.values()), places, notes)
 
 
