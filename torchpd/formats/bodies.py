@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import split
-from .content import CELLS, Array, Index, MeshContent
+from .content import Array, Index, MeshContent
 from .guard import PathLike, read
 
-__all__ = ["Body", "Surface", "has_volume", "read_body", "read_surface"]
+__all__ = ["Body", "Surface", "read_body", "read_surface"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +65,6 @@ def read_body(owner: str, path: PathLike) -> Body:
     return Body(
         solid.points[kept], number[solid.elements], solid.regions, number[flat.elements[within]].reshape(-1, 3), notes
     )
-
-
-def has_volume(owner: str, path: PathLike) -> bool:
-    """Whether a file holds tets, hexahedra, wedges or pyramids."""
-    return any(CELLS.get(block.kind, (0, 0))[1] == 3 and len(block) for block in read(owner, path).cells)
 
 
 def read_surface(owner: str, path: PathLike) -> Surface:
