@@ -159,6 +159,23 @@ def test_gmsh_4_counts_are_compared(tmp_path: Path) -> None:
             TetMesh.from_file(tmp_path / "a.msh")
 
 
+@pytest.mark.parametrize("binary", [False, True])
+def test_meshes_of_fluent_share_the_suffix_of_gmsh(tmp_path: Path, binary: bool) -> None:
+    path = tmp_path / "a.msh"
+    meshio.ansys.write(path, mixed(), binary=binary)
+    expect_mixed(content_of(path), regions=False)
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"(12 (0 1 8 0))", b"(12 (0 1 9 0))"))
+    with pytest.raises(ValueError, match=r"a\.msh \(Gmsh\): it is a mesh of Fluent that declares 9 cells, but 8 come"):
+        TetMesh.from_file(path)
+    path.write_bytes(data + b"(13 (2 1 1 2 3)(\n1 2 3 1 0\n))\n")
+    with pytest.raises(ValueError, match="a mesh of Fluent, which lists faces"):
+        TetMesh.from_file(path)
+    path.write_bytes(b"(12 (1 1 2")
+    with pytest.raises(ValueError, match=r"cannot read a\.msh"):
+        TetMesh.from_file(path)
+
+
 # VTK:
 
 

@@ -37,12 +37,28 @@ def read(path: Path) -> MeshContent:
     """Read a file with meshio."""
     import meshio
 
-    if path.suffix.lower() == ".msh":  # Gmsh's, but for a reader of its own
-        with path.open("rb", buffering=0) as raw:
-            return content_of(meshio.read(_Ending(raw), file_format="ansys"))
+    if path.suffix.lower() == ".msh":
+        return _read_fluent(path)
     if path.suffix.lower() in (".cgns", ".hmf"):
         _check_sections(path)
     return content_of(meshio.read(path), by_block=path.suffix.lower() in _BLOCKS)
+
+
+def _read_fluent(path: Path) -> MeshContent:
+    """Read a .msh of Fluent's, in which cells must list their corners."""
+    import meshio
+
+    data = path.read_bytes()
+    if re.search(rb"\(\s*(20|30)?13\s*\(", data):
+        raise ValueError("it is a mesh of Fluent, which lists faces, not corners of cells; write it as .vtu")
+    with path.open("rb", buffering=0) as raw:
+        content = content_of(meshio.read(_Ending(raw), file_format="ansys"))
+    head = re.search(rb"\(\s*12\s*\(\s*0\s+1\s+([0-9a-fA-F]+)", data)
+    came = sum(map(len, content.cells))
+    if head is None or int(head.group(1), 16) != came:
+        told = "no number of cells" if head is None else f"{int(head.group(1), 16)} cells"
+        raise ValueError(f"it is a mesh of Fluent that declares {told}, but {came} come")
+    return content
 
 
 def _check_sections(path: Path) -> None:

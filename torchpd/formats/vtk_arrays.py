@@ -85,14 +85,14 @@ class Document:
         values = values.astype(values.dtype.newbyteorder("="))
         return values if components == 1 else values.reshape(-1, components)
 
-    def _appended(self, offset: int) -> bytes:
+    def _appended(self, offset: int) -> bytes | memoryview:
         if not 0 <= offset < len(self.appended):
             raise ValueError(f"an array begins at {offset} of the appended data, which have {len(self.appended)} bytes")
         if self.encoding == "raw":
-            return self.appended[offset:]
+            return memoryview(self.appended)[offset:]
         return _decode(self.appended[offset : next(end for end in self.offsets if end > offset)])
 
-    def _numbers(self, data: bytes, dtype: Any, name: str) -> NDArray[Any]:
+    def _numbers(self, data: bytes | memoryview, dtype: Any, name: str) -> NDArray[Any]:
         """Numbers behind their header: the count of bytes, or the sizes of compressed blocks."""
         size = self.header.itemsize
         if not data and not self.compressor:
@@ -110,7 +110,7 @@ class Document:
             raise ValueError(f"array {name} must hold whole numbers of {dtype.itemsize} bytes, got {len(data)} bytes")
         return np.frombuffer(data, dtype)
 
-    def _decompressed(self, data: bytes, sizes: list[int], name: str) -> bytes:
+    def _decompressed(self, data: bytes | memoryview, sizes: list[int], name: str) -> bytes:
         if len(sizes) == 1:
             return b""
         count, full, last = sizes[:3]
@@ -135,7 +135,7 @@ def _decode(text: bytes) -> bytes:
     return b"".join(base64.b64decode(part) for part in parts)
 
 
-def _unpack(compressor: str, data: bytes, expected: int) -> bytes:
+def _unpack(compressor: str, data: bytes | memoryview, expected: int) -> bytes:
     try:
         if compressor == "vtkZLibDataCompressor":
             return zlib.decompressobj().decompress(data, expected + 1)
