@@ -1,0 +1,95 @@
+"""Faces of a surface file: checked corners, blocks by kind, and texture coordinates that become one a vertex."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .content import Array, Cells, Index
+
+__all__ = [
+    "check_corners",
+    "check_points",
+    "count_of",
+    "face_blocks",
+    "fan_triangles",
+    "join",
+    "one_uv_each",
+    "strip_triangles",
+]
+
+
+def count_of(count: int, noun: str) -> str:
+    """A number with its noun: "1 line", "2 lines"."""
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
+def check_points(points: Array) -> None:
+    """Refuse coordinates that are not finite."""
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise ValueError(
+            f"coordinates must be finite, got {points[bad[0]].tolist()} at vertex {int(bad[0])} (counted from 0; "
+            f"{bad.size} in all)"
+        )
+
+
+def check_corners(corners: Index, count: int, nouns: str = "vertices", first: int = 0) -> None:
+    """Refuse numbers that name nothing; `first` is the number that the file gives to the first vertex."""
+    bad = np.flatnonzero((corners < 0) | (corners >= count))
+    if bad.size:
+        raise ValueError(
+            f"faces name {nouns} that are not there: {int(corners[bad[0]]) + first} ({bad.size} such corners); there "
+            f"are {count}, counted from {first}"
+        )
+
+
+def face_blocks(corners: Index, sizes: Index, notes: list[str]) -> list[Cells]:
+    """Faces in the order of the file as one block of triangles, quads or polygons; less than 3 corners are noted."""
+    few = sizes < 3
+    if few.any():
+        notes.append(f"{count_of(int(few.sum()), 'face')} with less than 3 corners left out")
+        corners, sizes = corners[np.repeat(~few, sizes)], sizes[~few]
+    for size, kind in ((3, "triangle"), (4, "quad")):
+        if len(sizes) and (sizes == size).all():
+            return [Cells(kind, corners.reshape(-1, size))]
+    return [Cells("polygon", corners, sizes=sizes)] if len(sizes) else []
+
+
+def strip_triangles(strip: Index) -> Index:
+    """The triangles of a strip [n], every second one turned so that all have one winding: [n - 2, 3]."""
+    triangles = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1) if len(strip) > 2 else np.empty((0, 3), np.int64)
+    triangles[1::2] = triangles[1::2, [1, 0, 2]]
+    return triangles
+
+
+def fan_triangles(fan: Index) -> Index:
+    """The triangles of a fan [n] around its first vertex: [n - 2, 3]."""
+    if len(fan) < 3:
+        return np.empty((0, 3), np.int64)
+    return np.stack([np.broadcast_to(fan[0], len(fan) - 2), fan[1:-1], fan[2:]], axis=1)
+
+
+def one_uv_each(points: Array, corners: Index, numbers: Index, uvs: Array) -> tuple[Array, Index, Array]:
+    """Points, corners and uvs with one texture coordinate for each vertex.
+
+    Corner k has point `corners[k]` and texture coordinate `numbers[k]`. Vertices keep their numbers and take their
+    first texture coordinate; a copy of the vertex at the end takes each further one.
+    """
+    pairs, first, inverse = np.unique(corners * len(uvs) + numbers, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # pairs as they appear
+    vertex, number = np.divmod(pairs[order], len(uvs))
+    leads = np.zeros(len(pairs), dtype=bool)
+    leads[np.unique(vertex, return_index=True)[1]] = True
+    target = np.where(leads, vertex, len(points) - 1 + np.cumsum(~leads))
+    coordinates = np.zeros((len(points) + int((~leads).sum()), 2))
+    coordinates[target] = uvs[number]
+    place = np.empty(len(pairs), dtype=np.int64)
+    place[order] = target
+    return np.concatenate([points, points[vertex[~leads]]]), place[inverse.reshape(-1)], coordinates
+
+
+def join(parts: Sequence[Index]) -> Index:
+    """One array of all, also of none."""
+    return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
