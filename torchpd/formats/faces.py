@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .content import Array, Cells, Index
 
@@ -58,10 +59,14 @@ def face_blocks(corners: Index, sizes: Index, notes: list[str]) -> list[Cells]:
 
 
 def strip_triangles(strip: Index) -> Index:
-    """The triangles of a strip [n], every second one turned so that all have one winding: [n - 2, 3]."""
-    triangles = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1) if len(strip) > 2 else np.empty((0, 3), np.int64)
+    """The triangles of a strip [n], with one winding; where it turns it names a vertex twice, which is no triangle."""
+    if len(strip) < 3:
+        return np.empty((0, 3), np.int64)
+    triangles = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
     triangles[1::2] = triangles[1::2, [1, 0, 2]]
-    return triangles
+    a, b, c = triangles.T
+    kept: NDArray[np.bool_] = (a != b) & (b != c) & (c != a)
+    return triangles[kept]
 
 
 def fan_triangles(fan: Index) -> Index:

@@ -77,9 +77,12 @@ def _local(node: dict[str, Any], number: int) -> Array:
             raise ValueError(f"{name} of node {number} must be {len(default)} finite numbers")
         return array
 
-    if "matrix" in node:
-        return values("matrix", [0.0] * 16).reshape(4, 4).T
     transform = np.eye(4)
+    if "matrix" in node:
+        transform[:] = values("matrix", [0.0] * 16).reshape(4, 4).T
+        if not np.array_equal(transform[3], [0.0, 0.0, 0.0, 1.0]):
+            raise ValueError(f"matrix of node {number} must be affine, but its last row is {transform[3].tolist()}")
+        return transform
     x, y, z, w = values("rotation", [0.0, 0.0, 0.0, 1.0])
     length = x * x + y * y + z * z + w * w
     if length == 0.0:
@@ -159,9 +162,7 @@ class _Reading:
 
     def _triangles(self, corners: Index, mode: int) -> Index:
         if mode == 5:
-            triangles = strip_triangles(corners)
-            a, b, c = triangles.T
-            return triangles[(a != b) & (b != c) & (c != a)]  # where a strip turns, it names a vertex twice
+            return strip_triangles(corners)
         if mode == 6:
             return fan_triangles(corners)
         if len(corners) % 3:

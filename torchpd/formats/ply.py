@@ -233,11 +233,9 @@ def _with_faces(content: MeshContent, face: _Element) -> MeshContent:
 
 
 def _strips(element: _Element, count: int) -> list[Cells]:
-    """The triangles of strips; -1 begins a new strip, and a triangle that names a vertex twice is a turn of it."""
+    """The triangles of strips; -1 begins a new strip."""
     name = element.find(_CORNERS) or ""
     numbers = np.split(_whole(element, name, count), np.cumsum(element.sizes[name])[:-1])
     runs = [run[run >= 0] for strip in numbers for run in np.split(strip, np.flatnonzero(strip == -1))]
     triangles = join([strip_triangles(run).reshape(-1) for run in runs]).reshape(-1, 3)
-    a, b, c = triangles.T
-    triangles = triangles[(a != b) & (b != c) & (c != a)]
     return [Cells("triangle", triangles)] if len(triangles) else []

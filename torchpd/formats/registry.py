@@ -70,5 +70,5 @@ FORMATS: dict[str, Format] = {
     ".vtp": Format("VTK XML", vtk_xml.read),
     ".vtu": Format("VTK XML", vtk_xml.read),
     **{suffix: Format(name, through_meshio.read) for suffix, name in through_meshio.NAMES.items()},
-    **{suffix: Format(name, surfaces.read) for suffix, name in surfaces.NAMES.items()},
+    **{suffix: Format(*row) for suffix, row in surfaces.READERS.items()},
 }

@@ -1,38 +1,26 @@
-"""Surfaces that trimesh reads."""
+"""Formats of surfaces: what they are called, and their readers."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from .content import Reader
+from .gltf import read_gltf
+from .obj import read_obj
+from .off import read_off
+from .ply import read_ply
+from .stl import read_stl
+from .usd import read_usd
 
-import numpy as np
+__all__ = ["READERS"]
 
-from .content import Cells, MeshContent
-
-__all__ = ["NAMES", "read"]
-
-NAMES = {
-    ".glb": "binary glTF",
-    ".gltf": "glTF",
-    ".obj": "Wavefront OBJ",
-    ".off": "OFF",
-    ".ply": "PLY",
-    ".stl": "STL",
+READERS: dict[str, tuple[str, Reader]] = {
+    ".glb": ("binary glTF", read_gltf),
+    ".gltf": ("glTF", read_gltf),
+    ".obj": ("Wavefront OBJ", read_obj),
+    ".off": ("OFF", read_off),
+    ".ply": ("PLY", read_ply),
+    ".stl": ("STL", read_stl),
+    ".usd": ("USD", read_usd),
+    ".usda": ("USD", read_usd),
+    ".usdc": ("USD", read_usd),
+    ".usdz": ("USD", read_usd),
 }
-
-
-def read(path: Path) -> MeshContent:
-    """Read a file with trimesh, all geometry of a scene in place."""
-    import trimesh
-
-    # process=False: vertices keep the order of the file.
-    surface = trimesh.load(path, process=False)
-    if isinstance(surface, trimesh.Scene):
-        if not surface.geometry:
-            raise ValueError("it holds no triangles")
-        surface = surface.to_mesh()
-    if not isinstance(surface, trimesh.Trimesh):
-        raise ValueError(f"it holds a {type(surface).__name__}, no triangles")
-    uvs = getattr(surface.visual, "uv", None)
-    points = np.asarray(surface.vertices, dtype=np.float64)
-    cells = [Cells("triangle", np.asarray(surface.faces, dtype=np.int64))]
-    return MeshContent(points, cells, uvs=None if uvs is None else np.asarray(uvs, dtype=np.float64))
