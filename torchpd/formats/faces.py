@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +12,18 @@ from .content import Array, Cells, Index
 __all__ = [
     "check_corners",
     "check_points",
-    "count_of",
     "face_blocks",
     "fan_triangles",
     "join",
+    "left_out",
     "one_uv_each",
     "strip_triangles",
 ]
 
 
-def count_of(count: int, noun: str) -> str:
-    """A number with its noun: "1 line", "2 lines"."""
-    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+def left_out(others: Mapping[str, int]) -> list[str]:
+    """A note that names what of a file is not among its cells, with its number; none if there is nothing."""
+    return ["left out: " + ", ".join(f"{kind} ({count:,})" for kind, count in others.items())] if others else []
 
 
 def check_points(points: Array) -> None:
@@ -47,10 +47,10 @@ def check_corners(corners: Index, count: int, nouns: str = "vertices", first: in
 
 
 def face_blocks(corners: Index, sizes: Index, notes: list[str]) -> list[Cells]:
-    """Faces in the order of the file as one block of triangles, quads or polygons; less than 3 corners are noted."""
+    """Faces in the order of the file as one block of triangles, quads or polygons; fewer than 3 corners are noted."""
     few = sizes < 3
     if few.any():
-        notes.append(f"{count_of(int(few.sum()), 'face')} with less than 3 corners left out")
+        notes += left_out({"faces with fewer than 3 corners": int(few.sum())})
         corners, sizes = corners[np.repeat(~few, sizes)], sizes[~few]
     for size, kind in ((3, "triangle"), (4, "quad")):
         if len(sizes) and (sizes == size).all():

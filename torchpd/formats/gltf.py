@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .content import Array, Cells, Index, MeshContent
-from .faces import check_corners, check_points, count_of, fan_triangles, join, strip_triangles
+from .faces import check_corners, check_points, fan_triangles, join, left_out, strip_triangles
 from .gltf_buffers import Document
 
 __all__ = ["read_gltf"]
@@ -26,7 +26,7 @@ _ADVICE = {
     "KHR_meshopt_compression": "decompress it, as with gltf-transform: gltf-transform cp in.glb out.glb",
     "EXT_mesh_gpu_instancing": "write each instance as a node of its own",
 }
-_POINTS_AND_LINES = {0: "point", 1: "line", 2: "line loop", 3: "line strip"}
+_POINTS_AND_LINES = {0: "points", 1: "lines", 2: "line loops", 3: "line strips"}
 
 
 def read_gltf(path: Path) -> MeshContent:
@@ -119,10 +119,10 @@ class _Reading:
         self.used.add(node["mesh"])
         mesh = self.document.item("meshes", node["mesh"])
         if extensions.get("KHR_node_visibility", {}).get("visible") is False:
-            self.others["invisible mesh"] += 1
+            self.others["invisible meshes"] += 1
             return
         if "skin" in node:
-            self.others["skin (the mesh is in its bind pose)"] += 1
+            self.others["skins, of meshes in their bind pose"] += 1
         offsets: dict[tuple[int, int | None], int] = {}  # primitives of a mesh may share their vertices
         for primitive in self.document.items("primitives", mesh):
             self._take_primitive(primitive, transform, offsets)
@@ -133,15 +133,15 @@ class _Reading:
         mode = primitive.get("mode", 4)
         attributes = primitive.get("attributes", {})
         if mode in _POINTS_AND_LINES:
-            self.others[f"primitive of {_POINTS_AND_LINES[mode]}s"] += 1
+            self.others[f"primitives of {_POINTS_AND_LINES[mode]}"] += 1
             return
         if mode not in (4, 5, 6):
             raise ValueError(f"mode of a primitive must be 0 to 6, got {mode}")
         if "POSITION" not in attributes:
-            self.others["primitive without positions"] += 1
+            self.others["primitives without positions"] += 1
             return
         if primitive.get("targets"):
-            self.others["set of morph targets"] += 1
+            self.others["sets of morph targets"] += 1
         key = (attributes["POSITION"], attributes.get("TEXCOORD_0"))
         points = self.document.accessor(key[0], ("VEC3",))
         if key not in offsets:
@@ -184,12 +184,9 @@ class _Reading:
         points = np.concatenate(self.points) if self.points else np.empty((0, 3))
         check_points(points)
         triangles = join([part.reshape(-1) for part in self.triangles]).reshape(-1, 3)
-        notes = self.notes + [f"{count_of(count, kind)} left out" for kind, count in self.others.items()]
-        idle = len(self.document.items("meshes")) - len(self.used)
-        if idle:
-            notes.append(f"{count_of(idle, 'mesh')} in no node of the scene left out")
-        if self.document.items("animations"):
-            notes.append(f"{count_of(len(self.document.items('animations')), 'animation')} left out")
+        self.others["meshes in no node of the scene"] = len(self.document.items("meshes")) - len(self.used)
+        self.others["animations"] = len(self.document.items("animations"))
+        notes = self.notes + left_out(+self.others)
         uvs = None
         if self.uvs and all(part is not None for part in self.uvs):
             uvs = np.concatenate([part for part in self.uvs if part is not None])

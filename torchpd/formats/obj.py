@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from .content import Array, MeshContent
-from .faces import check_corners, count_of, face_blocks, one_uv_each
+from .faces import check_corners, face_blocks, left_out, one_uv_each
 
 __all__ = ["read_obj"]
 
-_OTHER = {b"l": "line", b"p": "point element", b"curv": "curve", b"curv2": "curve", b"surf": "free-form surface"}
+_OTHER = {b"l": "lines", b"p": "points", b"curv": "curves", b"curv2": "curves", b"surf": "free-form surfaces"}
 # Names, materials, normals and the parameters of free-form geometry: they change no face.
 _BESIDE = frozenset(
     b"vn vp g o s mg usemtl usemap mtllib maplib bevel c_interp d_interp lod shadow_obj trace_obj ctech stech cstype "
@@ -105,10 +105,9 @@ class _Reading:
         points = np.array(self.points).reshape(-1, 3)
         corners, sizes = np.array(self.corners, dtype=np.int64), np.array(self.sizes, dtype=np.int64)
         check_corners(corners, len(points), first=1)
-        notes = [f"{count_of(count, kind)} left out" for kind, count in self.others.items()]
         if self.unknown:
-            first = f"the first begins with {self.first_unknown}"
-            notes.append(f"{count_of(self.unknown, 'line')} of unknown kind left out ({first})")
+            self.others[f"lines of unknown kind, the first {self.first_unknown}"] = self.unknown
+        notes = left_out(self.others)
         uvs: Array | None = None
         if self.numbers and self.plain:
             notes.append(f"texture coordinates left out: {self.plain:,} of {len(sizes):,} faces have none")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .content import Array, Cells, Index, MeshContent
-from .faces import check_corners, check_points, count_of, face_blocks, join, one_uv_each, strip_triangles
+from .faces import check_corners, check_points, face_blocks, join, left_out, one_uv_each, strip_triangles
 
 __all__ = ["read_ply"]
 
@@ -109,7 +109,7 @@ def _read_binary(body: bytes, elements: list[_Element], order: str, unit: str = 
         least = sum(np.dtype(p.counter or p.kind).itemsize for p in element.properties)
         if element.count * least > left:
             raise ValueError(
-                f"its head declares {count_of(element.count, 'row')} of {element.name!r}, but only "
+                f"its head declares {element.count:,} rows of {element.name!r}, but only "
                 f"{left // width:,} {unit} are left for them"
             )
         place = _fill_alike(element, body, place, order) or _fill_each(element, body, place, order)
@@ -197,7 +197,7 @@ def _content(elements: list[_Element]) -> MeshContent:
         elif element.name == "tristrips" and element.find(_CORNERS):
             content.cells.extend(_strips(element, len(points)))
         elif element.name != "vertex" and element.count:
-            content.notes.append(f"{count_of(element.count, 'row')} of the element {element.name!r} left out")
+            content.notes.extend(left_out({f"rows of the element {element.name!r}": element.count}))
     return content
 
 

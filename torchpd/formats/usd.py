@@ -7,8 +7,6 @@ is read at its earliest time.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .content import Array, Cells, Index, MeshContent
-from .faces import check_corners, check_points, count_of, face_blocks, one_uv_each
+from .faces import check_corners, check_points, face_blocks, left_out, one_uv_each
+from .usd_stage import axes_of, check_lengths, open_stage, warnings_of
 
 __all__ = ["read_usd"]
 
@@ -27,16 +26,13 @@ _PURPOSES = ("default", "render")
 def read_usd(path: Path) -> MeshContent:
     """The meshes and tet meshes of a file that are visible, each where its transforms put it."""
     try:
-        from pxr import Usd, UsdGeom
+        from pxr import Usd, UsdGeom, UsdUtils
     except ImportError:
         raise ModuleNotFoundError("USD files need usd-core", name="usd-core") from None
-    with _diagnostics() as said:
-        stage = Usd.Stage.Open(str(path))
-        errors = [str(error) for error in stage.GetCompositionErrors()] if stage else [""]
-    if errors or said:
-        words = " ".join(" ".join([*said, *errors]).split())[:300]
-        raise ValueError(f"usd-core cannot put the whole of it together: {words}")
-    reading = _Reading(UsdGeom.XformCache(Usd.TimeCode.EarliestTime()), *_axes(stage))
+    check_lengths(path)
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    stage = open_stage(path, delegate)
+    reading = _Reading(UsdGeom.XformCache(Usd.TimeCode.EarliestTime()), *axes_of(stage))
     alive = Usd.PrimIsActive & Usd.PrimIsDefined & Usd.PrimIsLoaded & ~Usd.PrimIsAbstract
     prims = iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies(alive)))
     for prim in prims:
@@ -45,37 +41,9 @@ def read_usd(path: Path) -> MeshContent:
             prims.PruneChildren()
         elif prim.IsA(UsdGeom.Gprim):
             reading.take(prim)
-    return reading.content()
-
-
-@contextmanager
-def _diagnostics() -> Iterator[list[str]]:
-    """What usd-core has to say of a file, which it would print."""
-    from pxr import UsdUtils
-
-    delegate, said = UsdUtils.CoalescingDiagnosticDelegate(), list[str]()
-    try:
-        yield said
-    finally:
-        said += [item.commentary for item in delegate.TakeUncoalescedDiagnostics()]
-
-
-def _axes(stage: Any) -> tuple[Array, list[str]]:
-    """The matrix from the numbers of a stage to metres with y up [3, 3], and what there is to say of it."""
-    from pxr import UsdGeom
-
-    matrix, notes = np.eye(3), []
-    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
-        notes.append("the stage declares no metersPerUnit, and its numbers were taken as metres")
-    elif (scale := UsdGeom.GetStageMetersPerUnit(stage)) != 1.0:
-        if not 0.0 < scale < np.inf:
-            raise ValueError(f"metersPerUnit must be positive, got {scale}")
-        matrix *= scale
-        notes.append(f"its unit is {scale:g} m, and its numbers were turned into metres")
-    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
-        matrix = matrix @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-        notes.append("its z axis is up, and it was turned so that y is: (x, y, z) became (x, z, -y)")
-    return matrix, notes
+    content = reading.content()
+    content.notes.extend(warnings_of(delegate))
+    return content
 
 
 class _Reading:
@@ -90,7 +58,8 @@ class _Reading:
         self.uvs: list[Array | None] = []
         self.cells: list[Cells] = []
         self.count = 0
-        self.others: Counter[str] = Counter()
+        self.others: Counter[str] = Counter()  # what is left out
+        self.smooth: Counter[str] = Counter()  # schemes of subdivision
         self.moving = 0
 
     def take(self, prim: Any) -> None:
@@ -146,7 +115,7 @@ class _Reading:
         check_corners(corners, len(points), f"points of {name}")
         scheme = mesh.GetSubdivisionSchemeAttr().Get(self.time)
         if scheme != "none":
-            self.others[f"{scheme} subdivision (the control mesh was read)"] += 1
+            self.smooth[str(scheme)] += 1
         values = _coordinates(mesh.GetPrim(), self.time, corners, len(points))
         uvs = None
         if values is not None and len(corners):
@@ -160,7 +129,7 @@ class _Reading:
         if len(holes):
             check_corners(holes, len(sizes), f"faces of {name} in holeIndices")
             kept[holes] = False
-            self.others["face that is declared a hole"] += int((~kept).sum())
+            self.others["faces that are declared holes"] += int((~kept).sum())
         corners = corners[order][np.repeat(kept, sizes)] + self.count
         self.cells += face_blocks(corners, sizes[kept], self.notes)
         self._add(points, uvs)
@@ -198,7 +167,9 @@ class _Reading:
         self.count += len(points)
 
     def content(self) -> MeshContent:
-        notes = self.notes + [f"{count_of(count, kind)} left out" for kind, count in self.others.items()]
+        notes = self.notes + left_out(self.others)
+        for scheme, count in self.smooth.items():
+            notes.append(f"{count} of its meshes are to be subdivided ({scheme}); the control meshes were read")
         if self.moving:
             notes.append(f"{self.moving} of its meshes move, and were read at their earliest time")
         uvs = None
