@@ -65,6 +65,8 @@ def _nodes(document: Document, notes: list[str]) -> list[tuple[dict[str, Any], A
         transform = above @ _local(node, number)
         found.append((node, transform))
         stack += [(child, transform) for child in reversed(document.numbers(node, "children"))]
+    if "scene" not in document.root and len(seen) < len(nodes):
+        raise ValueError("some of its nodes are below themselves")
     return found
 
 
