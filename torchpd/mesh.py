@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .checks import as_array, check_finite, check_scalar, check_shape
 from .formats.bodies import read_body, read_surface
+from .formats.guard import naming
 from .mesh_checks import (
     MeshWarning,
     Numbers,
@@ -118,7 +119,8 @@ class TriMesh:
         surface = read_surface("TriMesh.from_file", path)
         if surface.notes:
             warn(f"TriMesh.from_file: {Path(path).name}: {'; '.join(surface.notes)}")
-        return cls(surface.points, surface.triangles, uvs=surface.uvs, drop_unreferenced=True, drop_degenerate=True)
+        with naming("TriMesh.from_file", path):
+            return cls(surface.points, surface.triangles, uvs=surface.uvs, drop_unreferenced=True, drop_degenerate=True)
 
     def to_trimesh(self) -> Any:
         """A trimesh.Trimesh with the same vertices, faces and texture coordinates."""
@@ -228,9 +230,10 @@ class TetMesh:
         body = read_body("TetMesh.from_file", path)
         if body.notes:
             warn(f"TetMesh.from_file: {Path(path).name}: {'; '.join(body.notes)}")
-        mesh = cls(
-            body.points, body.tets, regions=body.regions, drop_unreferenced=True, drop_degenerate=drop_degenerate
-        )
+        with naming("TetMesh.from_file", path):
+            mesh = cls(
+                body.points, body.tets, regions=body.regions, drop_unreferenced=True, drop_degenerate=drop_degenerate
+            )
         triangles = body.triangles[~has_repeated_corner(body.triangles)]
         if not len(triangles):
             return mesh

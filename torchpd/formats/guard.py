@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import os
 import warnings
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from .content import MeshContent
 from .registry import FORMATS, Format
 
-__all__ = ["PathLike", "existing", "read"]
+__all__ = ["PathLike", "existing", "naming", "read"]
 
 PathLike = str | os.PathLike[str]
 
@@ -68,6 +69,15 @@ def read(owner: str, path: PathLike) -> MeshContent:
         if isinstance(error, (KeyboardInterrupt, GeneratorExit)):
             raise
         raise ValueError(f"{failure}: {_words(error, said.getvalue(), kind)}") from error
+
+
+@contextmanager
+def naming(owner: str, path: PathLike) -> Iterator[None]:
+    """Errors of a mesh that is made of a file name the file."""
+    try:
+        yield
+    except (ValueError, IndexError, TypeError) as error:
+        raise ValueError(f"{owner} cannot use {Path(path).name}: {error}") from error
 
 
 def _check(content: MeshContent) -> None:
