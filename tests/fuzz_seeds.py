@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,6 +42,8 @@ def _of_format(place: Path, suffix: str) -> list[Seed]:
     surface = trimesh.creation.box((1.0, 2.0, 3.0))
     if suffix in (".obj", ".ply", ".stl", ".off", ".glb", ".gltf"):
         return _surfaces(place, suffix, surface)
+    if suffix == ".3mf":
+        return [Seed(_package(place / "a.3mf"), TriMesh)]
     if suffix.startswith(".usd"):
         return _stages(place, suffix)
     if suffix in (".vtk", ".vtu", ".msh", ".inp"):
@@ -50,7 +53,7 @@ def _of_format(place: Path, suffix: str) -> list[Seed]:
         path.write_text(_TEXTS[suffix])
         for name, text in _BESIDE.get(suffix, {}).items():
             (place / name).write_text(text)
-        kind = TriMesh if suffix in (".vtp", ".pvtp", ".3mf", ".dae") else TetMesh
+        kind = TriMesh if suffix in (".vtp", ".pvtp", ".dae") else TetMesh
         return [Seed(path, kind, tuple(place / name for name in _BESIDE.get(suffix, {})))]
     return _volumes(place, suffix)
 
@@ -76,6 +79,14 @@ def _surfaces(place: Path, suffix: str, surface: trimesh.Trimesh) -> list[Seed]:
             "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 -2/3 -1/-1\n"
         )
     return [Seed(path, TriMesh) for path in sorted(place.iterdir())]
+
+
+def _package(path: Path) -> Path:
+    kind = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("_rels/.rels", f'<R><Relationship Target="/3D/a.model" Type="{kind}"/></R>')
+        archive.writestr("3D/a.model", _MODEL)
+    return path
 
 
 def _stages(place: Path, suffix: str) -> list[Seed]:
@@ -143,9 +154,22 @@ def _mixed(place: Path, suffix: str) -> list[Seed]:
 
 
 _POINTS = "0 0 0 1 0 0 0 1 0 0 0 1"
+_MODEL = (
+    '<model unit="meter"><resources><object id="1"><mesh><vertices><vertex x="0" y="0" z="0"/>'
+    '<vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/></vertices>'
+    '<triangles><triangle v1="0" v2="1" v3="2"/></triangles></mesh></object>'
+    '</resources><build><item objectid="1" transform="1 0 0 0 1 0 0 0 1 5 6 7"/></build></model>'
+)
 _ARRAY = '<DataArray type="Float64" NumberOfComponents="3" format="ascii">{}</DataArray>'
 _XML = '<VTKFile type="{}" version="1.0" byte_order="LittleEndian">{}</VTKFile>\n'
 _TEXTS = {
+    ".dae": '<COLLADA xmlns="c"><asset><unit meter="1"/></asset><library_geometries><geometry id="g"><mesh>'
+    f'<source id="p"><float_array count="12">{_POINTS}</float_array><technique_common><accessor count="4" stride="3"/>'
+    '</technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/></vertices>'
+    '<polylist count="2"><input semantic="VERTEX" source="#v" offset="0"/><vcount>4 3</vcount><p>0 1 2 3 0 1 2</p>'
+    '</polylist></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s"><node id="n">'
+    '<translate>1 2 3</translate><rotate>0 0 1 90</rotate><instance_geometry url="#g"/></node></visual_scene>'
+    '</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>',
     ".tet": "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nt 0 1 2 3\n",
     ".fem": "BEGIN BULK\nGRID,1,,0.,0.,0.\nGRID,2,,1.,0.,0.\nGRID,3,,0.,1.,0.\nGRID,4,,0.,0.,1.\n"
     "CTETRA,1,1,1,2,3,4\nENDDATA\n",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .content import MeshContent
+from .content import CELLS, MeshContent
 from .registry import FORMATS, Format
 
 __all__ = ["PathLike", "existing", "naming", "read"]
@@ -77,15 +77,20 @@ def naming(owner: str, path: PathLike) -> Iterator[None]:
     try:
         yield
     except (ValueError, IndexError, TypeError) as error:
+        if Path(path).name in str(error):
+            raise
         raise ValueError(f"{owner} cannot use {Path(path).name}: {error}") from error
 
 
 def _check(content: MeshContent) -> None:
-    """Points must be finite, and every cell must name points of the file."""
+    """Points must be finite, and every cell have its corners, which are points of the file."""
     bad = np.flatnonzero(~np.isfinite(content.points).all(axis=1))
     if len(bad):
         raise ValueError(f"point {bad[0]} (counted from 0) must be finite, got {content.points[bad[0]].tolist()}")
     for block in content.cells:
+        corners = CELLS.get(block.kind, (0, 0))[0]
+        if corners and block.corners.shape[1:] != (corners,):
+            raise ValueError(f"a {block.kind} must have {corners} corners, got cells {list(block.corners.shape)}")
         outside = (block.corners < 0) | (block.corners >= len(content.points))
         if outside.any():
             number = int(block.corners[outside][0])

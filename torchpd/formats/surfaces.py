@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from .collada import read_collada
 from .content import Reader
 from .gltf import read_gltf
 from .obj import read_obj
 from .off import read_off
 from .ply import read_ply
 from .stl import read_stl
+from .threemf import read_3mf
 from .usd import read_usd
 
 __all__ = ["READERS"]
 
 READERS: dict[str, tuple[str, Reader]] = {
+    ".3mf": ("3MF", read_3mf),
+    ".dae": ("COLLADA", read_collada),
     ".glb": ("binary glTF", read_gltf),
     ".gltf": ("glTF", read_gltf),
     ".obj": ("Wavefront OBJ", read_obj),
