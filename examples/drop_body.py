@@ -13,7 +13,7 @@ TIME_STEP = 1 / 60  # s
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("surface", type=Path, nargs="?", help="any file that trimesh reads; default: an octopus")
+    parser.add_argument("surface", type=Path, nargs="?", help="file of a surface; default: an octopus")
     parser.add_argument("--cells", type=int, default=16, help="of the lattice along the longest side")
     parser.add_argument("--steps", type=int, default=90, help="of 1/60 s")
     parser.add_argument("--youngs", type=float, default=2e4, help="Young's modulus [Pa]")

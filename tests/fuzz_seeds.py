@@ -149,11 +149,17 @@ def _mixed(place: Path, suffix: str) -> list[Seed]:
             warnings.simplefilter("ignore")
             chosen = meshio.Mesh(CELLS, blocks[:1]) if name == "gmsh" else mesh  # of which meshio writes one kind only
             meshio.write(path, chosen, file_format=name.strip(), **options)
-        seeds.append(Seed(path, TetMesh))
+        seeds.append(Seed(path, TetMesh, tuple(sorted(set(place.glob(f"mixed{number}*")) - {path}))))
     return seeds
 
 
 _POINTS = "0 0 0 1 0 0 0 1 0 0 0 1"
+_XDMF = (
+    '<Xdmf Version="3.0"><Domain><Grid Name="a"><Geometry GeometryType="XYZ"><DataItem DataType="Float" Precision="8" '
+    f'Dimensions="4 3" Format="XML">{_POINTS}</DataItem></Geometry><Topology TopologyType="Tetrahedron" '
+    'NumberOfElements="1" NodesPerElement="4"><DataItem DataType="Int" Precision="8" Dimensions="1 4" Format="XML">'
+    "0 1 2 3</DataItem></Topology></Grid></Domain></Xdmf>"
+)
 _MODEL = (
     '<model unit="meter"><resources><object id="1"><mesh><vertices><vertex x="0" y="0" z="0"/>'
     '<vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/></vertices>'
@@ -170,6 +176,8 @@ _TEXTS = {
     '</polylist></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s"><node id="n">'
     '<translate>1 2 3</translate><rotate>0 0 1 90</rotate><instance_geometry url="#g"/></node></visual_scene>'
     '</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>',
+    ".xdmf": _XDMF,
+    ".xmf": _XDMF,
     ".tet": "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nt 0 1 2 3\n",
     ".fem": "BEGIN BULK\nGRID,1,,0.,0.,0.\nGRID,2,,1.,0.,0.\nGRID,3,,0.,1.,0.\nGRID,4,,0.,0.,1.\n"
     "CTETRA,1,1,1,2,3,4\nENDDATA\n",

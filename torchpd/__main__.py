@@ -16,8 +16,8 @@ __all__ = ["main"]
 _DEMO = """\
 Drops an elastic body on the ground and writes pictures, films and a convergence plot.
 
-MESH is a surface (.obj, .ply, .stl, .glb and whatever else trimesh reads), which is filled with a lattice of
-tetrahedra, or a tetrahedral mesh (.mesh, .msh, .vtk, .vtu). It is scaled to a metre. Without MESH: an octopus.
+MESH is a surface (.obj, .ply, .stl, .glb, .usd, ...), which is filled with a lattice of tetrahedra, or a volume mesh
+(.mesh, .msh, .vtk, .vtu, .inp, ...). It is scaled to a metre. Without MESH: an octopus.
 
 --patches: bodies of free-form patches instead, as large as the three scenes of the source paper, which are twisted,
 bent and dropped; a picture, moving surfaces, and what a frame costs beside the published times."""

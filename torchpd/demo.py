@@ -17,6 +17,7 @@ from .animation import write_film, write_surface
 from .convergence import SolvedAlreadyError, compare_solvers, plot_convergence
 from .doctor import OPTIONAL, missing_packages
 from .effects import Gravity, Ground, Solid
+from .formats.bodies import holds_body
 from .mesh import TetMesh, TriMesh
 from .placing import find_device
 from .render import Studio, contact_sheet
@@ -33,7 +34,6 @@ Index = NDArray[np.int64]
 TIME_STEP = 1 / 60  # s
 DROP_HEIGHT = 0.25  # m under the lowest vertex
 _DRAWING = ("mitsuba", "PIL", "imageio_ffmpeg", "pxr", "matplotlib")
-_VOLUME_SUFFIXES = (".mesh", ".msh", ".vtk", ".vtu")
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def check_packages() -> None:
 def _load(path: Path | None) -> TetMesh | TriMesh:
     if path is None:
         return shapes.octopus()
-    return TetMesh.from_file(path) if path.suffix.lower() in _VOLUME_SUFFIXES else TriMesh.from_file(path)
+    return TetMesh.from_file(path) if holds_body("demo", path) else TriMesh.from_file(path)
 
 
 def _place(shape: TetMesh | TriMesh, cells: int) -> TetMesh:

@@ -112,9 +112,20 @@ class TriMesh:
 
     @classmethod
     def from_file(cls, path: PathLike) -> TriMesh:
-        """Read the triangles of a mesh file (.obj, .ply, .stl, .glb, .vtk, ...); quads and polygons become triangles.
+        """Read the triangles of a mesh file; quads and polygons become triangles.
 
-        Of a volume mesh the triangles that it lists are read. What is left out a `MeshWarning` says.
+        Surfaces: .obj, .ply, .stl, .off, .gltf, .glb, .dae, .3mf, and through usd-core .usd, .usda, .usdc, .usdz. Of a
+        volume mesh the triangles that it lists are read. What is left out, or assumed, a `MeshWarning` says.
+
+        All objects of a file are read, and parts of a scene where its transforms put them. Declared units become
+        metres, and a declared axis that is up becomes y (.usd, .dae; of .3mf the unit only, where it is a millimetre
+        unless it says otherwise). Vertices keep the order of the file; one with several texture coordinates is doubled,
+        and equal corners of an .stl become one vertex.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ModuleNotFoundError: the format needs a package that is not installed, which is named.
+            ValueError: the file cannot be read, or holds no triangles; with its name, its format and what was met.
         """
         surface = read_surface("TriMesh.from_file", path)
         if surface.notes:

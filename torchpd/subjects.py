@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from . import shapes
 from .effects import Gravity, Ground, Pin, Solid
+from .formats.bodies import holds_body
 from .mesh import TetMesh, TriMesh
 from .scene import Scene
 from .simulator import Simulator
@@ -24,7 +25,6 @@ __all__ = ["SCENES", "SUBJECTS", "Subject", "subject_of"]
 Array = NDArray[np.float64]
 
 DENSITY = 1000.0  # kg/m^3
-_TETRAHEDRAL = (".mesh", ".msh", ".vtk", ".vtu")
 _GAP = 0.002  # m between the ground and a body that is about to land
 _LANDING = (0.3, -2.0, 0.0)  # m/s
 _HELD = 0.1  # of the height of a body
@@ -173,5 +173,5 @@ def subject_of(name: str, scene: str | None = None) -> Subject:
     path = Path(name)
     if not path.is_file():
         raise FileNotFoundError(f"study: {name} is neither a file of a mesh nor one of {', '.join(SUBJECTS)}")
-    shape = TetMesh.from_file(path) if path.suffix.lower() in _TETRAHEDRAL else TriMesh.from_file(path)
+    shape = TetMesh.from_file(path) if holds_body("study", path) else TriMesh.from_file(path)
     return _body(path.name, shape, scene)

@@ -61,7 +61,8 @@ def tetrahedralize(
     "tetwild" follows the surface closely with tets of varying shape; it needs the package pytetwild.
 
     Args:
-        surface: a TriMesh, a trimesh.Trimesh or trimesh.Scene, or the path of a file that trimesh reads.
+        surface: a TriMesh, a trimesh.Trimesh or trimesh.Scene, or the path of a file (see
+            `TriMesh.from_file`).
         cells: cells along the longest side of the bounding box; for "tetwild" the aim is edges as long as a cell.
         method: "lattice" or "tetwild".
         progress: show a progress bar.

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import split
-from .content import Array, Index, MeshContent
+from .content import CELLS, Array, Index, MeshContent
 from .guard import PathLike, read
 
-__all__ = ["Body", "Surface", "read_body", "read_surface"]
+__all__ = ["Body", "Surface", "holds_body", "read_body", "read_surface"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +42,11 @@ class Surface:
     triangles: Index
     uvs: Array | None
     notes: list[str]
+
+
+def holds_body(owner: str, path: PathLike) -> bool:
+    """Whether a file holds cells that have a volume."""
+    return any(len(block) and CELLS.get(block.kind, (0, 0))[1] == 3 for block in read(owner, path).cells)
 
 
 def read_body(owner: str, path: PathLike) -> Body:
