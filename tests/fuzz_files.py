@@ -1,6 +1,7 @@
 """Damaged mesh files: each is read or refused by name, in time, in silence and within a bound of memory.
 
-`python tests/fuzz_files.py 5000` damages so many files, made from small sound ones of every format, and reports.
+`python tests/fuzz_files.py 5000` damages so many files, made from small sound ones of every format, and reports; a
+second number is that of the first file, for others than the last time.
 """
 
 from __future__ import annotations
@@ -133,6 +134,8 @@ def try_file(seed: Seed, path: Path) -> tuple[str, str]:
                 fault = f"an error that does not name the file: {error!r}"
             if "memory" in str(error):
                 fault = f"memory: {error}"
+        except ModuleNotFoundError as error:
+            end, fault = "missing", str(error)
         except BaseException as error:
             end, fault = "error", repr(error)
     seconds = time.process_time() - begin
@@ -157,19 +160,20 @@ def limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (mapped + MEMORY, resource.RLIM_INFINITY))
 
 
-def run(count: int, folder: Path, silence: Silence) -> tuple[Counter[str], list[str]]:
-    """What became of `count` damaged files, the seeds in turn, and what is wrong with it."""
-    seeds = make_seeds(folder)
-    faults = []
-    for seed in seeds:
+def run(numbers: range, folder: Path, silence: Silence) -> tuple[Counter[str], list[str]]:
+    """What became of damaged files, the seeds in turn, and what is wrong with it."""
+    seeds, faults = [], []
+    for seed in make_seeds(folder):
         end, fault = try_file(seed, seed.path)
-        if end != "read" or fault:
-            faults.append(f"{seed.path.name} is sound, but {end}: {fault}")
+        if end != "missing":
+            seeds.append(seed)
+            if end != "read" or fault:
+                faults.append(f"{seed.path.name} is sound, but {end}: {fault}")
     silence.taken()
     limit_memory()
     signal.signal(signal.SIGPROF, stop)
     ends: Counter[str] = Counter()
-    for number in range(count):
+    for number in numbers:
         seed = seeds[number % len(seeds)]
         place = folder / "work"
         shutil.copytree(seed.path.parent, place)
@@ -191,19 +195,20 @@ def run(count: int, folder: Path, silence: Silence) -> tuple[Counter[str], list[
     return ends, faults
 
 
-def main(count: int, folder: Path) -> int:
+def main(numbers: range, folder: Path) -> int:
     """Run, and report on stdout; how many faults there are."""
     begin, silence = time.perf_counter(), Silence(folder / "last")
     (folder / "seeds").mkdir()
     try:
-        ends, faults = run(count, folder / "seeds", silence)
+        ends, faults = run(numbers, folder / "seeds", silence)
     finally:
         silence.end()
-    print(f"{count} damaged files in {time.perf_counter() - begin:.1f} s: {dict(ends)}, {len(faults)} faults")
+    print(f"{len(numbers)} damaged files in {time.perf_counter() - begin:.1f} s: {dict(ends)}, {len(faults)} faults")
     print("\n".join(faults))
     return len(faults)
 
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as place:
-        sys.exit(min(main(int(sys.argv[1]), Path(place)), 1))
+        count, first = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
+        sys.exit(min(main(range(first, first + count), Path(place)), 1))
