@@ -76,6 +76,9 @@ def test_scenes_are_joined_with_their_places() -> None:
     scene.add_geometry(one, transform=trimesh.transformations.translation_matrix([3, 0, 0]))
     surface = TriMesh.from_trimesh(scene)
     np.testing.assert_allclose(surface.bounds, [[-0.5, -0.5, -0.5], [3.5, 0.5, 0.5]])
+    scene.add_geometry(trimesh.PointCloud(np.zeros((1, 3))))
+    with pytest.warns(MeshWarning, match="left out, for they have no triangles: PointCloud"):
+        assert len(TriMesh.from_trimesh(scene).triangles) == 24
     with pytest.raises(TypeError, match="must be a Trimesh or a Scene, got int"):
         TriMesh.from_trimesh(3)
 

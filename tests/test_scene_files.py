@@ -122,6 +122,7 @@ def test_a_collada_says_what_it_leaves_out(tmp_path: Path) -> None:
         ('<polylist count="6"', '<polylist count="7"', "polylist declare 7 faces and have 6"),
         ("<vcount>4 ", "<vcount>5 ", "with 25 corners, of which 24 are there"),
         ("<p>2 0", "<p>8 0", "vertices in polylist that are not there: 8"),
+        ("</library_geometries>", '<geometry id="box"/></library_geometries>', "several of its elements have this id"),
         ('url="#box"', 'url="other.dae#box"', "refers to 'other.dae#box', which is not within the file"),
         ('url="#box"', 'url="#lost"', "refers to the geometry '#lost', which is not there"),
         ('<node id="a">', '<node id="a"><instance_node url="#a"/>', "node 'a' is below itself"),
@@ -201,6 +202,7 @@ def test_objects_in_other_parts_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
+        ("</resources>", '<object id="1"/></resources>', "object '1' of 3D/a.model comes twice"),
         ('unit="meter"', 'unit="mile"', "unit must be micron, .*got 'mile'"),
         (
             'unit="meter"',

@@ -96,6 +96,17 @@ def test_an_obj_says_what_it_leaves_out(tmp_path: Path) -> None:
     assert surface.uvs is None
 
 
+def test_texture_coordinates_that_are_none_cost_no_surface(tmp_path: Path) -> None:
+    lines = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt -nan(ind) 0\nvt 0\nf 1/1 2/2 3/3\n"
+    (tmp_path / "a.obj").write_text(lines)
+    with pytest.warns(MeshWarning, match="texture coordinates left out: 1 are not finite"):
+        surface = TriMesh.from_file(tmp_path / "a.obj")
+    assert surface.uvs is None
+    assert len(surface.triangles) == 1
+    uvs = read(tmp_path / "b.obj", lines.replace("-nan(ind)", "1")).uvs
+    np.testing.assert_array_equal(uvs, [[0, 0], [1, 0], [0, 0]])
+
+
 @pytest.mark.parametrize(
     ("data", "match"),
     [

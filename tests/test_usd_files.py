@@ -141,6 +141,7 @@ def test_what_is_left_out_is_said(tmp_path: Path) -> None:
     add_box(stage, "/guide").CreatePurposeAttr("guide")
     add_box(stage, "/hidden").CreateVisibilityAttr("invisible")
     UsdGeom.Sphere.Define(stage, "/ball")
+    UsdGeom.Mesh.Define(stage, "/nothing")
     UsdGeom.PointInstancer.Define(stage, "/many")
     with pytest.warns(MeshWarning, match="PointInstancer") as said:
         surface = TriMesh.from_file(write(stage, tmp_path / "a.usdc"))
@@ -148,7 +149,8 @@ def test_what_is_left_out_is_said(tmp_path: Path) -> None:
     assert len(surface.triangles) == 10
     words = str(said[0].message)
     for part in (
-        "Mesh of purpose guide (1)", "invisible Mesh (1)", "Sphere (1)", "PointInstancer (1)", "declared holes (1)",
+        "Mesh of purpose guide (1)", "invisible Mesh (1)", "Sphere (1)",
+        "Mesh without faces (1)", "PointInstancer (1)", "declared holes (1)",
         "to be subdivided (loop)", "1 of its meshes move, and were read at their earliest time",
     ):  # fmt: skip
         assert part in words

@@ -83,8 +83,11 @@ def read_surface(owner: str, path: PathLike) -> Surface:
     # The vertices inside of a volume are no part of the surface: that they are left out is nothing to report.
     kept = used | ~_in_cells(content, len(used))
     number = np.cumsum(kept) - 1
-    uvs = None if content.uvs is None else content.uvs[kept]
-    return Surface(content.points[kept], number[flat.elements], uvs, [*content.notes, *flat.notes])
+    uvs, notes = None if content.uvs is None else content.uvs[kept], [*content.notes, *flat.notes]
+    if uvs is not None and not np.isfinite(uvs).all():
+        notes.append(f"texture coordinates left out: {int((~np.isfinite(uvs)).any(axis=1).sum())} are not finite")
+        uvs = None
+    return Surface(content.points[kept], number[flat.elements], uvs, notes)
 
 
 def _in_cells(content: MeshContent, count: int) -> NDArray[np.bool_]:

@@ -74,7 +74,9 @@ class _Reading:
 
     def __init__(self, root: Any) -> None:
         self.root = root
-        self.by_id = {element.get("id"): element for element in root.iter() if element.get("id")}
+        named = [element for element in root.iter() if element.get("id")]
+        self.by_id = {element.get("id"): element for element in named}
+        self.twice = {name for name, count in Counter(e.get("id") for e in named).items() if count > 1}
         self.meshes: dict[str, Mesh] = {}
         self.points: list[Array] = []
         self.uvs: list[Array | None] = []
@@ -91,6 +93,8 @@ class _Reading:
         found = self.by_id.get(name[1:])
         if found is None or found.tag.rpartition("}")[2] != kind:
             raise ValueError(f"it refers to the {kind} {name[:80]!r}, which is not there")
+        if name[1:] in self.twice:
+            raise ValueError(f"it refers to {name[:80]!r}, but several of its elements have this id")
         return found
 
     def scene(self) -> Any:
@@ -143,6 +147,7 @@ class _Reading:
         if name not in self.meshes:
             self.meshes[name] = read_mesh(geometry.find("{*}mesh"), self.find, self.others)
         mesh = self.meshes[name]
+        self.others["geometries without faces"] += not len(mesh.corners)
         turned = np.linalg.det(matrix[:3, :3]) < 0
         self.cells += [cells for cells in mesh.placed(self.count, turned=bool(turned)) if len(cells)]
         self.points.append(mesh.points @ matrix[:3, :3].T + matrix[:3, 3])

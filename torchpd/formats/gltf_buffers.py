@@ -184,8 +184,8 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
     version, total = struct.unpack("<II", data[4:12]) if len(data) >= 12 else (2, 12)
     if version != 2:
         raise ValueError(f"version 2 of the .glb container is read, got {version}")
-    if total > len(data):
-        raise ValueError(f"its head declares {total:,} bytes, but the file has {len(data):,}; it was cut off")
+    if total != len(data):
+        raise ValueError(f"its head declares {total:,} bytes, but the file has {len(data):,}; was it cut off?")
     found: dict[int, bytes] = {}
     place = 12
     while place + 8 <= total:
@@ -196,4 +196,4 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
         place += 8 + length
     if _JSON not in found:
         raise ValueError("it has no chunk of JSON")
-    return found[_JSON], found.get(_BIN)
+    return found[_JSON].rstrip(b"\0 "), found.get(_BIN)

@@ -45,7 +45,8 @@ def read(owner: str, path: PathLike) -> MeshContent:
     kind = FORMATS.get(file.suffix.lower())
     if kind is None:
         known = " ".join(sorted(FORMATS))
-        raise ValueError(f"{owner} cannot read {file.name}: {_ENDINGS} ({known})")
+        others = "TriMesh.from_trimesh(trimesh.load(path)) takes what else trimesh reads"
+        raise ValueError(f"{owner} cannot read {file.name}: {_ENDINGS} ({known}); {others}")
     failure = f"{owner} cannot read {file.name} ({kind.name})"
     if not file.stat().st_size:
         raise ValueError(f"{failure}: the file is empty; write it again")

@@ -10,7 +10,7 @@ import codecs
 from array import array
 from collections import Counter
 from collections.abc import Iterator
-from math import isfinite
+from math import isfinite, nan
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +77,7 @@ class _Reading:
         if key == b"v":
             self.points.extend(_numbers(words, 3))
         elif key == b"vt":
-            self.uvs.extend(_numbers([*words, b"0"] if len(words) == 2 else words, 2))
+            self.uvs.extend(_texture(words[1:]))
         elif key in (b"f", b"fo"):
             self._take_face(words[1:])
         elif key in _OTHER:
@@ -125,6 +125,14 @@ def _numbers(words: list[bytes], count: int) -> list[float]:
     if not all(map(isfinite, values)):
         raise ValueError(f"{words[0].decode()} must be finite, got {values}")
     return values
+
+
+def _texture(words: list[bytes]) -> list[float]:
+    """Two texture coordinates; what is none, as "nan(ind)", costs them, but not the surface."""
+    try:
+        return [float(word) for word in (words + [b"0"])[:2]] if words else [nan, nan]
+    except ValueError:
+        return [nan, nan]
 
 
 def _counted(words: list[bytes], so_far: int, noun: str) -> list[int]:

@@ -63,7 +63,10 @@ class _Package:
             if part == self.main:
                 self.root = root
             for thing in root.iterfind("{*}resources/{*}object"):
-                self.objects[part, thing.get("id", "")] = thing
+                key = part, thing.get("id", "")
+                if key in self.objects:
+                    raise ValueError(f"object {key[1]!r} of {part} comes twice")
+                self.objects[key] = thing
         unit = self.root.get("unit", "millimeter")
         if unit not in _UNITS:
             raise ValueError(f"unit must be {', '.join(_UNITS)}, got {unit!r}")
@@ -137,6 +140,7 @@ class _Reading:
             self.take(_key(part, key[0]), joint, (*above, key))
         if thing.find("{*}mesh") is not None:
             points, triangles = self._mesh(key, thing.find("{*}mesh"))
+            self.others["objects without triangles"] += not len(triangles)
             turned = np.linalg.det(matrix[:3]) < 0
             self.triangles.append((triangles[:, ::-1] if turned else triangles) + self.count)
             self.points.append((points @ matrix[:3] + matrix[3]) * self.package.scale)

@@ -113,12 +113,15 @@ class _Reading:
                 f"{name} has {len(corners)} faceVertexIndices; its faceVertexCounts add up to {sizes.sum()}"
             )
         check_corners(corners, len(points), f"points of {name}")
+        if not len(corners):
+            self.others["Mesh without faces"] += 1
+            return
         scheme = mesh.GetSubdivisionSchemeAttr().Get(self.time)
         if scheme != "none":
             self.smooth[str(scheme)] += 1
         values = _coordinates(mesh.GetPrim(), self.time, corners, len(points))
         uvs = None
-        if values is not None and len(corners):
+        if values is not None:
             points, corners, uvs = one_uv_each(points, corners, *values)
         order = np.arange(len(corners))
         if turned:  # each face from its last corner to its first
@@ -143,6 +146,8 @@ class _Reading:
             check_corners(corners.reshape(-1), len(points), f"points of {name}")
         if turned:
             tets, faces = tets[:, [0, 1, 3, 2]], faces[:, ::-1]
+        if not len(tets):
+            self.others["TetMesh without tets"] += 1
         regions = self._regions(mesh, len(tets))
         self.cells += [Cells("tetra", tets + self.count, regions=regions)] if len(tets) else []
         self.cells += [Cells("triangle", faces + self.count)] if len(faces) else []
