@@ -56,7 +56,7 @@ def obj(faces: list[list[int]], first: int = 1) -> str:
         b"\xef\xbb\xbf" + obj(QUADS).encode(),
         obj(QUADS).encode("utf-16"),
         b"# K\xf6rper\no K\xf6rper\n" + obj(TRIANGLES).encode(),
-        obj(QUADS).replace("f 3 4", "f 3 \\\n  4").replace("\n", "\r\n"),
+        obj(QUADS).replace("f 3 4", "f \\\n3 \\\n  4").replace("\n", "\r\n"),
         obj(QUADS).replace("\n", " 1.0 0.5 0.25\n", 8).replace("f 3 4 2 1", "g one\nusemtl red\ns off\nf 3 4 2 1"),
         "vn 0 0 1\n" + obj(QUADS).replace("f 3 4 2 1", "f 3//1 4//1 2//1 1//1"),
         "# a comment that ends in a folder C:\\\n" + obj(QUADS),

@@ -67,13 +67,17 @@ def test_meshes_are_read_where_they_are(tmp_path: Path, suffix: str) -> None:
     mirrored.AddScaleOp().Set((-2, 1, 1))
     left = add_box(stage, "/top/three", [face[::-1] for face in QUADS])
     left.CreateOrientationAttr("leftHanded")
+    both = add_box(stage, "/top/four", [face[::-1] for face in QUADS])
+    both.CreateOrientationAttr("leftHanded")
+    both.AddScaleOp().Set((-2, 1, 1))
     surface = read(stage, tmp_path / f"a{suffix}")
     x, y, z = BOX.T
-    one, two, three = surface.vertices.reshape(3, 8, 3)
+    one, two, three, four = surface.vertices.reshape(4, 8, 3)
     np.testing.assert_allclose(one, np.stack([5 - y, x, z], axis=1), atol=1e-12)
     np.testing.assert_allclose(two, np.stack([5 - y, -2 * x, z], axis=1), atol=1e-12)
     np.testing.assert_array_equal(three, one)
-    assert surface.volume() == pytest.approx((1 + 2 + 1) * 6.0)
+    np.testing.assert_array_equal(four, two)
+    assert surface.volume() == pytest.approx((1 + 2 + 1 + 2) * 6.0)
 
 
 def test_units_and_axes_are_read(tmp_path: Path) -> None:
