@@ -227,10 +227,11 @@ def text_stl(faces: list[list[int]], name: str = "box") -> str:
         binary_stl(b"solid made by hand"),
         text_stl(TRIANGLES),
         text_stl(TRIANGLES).upper().encode(),
+        b"\xef\xbb\xbf" + text_stl(TRIANGLES).encode(),
         text_stl(TRIANGLES, "K\xf6rper").encode("latin-1"),
         text_stl(TRIANGLES[:5]) + text_stl(TRIANGLES[5:], "the rest"),
     ],
-    ids=["binary", "binary solid", "text", "upper case", "latin-1", "two solids"],
+    ids=["binary", "binary solid", "text", "upper case", "mark", "latin-1", "two solids"],
 )
 def test_every_stl_of_the_box_is_read_with_shared_vertices(tmp_path: Path, data: str | bytes) -> None:
     assert is_box(read(tmp_path / "box.stl", data))

@@ -160,6 +160,13 @@ def test_what_is_left_out_is_said(tmp_path: Path) -> None:
         assert part in words
 
 
+def test_a_stage_without_meshes_says_what_it_has(tmp_path: Path) -> None:
+    stage = new_stage()
+    UsdGeom.Sphere.Define(stage, "/ball")
+    with pytest.raises(ValueError, match=r"a\.usda holds no triangles.*Sphere \(1\)"):
+        TriMesh.from_file(write(stage, tmp_path / "a.usda"))
+
+
 def test_usd_files_that_break_their_word_are_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     def refuse(path: Path, match: str) -> None:
         with pytest.raises(ValueError, match=rf"cannot read {path.name} \(USD\): .*{match}"):

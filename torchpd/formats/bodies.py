@@ -77,7 +77,7 @@ def read_surface(owner: str, path: PathLike) -> Surface:
     content = read(owner, path)
     flat = split.triangles_of(content)
     if not len(flat.elements):
-        raise ValueError(f"{owner}: {Path(path).name} holds no triangles, but {_kinds(content)}")
+        raise ValueError(f"{owner}: {Path(path).name} holds no triangles, but {_kinds(content)}{_noted(content)}")
     used = np.zeros(len(content.points), dtype=bool)
     used[flat.elements] = True
     # The vertices inside of a volume are no part of the surface: that they are left out is nothing to report.
@@ -113,5 +113,9 @@ def _without_tets(owner: str, name: str, content: MeshContent) -> str:
     fix = "turn a surface into tetrahedra with torchpd.tetrahedralize(path, cells=...)"
     if not flat:
         fix = "write it with its cells where it was made"
-    notes = f" ({'; '.join(content.notes)})" if content.notes else ""
-    return f"{owner}: {name} must hold tetrahedra, hexahedra, wedges or pyramids, got {came}{notes}; {fix}"
+    must = "must hold tetrahedra, hexahedra, wedges or pyramids"
+    return f"{owner}: {name} {must}, got {came}{_noted(content)}; {fix}"
+
+
+def _noted(content: MeshContent) -> str:
+    return f" ({'; '.join(content.notes)})" if content.notes else ""

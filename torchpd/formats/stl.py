@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from array import array
 from pathlib import Path
 
@@ -21,12 +22,13 @@ _FACET = [b"facet", b"outer", b"vertex", b"vertex", b"vertex", b"endloop", b"end
 def read_stl(path: Path) -> MeshContent:
     """The triangles of all solids of a file; a binary file may begin with "solid" too."""
     data = path.read_bytes()
+    text = data.removeprefix(codecs.BOM_UTF8)
     declared = int.from_bytes(data[_HEAD : _HEAD + 4], "little")
     room = len(data) - _HEAD - 4
     if room >= 0 and room == declared * _ROW.itemsize:
         corners = np.frombuffer(data, _ROW, declared, _HEAD + 4)["corners"].astype(np.float64)
-    elif data.lstrip()[:5].lower() == b"solid" and b"\0" not in data[:_HEAD]:
-        corners = _read_text(data)
+    elif text.lstrip()[:5].lower() == b"solid" and b"\0" not in text[:_HEAD]:
+        corners = _read_text(text)
     elif room < 0:
         raise ValueError(f"it holds {len(data)} bytes; a text file begins with 'solid', a binary one has 84 or more")
     else:
