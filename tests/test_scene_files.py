@@ -105,6 +105,18 @@ def test_units_axes_and_texture_coordinates_of_collada(tmp_path: Path) -> None:
         assert surface.volume() == pytest.approx(6e-6)
 
 
+def test_parts_of_parts_without_end_are_refused(tmp_path: Path) -> None:
+    twice = "".join(f'<node id="n{k}">' + f'<instance_node url="#n{k + 1}"/>' * 2 + "</node>" for k in range(40))
+    (tmp_path / "a.dae").write_text(collada(nodes=twice + '<node id="n40"/>'))
+    refuse(tmp_path / "a.dae", "more than 100,000 instances")
+    pairs = [f'<component objectid="{k + 1}"/>' * 2 for k in range(1, 40)]
+    objects = "".join(
+        f'<object id="{k}"><components>{pair}</components></object>' for k, pair in enumerate(pairs, start=1)
+    )
+    text = model(objects + f'<object id="40">{MESH}</object>', '<item objectid="1"/>')
+    refuse(pack(tmp_path / "a.3mf", text), "more than 100,000 instances")
+
+
 def test_a_collada_says_what_it_leaves_out(tmp_path: Path) -> None:
     text = collada(POLYLIST + primitive("lines", 1, [0, 1]) + primitive("polygons", 1, [0, 1]))
     (tmp_path / "a.dae").write_text(text.replace("</library_geometries>", '<geometry id="x"/></library_geometries>'))
@@ -125,7 +137,7 @@ def test_a_collada_says_what_it_leaves_out(tmp_path: Path) -> None:
         ("</library_geometries>", '<geometry id="box"/></library_geometries>', "several of its elements have this id"),
         ('url="#box"', 'url="other.dae#box"', "refers to 'other.dae#box', which is not within the file"),
         ('url="#box"', 'url="#lost"', "refers to the geometry '#lost', which is not there"),
-        ('<node id="a">', '<node id="a"><instance_node url="#a"/>', "node 'a' is below itself"),
+        ('<node id="a">', '<node id="a"><instance_node url="#a"/>', "one of its parts is a part of itself"),
         ('<node id="a">', '<node id="a"><skew>0 0 0 0 0 0 0</skew>', "the transform 'skew', which is not read"),
         ("Y_UP", "W_UP", "up_axis must be"),
         ('meter="1"', 'meter="0"', "must be a positive number of metres"),
@@ -212,7 +224,7 @@ def test_objects_in_other_parts_are_read(tmp_path: Path) -> None:
         ('v1="2"', 'v1="8"', "vertices of object 1 that are not there: 8"),
         ('x="0.0"', 'x="nan"', "coordinates must be finite"),
         ('<item objectid="1"/>', '<item objectid="5"/>', "object '5' of 3D/a.model is used, but is not there"),
-        ("<mesh>", '<components><component objectid="1"/></components><mesh>', "object '1' is a component of itself"),
+        ("<mesh>", '<components><component objectid="1"/></components><mesh>', "one of its parts is a part of itself"),
         ('<item objectid="1"/>', '<item objectid="1" transform="1 0 0"/>', "a transform must be 12 finite numbers"),
         ("</model>", "", "3D/a.model is no sound XML"),
     ],

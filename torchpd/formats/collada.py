@@ -11,7 +11,7 @@ import numpy as np
 
 from .collada_mesh import Mesh, read_mesh
 from .content import Array, Cells, MeshContent
-from .faces import check_points, left_out
+from .faces import check_points, check_tree, left_out
 
 __all__ = ["read_collada"]
 
@@ -31,8 +31,10 @@ def read_collada(path: Path) -> MeshContent:
     if root.tag.rpartition("}")[2] != "COLLADA":
         raise ValueError(f"its first element must be COLLADA, got {root.tag[:60]!r}")
     reading = _Reading(root)
-    for node in reading.scene().iterfind("{*}node"):
-        reading.take(node, np.eye(4), ())
+    nodes = reading.scene().findall("{*}node")
+    check_tree(nodes, reading.nodes_below)
+    for node in nodes:
+        reading.take(node, np.eye(4))
     return reading.content()
 
 
@@ -107,18 +109,19 @@ class _Reading:
             raise ValueError(f"it must say which scene is drawn, or have one, got {len(scenes)}")
         return scenes[0]
 
-    def take(self, node: Any, above: Array, path: tuple[Any, ...]) -> None:
+    def nodes_below(self, node: Any) -> list[Any]:
+        """The nodes of a node, of its own and of elsewhere."""
+        instances = node.iterfind("{*}instance_node")
+        return [*node.iterfind("{*}node"), *(self.find(instance.get("url"), "node") for instance in instances)]
+
+    def take(self, node: Any, above: Array) -> None:
         """Add the meshes of a node and of those below it."""
-        if any(node is other for other in path):
-            raise ValueError(f"node {node.get('id')!r} is below itself")
         matrix = above @ _local(node)
+        for below in self.nodes_below(node):
+            self.take(below, matrix)
         for child in node:
             name = child.tag.rpartition("}")[2]
-            if name == "node":
-                self.take(child, matrix, (*path, node))
-            elif name == "instance_node":
-                self.take(self.find(child.get("url"), "node"), matrix, (*path, node))
-            elif name == "instance_geometry":
+            if name == "instance_geometry":
                 self._take_geometry(child.get("url"), matrix)
             elif name == "instance_controller":
                 self._take_controller(child.get("url"), matrix)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,11 @@ from numpy.typing import NDArray
 from .content import Array, Cells, Index
 
 __all__ = [
+    "MOST_INSTANCES",
     "check_corners",
+    "check_instances",
     "check_points",
+    "check_tree",
     "face_blocks",
     "fan_triangles",
     "join",
@@ -21,9 +25,33 @@ __all__ = [
 ]
 
 
+def check_instances(count: int) -> None:
+    """Refuse scenes that name parts of parts without end: twenty names of two parts each are a million parts."""
+    if count > MOST_INSTANCES:
+        raise ValueError(f"it has more than {MOST_INSTANCES:,} instances, some of them of each other's parts")
+
+
+def check_tree(roots: Iterable[Hashable], parts_of: Callable[[Any], Iterable[Hashable]]) -> None:
+    """Refuse parts that are parts of themselves, and, before they are placed, more instances than can be."""
+    sizes: dict[Hashable, int] = {}  # 0: being counted
+
+    def size(part: Hashable) -> int:
+        if part not in sizes:
+            sizes[part] = 0
+            sizes[part] = 1 + sum(size(inner) for inner in parts_of(part))
+        elif not sizes[part]:
+            raise ValueError("one of its parts is a part of itself")
+        return sizes[part]
+
+    check_instances(sum(size(root) for root in roots))
+
+
 def left_out(others: Mapping[str, int]) -> list[str]:
     """A note that names what of a file is not among its cells, with its number; none if there is nothing."""
     return ["left out: " + ", ".join(f"{kind} ({count:,})" for kind, count in others.items())] if others else []
+
+
+MOST_INSTANCES = 100_000  # of nodes or components of a scene
 
 
 def check_points(points: Array) -> None:

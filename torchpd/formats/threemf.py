@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from .content import Array, Cells, Index, MeshContent
-from .faces import check_corners, check_points, join, left_out
+from .faces import check_corners, check_points, check_tree, join, left_out
 
 __all__ = ["read_3mf"]
 
@@ -32,8 +32,10 @@ def read_3mf(path: Path) -> MeshContent:
     except (zipfile.BadZipFile, NotImplementedError, EOFError) as error:
         raise ValueError(f"its archive cannot be read: {error}") from None
     reading = _Reading(package)
-    for item in package.root.iterfind("{*}build/{*}item"):
-        reading.take(_key(item, package.main), _transform(item), ())
+    items = [(_key(item, package.main), _transform(item)) for item in package.root.iterfind("{*}build/{*}item")]
+    check_tree([key for key, _ in items], reading.parts_of)
+    for key, matrix in items:
+        reading.take(key, matrix)
     return reading.content()
 
 
@@ -123,13 +125,16 @@ class _Reading:
         self.used: set[_Key] = set()
         self.others: Counter[str] = Counter()
 
-    def take(self, key: _Key, matrix: Array, above: tuple[_Key, ...]) -> None:
-        """Add an object, with its components."""
+    def parts_of(self, key: _Key) -> list[_Key]:
+        """The components of an object."""
         thing = self.package.objects.get(key)
         if thing is None:
             raise ValueError(f"object {key[1]!r} of {key[0]} is used, but is not there")
-        if key in above:
-            raise ValueError(f"object {key[1]!r} is a component of itself")
+        return [_key(part, key[0]) for part in thing.iterfind("{*}components/{*}component")]
+
+    def take(self, key: _Key, matrix: Array) -> None:
+        """Add an object, with its components."""
+        thing = self.package.objects[key]
         self.used.add(key)
         if thing.get("type") == _SUPPORT:
             self.others["objects of type support"] += 1
@@ -137,7 +142,7 @@ class _Reading:
         for part in thing.iterfind("{*}components/{*}component"):
             inner = _transform(part)
             joint = np.vstack([inner[:3] @ matrix[:3], inner[3] @ matrix[:3] + matrix[3]])
-            self.take(_key(part, key[0]), joint, (*above, key))
+            self.take(_key(part, key[0]), joint)
         if thing.find("{*}mesh") is not None:
             points, triangles = self._mesh(key, thing.find("{*}mesh"))
             self.others["objects without triangles"] += not len(triangles)

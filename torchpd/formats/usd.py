@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .content import Array, Cells, Index, MeshContent
-from .faces import check_corners, check_points, face_blocks, left_out, one_uv_each
+from .faces import check_corners, check_instances, check_points, face_blocks, left_out, one_uv_each
 from .usd_stage import axes_of, check_lengths, open_stage, warnings_of
 
 __all__ = ["read_usd"]
@@ -57,7 +57,7 @@ class _Reading:
         self.points: list[Array] = []
         self.uvs: list[Array | None] = []
         self.cells: list[Cells] = []
-        self.count = 0
+        self.count = self.prims = 0
         self.others: Counter[str] = Counter()  # what is left out
         self.smooth: Counter[str] = Counter()  # schemes of subdivision
         self.moving = 0
@@ -66,6 +66,8 @@ class _Reading:
         """Add a mesh or a tet mesh; anything else is counted."""
         from pxr import UsdGeom
 
+        self.prims += 1
+        check_instances(self.prims)
         shown = UsdGeom.Imageable(prim)
         if shown.ComputeVisibility(self.time) == UsdGeom.Tokens.invisible:
             self.others[f"invisible {prim.GetTypeName()}"] += 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import struct
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,11 @@ __all__ = ["axes_of", "check_lengths", "open_stage", "warnings_of"]
 
 def check_lengths(path: Path) -> None:
     """Refuse a binary layer whose table of contents names bytes that it does not have: usd-core prints, and asks."""
-    layers = [path.read_bytes()]
-    if path.suffix.lower() == ".usdz":
-        with zipfile.ZipFile(path) as archive:
-            layers = [archive.read(name) for name in archive.namelist() if name.lower().endswith((".usd", ".usdc"))]
-    for layer in layers:
-        if not layer.startswith(b"PXR-USDC"):
-            continue
+    data = path.read_bytes()
+    # an archive (.usdz) holds its layers as they are
+    begins = [match.start() for match in re.finditer(b"PXR-USDC", data)] if data[:2] in (b"PX", b"PK") else []
+    for begin in begins:
+        layer = data[begin:]
         start = int.from_bytes(layer[16:24], "little")
         count = int.from_bytes(layer[start : start + 8], "little")
         rows = layer[start + 8 : start + 8 + 32 * min(count, len(layer))]
