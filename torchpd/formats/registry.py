@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from . import (
+from . import surfaces
+from .content import Reader
+from .volumes import (
     abaqus,
     avs,
     dolfin,
@@ -17,7 +19,6 @@ from . import (
     netgen,
     permas,
     su2,
-    surfaces,
     tecplot,
     tetgen,
     through_meshio,
@@ -25,7 +26,6 @@ from . import (
     vtk,
     vtk_xml,
 )
-from .content import Reader
 
 __all__ = ["FORMATS", "Format"]
 

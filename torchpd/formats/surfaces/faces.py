@@ -1,0 +1,128 @@
+"""Faces of a surface file: checked corners, blocks by kind, and texture coordinates that become one a vertex."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..content import Array, Cells, Index
+
+__all__ = [
+    "MOST_INSTANCES",
+    "check_corners",
+    "check_instances",
+    "check_points",
+    "check_tree",
+    "face_blocks",
+    "fan_triangles",
+    "join",
+    "left_out",
+    "one_uv_each",
+    "strip_triangles",
+]
+
+
+def check_instances(count: int) -> None:
+    """Refuse scenes that name parts of parts without end: twenty names of two parts each are a million parts."""
+    if count > MOST_INSTANCES:
+        raise ValueError(f"it has more than {MOST_INSTANCES:,} instances, some of them of each other's parts")
+
+
+def check_tree(roots: Iterable[Hashable], parts_of: Callable[[Any], Iterable[Hashable]]) -> None:
+    """Refuse parts that are parts of themselves, and, before they are placed, more instances than can be."""
+    sizes: dict[Hashable, int] = {}  # 0: being counted
+
+    def size(part: Hashable) -> int:
+        if part not in sizes:
+            sizes[part] = 0
+            sizes[part] = 1 + sum(size(inner) for inner in parts_of(part))
+        elif not sizes[part]:
+            raise ValueError("one of its parts is a part of itself")
+        return sizes[part]
+
+    check_instances(sum(size(root) for root in roots))
+
+
+def left_out(others: Mapping[str, int]) -> list[str]:
+    """A note that names what of a file is not among its cells, with its number; none if there is nothing."""
+    return ["left out: " + ", ".join(f"{kind} ({count:,})" for kind, count in others.items())] if others else []
+
+
+MOST_INSTANCES = 100_000  # of nodes or components of a scene
+
+
+def check_points(points: Array) -> None:
+    """Refuse coordinates that are not finite."""
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise ValueError(
+            f"coordinates must be finite, got {points[bad[0]].tolist()} at vertex {int(bad[0])} (counted from 0; "
+            f"{bad.size} in all)"
+        )
+
+
+def check_corners(corners: Index, count: int, nouns: str = "vertices", first: int = 0) -> None:
+    """Refuse numbers that name nothing; `first` is the number that the file gives to the first vertex."""
+    bad = np.flatnonzero((corners < 0) | (corners >= count))
+    if bad.size:
+        raise ValueError(
+            f"faces name {nouns} that are not there: {int(corners[bad[0]]) + first} ({bad.size} such corners); there "
+            f"are {count}, counted from {first}"
+        )
+
+
+def face_blocks(corners: Index, sizes: Index, notes: list[str]) -> list[Cells]:
+    """Faces in the order of the file as one block of triangles, quads or polygons; fewer than 3 corners are noted."""
+    few = sizes < 3
+    if few.any():
+        notes += left_out({"faces with fewer than 3 corners": int(few.sum())})
+        corners, sizes = corners[np.repeat(~few, sizes)], sizes[~few]
+    for size, kind in ((3, "triangle"), (4, "quad")):
+        if len(sizes) and (sizes == size).all():
+            return [Cells(kind, corners.reshape(-1, size))]
+    return [Cells("polygon", corners, sizes=sizes)] if len(sizes) else []
+
+
+def strip_triangles(strip: Index) -> Index:
+    """The triangles of a strip [n], with one winding; where it turns it names a vertex twice, which is no triangle."""
+    if len(strip) < 3:
+        return np.empty((0, 3), np.int64)
+    triangles = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
+    triangles[1::2] = triangles[1::2, [1, 0, 2]]
+    a, b, c = triangles.T
+    kept: NDArray[np.bool_] = (a != b) & (b != c) & (c != a)
+    return triangles[kept]
+
+
+def fan_triangles(fan: Index) -> Index:
+    """The triangles of a fan [n] around its first vertex: [n - 2, 3]."""
+    if len(fan) < 3:
+        return np.empty((0, 3), np.int64)
+    return np.stack([np.broadcast_to(fan[0], len(fan) - 2), fan[1:-1], fan[2:]], axis=1)
+
+
+def one_uv_each(points: Array, corners: Index, numbers: Index, uvs: Array) -> tuple[Array, Index, Array]:
+    """Points, corners and uvs with one texture coordinate for each vertex.
+
+    Corner k has point `corners[k]` and texture coordinate `numbers[k]`. Vertices keep their numbers and take their
+    first texture coordinate; a copy of the vertex at the end takes each further one.
+    """
+    pairs, first, inverse = np.unique(corners * len(uvs) + numbers, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # pairs as they appear
+    vertex, number = np.divmod(pairs[order], len(uvs))
+    leads = np.zeros(len(pairs), dtype=bool)
+    leads[np.unique(vertex, return_index=True)[1]] = True
+    target = np.where(leads, vertex, len(points) - 1 + np.cumsum(~leads))
+    coordinates = np.zeros((len(points) + int((~leads).sum()), 2))
+    coordinates[target] = uvs[number]
+    place = np.empty(len(pairs), dtype=np.int64)
+    place[order] = target
+    return np.concatenate([points, points[vertex[~leads]]]), place[inverse.reshape(-1)], coordinates
+
+
+def join(parts: Sequence[Index]) -> Index:
+    """One array of all, also of none."""
+    return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)

@@ -1,0 +1,151 @@
+"""Cells of VTK's data model, from legacy and XML files: types, connectivity, and the array that names regions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..content import CELLS, Array, Cells, Index, MeshContent
+from .gather import block
+from .regions import choose
+
+__all__ = ["Piece", "content_of", "offsets_of"]
+
+# https://vtk.org/doc/nightly/html/vtkCellType_8h_source.html: the kind of each type, corners first in all of them.
+_KINDS: dict[int, str] = {
+    0: "empty cell",
+    1: "vertex",
+    **dict.fromkeys((3, 21, 35, 60, 68, 75), "line"),
+    **dict.fromkeys((5, 22, 34, 61, 69, 76), "triangle"),
+    **dict.fromkeys((8, 9, 23, 28, 30, 62, 70, 77), "quad"),
+    **dict.fromkeys((10, 24, 64, 71, 78), "tetra"),
+    **dict.fromkeys((11, 12, 25, 29, 33, 67, 72, 79), "hexahedron"),
+    **dict.fromkeys((13, 26, 31, 32, 65, 73, 80), "wedge"),
+    **dict.fromkeys((14, 27, 37, 66, 74, 81), "pyramid"),
+    2: "cloud of vertices",
+    4: "polyline",
+    6: "triangle strip",
+    7: "polygon",
+    15: "pentagonal prism",
+    16: "hexagonal prism",
+    36: "polygon of higher order",
+    41: "convex point set",
+    42: "polyhedron",
+    63: "polygon of higher order",
+}
+_PIXELS = {8: [0, 1, 3, 2], 11: [0, 1, 3, 2, 4, 5, 7, 6]}  # corners that count along the axes
+_STRIP = 6
+
+
+@dataclass(eq=False)
+class Piece:
+    """One piece of a file: points [N, 3], cells by type [n], nodes one after another, and arrays of the cells."""
+
+    points: Array
+    types: Index
+    nodes: Index
+    starts: Index  # [n + 1] where the nodes of each cell begin
+    data: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+
+def offsets_of(ends: Index, nodes: Index, what: str) -> Index:
+    """Where the nodes of each cell begin [n + 1], from where they end [n]."""
+    starts = np.concatenate([np.zeros(1, dtype=np.int64), ends])
+    if (np.diff(starts) < 0).any() or starts[-1] != len(nodes):
+        raise ValueError(f"offsets of {what} must rise to {len(nodes)}, the count of their nodes, got {starts[-1]}")
+    return starts
+
+
+def content_of(pieces: list[Piece]) -> MeshContent:
+    """One mesh of all pieces; points of different pieces stay apart."""
+    notes: list[str] = []
+    regions = _regions(pieces, notes)
+    cells, first = [], 0
+    for piece, marks in zip(pieces, regions, strict=True):
+        outside = (piece.nodes < 0) | (piece.nodes >= len(piece.points))
+        if outside.any():
+            wrong = int(piece.nodes[outside][0])
+            raise ValueError(f"cells name point {wrong}, but there are {len(piece.points)} (counted from 0)")
+        cells += _blocks(piece, marks, first)
+        first += len(piece.points)
+    points = np.concatenate([piece.points for piece in pieces]) if pieces else np.empty((0, 3))
+    if len(pieces) > 1:
+        owners = np.repeat(np.arange(len(pieces)), [len(piece.points) for piece in pieces])
+        points, number = _joined(points, owners, notes)
+        cells = [
+            replace(c, corners=number[c.corners], beyond=None if c.beyond is None else number[c.beyond]) for c in cells
+        ]
+    return MeshContent(points, cells, notes=notes)
+
+
+def _joined(points: Array, owners: Index, notes: list[str]) -> tuple[Array, Index]:
+    """Points without those that another piece has at the same place, and the new number of each.
+
+    Writers in parallel cut a mesh into pieces, each with the points on the cut. Where one piece has two points at a
+    place, they are different ones, and stay.
+    """
+    _, first, place = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    place = place.reshape(-1)
+    order = np.lexsort((owners, place))
+    doubled = (place[order][1:] == place[order][:-1]) & (owners[order][1:] == owners[order][:-1])
+    apart = np.zeros(len(first), dtype=bool)
+    apart[place[order][1:][doubled]] = True
+    chosen = np.where(apart[place], np.arange(len(points)), first[place])
+    kept = chosen == np.arange(len(points))
+    if not kept.all():
+        notes.append(f"{int((~kept).sum())} points that several pieces have at the same place were joined")
+    return points[kept], (np.cumsum(kept) - 1)[chosen]
+
+
+def _blocks(piece: Piece, marks: Index | None, first: int) -> list[Cells]:
+    """Blocks of all cells of one type and size."""
+    sizes = np.diff(piece.starts)
+    form = piece.types * (int(sizes.max(initial=0)) + 1) + sizes  # one number for each pair
+    blocks = []
+    for number in np.unique(form):
+        which = np.flatnonzero(form == number)
+        kind, size = int(piece.types[which[0]]), int(sizes[which[0]])
+        nodes = piece.nodes[piece.starts[which][:, None] + np.arange(size)] + first
+        own = None if marks is None else marks[which]
+        name = _KINDS.get(kind, f"cell of VTK type {kind}")
+        if kind == _STRIP:
+            blocks.append(_unroll(nodes, own))
+        elif name in CELLS:
+            blocks.append(block(name, nodes[:, _PIXELS[kind]] if kind in _PIXELS else nodes, own))
+        else:
+            blocks.append(Cells(name, nodes.reshape(-1), np.full(len(which), size), own))
+    return blocks
+
+
+def _unroll(nodes: Index, marks: Index | None) -> Cells:
+    """Triangles of strips of one length; every second one runs the other way round."""
+    count = max(nodes.shape[1] - 2, 0)
+    rows: Index = np.arange(count)[:, None] + np.arange(3)
+    rows[1::2] = rows[1::2, [1, 0, 2]]
+    return Cells("triangle", nodes[:, rows].reshape(-1, 3), None, None if marks is None else np.repeat(marks, count))
+
+
+def _regions(pieces: list[Piece], notes: list[str]) -> list[Index | None]:
+    """The region numbers of the cells of each piece: the array with a name for such, or the only one of integers."""
+    names = {
+        name
+        for piece in pieces
+        for name, values in piece.data.items()
+        if not name.lower().startswith("vtk") and len(values) == len(piece.types) and _is_whole(values)
+    }
+    chosen = choose(names, notes)
+    if chosen is None:
+        return [None for _ in pieces]
+    return [
+        piece.data[chosen].astype(np.int64)
+        if chosen in piece.data and len(piece.data[chosen]) == len(piece.types)
+        else np.zeros(len(piece.types), dtype=np.int64)
+        for piece in pieces
+    ]
+
+
+def _is_whole(values: NDArray[Any]) -> bool:
+    return bool(values.ndim == 1 and values.dtype.kind in "iu")
