@@ -28,7 +28,7 @@ def main() -> None:
     youngs = 1e5 * 10.0 ** random[:, 0]  # 1e5 to 1e6 Pa
     density = 500.0 + 1000.0 * random[:, 1]  # kg/m^3
     sim.set_material(
-        stiffness=youngs[:, None] * torch.ones(len(mesh.tets)),
+        stiffness=youngs[:, None],
         masses=density[:, None] / 1000.0 * sim.masses,
         gravity=torch.stack(
             [0.5 * (random[:, 2] - 0.5), torch.full((options.batch,), -9.81), random[:, 2] * 0.0], dim=1

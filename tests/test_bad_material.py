@@ -120,6 +120,44 @@ def test_one_number_is_for_what_has_one_each() -> None:
         assert bool((getattr(sim, name) == number).all())
 
 
+@pytest.mark.parametrize("name", ["stiffness", "masses", "damping", "pin_stiffness"])
+@pytest.mark.parametrize("count", [3, 48])
+def test_one_number_for_each_environment(name: str, count: int) -> None:
+    """[B, 1], also for as many environments as the scene has tetrahedra."""
+    sim = small_simulator()
+    numbers = torch.arange(1.0, count + 1.0)
+    sim.set_material(**{name: numbers[:, None]})
+    rows = {"stiffness": 48, "masses": 27, "pin_stiffness": 3}
+    wanted = numbers[:, None].expand(count, rows[name]) if name in rows else numbers
+    assert torch.equal(getattr(sim, name).detach(), wanted)
+    assert len(sim.rest_state().positions) == count
+
+
+def test_one_dimension_counts_elements() -> None:
+    """[n] is of n elements, whatever the number of environments, and [1] is of all; a scene of one element agrees."""
+    sim = small_simulator()
+    sim.set_material(stiffness=torch.arange(1.0, 49.0))
+    assert sim.stiffness.shape == (48,)
+    sim.set_material(stiffness=torch.tensor([2.0]))
+    assert torch.equal(sim.stiffness.detach(), torch.full((48,), 2.0))
+    tet = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    single = pd.Simulator(pd.Scene(pd.Solid(pd.TetMesh(tet, [[0, 1, 2, 3]]), 1e5)), 1 / 60, 2)
+    with pytest.raises(ValueError, match=r"stiffness must be \[1\], .*, got \[3\]"):
+        single.set_material(stiffness=torch.ones(3))
+    single.set_material(stiffness=torch.ones(3, 1))
+    assert single.stiffness.shape == (3, 1)
+
+
+@pytest.mark.parametrize("name", ["stiffness", "damping"])
+def test_files_have_whole_arrays(name: str) -> None:
+    """Loading expands nothing: a file with another shape is a file of another scene."""
+    sim = small_simulator()
+    before = [array.clone() for array in sim.material()]
+    with pytest.raises(ValueError, match=rf"load_state_dict: {name} must be .*, got \[3, 1\]"):
+        sim.load_state_dict({**sim.state_dict(), name: torch.ones(3, 1)})
+    assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
+
+
 def test_material_that_rounds_to_nothing_is_refused() -> None:
     thin = pd.Scene(pd.Solid(body().mesh, youngs=1e-60))
     with pytest.raises(ValueError, match=r"^Simulator: stiffness must be positive in torch\.float32, got 0\.0 at"):

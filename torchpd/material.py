@@ -31,6 +31,7 @@ __all__ = [
     "in_order",
     "material_of",
     "named_arrays",
+    "one_for_all_rows",
     "real_tensor",
 ]
 
@@ -121,14 +122,27 @@ def real_tensor(owner: str, name: str, value: Tensor | float) -> Tensor:
     return tensor
 
 
+def one_for_all_rows(name: str, tensor: Tensor, rows: int) -> Tensor:
+    """Expand one number for all rows, [] or [1], to [rows], and one for each environment, [B, 1], to [B, rows].
+
+    The last dimension always counts rows: [n] is one number for each of n rows, never for each of n environments.
+    Only an array without rows, `damping`, has one number for each environment: [B], or [B, 1].
+    """
+    if tensor.dim() > 2 or (name in MATERIAL_ROWS and MATERIAL_ROWS[name].width > 1):
+        return tensor
+    if dims_of(name) == 0:
+        return tensor.squeeze(-1) if tensor.dim() == 2 else tensor
+    one = tensor.dim() == 0 or tensor.shape[-1] == 1
+    return tensor.expand(*tensor.shape[:-1], rows) if one else tensor
+
+
 def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Tensor:
     """What is to replace the array `own` of a simulator, in its precision and on its device."""
     row, tensor = MATERIAL_ROWS[name], real_tensor(owner, name, value).detach()
     tensor = tensor.to(dtype=own.dtype, device=own.device)
     shape = tuple(own.shape[own.dim() - row.dims :])
     alone = tensor.dim() == 0
-    if alone and row.width == 1:
-        tensor = tensor.expand(shape)
+    tensor = one_for_all_rows(name, tensor, shape[0] if shape else 1)
     if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
         came = f"one number, {tensor.item():g}" if alone else list(tensor.shape)
         things = {"tet": "tetrahedra", "vertex": "vertices"}.get(row.rows, f"{row.rows}s")
@@ -148,8 +162,7 @@ def check_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
         raise TypeError(f"{owner}: {PIN_HARD} must be bool, whether each pin is hard, got {tensor.dtype}")
     tensor = tensor.to(own.device)
     shape = own.shape[-1:]
-    if tensor.dim() == 0 or (tensor.dim() == 2 and tensor.shape[-1] == 1):
-        tensor = tensor.expand(*tensor.shape[:-1], *shape)
+    tensor = one_for_all_rows(PIN_HARD, tensor, shape[0])
     if tensor.dim() > 2 or tensor.shape[-1:] != shape:
         raise ValueError(
             f"{owner}: {PIN_HARD} must be one bool, {list(shape)}, [B, 1] or [B, {shape[0]}], got "

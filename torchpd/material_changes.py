@@ -12,7 +12,17 @@ from torch.nn.utils.parametrize import is_parametrized
 
 from .checks import check_has_values
 from .diagonal import named_material
-from .material import ARRAYS, PARTS_OF_ROWS, check_array, check_batches, check_hard, dims_of, in_order, named_arrays
+from .material import (
+    ARRAYS,
+    PARTS_OF_ROWS,
+    check_array,
+    check_batches,
+    check_hard,
+    dims_of,
+    in_order,
+    named_arrays,
+    one_for_all_rows,
+)
 from .material_parts import COLUMNS, whole_arrays
 from .multilevel import has_levels, has_strangers
 from .parametrized import invert, make, parametrization
@@ -237,7 +247,7 @@ def load_material(
             if older and original in state_dict and is_parametrized(sim, "pin_stiffness"):
                 made = make(sim, "pin_stiffness", state_dict[original])
                 arrays |= {"pin_stiffness": made} if bool(made.isinf().any()) else {PIN_HARD: made.isinf()}
-            check_saved(owner, arrays)
+            check_saved(sim, owner, arrays)
             if assign:
                 check_kinds(sim, owner, arrays)
             elif PIN_HARD in arrays:
@@ -258,7 +268,7 @@ def load_material(
     read_pins(sim)
 
 
-def check_saved(owner: str, arrays: Mapping[str, Any]) -> None:
+def check_saved(sim: Model, owner: str, arrays: Mapping[str, Any]) -> None:
     """Refuse what `set_material` would stretch, and torch refuses after arrays before it are written."""
     for name, array in arrays.items():
         if not isinstance(array, Tensor):
@@ -266,6 +276,13 @@ def check_saved(owner: str, arrays: Mapping[str, Any]) -> None:
         dims = dims_of(name)
         if array.dim() < dims:
             raise ValueError(f"{owner}: {name} must have {dims} or {dims + 1} dimensions, got {list(array.shape)}")
+        own = getattr(sim, name).shape
+        if one_for_all_rows(name, array, own[-1] if dims else 1).shape != array.shape:
+            wanted = list(own[len(own) - dims :])
+            raise ValueError(
+                f"{owner}: {name} must be {wanted}, or with a batch in front, got {list(array.shape)}; set_material "
+                "takes one number for all"
+            )
 
 
 def check_originals(sim: Model, state_dict: Mapping[str, Any]) -> None:

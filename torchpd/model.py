@@ -314,10 +314,12 @@ class Model(nn.Module):
 
         Args:
             arrays: by name, see `Simulator`; one number is for all elements, vertices or pins of `stiffness`, `masses`
-                or `pin_stiffness`. It counts as it is: where tetrahedra are partly full (`mesh.fill`) multiply
-                `sim.stiffness` instead. Columns of contacts have names too, to be given in place of `planes` and
-                `spheres`: `friction` [C + S] of grounds, then spheres, `height` [C] and `radius` [S] in m, each also
-                one number, or [B, 1] for all of an environment. Shapes and values are checked here, once, and that
+                or `pin_stiffness`, and [B, 1] is one for each environment, of `damping` too. The last dimension always
+                counts elements: [n] is never one number for each of n environments. A number counts as it is: where
+                tetrahedra are partly full (`mesh.fill`) multiply `sim.stiffness` instead. Columns of contacts have
+                names too, to be given in place of `planes` and `spheres`: `friction` [C + S] of grounds, then spheres,
+                `height` [C] and `radius` [S] in m, each also one number, or [B, 1] for all of an environment. Shapes
+                and values are checked here, once, and that
                 batches agree with each other and with those of the arrays that stay. Pins that hold others, or much
                 harder, make the matrix of `Multilevel` anew, see `prepare_solver`. A body that hard pins clamped, and
                 no longer do in some environment, makes the plan anew, on a GPU as `to` does. Capture a captured step
