@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
@@ -67,6 +69,25 @@ def test_grip_and_twist(run) -> None:
     assert miss <= 2**-23  # float32 numbers of about 1: a hard grip reaches its targets within rounding
     (soft_miss,) = numbers(run("grip_and_twist.py", "--steps", "4", "--soft", "10"), r"by at most (\S+) m")
     assert soft_miss > 1e-3
+
+
+def test_train_distributed(tmp_path: Path) -> None:
+    """Two processes with gloo, as `torchrun` starts them, on the CPU."""
+
+    def torchrun(name: str, *words: str) -> str:
+        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+        environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+        program = [str(EXAMPLES / name), *words]
+        return subprocess.run(
+            [*command, *program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        ).stdout
+
+    text = torchrun("train_distributed.py", "--environments", "6", "--steps", "4", "--updates", "20")
+    first, last = (float(off) for off in re.findall(r"off by +(\S+) mm", text)[::2])
+    assert last < first
+    (_, own, weights), (_, others, same) = re.findall(r"rank (\d): mean damping (\S+) 1/s, weights (\S+)", text)
+    assert own != others  # material of a rank's own environments
+    assert weights == same  # one network
 
 
 def test_push_to_goal(run) -> None:

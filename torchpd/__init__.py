@@ -18,6 +18,7 @@ from .warn import TuningWarning
 
 if load_extension()[0] is not None:
     from .capture import CapturedStep
+    from .distributed import keep_material_per_rank
     from .forecast import UnsolvedWarning
     from .ops import nearest_rotation
     from .patch_body import PatchBody
@@ -88,6 +89,7 @@ __all__ = [
     "embed",
     "estimate_rho",
     "fit_patches",
+    "keep_material_per_rank",
     "nearest_rotation",
     "shapes",
     "tetrahedralize",
