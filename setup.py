@@ -87,6 +87,7 @@ from torch.utils import cpp_extension  # noqa: E402
 # The ninja that pip installed lies beside python, which is not on the PATH of an environment that is not activated.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 TOOLKIT = runpy.run_path(str(ROOT / "torchpd" / "toolkit.py"))
+LINKING = runpy.run_path(str(ROOT / "torchpd" / "linking.py"))
 
 
 def relative(pattern: str) -> list[str]:
@@ -111,7 +112,7 @@ def make_extension():
         include_dirs=[str(ROOT / "csrc")],
         define_macros=[("TORCHPD_CUDA", None)] if cuda else [],
         extra_compile_args={"cxx": cxx, "nvcc": [*TOOLKIT["NVCC_FLAGS"], *TOOLKIT["NVCC_PACKING"]]},
-        extra_link_args=threads,
+        extra_link_args=[*threads, *LINKING["shared_runtime"](compiler())],
     )
 
 
@@ -131,6 +132,17 @@ class BuildExtension(cpp_extension.BuildExtension):
         reason = TOOLKIT["find_toolkit"]().reason
         print(f"torchpd: building for the CPU{' only: ' + reason if reason else ' and CUDA'}", flush=True)
         super().build_extensions()
+        if sys.platform == "linux":
+            self.check_runtime()
+
+    def check_runtime(self) -> None:
+        """Remove and refuse an extension whose errors would crash."""
+        for extension in self.extensions:
+            built = Path(self.get_ext_fullpath(extension.name))
+            libraries = LINKING["libraries_in"](built)
+            if libraries is not None and (fault := LINKING["runtime_fault"](libraries, shlex.join(compiler()))):
+                built.unlink()
+                fail(fault)
 
 
 setup(ext_modules=[make_extension()], cmdclass={"build_ext": BuildExtension})

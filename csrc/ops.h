@@ -205,10 +205,11 @@ Tensor diagonal_typed(const Tensor& stiffness, at::TensorList plan, bool weighte
   call.field = Field::diagonal;
   call.weighted = weighted;
   check_tets(stiffness, call.plan.tets);
-  std::vector<std::int64_t> shape(stiffness.sizes().begin(), stiffness.sizes().end());
-  shape.back() = call.plan.vertices;
-  call.batch = shape.size() == 2 ? shape[0] : 1;
-  const Tensor w = stiffness.contiguous(), out = at::empty(shape, stiffness.options());
+  const bool batched = stiffness.dim() == 2;
+  call.batch = batched ? stiffness.size(0) : 1;
+  const Tensor w = stiffness.contiguous();
+  const Tensor out = batched ? at::empty({call.batch, call.plan.vertices}, stiffness.options())
+                             : at::empty({call.plan.vertices}, stiffness.options());
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
   call.out = out.mutable_data_ptr<T>();

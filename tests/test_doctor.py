@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -28,6 +29,7 @@ BUILD = {
 @pytest.fixture
 def built(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_load_build", lambda: (BUILD, ""))
+    monkeypatch.setattr(doctor, "_problem_of_errors", lambda: "")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 
@@ -89,6 +91,30 @@ def test_a_cuda_build_without_a_gpu_for_it_is_told(
         assert said in note
         assert "doctor" not in note
         assert f"Note: {note}\nNo problem found." in doctor.report()
+
+
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [
+        ("print('matrices must be [..., 3, 3], got Float [2] on cpu')", ""),
+        ("print('matrices must be [..., 3, 3], got Float [')", r"are cut short .*got Float \['\): .* C\+\+ runtime"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", r"by SIGSEGV .* -static-libstdc\+\+ .*make setup"),
+        ("import os; os.abort()", "by SIGABRT where they should raise"),
+        ("raise OSError('no library')", "does not raise ValueError: .*OSError: no library$"),
+        ("pass", "does not raise ValueError: nothing was raised$"),
+    ],
+)
+def test_errors_that_do_not_come_back_are_a_problem(program: str, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_WRONG_CALL", program)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(doctor, "_load_build", lambda: (BUILD, ""))
+    assert len(doctor.problems()) == bool(said)
+    for problem in doctor.problems():
+        assert re.search(said, problem)
+
+
+def test_errors_of_this_build_come_back() -> None:
+    assert doctor._problem_of_errors() == ""
 
 
 def test_devices_and_driver_are_shown(built: None, monkeypatch: pytest.MonkeyPatch) -> None:

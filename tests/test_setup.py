@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from torchpd.linking import libraries_in, library_names, runtime_fault, shared_runtime
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -57,3 +59,35 @@ def test_old_python(tmp_path: Path) -> None:
 def test_missing_compiler(compiler: str, tmp_path: Path) -> None:
     sentence = failure("build_ext", "--build-lib", str(tmp_path), CXX=compiler)
     assert f"`{compiler}` does not compile C++20; install g++" in sentence
+
+
+DYNAMIC_SECTION = """
+ 0x0000000000000001 (NEEDED)             Shared library: [libc10.so]
+ 0x0000000000000001 (NEEDED)             Shared library: [%s]
+ 0x000000000000001d (RUNPATH)            Library runpath: [libstdc++.so.6]
+"""
+
+
+def test_an_extension_without_the_shared_runtime_is_refused() -> None:
+    assert library_names(DYNAMIC_SECTION % "libstdc++.so.6") == ["libc10.so", "libstdc++.so.6"]
+    assert runtime_fault(["libc10.so", "libstdc++.so.6"], "c++") == ""
+    fault = runtime_fault(library_names(DYNAMIC_SECTION % "libc.so.6"), "c++ -static-libstdc++")
+    for said in ("`c++ -static-libstdc++` links libstdc++ statically", "needs libc10.so, libc.so.6", "LDFLAGS"):
+        assert said in fault
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="libraries of Linux")
+def test_the_shared_runtime_comes_before_a_static_one(tmp_path: Path) -> None:
+    """With a compiler that links libstdc++ statically where it can."""
+    source, wrapper = tmp_path / "thrower.cpp", tmp_path / "c++"
+    source.write_text('#include <stdexcept>\nvoid thrower() { throw std::runtime_error(""); }\n')
+    own = os.environ.get("CXX", "c++")
+    wrapper.write_text(f'#!/bin/sh\nexec {own} -static-libstdc++ -static-libgcc "$@"\n')
+    wrapper.chmod(0o755)
+    for named in (False, True):
+        built = tmp_path / f"{named}.so"
+        runtime = shared_runtime([str(wrapper)]) if named else []
+        subprocess.run([wrapper, "-shared", "-fPIC", source, *runtime, "-o", built], check=True)
+        libraries = libraries_in(built)
+        assert libraries is not None
+        assert (runtime_fault(libraries, "c++") == "") == named

@@ -9,9 +9,11 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -53,6 +55,15 @@ OPTIONAL = (
     Package("pxr", "usd-core", "USD files"),
     Package("pytetwild", "pytetwild", 'tetrahedralize(method="tetwild")'),
 )
+# a wrong argument of an op, which has to raise ValueError and say what came
+_WRONG_CALL = """
+import torch, torchpd
+try:
+    torch.ops.torchpd.nearest_rotation(torch.zeros(2))
+except ValueError as error:
+    print(error)
+"""
+_END_OF_ERROR = "[2] on cpu"
 
 
 def _load_build() -> tuple[Mapping[str, Any] | None, str]:
@@ -114,6 +125,32 @@ def _cuda_state(build: Mapping[str, Any] | None, toolkit: Toolkit) -> str:
     return f"not built: {toolkit.reason}"
 
 
+def _call_wrongly() -> subprocess.CompletedProcess[str]:
+    """What a process does in which an op gets a wrong argument."""
+    paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    command = [sys.executable, "-c", _WRONG_CALL]
+    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+
+
+def _problem_of_errors() -> str:
+    """Why an error of an op does not come back as an exception of Python; empty when it does."""
+    run = _call_wrongly()
+    said = run.stdout.strip()
+    if run.returncode == 0 and said.endswith(_END_OF_ERROR):
+        return ""
+    if run.returncode > 0 or (run.returncode == 0 and not said):
+        last = " ".join(run.stderr.split())[-300:] or "nothing was raised"
+        return f"an op that gets a wrong argument does not raise ValueError: {last}"
+    names = {int(one): one.name for one in signal.Signals}
+    crash = f"end the process by {names.get(-run.returncode, -run.returncode)} where they should raise an exception"
+    return (
+        f"errors of ops {crash if run.returncode else f'are cut short ({said!r})'}: the extension has a C++ runtime of "
+        "its own, beside torch's. Take -static-libstdc++ out of CXX, CXXFLAGS and LDFLAGS, or name another compiler in "
+        f"CXX, and build it again with {BUILD_COMMAND}"
+    )
+
+
 def problems() -> list[str]:
     """What keeps torchpd from working, each with its remedy; empty when all is well."""
     found = [f"{package.pip_name} is missing: pip install {package.pip_name}" for package in missing_packages(REQUIRED)]
@@ -122,6 +159,8 @@ def problems() -> list[str]:
         found.append(f"the extension torchpd._C cannot be loaded ({reason}): build it with {BUILD_COMMAND}")
     elif torch.cuda.is_available() and not build["cuda"]:
         found.append(f"a GPU is there, but CUDA is {_cuda_state(build, find_toolkit())}")
+    if build is not None and (problem := _problem_of_errors()):
+        found.append(problem)
     return found
 
 
