@@ -7,6 +7,7 @@
 #endif
 #define PD_TARGET freeform_cpu
 #include "freeform_ops.h"
+#include "cpu/team.h"
 
 #include <ATen/Parallel.h>
 
@@ -14,11 +15,12 @@ namespace pd::freeform {
 namespace {
 
 struct Cpu {
-  // Items of one task differ in cost: small grains keep all threads busy.
+  // A thread takes 64 items or more.
   template <class Task>
   static void run(const Task& task, std::int64_t count, const Tensor&) {
-    at::parallel_for(0, count, 64, [&](std::int64_t begin, std::int64_t end) {
-      for (std::int64_t i = begin; i < end; ++i) item(task, i);
+    const auto useful = std::min<std::int64_t>(at::get_num_threads(), (count + 63) / 64);
+    run_team(int(useful), [&](const Team& team) {
+      for (std::int64_t i = team.begin(count); i < team.end(count); ++i) item(task, i);
     });
   }
 };

@@ -1,5 +1,6 @@
 // `torchpd._C`: mesh work on NumPy arrays, the tables, what was built. Loading it also registers the ops.
 #include "cpu/dispatch.h"
+#include "cpu/team.h"
 #include "cuda/launch.h"
 #include "plan/build.h"
 #include "plan/device_build.h"
@@ -15,6 +16,7 @@
 
 #include <algorithm>
 #include <map>
+#include <optional>
 #include <span>
 #include <stdexcept>
 #include <vector>
@@ -245,6 +247,19 @@ std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes, int sc
   return bytes_of(step);
 }
 
+unsigned long main_thread = 0;
+
+// What Python does between two of its own instructions: handlers of signals run, that of Ctrl-C raises KeyboardInterrupt.
+// Only the main thread has any.
+void run_signal_handlers() {
+  if (PyThread_get_thread_ident() != main_thread) return;
+  const PyGILState_STATE held = PyGILState_Ensure();
+  std::optional<py::error_already_set> raised;
+  if (PyErr_CheckSignals() != 0) raised.emplace();
+  PyGILState_Release(held);
+  if (raised) throw *raised;
+}
+
 // float32 multiply-adds per second that one thread of this processor does
 double multiply_adds_per_second() {
   float seconds = 0;
@@ -259,6 +274,9 @@ PYBIND11_MODULE(_C, m) {
   m.doc() =
       "Mesh work, tables and build information of torchpd; loading it registers the ops "
       "torchpd::*.";
+  main_thread =
+      py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
+  pd::Watch::set_question(&run_signal_handlers);
   m.def("build_plan", &build_plan, py::arg("positions"), py::arg("tets"), py::arg("patch_size"),
         py::arg("progress"));
   m.def("build_device_plan", &build_device_plan, py::arg("positions"), py::arg("tets"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["PerStep", "Rollout", "roll"]
 
 PerStep = Callable[[int], Any]
-_MOVES_OF_BAR = 50
+_SECONDS_OF_PIECE = 0.1
 _SPHERES = list(MATERIAL_ROWS).index("spheres")
 
 
@@ -98,16 +99,28 @@ def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
 
 
 def _in_pieces(sim: Simulator, call: Rollout, bar: tqdm[NoReturn]) -> Track:
-    """So that the bar moves."""
-    size = max(call.every, call.steps // _MOVES_OF_BAR // call.every * call.every)
+    """In pieces of a tenth of a second or so: the bar moves, and on a GPU, too, Ctrl-C ends it between them."""
     material = _constant_material(sim, call)
-    tracks = []
-    for first in range(0, max(call.steps, 1), size):
-        part = replace(call, steps=min(size, call.steps - first))
-        tracks.append(_piece(sim, part, material))
-        call = replace(call, state=tracks[-1].state()) if part.records else call
-        material = _moved_on(material, part.steps)
-        bar.update(part.steps)
+    tracks = [_piece(sim, replace(call, steps=0, report=False), material)]
+    state, done, size = call.state, 0, 1
+    while done < call.steps:
+        whole, left = size // call.every * call.every, call.every - done % call.every
+        steps = min(whole if whole and left == call.every else min(size, left), call.steps - done)
+        recorded = (done + steps) // call.every > done // call.every
+        every = call.every if recorded and steps >= call.every else steps
+        part = replace(call, state=state, steps=steps, every=every, report=call.report and recorded)
+        begin = time.perf_counter()
+        track = _piece(sim, part, material)
+        if sim.device.type == "cuda":
+            torch.cuda.current_stream(sim.device).synchronize()
+        if time.perf_counter() - begin < _SECONDS_OF_PIECE:
+            size *= 2
+        if recorded:
+            tracks.append(track)
+        done += steps
+        if done < call.steps:
+            state, material = track.state(), _moved_on(material, steps)
+        bar.update(steps)
     info = Info(*(torch.cat(column) for column in zip(*(track.info for track in tracks), strict=True)))
     return Track(torch.cat([t.positions for t in tracks]), torch.cat([t.velocities for t in tracks]), info)
 

@@ -83,7 +83,8 @@ class ConjugatePass {
     load(numbers.begins);
     numbers.scale_by(1 / double(unit_));
     if (numbers.begins) begin(numbers);
-    for (int k = 0; k < call_.iterations && numbers.active; ++k) iterate(numbers);
+    for (int k = 0; k < call_.iterations && numbers.active && !team_.ended(plan_.vertices); ++k)
+      iterate(numbers);
     store();
     numbers.scale_by(double(unit_));
     if (team_.rank == 0) numbers.write(call_.progress + environment * progress_count);

@@ -51,13 +51,14 @@ void step_batches(const StepCall<T>& call, int threads) {
   constexpr int W = Lanes::environments;
   const std::int64_t groups = (call.batch + W - 1) / W;
   std::atomic<std::int64_t> next{0};
-  run_team(int(std::min<std::int64_t>(threads, groups)), [&](const Team&) {
+  run_team(int(std::min<std::int64_t>(threads, groups)), [&](const Team& team) {
     const CleanRegisters clean;
     Workspace<Lanes> work(call);
     Scratch<Lanes> scratch(call.plan.most_slots);
     Runner<Lanes, Touching, T> runner(call, 1);
-    const Team alone;
-    for (std::int64_t g = next++; g < groups; g = next++) runner.roll(work, scratch, alone, g * W);
+    const Team alone = team.alone();
+    for (std::int64_t g = next++; g < groups && !alone.ended(0); g = next++)
+      runner.roll(work, scratch, alone, g * W);
   });
 }
 
@@ -80,7 +81,7 @@ void step_singles(const StepCall<T>& call, int threads) {
   Runner<Lanes, Touching, T> runner(call, threads);
   run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
     const CleanRegisters clean;
-    for (std::int64_t e = 0; e < call.batch; ++e) {
+    for (std::int64_t e = 0; e < call.batch && !team.ended(0); ++e) {
       runner.roll(work, scratches[team.rank], team, e);
       team.barrier();
     }
@@ -122,11 +123,11 @@ void conjugate_any(const ConjugateCall<T>& call, int threads) {
   using Lanes = Single<T>;
   if (call.batch > 1 && call.plan.patches < 2 * threads) {
     std::atomic<std::int64_t> next{0};
-    run_team(int(std::min<std::int64_t>(threads, call.batch)), [&](const Team&) {
+    run_team(int(std::min<std::int64_t>(threads, call.batch)), [&](const Team& team) {
       const CleanRegisters clean;
       ConjugateMemory<T> work(call);
       Scratch<Lanes> scratch(call.plan.most_slots);
-      const Team alone;
+      const Team alone = team.alone();
       ConjugatePass<T> pass(call, work, scratch, alone);
       for (std::int64_t e = next++; e < call.batch; e = next++) pass.run(e);
     });

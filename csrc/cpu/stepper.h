@@ -40,6 +40,7 @@ class Stepper {
     weigh();
     for (int t = 0; t < set_.steps; ++t) {
       step(*this, set_);
+      if (is_ended()) return;
       if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
       move_balls();
     }
@@ -129,11 +130,15 @@ class Stepper {
   }
 
   bool finished() const {
+    if (is_ended()) return true;
     for (bool done : done_) {
       if (!done) return false;
     }
     return true;
   }
+
+  // Whether the call is to end now; then nothing of this step counts.
+  bool is_ended() const { return team_.ended(std::int64_t(plan_.vertices) * width); }
 
   // The gradient on the straight course x + h v is what residuals are relative to, whatever the first iterate.
   void measure_course() {

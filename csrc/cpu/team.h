@@ -1,50 +1,146 @@
-// A few threads that work on one thing together. The kernels see only this, not OpenMP.
+// A few threads that work on one thing together.
 #pragma once
 
 #include <atomic>
+#include <chrono>
 #include <cstdint>
+#include <exception>
 
 namespace pd {
 
-// Spins for some microseconds, then sleeps: on a busy machine a thread that keeps spinning would keep the one that it waits
-// for from running.
-class Barrier {
- public:
-  void wait(int size) {
-    const std::uint32_t phase = phase_.load(std::memory_order_acquire);
-    if (arrived_.fetch_add(1, std::memory_order_acq_rel) + 1 == size) {
-      arrived_.store(0, std::memory_order_relaxed);
-      phase_.fetch_add(1, std::memory_order_acq_rel);
-      phase_.notify_all();
-      return;
-    }
-    for (int spin = 0; spin < 4000; ++spin) {
-      if (phase_.load(std::memory_order_acquire) != phase) return;
-      pause();
-    }
-    while (phase_.load(std::memory_order_acquire) == phase)
-      phase_.wait(phase, std::memory_order_acquire);
-  }
-
- private:
-  static void pause() {
+// Whether done() becomes true while this thread looks so many times.
+template <class Done>
+bool comes_soon(int looks, Done done) {
+  for (int look = 0; look < looks; ++look) {
+    if (done()) return true;
 #if defined(__x86_64__)
     __builtin_ia32_pause();
 #elif defined(__aarch64__)
     __asm__ volatile("yield");
 #endif
   }
+  return false;
+}
 
-  std::atomic<int> arrived_{0};
-  std::atomic<std::uint32_t> phase_{0};
+// Waits until done(): a few microseconds awake, since most waits are as short, then by sleep(). On a busy machine a thread
+// that stayed awake would keep the one that it waits for from running.
+template <class Done, class Sleep>
+void await(Done done, Sleep sleep) {
+  if (comes_soon(500, done)) return;
+  while (!done()) sleep();
+}
+
+// How long a team is waited for before its caller goes on alone: far longer than an idle core takes to wake up, and shorter
+// than other processes keep one.
+constexpr std::chrono::milliseconds team_patience{1};
+
+// Whether a call is to end before its work is done, as Ctrl-C asks for. The calling thread asks, now and then.
+class Watch {
+ public:
+  // Throws what a call is to end with, or returns. None: no call ends early.
+  using Question = void (*)();
+  static void set_question(Question question);
+
+  // To be called by the calling thread after so much work [vertices]: short calls never read the clock.
+  void worked(std::int64_t amount) {
+    amount_ += amount;
+    if (amount_ < amount_between_looks) return;
+    amount_ = 0;
+    look();
+  }
+  // Asks, if that was not done for a while.
+  void look();
+  bool ended() const { return ended_.load(std::memory_order_relaxed); }
+  // Throws what the question threw.
+  void conclude() const {
+    if (failure_) std::rethrow_exception(failure_);
+  }
+
+ private:
+  static constexpr std::int64_t amount_between_looks = 1 << 16;  // some milliseconds
+
+  std::int64_t amount_ = 0;
+  std::chrono::steady_clock::time_point next_{};
+  std::exception_ptr failure_;
+  std::atomic<bool> ended_{false};
 };
 
+// Where the members of a team meet.
+class Barrier {
+ public:
+  using Clock = std::chrono::steady_clock;
+
+  explicit Barrier(Watch& watch) : watch_(watch) {}
+  void begin(Clock::time_point now) { begun_ = now; }
+
+  void wait(int size, bool calls) {
+    const std::uint32_t phase = phase_.load(std::memory_order_acquire);
+    if (arrived_.fetch_add(1, std::memory_order_acq_rel) + 1 == size) {
+      arrived_.store(0, std::memory_order_relaxed);
+      ended_ = watch_.ended();
+      splits_ = slow();
+      phase_.fetch_add(1, std::memory_order_acq_rel);
+      phase_.notify_all();
+      return;
+    }
+    const auto all_are_here = [&] { return phase_.load(std::memory_order_acquire) != phase; };
+    // most waits are too short to be timed
+    if (comes_soon(50, all_are_here)) return;
+    const auto before = calls ? Clock::now() : Clock::time_point{};
+    await(all_are_here, [&] { phase_.wait(phase, std::memory_order_acquire); });
+    if (calls) count(before, size);
+  }
+  // What the watch said when the last member came: the same for all of them until they meet again.
+  bool ended() const { return ended_; }
+  // Whether it was `slow` then.
+  bool splits() const { return splits_; }
+  // Whether the calling thread would have got further alone: it has waited longer than the others' shares take.
+  bool slow() const { return slow_.load(std::memory_order_relaxed); }
+
+ private:
+  void count(Clock::time_point before, int size) {
+    watch_.look();
+    const auto now = Clock::now();
+    waited_ += now - before;
+    const auto others_share = (size - 1) * (now - begun_ - waited_);
+    if (waited_ > others_share + team_patience) slow_.store(true, std::memory_order_relaxed);
+  }
+
+  Watch& watch_;
+  std::atomic<int> arrived_{0};
+  std::atomic<std::uint32_t> phase_{0};
+  bool ended_ = false, splits_ = false;
+  std::atomic<bool> slow_{false};
+  Clock::time_point begun_{};
+  Clock::duration waited_{0};
+};
+
+// Thrown in the members that a team goes on without.
+struct Dismissed {};
+
 struct Team {
-  int rank = 0, size = 1;
-  Barrier* shared = nullptr;  // null for a team of one
+  int rank = 0;
+  mutable int size = 1;               // may become 1 in `ended`
+  mutable Barrier* shared = nullptr;  // null for a team of one
+  Watch* watch = nullptr;
+  bool calls = false;  // whether this is the thread that called
 
   void barrier() const {
-    if (shared) shared->wait(size);
+    if (shared) shared->wait(size, calls);
+  }
+  // This member as a team of its own.
+  Team alone() const { return {0, 1, nullptr, watch, calls}; }
+  // Whether to stop, after so much work [vertices]. Between two barriers all members get the same answer. Here, where nothing
+  // is half done, the calling thread goes on alone if other processes keep the others from their cores; shares change then,
+  // but no number, as none depends on the size of a team.
+  bool ended(std::int64_t work) const {
+    if (calls) watch->worked(work);
+    if (shared && shared->splits()) {
+      if (!calls) throw Dismissed{};
+      size = 1;
+      shared = nullptr;
+    }
+    return shared ? shared->ended() : watch->ended();
   }
   // first item of this member's share of `count`, and of the next member's
   std::int64_t begin(std::int64_t count) const { return count * rank / size; }
@@ -54,7 +150,8 @@ struct Team {
 // How many threads this process may use at most.
 int most_threads();
 
-// Calls work(context, team) in every thread of a new team of at most `threads`; alone inside another parallel region.
+// Calls work(context, team) in every thread of a team of at most `threads`, the calling one and those that come at once; alone
+// inside another team. Throws what a member threw, or what the watch's question did.
 void run_team(int threads, void (*work)(void* context, const Team& team), void* context);
 
 template <class Work>
