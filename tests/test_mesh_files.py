@@ -243,3 +243,13 @@ def test_bad_regions_are_refused() -> None:
         TetMesh(CORNERS, TET, regions=[1, 2])
     with pytest.raises(TypeError, match=r"TetMesh\.regions must hold integers, got float64"):
         TetMesh(CORNERS, TET, regions=[1.5])
+
+
+def test_reading_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A .msh is tried as a file of another program first, whose reader says nothing, and a line break after it."""
+    path = tmp_path / "box.msh"
+    box = shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
+    meshio.write(path, meshio.Mesh(box.vertices, [("tetra", box.tets)]), file_format="gmsh")
+    capfd.readouterr()
+    TetMesh.from_file(path)
+    assert capfd.readouterr() == ("", "")
