@@ -69,7 +69,6 @@ def calls_of(sim: pd.Simulator, state: pd.State) -> dict[str, Calls]:
         "functions": lambda: sim.rollout(
             state, 2, forces=lambda step: step * forces, targets=lambda step: {pin: held, ball: centres + 0.01 * step}
         ),
-        "a bar": lambda: sim.rollout(state, 2, targets=goals, progress=True),
         "a history for gradients": lambda: sim.rollout(pd.State(leaf, state.velocities), 2),
     }
     others: Calls = {
@@ -80,7 +79,9 @@ def calls_of(sim: pd.Simulator, state: pd.State) -> dict[str, Calls]:
         "reactions": lambda: sim.reactions(state, state.positions, forces, goals),
         "stress": lambda: sim.vertex_average(sim.stress(state).cauchy),
     }
-    return {"steps": steps, "rollouts": rollouts, "others": others}
+    # shows what is done, not what is asked for
+    bars: Calls = {"a bar": lambda: sim.rollout(state, 2, targets=goals, progress=True)}
+    return {"steps": steps, "rollouts": rollouts, "others": others, "bars": bars}
 
 
 def call_all(calls: Calls, results: dict[str, Any]) -> None:
@@ -92,7 +93,7 @@ def call_all(calls: Calls, results: dict[str, Any]) -> None:
 @pytest.mark.parametrize("precision", DTYPES)
 @pytest.mark.parametrize("everything", [False, True], ids=["plain", "everything"])
 @pytest.mark.parametrize("runner", [*KERNELS, *OUTER])
-def test_nobody_waits_for_the_device(runner: str, everything: bool, precision: str) -> None:
+def test_a_bar_alone_waits_for_the_device(runner: str, everything: bool, precision: str) -> None:
     sim, state = simulator_of(runner, DTYPES[precision])
     if everything:
         give_everything(sim)
@@ -100,7 +101,7 @@ def test_nobody_waits_for_the_device(runner: str, everything: bool, precision: s
         results: dict[str, Any] = {}
         for _ in range(2):
             call_all(calls, results)  # modules are loaded and memory is allocated by the first ones
-        assert not host_waits(partial(call_all, calls, results)), name
+        assert host_waits(partial(call_all, calls, results)) == (name == "bars"), name
 
 
 def test_a_wait_is_noticed() -> None:

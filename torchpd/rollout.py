@@ -112,7 +112,7 @@ def _in_pieces(sim: Simulator, call: Rollout, bar: tqdm[NoReturn]) -> Track:
         begin = time.perf_counter()
         track = _piece(sim, part, material)
         if sim.device.type == "cuda":
-            torch.cuda.current_stream(sim.device).synchronize()
+            _finish(sim.device)
         if time.perf_counter() - begin < _SECONDS_OF_PIECE:
             size *= 2
         if recorded:
@@ -123,6 +123,14 @@ def _in_pieces(sim: Simulator, call: Rollout, bar: tqdm[NoReturn]) -> Track:
         bar.update(steps)
     info = Info(*(torch.cat(column) for column in zip(*(track.info for track in tracks), strict=True)))
     return Track(torch.cat([t.positions for t in tracks]), torch.cat([t.velocities for t in tracks]), info)
+
+
+def _finish(device: torch.device) -> None:
+    """Wait for a GPU, but hear signals."""
+    reached = torch.cuda.Event()
+    reached.record(torch.cuda.current_stream(device))
+    while not reached.query():
+        time.sleep(1e-4)
 
 
 def _one_by_one(sim: Simulator, call: Rollout, bar: tqdm[NoReturn] | None) -> Track:
