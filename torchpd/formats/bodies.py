@@ -65,7 +65,7 @@ def read_body(owner: str, path: PathLike) -> Body:
         outside = int((~within).sum())
         notes.append(f"{outside} of {len(within)} triangles have corners that belong to no tet, and were left out")
     # What cells of other kinds use has been said of these; the others are strays, of which the mesh speaks.
-    kept = used | ~_in_cells(content, len(used))
+    kept = _kept(content, used, notes)
     number = np.cumsum(kept) - 1
     return Body(
         solid.points[kept], number[solid.elements], solid.regions, number[flat.elements[within]].reshape(-1, 3), notes
@@ -81,23 +81,26 @@ def read_surface(owner: str, path: PathLike) -> Surface:
     used = np.zeros(len(content.points), dtype=bool)
     used[flat.elements] = True
     # The vertices inside of a volume are no part of the surface: that they are left out is nothing to report.
-    kept = used | ~_in_cells(content, len(used))
+    notes = [*content.notes, *flat.notes]
+    kept = _kept(content, used, notes)
     number = np.cumsum(kept) - 1
-    uvs, notes = None if content.uvs is None else content.uvs[kept], [*content.notes, *flat.notes]
+    uvs = None if content.uvs is None else content.uvs[kept]
     if uvs is not None and not np.isfinite(uvs).all():
         notes.append(f"texture coordinates left out: {int((~np.isfinite(uvs)).any(axis=1).sum())} are not finite")
         uvs = None
     return Surface(content.points[kept], number[flat.elements], uvs, notes)
 
 
-def _in_cells(content: MeshContent, count: int) -> NDArray[np.bool_]:
-    """Which points a cell of the file uses, as a corner or beyond."""
-    there = np.zeros(count, dtype=bool)
-    for block in content.cells:
-        there[block.corners] = True
-        if block.beyond is not None:
-            there[block.beyond] = True
-    return there
+def _kept(content: MeshContent, used: NDArray[np.bool_], notes: list[str]) -> NDArray[np.bool_]:
+    """Which points remain: those that are used, and strays, which no cell of the file uses, where they are finite."""
+    strays = np.zeros(len(used), dtype=bool)
+    strays[: len(content.points)] = ~content.in_cells()
+    finite = np.isfinite(content.points).all(axis=1)
+    lost = int((~finite).sum())
+    if lost:
+        notes.append(f"{lost} vertices that no cell uses are not finite and were left out")
+        strays[: len(finite)] &= finite
+    return used | strays
 
 
 def _kinds(content: MeshContent) -> str:

@@ -68,5 +68,14 @@ class MeshContent:
     uvs: Array | None = None
     notes: list[str] = field(default_factory=list)
 
+    def in_cells(self) -> NDArray[np.bool_]:
+        """Which points a cell uses [N], as a corner or beyond."""
+        used = np.zeros(len(self.points), dtype=bool)
+        for block in self.cells:
+            used[block.corners] = True
+            if block.beyond is not None:
+                used[block.beyond] = True
+        return used
+
 
 Reader = Callable[[Path], MeshContent]

@@ -84,10 +84,7 @@ def naming(owner: str, path: PathLike) -> Iterator[None]:
 
 
 def _check(content: MeshContent) -> None:
-    """Points must be finite, and every cell have its corners, which are points of the file."""
-    bad = np.flatnonzero(~np.isfinite(content.points).all(axis=1))
-    if len(bad):
-        raise ValueError(f"point {bad[0]} (counted from 0) must be finite, got {content.points[bad[0]].tolist()}")
+    """Every cell must have its corners, which are points of the file, and these be finite."""
     for block in content.cells:
         corners = CELLS.get(block.kind, (0, 0))[0]
         if corners and block.corners.shape[1:] != (corners,):
@@ -98,6 +95,9 @@ def _check(content: MeshContent) -> None:
             raise ValueError(
                 f"a {block.kind} names point {number} (counted from 0), but the file holds {len(content.points)} points"
             )
+    bad = np.flatnonzero(~np.isfinite(content.points).all(axis=1) & content.in_cells())
+    if len(bad):
+        raise ValueError(f"point {bad[0]} (counted from 0) must be finite, got {content.points[bad[0]].tolist()}")
 
 
 def _words(error: BaseException, said: str, kind: Format) -> str:

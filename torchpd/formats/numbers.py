@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .content import Array, Index
 
-__all__ = ["Binary", "Numbers", "Text", "check_room", "lines_of", "parse", "text_of", "words"]
+__all__ = ["Binary", "Numbers", "Text", "check_room", "check_rows", "lines_of", "parse", "text_of", "words"]
 
 _CHUNK = 1 << 20
 _SPACE = b" \t\n\r\x0b\x0c"
@@ -21,6 +21,12 @@ def check_room(count: int, least: int, room: int, what: str) -> None:
     """Refuse a declared count whose rows, of at least so many bytes each, do not fit into what is left of a file."""
     if count < 0 or count * least > room:
         raise ValueError(f"it declares {count} {what}, but the {room} bytes that are left have no room for them")
+
+
+def check_rows(lines: list[str], count: int, what: str) -> None:
+    """Refuse more or fewer lines, of a row each, than a file declares."""
+    if len(lines) != count:
+        raise ValueError(f"it declares {count} {what}, a line each, but {len(lines)} lines come")
 
 
 def text_of(path: Path) -> str:
@@ -74,6 +80,7 @@ class Numbers(Protocol):
     def ints(self, count: int, what: str) -> Index: ...
     def sizes(self, count: int, what: str) -> Index: ...
     def floats(self, count: int, what: str) -> Array: ...
+    def left(self) -> int: ...
 
 
 class Text:
@@ -119,6 +126,10 @@ class Text:
             self.at = min(end, len(self.data))
         return self.data[begin : self.at]
 
+    def left(self) -> int:
+        """How many words are left."""
+        return len(self.data[self.at :].split())
+
     def ints(self, count: int, what: str) -> Index:
         return np.asarray(parse(self.words(count, what), np.int64, what))
 
@@ -144,6 +155,10 @@ class Binary:
         values = np.frombuffer(self.data, kind, count, self.at)
         self.at += count * kind.itemsize
         return values
+
+    def left(self) -> int:
+        """How many bytes are left."""
+        return len(self.data) - self.at
 
     def ints(self, count: int, what: str) -> Index:
         return self.take(self.integer, count, what).astype(np.int64)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..content import Array, Cells, MeshContent
 from .collada_mesh import Mesh, read_mesh
-from .faces import check_points, check_tree, left_out
+from .faces import check_tree, left_out
 
 __all__ = ["read_collada"]
 
@@ -162,7 +162,6 @@ class _Reading:
         self.others["geometries in no node of the scene"] = sum(g.get("id") not in self.used for g in geometries)
         notes = left_out(+self.others)
         points = np.concatenate([np.empty((0, 3)), *self.points]) @ self._axes(notes).T
-        check_points(points)
         uvs = None
         if self.uvs and all(part is not None for part in self.uvs):
             uvs = np.concatenate([part for part in self.uvs if part is not None])

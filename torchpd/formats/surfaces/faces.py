@@ -14,7 +14,6 @@ __all__ = [
     "MOST_INSTANCES",
     "check_corners",
     "check_instances",
-    "check_points",
     "check_tree",
     "face_blocks",
     "fan_triangles",
@@ -52,16 +51,6 @@ def left_out(others: Mapping[str, int]) -> list[str]:
 
 
 MOST_INSTANCES = 100_000  # of nodes or components of a scene
-
-
-def check_points(points: Array) -> None:
-    """Refuse coordinates that are not finite."""
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if bad.size:
-        raise ValueError(
-            f"coordinates must be finite, got {points[bad[0]].tolist()} at vertex {int(bad[0])} (counted from 0; "
-            f"{bad.size} in all)"
-        )
 
 
 def check_corners(corners: Index, count: int, nouns: str = "vertices", first: int = 0) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..content import Array, Cells, Index, MeshContent
-from .faces import check_corners, check_points, fan_triangles, join, left_out, strip_triangles
+from .faces import check_corners, fan_triangles, join, left_out, strip_triangles
 from .gltf_buffers import Document
 
 __all__ = ["read_gltf"]
@@ -184,7 +184,6 @@ class _Reading:
 
     def content(self) -> MeshContent:
         points = np.concatenate(self.points) if self.points else np.empty((0, 3))
-        check_points(points)
         triangles = join([part.reshape(-1) for part in self.triangles]).reshape(-1, 3)
         self.others["meshes in no node of the scene"] = len(self.document.items("meshes")) - len(self.used)
         self.others["animations"] = len(self.document.items("animations"))

@@ -10,7 +10,7 @@ import codecs
 from array import array
 from collections import Counter
 from collections.abc import Iterator
-from math import isfinite, nan
+from math import nan
 from pathlib import Path
 
 import numpy as np
@@ -46,9 +46,7 @@ def _lines(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
             data = data.decode(encoding, errors="replace").encode()
     held: list[bytes] = []
     for number, line in enumerate(data.removeprefix(codecs.BOM_UTF8).splitlines(), start=1):
-        words = line.split()
-        if words and words[0].startswith(b"#") and not held:
-            continue
+        words = line.split(b"#")[0].split()
         if words and words[-1].endswith(b"\\"):
             held += [word for word in (*words[:-1], words[-1][:-1]) if word]
         elif words or held:
@@ -121,10 +119,7 @@ class _Reading:
 def _numbers(words: list[bytes], count: int) -> list[float]:
     if len(words) <= count:
         raise ValueError(f"{words[0].decode()} needs {count} numbers, got {len(words) - 1}")
-    values = [float(word) for word in words[1 : count + 1]]
-    if not all(map(isfinite, values)):
-        raise ValueError(f"{words[0].decode()} must be finite, got {values}")
-    return values
+    return [float(word) for word in words[1 : count + 1]]
 
 
 def _texture(words: list[bytes]) -> list[float]:

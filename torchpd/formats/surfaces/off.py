@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..content import Array, Index, MeshContent
-from .faces import check_corners, check_points, face_blocks
+from .faces import check_corners, face_blocks
 
 __all__ = ["read_off"]
 
@@ -31,7 +31,6 @@ def read_off(path: Path) -> MeshContent:
         )
     table = _table(lines[1 : vertices + 1], with_uvs)
     points, uvs = table[:, :3], table[:, 3:] if with_uvs else None
-    check_points(points)
     corners, sizes = _polygons(lines[vertices + 1 :])
     check_corners(corners, vertices)
     notes: list[str] = []
@@ -43,9 +42,11 @@ def _head(lines: list[_Line]) -> tuple[bool, list[_Line]]:
     if not lines:
         raise ValueError("it is empty; an OFF file begins with 'OFF'")
     number, (word, *rest) = lines[0]
-    match = re.fullmatch(rb"(ST)?C?N?(4?n?)OFF", word, flags=re.IGNORECASE)
+    match = re.fullmatch(rb"(ST)?C?N?(4?n?)OFF(\d*)", word, flags=re.IGNORECASE)
     if not match:
         raise ValueError(f"line {number}: the word 'OFF' must come first, got {word[:20].decode('ascii', 'replace')!r}")
+    if match.group(3):  # ModelNet's files leave out the blank
+        rest.insert(0, match.group(3))
     if match.group(2) or b"BINARY" in rest:
         raise ValueError("only OFF files of text, with three coordinates a vertex, are read; write it as plain OFF")
     return match.group(1) is not None, [(number, rest), *lines[1:]] if rest else lines[1:]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from array import array
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..content import Array, Cells, Index, MeshContent
-from .faces import check_corners, check_points, face_blocks, join, left_out, one_uv_each, strip_triangles
+from .faces import check_corners, face_blocks, join, left_out, one_uv_each, strip_triangles
 
 __all__ = ["read_ply"]
 
@@ -57,12 +58,12 @@ def read_ply(path: Path) -> MeshContent:
 
 def _head(data: bytes) -> tuple[str, list[_Element], bytes]:
     """Byte order ("" of a text), the elements that the head declares, and what follows the head."""
-    begin = data.find(b"end_header")
-    if not data.startswith(b"ply") or begin < 0:
+    last = re.search(rb"(?<=[\r\n])end_header", data)
+    if not data.startswith(b"ply") or last is None:
         raise ValueError("a PLY begins with 'ply' and has a line 'end_header'; the file is empty, cut off or no PLY")
     end = b"\r\n" if data.startswith(b"ply\r\n") else data[3:4]
     order, elements = None, list[_Element]()
-    for number, line in enumerate(data[:begin].decode("latin-1").splitlines()[1:], start=2):
+    for number, line in enumerate(data[: last.start()].decode("latin-1").splitlines()[1:], start=2):
         words = line.split()
         try:
             if not words or words[0] in ("comment", "obj_info"):
@@ -87,7 +88,7 @@ def _head(data: bytes) -> tuple[str, list[_Element], bytes]:
         names = [p.name for p in element.properties]
         if len(set(names)) < len(names) or not names or any(p.counter[:1] == "f" for p in element.properties):
             raise ValueError(f"the properties of its element {element.name!r} must be different ones: {names}")
-    return order, elements, data[begin + len("end_header") :].removeprefix(end)
+    return order, elements, data[last.end() :].removeprefix(end)
 
 
 def _read_text(body: bytes, elements: list[_Element]) -> str:
@@ -113,7 +114,7 @@ def _read_binary(body: bytes, elements: list[_Element], order: str, unit: str = 
                 f"{left // width:,} {unit} are left for them"
             )
         place = _fill_alike(element, body, place, order) or _fill_each(element, body, place, order)
-    return f"{(len(body) - place) // width:,} {unit}" if place < len(body) else ""
+    return f"{(len(body) - place) // width:,} {unit}" if body[place:].strip() else ""
 
 
 def _fill_alike(element: _Element, body: bytes, place: int, order: str) -> int:
@@ -188,7 +189,6 @@ def _content(elements: list[_Element]) -> MeshContent:
     if vertex.find(("x",)) is None or vertex.find(("y",)) is None or vertex.find(("z",)) is None:
         raise ValueError(f"its vertices must have x, y and z, got {', '.join(vertex.values)}")
     points = np.stack([vertex.values[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    check_points(points)
     uvs = next((_columns(vertex, pair) for pair in _UVS if vertex.find(pair[:1]) and vertex.find(pair[1:])), None)
     content = MeshContent(points, [], uvs)
     for element in elements:

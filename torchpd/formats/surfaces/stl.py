@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from ..content import Array, Cells, MeshContent
-from .faces import check_points
 
 __all__ = ["read_stl"]
 
@@ -27,7 +26,7 @@ def read_stl(path: Path) -> MeshContent:
     room = len(data) - _HEAD - 4
     if room >= 0 and room == declared * _ROW.itemsize:
         corners = np.frombuffer(data, _ROW, declared, _HEAD + 4)["corners"].astype(np.float64)
-    elif text.lstrip()[:5].lower() == b"solid" and b"\0" not in text[:_HEAD]:
+    elif text.lstrip()[:5].lower() == b"solid" and b"\0" not in text:
         corners = _read_text(text)
     elif room < 0:
         raise ValueError(f"it holds {len(data)} bytes; a text file begins with 'solid', a binary one has 84 or more")
@@ -37,7 +36,6 @@ def read_stl(path: Path) -> MeshContent:
             f"{len(data):,} bytes; it was cut off or is no STL"
         )
     points = corners.reshape(-1, 3)
-    check_points(points)
     points, numbers = _merge(points)
     return MeshContent(points, [Cells("triangle", numbers.reshape(-1, 3))] if len(numbers) else [])
 

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..content import Array, Cells, Index, MeshContent
-from .faces import check_corners, check_points, check_tree, join, left_out
+from .faces import check_corners, check_tree, join, left_out
 
 __all__ = ["read_3mf"]
 
@@ -158,7 +158,6 @@ class _Reading:
             names = [[row.get(name, "") for name in ("v1", "v2", "v3")] for row in faces]
             points = np.array(corners, dtype=np.float64).reshape(-1, 3)
             triangles = np.array(names or [], dtype=np.int64).reshape(-1, 3)
-            check_points(points)
             check_corners(triangles.reshape(-1), len(points), f"vertices of object {key[1]}")
             for part in mesh:
                 name = part.tag.rpartition("}")[2]

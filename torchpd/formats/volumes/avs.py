@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..content import MeshContent
-from ..numbers import check_room, lines_of, parse
+from ..numbers import check_room, check_rows, lines_of, parse
 from .gather import Numbering, blocks_of
 
 __all__ = ["read"]
@@ -38,6 +38,8 @@ def read(path: Path) -> MeshContent:
     count, total = int(head[0]), int(head[1])
     check_room(count, 1, len(lines) - 1, "points, a line each,")
     check_room(total, 1, len(lines) - 1 - count, "cells, a line each,")
+    if not head[2:4].any():  # neither data of points nor of cells
+        check_rows(lines[1 + count :], total, "cells")
     table = parse("\n".join(lines[1 : 1 + count]).encode(), np.float64, "points")
     if len(table) != 4 * count:
         raise ValueError(f"its {count} points must have number, x, y and z, but {len(table)} numbers come")

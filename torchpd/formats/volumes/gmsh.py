@@ -29,6 +29,9 @@ class _File:
         self.numbers: list[Index] = []
         self.points: list[Array] = []
         self.elements: list[tuple[int, Index, Index, Index]] = []  # type, nodes, physical group, geometric entity
+        self.partitions = 0
+        self.parts: dict[tuple[int, int], Index] = {}  # the partitions of (dimension, tag) of an entity
+        self.present: set[int] = set()  # the partitions of which elements come
         self.groups: dict[tuple[int, int], list[int]] = {}  # physical groups of (dimension, tag) of an entity
         self.names: dict[tuple[int, int], str] = {}
         self.notes: list[str] = []
@@ -87,7 +90,10 @@ def _read_section(file: _File, name: str, data: bytes, at: int) -> int:
             raise ValueError(f"section ${name} has no end: the file was cut off")
         return len(data)  # data beside the mesh, which nobody needs
     if name in readers and not (file.order and name not in ("MeshFormat", "PhysicalNames")):
-        readers[name](file, Text(data[at:end]), name)
+        text = Text(data[at:end])
+        readers[name](file, text, name)
+        if readers[name] in (_read_nodes, _read_elements) and (more := text.left()):
+            raise ValueError(f"section ${name} holds {more} numbers more than it declares")
     return end + len(closing)
 
 
@@ -120,7 +126,7 @@ def _read_entities(file: _File, numbers: Numbers, name: str) -> None:
     """The physical groups of each entity; with partitions, entities have others as their parents."""
     split = name == "PartitionedEntities"
     if split:
-        ghosts = int(numbers.sizes(2, "partitions")[1])
+        file.partitions, ghosts = map(int, numbers.sizes(2, "partitions"))
         numbers.ints(2 * ghosts, "ghost entities")
     counts = numbers.sizes(4, "entities")
     for dimension, count in enumerate(counts):
@@ -129,7 +135,7 @@ def _read_entities(file: _File, numbers: Numbers, name: str) -> None:
             tag = int(numbers.ints(1, _ENTITIES[dimension])[0])
             if split:
                 numbers.ints(2, "parents")
-                numbers.ints(int(numbers.sizes(1, "partitions")[0]), "partitions")
+                file.parts[dimension, tag] = numbers.ints(int(numbers.sizes(1, "partitions")[0]), "partitions")
             numbers.floats(box, "bounding boxes")
             groups = numbers.ints(int(numbers.sizes(1, "physical groups")[0]), "physical groups")
             file.groups[dimension, tag] = [abs(int(group)) for group in groups]
@@ -213,6 +219,7 @@ def _read_entity_blocks(file: _File, numbers: Numbers) -> None:
         width = 1 + _nodes_of(kind)
         read = numbers.sizes if newer else numbers.ints
         nodes = read(count * width, "elements").reshape(count, width)[:, 1:]
+        file.present.update(file.parts.get((dimension, tag), np.empty(0)).tolist())
         groups = file.groups.get((dimension, tag), [])
         several += count if len(groups) > 1 else 0
         physical = groups[0] if groups else 0
@@ -244,6 +251,7 @@ def _read_rows(file: _File, text: Numbers) -> None:
     assert isinstance(text, Text)
     total = int(text.ints(1, "elements")[0])
     values = parse(text.data[text.at :], np.int64, "elements")
+    text.at = len(text.data)
     check_room(total, 4, len(values), "elements of at least four numbers")
     old = file.version < 2  # number, type, physical, elementary, count of nodes, nodes
     plain, at = values.tolist(), 0
@@ -289,6 +297,8 @@ def _content(file: _File) -> MeshContent:
         if TYPES[kind][2] == 3:
             solid.append(cells[-1])
     notes = list(file.notes)
+    if len(file.present) < file.partitions:
+        notes.append(f"it holds {len(file.present)} of its {file.partitions} partitions, the others are left out")
     if repeated:
         notes.append(f"{repeated} elements come again, for other physical groups, and were left out")
     # Without physical groups, the volumes of the geometry are the regions where there are several.

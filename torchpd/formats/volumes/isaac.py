@@ -18,10 +18,10 @@ def read(path: Path) -> MeshContent:
     rows: dict[str, list[str]] = {"v": [], "t": []}
     widths = {"v": 3, "t": 4}
     for line in lines_of(path, "#"):
-        key, _, rest = line.partition(" ")
-        if key not in rows or len(rest.split()) != widths[key]:
+        key, *rest = line.split()
+        if key not in rows or len(rest) != widths[key]:
             raise ValueError(f"a line must be `v x y z` or `t i j k l`, got {line[:40]!r}")
-        rows[key].append(rest)
+        rows[key].append(" ".join(rest))
     points = parse("\n".join(rows["v"]).encode(), np.float64, "vertices").reshape(-1, 3)
     tets = parse("\n".join(rows["t"]).encode(), np.int64, "tets").reshape(-1, 4)
     return MeshContent(points, [block("tetra", tets)])

@@ -77,8 +77,7 @@ def _rows(numbers: Text, width: int, key: str) -> Array:
     """As many rows as the first number says, and nothing behind them."""
     count = int(numbers.ints(1, key)[0])
     rows = numbers.floats(width * count, key).reshape(count, width)
-    more = len(numbers.data[numbers.at :].split())
-    if more:
+    if more := numbers.left():
         raise ValueError(f"{key} should be {count} rows of {width} numbers, but {more} more come")
     return rows
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..content import MeshContent
-from ..numbers import check_room, lines_of, parse
+from ..numbers import check_rows, lines_of, parse
 from .gather import blocks_of, in_space
 
 __all__ = ["read"]
@@ -69,5 +69,5 @@ def read(path: Path) -> MeshContent:
 def _declared(rows: list[str], what: str) -> list[str]:
     """The rows behind their count."""
     count = int(parse(rows[0].encode() if rows else b"x", np.int64, f"the count of {what}")[0])
-    check_room(count, 1, len(rows) - 1, f"{what}, a line each,")
-    return rows[1 : 1 + count]
+    check_rows(rows[1:], count, what)
+    return rows[1:]

@@ -71,6 +71,9 @@ def read(path: Path) -> MeshContent:
 def _rows(lines: list[str], at: int, count: int, what: str) -> list[str]:
     check_room(count, 1, len(lines) - at, f"{what}, a line each,")
     rows = lines[at : at + count]
+    behind = lines[at + count : at + count + 1]
+    if behind and "=" not in behind[0]:
+        raise ValueError(f"it declares {count} {what}, but {behind[0][:40]!r} follows them")
     wrong = next((row for row in rows if "=" in row), None)
     if wrong is not None:
         raise ValueError(f"it declares {count} {what}, but {wrong[:40]!r} comes among them")

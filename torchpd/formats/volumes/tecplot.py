@@ -93,8 +93,7 @@ def _read_zone(part: str, count: int, axes: list[int], marked: int | None) -> tu
         table = numbers.floats(zone.nodes * count, "points").reshape(zone.nodes, count)
         columns = dict(enumerate(table.T))
     corners: Index = numbers.ints(zone.cells * zone.corners, "cells").reshape(zone.cells, zone.corners) - 1
-    more = len(numbers.data[numbers.at :].split())
-    if more:
+    if more := numbers.left():
         raise ValueError(f"a zone of {zone.cells} cells has {more} numbers more")
     if corners.size and (corners.min() < 0 or corners.max() >= zone.nodes):
         raise ValueError(f"cells of a zone name point {int(corners.max()) + 1}, but it has {zone.nodes}")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..content import Array, Cells, Index, MeshContent
-from ..numbers import Text, check_room, lines_of
+from ..numbers import Text, check_rows, lines_of
 from .gather import Numbering, block
 
 __all__ = ["read"]
@@ -52,11 +52,11 @@ def _table(path: Path, what: str) -> tuple[list[int], Array]:
     if not head or not all(word.isdigit() for word in head):
         raise ValueError(f"{path.name} must begin with the number of {what}, got {' '.join(head)[:40] or 'nothing'!r}")
     count = int(head[0])
-    check_room(count, 1, len(lines) - 1, f"{what}, a line each,")
-    text = "\n".join(lines[1 : 1 + count]).encode()
+    check_rows(lines[1:], count, what)
+    text = "\n".join(lines[1:]).encode()
     width = len(lines[1].split()) if count else 0
     values = Text(text).floats(count * width, what)
-    uneven = any(len(line.split()) != width for line in lines[1 : 1 + count])
+    uneven = any(len(line.split()) != width for line in lines[1:])
     if uneven:
         raise ValueError(f"rows of {path.name} must all have {width} numbers")
     return [int(word) for word in head], values.reshape(count, width) if count else np.empty((0, 5))

@@ -53,4 +53,6 @@ def read(path: Path) -> MeshContent:
             numbers.ints(counts["triangle"] + counts["quad"], "marks of faces")
         # its third corner is the tip of a pyramid
         cells.append(block(kind, rows[:, [1, 0, 3, 4, 2]] if kind == "pyramid" else rows))
-    return MeshContent(np.asarray(points), cells)
+    left = numbers.left() - 4 * records
+    notes = [f"{left} {'bytes' if form else 'numbers'} behind its cells left out"] if left > 0 else []
+    return MeshContent(np.asarray(points), cells, notes=notes)
