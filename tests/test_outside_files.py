@@ -6,6 +6,7 @@ import struct
 import warnings
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 
@@ -194,3 +195,41 @@ def test_a_binary_stl_of_another_length_that_begins_with_solid(tmp_path: Path) -
     path.write_bytes(b"solid of another program".ljust(80) + struct.pack("<I", 9) + body)
     with pytest.raises(ValueError, match="declares 9 triangles"):
         TriMesh.from_file(path)
+
+
+@pytest.mark.parametrize("suffix", [".vtk", ".vtu"])
+def test_whole_numbers_of_floats_are_regions_where_their_name_says_so(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    for name, values, regions in (
+        ("MaterialIDs", [1.0, 2.0], [1, 2]),
+        ("label", [0.5, 1], None),
+        ("E", [1.0, 2], None),
+    ):
+        meshio.Mesh(POINTS, [("tetra", TETS)], cell_data={name: [np.array(values)]}).write(path)
+        mesh = tets_in(path)
+        assert (None if mesh.regions is None else mesh.regions.tolist()) == regions
+
+
+def test_names_of_abaqus_in_quotes_hold_commas(tmp_path: Path) -> None:
+    path = tmp_path / "a.inp"
+    nodes = rows(POINTS, first=1).replace(" ", ", ")
+    sets = "".join(f'*ELEMENT, TYPE=C3D4, ELSET="bone, {side}"\n{{}}' for side in ("left", "right"))
+    cells = [rows(TETS[k : k + 1], first=k + 1, shift=1).replace(" ", ", ") for k in (0, 1)]
+    both = '*ELSET, ELSET=all\n"bone, left", "bone, right"\n'
+    path.write_text("*NODE\n" + nodes + sets.format(*cells))
+    with pytest.warns(MeshWarning, match=r"1 is BONE, LEFT, 2 is BONE, RIGHT"):
+        mesh = tets_in(path)
+    assert mesh.regions is not None
+    assert mesh.regions.tolist() == [1, 2]
+    path.write_text("*NODE\n" + nodes + sets.format(*cells) + both + "*SOLID SECTION, ELSET=all\n")
+    with pytest.warns(MeshWarning, match="1 is ALL"):
+        mesh = tets_in(path)
+    assert mesh.regions is not None
+    assert mesh.regions.tolist() == [1, 1]
+
+
+def test_errors_of_libraries_say_nothing_of_their_own_names(tmp_path: Path) -> None:
+    path = tmp_path / "a.xdmf"
+    path.write_text('<Xdmf Version="3.0"><Domain><Grid><Time Value="1"/></Grid></Domain></Xdmf>')
+    with pytest.raises(ValueError, match=r"a\.xdmf \(XDMF\): Unknown section 'Time'.; is the file complete"):
+        TetMesh.from_file(path)

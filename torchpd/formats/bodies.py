@@ -95,7 +95,7 @@ def _kept(content: MeshContent, used: NDArray[np.bool_], notes: list[str]) -> ND
     """Which points remain: those that are used, and strays, which no cell of the file uses, where they are finite."""
     strays = np.zeros(len(used), dtype=bool)
     strays[: len(content.points)] = ~content.in_cells()
-    finite = np.isfinite(content.points).all(axis=1)
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(content.points).all(axis=1))
     lost = int((~finite).sum())
     if lost:
         notes.append(f"{lost} vertices that no cell uses are not finite and were left out")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -102,7 +103,8 @@ def _check(content: MeshContent) -> None:
 
 def _words(error: BaseException, said: str, kind: Format) -> str:
     """What a reader met, as one line."""
-    told = " ".join(said.split()).removeprefix("Error: ")
+    # meshio names the file again, by its path, behind what it met
+    told = re.sub(r" ?Error: Couldn't read file .*", "", " ".join(said.split())).removeprefix("Error: ")
     words = " ".join(str(error).split())
     if isinstance(error, ValueError) and words:
         return f"{words} ({told})" if told and told not in words else words

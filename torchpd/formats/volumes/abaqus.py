@@ -11,7 +11,7 @@ from typing import NamedTuple
 from ..content import MeshContent
 from ..numbers import text_of
 from . import avs
-from .abaqus_parts import Part, Place, content_of, read_elements, read_nodes, read_set
+from .abaqus_parts import Part, Place, content_of, fields_of, read_elements, read_nodes, read_set
 
 __all__ = ["read"]
 
@@ -93,7 +93,7 @@ def _keywords(text: str) -> list[Keyword]:
             open_line += line
             if open_line.endswith(","):
                 continue
-            head, *rest = (field.strip() for field in open_line.split(","))
+            head, *rest = fields_of(open_line)
             options = {}
             for field in rest:
                 key, _, value = field.partition("=")

@@ -13,7 +13,7 @@ from ..content import CELLS, Array, Cells, Index, MeshContent
 from ..numbers import parse
 from .gather import Numbering, block
 
-__all__ = ["Part", "Place", "content_of", "read_elements", "read_nodes", "read_set"]
+__all__ = ["Part", "Place", "content_of", "fields_of", "read_elements", "read_nodes", "read_set"]
 
 # Solids by the count of their nodes, whatever they compute; flat elements; trusses, as which meshers write edges.
 _SOLID = re.compile(r"(?:(?:A|D|DC|EM)?C3D|Q3D)(4|5|6|8|10|13|15|18|20|27)(?!\d)|(?:SC|CSS)(6|8)")
@@ -21,6 +21,7 @@ _SOLIDS = {4: "tetra", 10: "tetra", 5: "pyramid", 13: "pyramid", 6: "wedge", 15:
 _SOLIDS |= {8: "hexahedron", 20: "hexahedron", 27: "hexahedron"}
 _FLAT = re.compile(r"(?:S|DS|M3D|R3D|SFM3D|STRI|CPS|CPE|CPEG|CAX|CGAX|D?C2D|AC2D|DC2D|DCAX|ACAX)([34689])")
 _FLATS = {3: "triangle", 6: "triangle", 4: "quad", 8: "quad", 9: "quad"}
+_FIELD = re.compile(r'(?:"[^"]*"|[^,])+')
 _TRUSS = re.compile(r"T[23]D([23])")
 
 
@@ -74,6 +75,11 @@ def _reals(line: str) -> Array:
     """The numbers between the commas of a line, of which one that is missing is 0."""
     fields = [entry.strip() or "0" for entry in line.rstrip(", ").split(",")]
     return np.asarray(parse(" ".join(fields).encode(), np.float64, "data"), dtype=np.float64)
+
+
+def fields_of(line: str) -> list[str]:
+    """What stands between the commas of a line that are not in quotes."""
+    return [field.strip() for field in (_FIELD.findall(line) if '"' in line else line.split(","))]
 
 
 def _whole(text: str, what: str) -> Index:
@@ -139,7 +145,7 @@ def read_set(part: Part, lines: list[str], options: dict[str, str]) -> None:
     """Numbers of elements, names of other sets or, with GENERATE, rows of first, last and step."""
     found = part.sets.setdefault(options.get("ELSET", "").upper(), [])
     for line in lines:
-        entries = [entry.strip().strip('"') for entry in line.split(",") if entry.strip()]
+        entries = [entry.strip('"') for entry in fields_of(line) if entry]
         if "GENERATE" in options:
             first, last, step = (*_whole(" ".join(entries), "*ELSET").tolist(), 1, 1)[:3]
             found.append(range(first, last + 1, max(step, 1)))

@@ -30,7 +30,7 @@ class _File:
         self.points: list[Array] = []
         self.elements: list[tuple[int, Index, Index, Index]] = []  # type, nodes, physical group, geometric entity
         self.partitions = 0
-        self.parts: dict[tuple[int, int], Index] = {}  # the partitions of (dimension, tag) of an entity
+        self.parts: dict[tuple[int, int], list[int]] = {}  # the partitions of (dimension, tag) of an entity
         self.present: set[int] = set()  # the partitions of which elements come
         self.groups: dict[tuple[int, int], list[int]] = {}  # physical groups of (dimension, tag) of an entity
         self.names: dict[tuple[int, int], str] = {}
@@ -135,7 +135,8 @@ def _read_entities(file: _File, numbers: Numbers, name: str) -> None:
             tag = int(numbers.ints(1, _ENTITIES[dimension])[0])
             if split:
                 numbers.ints(2, "parents")
-                file.parts[dimension, tag] = numbers.ints(int(numbers.sizes(1, "partitions")[0]), "partitions")
+                count = int(numbers.sizes(1, "partitions")[0])
+                file.parts[dimension, tag] = numbers.ints(count, "partitions").tolist()
             numbers.floats(box, "bounding boxes")
             groups = numbers.ints(int(numbers.sizes(1, "physical groups")[0]), "physical groups")
             file.groups[dimension, tag] = [abs(int(group)) for group in groups]
@@ -219,7 +220,7 @@ def _read_entity_blocks(file: _File, numbers: Numbers) -> None:
         width = 1 + _nodes_of(kind)
         read = numbers.sizes if newer else numbers.ints
         nodes = read(count * width, "elements").reshape(count, width)[:, 1:]
-        file.present.update(file.parts.get((dimension, tag), np.empty(0)).tolist())
+        file.present.update(file.parts.get((dimension, tag), []))
         groups = file.groups.get((dimension, tag), [])
         several += count if len(groups) > 1 else 0
         physical = groups[0] if groups else 0
@@ -298,7 +299,7 @@ def _content(file: _File) -> MeshContent:
             solid.append(cells[-1])
     notes = list(file.notes)
     if len(file.present) < file.partitions:
-        notes.append(f"it holds {len(file.present)} of its {file.partitions} partitions, the others are left out")
+        notes.append(f"only {len(file.present)} of its {file.partitions} partitions come")
     if repeated:
         notes.append(f"{repeated} elements come again, for other physical groups, and were left out")
     # Without physical groups, the volumes of the geometry are the regions where there are several.

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
-__all__ = ["choose"]
+import numpy as np
+
+__all__ = ["choose", "may_be"]
 
 # Names that are known to be those of regions, in lower case, the best first.
 _KNOWN = [
@@ -14,8 +17,17 @@ _KNOWN = [
 ]
 
 
+def may_be(name: str, values: Any) -> bool:
+    """Whether an array holds a whole number for each cell: integers or, under a name that is known, reals."""
+    array = np.asarray(values)
+    if array.size != len(array) or array.dtype.kind not in "iuf":
+        return False
+    real = array.dtype.kind == "f"
+    return not real or (name.lower() in _KNOWN and bool(((array == np.rint(array)) & (np.abs(array) < 2.0**53)).all()))
+
+
 def choose(names: Iterable[str], notes: list[str]) -> str | None:
-    """Choose among the arrays of integers: one whose name is known, or else the only one; None where neither is.
+    """Choose among the arrays that may be: one whose name is known, or else the only one; None where neither is.
 
     What was chosen by another name, or not chosen, is added to the notes.
     """

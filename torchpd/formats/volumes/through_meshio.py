@@ -11,7 +11,7 @@ import numpy as np
 
 from ..content import CELLS, Cells, Index, MeshContent
 from .gather import block, in_space
-from .regions import choose
+from .regions import choose, may_be
 
 __all__ = ["NAMES", "read"]
 
@@ -94,7 +94,9 @@ class _Ending(io.BufferedReader):
 def content_of(mesh: Any, *, by_block: bool = False) -> MeshContent:
     """Points, cells and regions of a `meshio.Mesh`; blocks of cells are regions where there are no others."""
     notes: list[str] = []
-    chosen = choose((name for name, parts in mesh.cell_data.items() if all(map(_is_whole, parts))), notes)
+    chosen = choose(
+        (name for name, parts in mesh.cell_data.items() if all(may_be(name, part) for part in parts)), notes
+    )
     cells = []
     for number, part in enumerate(mesh.cells):
         if not len(part.data):
@@ -112,11 +114,6 @@ def content_of(mesh: Any, *, by_block: bool = False) -> MeshContent:
         told = ", ".join(f"{number} is {' and '.join(map(str, groups))}" for number, groups in names.items())
         notes.append(f"regions keep their numbers, not their names: {told}")
     return MeshContent(in_space(mesh.points), cells, notes=notes)
-
-
-def _is_whole(values: Any) -> bool:
-    array = np.asarray(values)
-    return bool(array.dtype.kind in "iu" and array.size == len(array))
 
 
 def _cells(kind: str, nodes: Any, regions: Index | None) -> Cells:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..content import CELLS, Array, Cells, Index, MeshContent
 from .gather import block
-from .regions import choose
+from .regions import choose, may_be
 
 __all__ = ["Piece", "content_of", "offsets_of"]
 
@@ -130,13 +130,12 @@ def _unroll(nodes: Index, marks: Index | None) -> Cells:
 
 def _regions(pieces: list[Piece], notes: list[str]) -> list[Index | None]:
     """The region numbers of the cells of each piece: the array with a name for such, or the only one of integers."""
-    names = {
-        name
-        for piece in pieces
-        for name, values in piece.data.items()
-        if not name.lower().startswith("vtk") and len(values) == len(piece.types) and _is_whole(values)
-    }
-    chosen = choose(names, notes)
+    arrays: dict[str, list[NDArray[Any]]] = {}
+    for piece in pieces:
+        for name, values in piece.data.items():
+            if not name.lower().startswith("vtk") and len(values) == len(piece.types):
+                arrays.setdefault(name, []).append(values)
+    chosen = choose((name for name, parts in arrays.items() if all(may_be(name, part) for part in parts)), notes)
     if chosen is None:
         return [None for _ in pieces]
     return [
@@ -145,7 +144,3 @@ def _regions(pieces: list[Piece], notes: list[str]) -> list[Index | None]:
         else np.zeros(len(piece.types), dtype=np.int64)
         for piece in pieces
     ]
-
-
-def _is_whole(values: NDArray[Any]) -> bool:
-    return bool(values.ndim == 1 and values.dtype.kind in "iu")
