@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import Any, Protocol
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .content import Array, Index
 
-__all__ = ["Binary", "Numbers", "Text", "check_room", "check_rows", "lines_of", "parse", "text_of", "words"]
+__all__ = ["Binary", "Numbers", "Text", "check_room", "check_rows", "lines_of", "parse", "text_of", "words", "xml_of"]
 
 _CHUNK = 1 << 20
 _SPACE = b" \t\n\r\x0b\x0c"
@@ -40,6 +41,14 @@ def text_of(path: Path) -> str:
         except UnicodeDecodeError:
             text = data.decode("latin-1")
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def xml_of(data: bytes) -> ElementTree.Element:
+    """The root of an XML document."""
+    try:
+        return ElementTree.fromstring(data.lstrip())
+    except ElementTree.ParseError as error:
+        raise ValueError(f"it is no complete XML document: {error}") from None
 
 
 def lines_of(path: Path, comment: str) -> list[str]:

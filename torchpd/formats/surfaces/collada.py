@@ -5,29 +5,27 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
 from ..content import Array, Cells, MeshContent
+from ..numbers import xml_of
+from ..transforms import Z_UP, rotation
 from .collada_mesh import Mesh, read_mesh
-from .faces import check_tree, left_out
+from .faces import check_tree, join_uvs, left_out
 
 __all__ = ["read_collada"]
 
 _UP = {
     "Y_UP": np.eye(3),
-    "Z_UP": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "Z_UP": Z_UP,
     "X_UP": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
 
 
 def read_collada(path: Path) -> MeshContent:
     """All meshes of the scene of a file."""
-    try:
-        root = ElementTree.fromstring(path.read_bytes())
-    except ElementTree.ParseError as error:
-        raise ValueError(f"it is no sound XML: {error}") from None
+    root = xml_of(path.read_bytes())
     if root.tag.rpartition("}")[2] != "COLLADA":
         raise ValueError(f"its first element must be COLLADA, got {root.tag[:60]!r}")
     reading = _Reading(root)
@@ -60,9 +58,7 @@ def _local(node: Any) -> Array:
             step[:3, :3] = np.diag(_numbers(element, 3))
         elif name == "rotate":
             *axis, angle = _numbers(element, 4)
-            x, y, z = np.array(axis) / (np.linalg.norm(axis) or 1.0)
-            cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            step[:3, :3] += np.sin(np.radians(angle)) * cross + (1.0 - np.cos(np.radians(angle))) * cross @ cross
+            step[:3, :3] = rotation(np.array(axis), angle)
         elif name in ("lookat", "skew"):
             raise ValueError(f"a node has the transform {name!r}, which is not read; write it as a matrix")
         matrix = matrix @ step
@@ -162,12 +158,7 @@ class _Reading:
         self.others["geometries in no node of the scene"] = sum(g.get("id") not in self.used for g in geometries)
         notes = left_out(+self.others)
         points = np.concatenate([np.empty((0, 3)), *self.points]) @ self._axes(notes).T
-        uvs = None
-        if self.uvs and all(part is not None for part in self.uvs):
-            uvs = np.concatenate([part for part in self.uvs if part is not None])
-        elif any(part is not None for part in self.uvs):
-            notes.append("texture coordinates left out: some meshes have none")
-        return MeshContent(points, self.cells, uvs, notes)
+        return MeshContent(points, self.cells, join_uvs(self.uvs, notes), notes)
 
     def _axes(self, notes: list[str]) -> Array:
         """The matrix from the numbers of the file to metres with y up [3, 3]."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..content import Array, Cells, Index
-from .faces import check_corners, face_blocks, fan_triangles, join, one_uv_each, strip_triangles
+from .faces import check_corners, face_blocks, fan_triangles, join, one_uv_each, strip_triangles, turn_faces
 
 __all__ = ["Mesh", "read_mesh"]
 
@@ -30,11 +30,8 @@ class Mesh:
 
     def placed(self, first: int, *, turned: bool) -> list[Cells]:
         """The faces with vertex numbers from `first` on, each from its last corner to its first where turned."""
-        order = np.arange(len(self.corners))
-        if turned:
-            begins = np.repeat(np.cumsum(self.sizes) - self.sizes, self.sizes)
-            order = begins + np.repeat(self.sizes, self.sizes) - 1 - (order - begins)
-        return face_blocks(self.corners[order] + first, self.sizes, [])
+        corners = turn_faces(self.corners, self.sizes) if turned else self.corners
+        return face_blocks(corners + first, self.sizes, [])
 
 
 def read_mesh(mesh: Any, find: _Find, others: Counter[str]) -> Mesh:

@@ -18,9 +18,11 @@ __all__ = [
     "face_blocks",
     "fan_triangles",
     "join",
+    "join_uvs",
     "left_out",
     "one_uv_each",
     "strip_triangles",
+    "turn_faces",
 ]
 
 
@@ -110,6 +112,21 @@ def one_uv_each(points: Array, corners: Index, numbers: Index, uvs: Array) -> tu
     place = np.empty(len(pairs), dtype=np.int64)
     place[order] = target
     return np.concatenate([points, points[vertex[~leads]]]), place[inverse.reshape(-1)], coordinates
+
+
+def turn_faces(corners: Index, sizes: Index) -> Index:
+    """The corners of each face from its last to its first."""
+    begins = np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return corners[2 * begins + np.repeat(sizes, sizes) - 1 - np.arange(len(corners))]
+
+
+def join_uvs(parts: Sequence[Array | None], notes: list[str]) -> Array | None:
+    """The texture coordinates of all parts of a scene; None, which is noted, where only some have them."""
+    found = [part for part in parts if part is not None]
+    if found and len(found) < len(parts):
+        notes.append(f"texture coordinates left out: {len(parts) - len(found)} of its {len(parts)} parts have none")
+        return None
+    return np.concatenate(found) if found else None
 
 
 def join(parts: Sequence[Index]) -> Index:

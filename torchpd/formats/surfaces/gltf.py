@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..content import Array, Cells, Index, MeshContent
-from .faces import check_corners, fan_triangles, join, left_out, strip_triangles
+from .faces import check_corners, fan_triangles, join, join_uvs, left_out, strip_triangles
 from .gltf_buffers import Document
 
 __all__ = ["read_gltf"]
@@ -188,9 +188,5 @@ class _Reading:
         self.others["meshes in no node of the scene"] = len(self.document.items("meshes")) - len(self.used)
         self.others["animations"] = len(self.document.items("animations"))
         notes = self.notes + left_out(+self.others)
-        uvs = None
-        if self.uvs and all(part is not None for part in self.uvs):
-            uvs = np.concatenate([part for part in self.uvs if part is not None])
-        elif any(part is not None for part in self.uvs):
-            notes.append("texture coordinates left out: some primitives have none")
+        uvs = join_uvs(self.uvs, notes)
         return MeshContent(points, [Cells("triangle", triangles)] if len(triangles) else [], uvs, notes)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..content import Array, Cells, Index, MeshContent
-from .faces import check_corners, check_instances, face_blocks, left_out, one_uv_each
+from .faces import check_corners, check_instances, face_blocks, join_uvs, left_out, one_uv_each, turn_faces
 from .usd_stage import axes_of, check_lengths, open_stage, warnings_of
 
 __all__ = ["read_usd"]
@@ -124,17 +124,15 @@ class _Reading:
         uvs = None
         if values is not None:
             points, corners, uvs = one_uv_each(points, corners, *values)
-        order = np.arange(len(corners))
-        if turned:  # each face from its last corner to its first
-            first = np.repeat(np.cumsum(sizes) - sizes, sizes)
-            order = first + np.repeat(sizes, sizes) - 1 - (order - first)
+        if turned:
+            corners = turn_faces(corners, sizes)
         kept = np.ones(len(sizes), dtype=bool)
         holes = self._values(mesh.GetHoleIndicesAttr(), 1, np.int64).reshape(-1)
         if len(holes):
             check_corners(holes, len(sizes), f"faces of {name} in holeIndices")
             kept[holes] = False
             self.others["faces that are declared holes"] += int((~kept).sum())
-        corners = corners[order][np.repeat(kept, sizes)] + self.count
+        corners = corners[np.repeat(kept, sizes)] + self.count
         self.cells += face_blocks(corners, sizes[kept], self.notes)
         self._add(points, uvs)
 
@@ -178,11 +176,7 @@ class _Reading:
             notes.append(f"{count} of its meshes are to be subdivided ({scheme}); the control meshes were read")
         if self.moving:
             notes.append(f"{self.moving} of its meshes move, and were read at their earliest time")
-        uvs = None
-        if self.uvs and all(part is not None for part in self.uvs):
-            uvs = np.concatenate([part for part in self.uvs if part is not None])
-        elif any(part is not None for part in self.uvs):
-            notes.append("texture coordinates left out: some meshes have none")
+        uvs = join_uvs(self.uvs, notes)
         return MeshContent(np.concatenate([np.empty((0, 3)), *self.points]), self.cells, uvs, notes)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..content import Array
+from ..transforms import Z_UP
 
 __all__ = ["axes_of", "check_lengths", "open_stage", "warnings_of"]
 
@@ -69,6 +70,6 @@ def axes_of(stage: Any) -> tuple[Array, list[str]]:
         matrix *= scale
         notes.append(f"its unit is {scale:g} m, and its numbers were turned into metres")
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
-        matrix = matrix @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+        matrix = matrix @ Z_UP
         notes.append("its z axis is up, and it was turned so that y is: (x, y, z) became (x, z, -y)")
     return matrix, notes

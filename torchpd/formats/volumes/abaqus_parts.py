@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from ..content import CELLS, Array, Cells, Index, MeshContent
 from ..numbers import parse
-from .gather import Numbering, block
+from ..transforms import rotation
+from .gather import SOLIDS, Numbering, block
 
 __all__ = ["Part", "Place", "content_of", "fields_of", "read_elements", "read_nodes", "read_set"]
 
 # Solids by the count of their nodes, whatever they compute; flat elements; trusses, as which meshers write edges.
 _SOLID = re.compile(r"(?:(?:A|D|DC|EM)?C3D|Q3D)(4|5|6|8|10|13|15|18|20|27)(?!\d)|(?:SC|CSS)(6|8)")
-_SOLIDS = {4: "tetra", 10: "tetra", 5: "pyramid", 13: "pyramid", 6: "wedge", 15: "wedge", 18: "wedge"}
-_SOLIDS |= {8: "hexahedron", 20: "hexahedron", 27: "hexahedron"}
 _FLAT = re.compile(r"(?:S|DS|M3D|R3D|SFM3D|STRI|CPS|CPE|CPEG|CAX|CGAX|D?C2D|AC2D|DC2D|DCAX|ACAX)([34689])")
 _FLATS = {3: "triangle", 6: "triangle", 4: "quad", 8: "quad", 9: "quad"}
 _FIELD = re.compile(r'(?:"[^"]*"|[^,])+')
@@ -55,20 +54,17 @@ class Place:
         rows = [_reals(line) for line in lines]
         if len(rows) > 2 or (rows and len(rows[0]) > 3) or (len(rows) == 2 and len(rows[1]) != 7):
             raise ValueError(f"*INSTANCE {name} must have a translation and an axis with an angle, got {lines[:3]}")
-        rotation, offset = np.eye(3), np.zeros(3)
+        turn, offset = np.eye(3), np.zeros(3)
         if rows:
             offset[: len(rows[0])] = rows[0]
         if len(rows) == 2:
-            start, end, angle = rows[1][:3], rows[1][3:6], np.deg2rad(rows[1][6])
-            length = float(np.linalg.norm(end - start))
-            if not length > 0:
+            start, end = rows[1][:3], rows[1][3:6]
+            if not np.linalg.norm(end - start) > 0:
                 raise ValueError(f"the axis of *INSTANCE {name} must have two different points")
-            x, y, z = (end - start) / length
-            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-            # Rodrigues' formula; the axis stands in the assembly, so that the part is moved before it turns.
-            rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-            offset = rotation @ (offset - start) + start
-        return cls(name, deepcopy(part), rotation, offset, part.name)
+            # The axis stands in the assembly, so that the part is moved before it turns.
+            turn = rotation(end - start, rows[1][6])
+            offset = turn @ (offset - start) + start
+        return cls(name, deepcopy(part), turn, offset, part.name)
 
 
 def _reals(line: str) -> Array:
@@ -107,7 +103,7 @@ def read_nodes(part: Part, lines: list[str]) -> None:
 
 def _kind_of(name: str) -> tuple[str, int | None]:
     """The kind of a type of elements, and how many nodes it has where that is known."""
-    for pattern, kinds in ((_SOLID, _SOLIDS), (_FLAT, _FLATS)):
+    for pattern, kinds in ((_SOLID, SOLIDS), (_FLAT, _FLATS)):
         if match := pattern.match(name):
             count = int(next(filter(None, match.groups())))
             return kinds[count], count

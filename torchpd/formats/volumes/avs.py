@@ -5,14 +5,13 @@ Format: https://lanl.github.io/LaGriT/pages/docs/read_avs.html.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..content import MeshContent
 from ..numbers import check_room, check_rows, lines_of, parse
-from .gather import Numbering, blocks_of
+from .gather import Numbering, blocks_of, renumbered
 
 __all__ = ["read"]
 
@@ -57,6 +56,5 @@ def read(path: Path) -> MeshContent:
         kinds.append(kind)
         nodes.append([corners[k] for k in order])
         regions.append(int(fields[1]))
-    cells = blocks_of(kinds, nodes, regions if any(regions) else None)
-    numbered = [replace(block, corners=place(block.corners)) for block in cells]
-    return MeshContent(rows[:, 1:], numbered)
+    cells = renumbered(blocks_of(kinds, nodes, regions if any(regions) else None), place)
+    return MeshContent(rows[:, 1:], cells)

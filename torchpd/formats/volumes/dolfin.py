@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..content import MeshContent
+from ..numbers import xml_of
 from .gather import block, in_space
 
 __all__ = ["read"]
@@ -20,10 +21,7 @@ _KINDS = {"tetrahedron": ("tetra", 4), "triangle": ("triangle", 3), "interval": 
 
 def read(path: Path) -> MeshContent:
     """Read one mesh."""
-    try:
-        root = ElementTree.fromstring(path.read_bytes())
-    except ElementTree.ParseError as error:
-        raise ValueError(f"it is no complete XML document: {error}") from None
+    root = xml_of(path.read_bytes())
     meshes = list(root.iter("mesh"))
     if len(meshes) != 1:
         raise ValueError(f"it must hold one mesh, got {len(meshes)}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from ..content import MeshContent
 from ..numbers import parse, text_of, words
 from . import through_meshio
-from .gather import Numbering, blocks_of
+from .gather import Numbering, blocks_of, renumbered
 
 __all__ = ["read"]
 
@@ -58,7 +57,7 @@ def read(path: Path) -> MeshContent:
     region = {zone: k for k, name in reversed(list(enumerate(groups, 1))) for zone in groups[name]}
     place = Numbering(np.array(numbers, dtype=np.int64), "grid point")
     marks = [region.get(zone, 0) for zone in zones] if region else None
-    cells = [replace(b, corners=place(b.corners)) for b in blocks_of(kinds, nodes, marks)]
+    cells = renumbered(blocks_of(kinds, nodes, marks), place)
     notes = [f"regions are numbers of groups: {', '.join(f'{k} is {name}' for k, name in enumerate(groups, 1))}"]
     table = parse("\n".join(points).encode(), np.float64, "grid points").reshape(-1, 3)
     return MeshContent(table, cells, notes=notes if groups else [])

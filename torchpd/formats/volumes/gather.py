@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..content import CELLS, Cells, Index
 
-__all__ = ["Numbering", "block", "blocks_of", "in_space"]
+__all__ = ["SOLIDS", "Numbering", "block", "blocks_of", "in_space", "renumbered"]
+
+
+# Kind of a solid by the count of its nodes.
+SOLIDS = {4: "tetra", 10: "tetra", 5: "pyramid", 13: "pyramid", 6: "wedge", 15: "wedge", 18: "wedge"}
+SOLIDS |= {8: "hexahedron", 20: "hexahedron", 27: "hexahedron"}
+
+
+def renumbered(cells: list[Cells], place: Callable[[Index], Index]) -> list[Cells]:
+    """Cells with the points that stand at `place` of their numbers."""
+    return [replace(c, corners=place(c.corners), beyond=None if c.beyond is None else place(c.beyond)) for c in cells]
 
 
 def in_space(points: Any) -> Any:

@@ -135,8 +135,8 @@ def _read_entities(file: _File, numbers: Numbers, name: str) -> None:
             tag = int(numbers.ints(1, _ENTITIES[dimension])[0])
             if split:
                 numbers.ints(2, "parents")
-                count = int(numbers.sizes(1, "partitions")[0])
-                file.parts[dimension, tag] = numbers.ints(count, "partitions").tolist()
+                held = int(numbers.sizes(1, "partitions")[0])
+                file.parts[dimension, tag] = numbers.ints(held, "partitions").tolist()
             numbers.floats(box, "bounding boxes")
             groups = numbers.ints(int(numbers.sizes(1, "physical groups")[0]), "physical groups")
             file.groups[dimension, tag] = [abs(int(group)) for group in groups]

@@ -6,14 +6,13 @@ Format: https://github.com/KratosMultiphysics/Kratos/wiki/Input-data.
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..content import MeshContent
 from ..numbers import lines_of, parse
-from .gather import Numbering, blocks_of
+from .gather import SOLIDS, Numbering, blocks_of, renumbered
 
 __all__ = ["read"]
 
@@ -28,8 +27,6 @@ _SHAPES = {
     "point": "vertex",
 }
 # Where the name tells no shape, dimension and count of nodes do.
-_SOLIDS = {4: "tetra", 10: "tetra", 5: "pyramid", 13: "pyramid", 6: "wedge", 15: "wedge", 18: "wedge"}
-_SOLIDS |= {8: "hexahedron", 20: "hexahedron", 27: "hexahedron"}
 _FLATS = {1: "vertex", 2: "line", 3: "triangle", 6: "triangle", 4: "quad", 8: "quad", 9: "quad"}
 
 
@@ -59,10 +56,7 @@ def read(path: Path) -> MeshContent:
         raise ValueError(f"block {stack[-1][0]} has no end: the file was cut off")
     table = parse("\n".join(rows).encode(), np.float64, "nodes").reshape(-1, 4)
     place = Numbering(table[:, 0].astype(np.int64))
-    cells = [
-        replace(b, corners=place(b.corners), beyond=None if b.beyond is None else place(b.beyond))
-        for b in blocks_of(kinds, nodes, regions if any(regions) else None)
-    ]
+    cells = renumbered(blocks_of(kinds, nodes, regions if any(regions) else None), place)
     return MeshContent(table[:, 1:], cells)
 
 
@@ -72,5 +66,5 @@ def _kind(head: list[str], count: int) -> str:
     if shape is not None and re.search(rf"\dD{count}N?$", name):
         return _SHAPES[shape.group()]
     flat = head[0] == "Conditions" or "2D" in name or re.search("shell|membrane|surface|face", name.lower()) is not None
-    kind = (_FLATS if flat else {2: "line", 3: "triangle", **_SOLIDS}).get(count)
+    kind = (_FLATS if flat else {2: "line", 3: "triangle", **SOLIDS}).get(count)
     return kind or f"element {name} of {count} nodes"

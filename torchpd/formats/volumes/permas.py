@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..content import MeshContent
 from ..numbers import lines_of, parse
-from .gather import Numbering, blocks_of
+from .gather import Numbering, blocks_of, renumbered
 
 __all__ = ["read"]
 
@@ -68,10 +67,7 @@ def read(path: Path) -> MeshContent:
             kinds.append(kind)
             nodes.append([row[k] for k in corners + others])
             marks.append(names.index(target) + 1 if target else 0)
-    cells = [
-        replace(b, corners=place(b.corners), beyond=None if b.beyond is None else place(b.beyond))
-        for b in blocks_of(kinds, nodes, marks if names else None)
-    ]
+    cells = renumbered(blocks_of(kinds, nodes, marks if names else None), place)
     notes = [f"regions are numbers of sets: {', '.join(f'{k} is {name}' for k, name in enumerate(names, 1))}"]
     return MeshContent(table[:, 1:], cells, notes=notes if names else [])
 

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from ..numbers import check_room, parse
+from ..numbers import check_room, parse, xml_of
 
 __all__ = ["Document"]
 
@@ -43,10 +43,7 @@ class Document:
                 raise ValueError("its appended data have no end: the file was cut off")
             self.appended = data[head.end() : end]
             data = data[: head.end() - 1] + data[end:]
-        try:
-            self.root = ElementTree.fromstring(data.lstrip())
-        except ElementTree.ParseError as error:
-            raise ValueError(f"it is no complete XML document: {error}") from None
+        self.root = xml_of(data)
         if self.root.tag != "VTKFile":
             raise ValueError(f"it must be a VTKFile, got <{self.root.tag[:40]}>")
         order = self.root.get("byte_order", "LittleEndian")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..content import CELLS, Array, Cells, Index, MeshContent
-from .gather import block
+from .gather import block, renumbered
 from .regions import choose, may_be
 
 __all__ = ["Piece", "content_of", "offsets_of"]
@@ -75,9 +75,7 @@ def content_of(pieces: list[Piece]) -> MeshContent:
     if len(pieces) > 1:
         owners = np.repeat(np.arange(len(pieces)), [len(piece.points) for piece in pieces])
         points, number = _joined(points, owners, notes)
-        cells = [
-            replace(c, corners=number[c.corners], beyond=None if c.beyond is None else number[c.beyond]) for c in cells
-        ]
+        cells = renumbered(cells, number.__getitem__)
     return MeshContent(points, cells, notes=notes)
 
 
