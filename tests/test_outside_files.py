@@ -92,7 +92,7 @@ def surface_of(path: Path, data: str | bytes) -> TriMesh:
 @pytest.mark.parametrize(
     ("name", "text", "match"),
     [
-        ("a.msh", gmsh_2(nodes=4, more=""), "more than"),
+        ("a.msh", gmsh_2(nodes=4), "more than"),
         ("a.msh", gmsh_4(blocks=1), "more than"),
         ("a.vol", netgen(cells=1), "declares 1 volumeelements.* 2 "),
         ("a.vol", netgen(points=4), "declares 4 points.* 5 "),
@@ -120,6 +120,17 @@ def test_as_many_rows_as_declared_are_read(tmp_path: Path, name: str) -> None:
     }
     (tmp_path / name).write_text(texts[name])
     tets_in(tmp_path / name)
+
+
+def test_more_blocks_than_declared_are_refused_in_binary_gmsh_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.msh"
+    mesh = meshio.Mesh(POINTS, [("tetra", TETS)])
+    meshio.gmsh.write(path, mesh, fmt_version="4.1", binary=True)
+    tets_in(path)
+    block = struct.pack("<3iQ5Q", 3, 2, 4, 1, 3, 1, 2, 3, 5)
+    path.write_bytes(path.read_bytes().replace(b"\n$EndElements", block + b"\n$EndElements"))
+    with pytest.raises(ValueError, match=r"section \$Elements holds more than it declares"):
+        TetMesh.from_file(path)
 
 
 @pytest.mark.parametrize(("nodes", "cells"), [(4, 2), (5, 1)])

@@ -79,7 +79,8 @@ def _read_section(file: _File, name: str, data: bytes, at: int) -> int:
     if name == "ParametricNodes":
         raise ValueError("$ParametricNodes are not read; save without parametric coordinates")
     closing = b"$END" + name.encode("latin-1") if name in ("NOD", "ELM") else b"$End" + name.encode("latin-1")
-    if file.order and name in readers and name not in ("MeshFormat", "PhysicalNames"):
+    binary = bool(file.order) and name in readers and name not in ("MeshFormat", "PhysicalNames")
+    if binary:
         small = "i4" if file.version < 4 else f"u{file.size}"
         numbers: Numbers = Binary(data, at, file.order + "i4", file.order + "f8", file.order + small)
         readers[name](file, numbers, name)
@@ -89,11 +90,13 @@ def _read_section(file: _File, name: str, data: bytes, at: int) -> int:
         if name in readers:
             raise ValueError(f"section ${name} has no end: the file was cut off")
         return len(data)  # data beside the mesh, which nobody needs
-    if name in readers and not (file.order and name not in ("MeshFormat", "PhysicalNames")):
-        text = Text(data[at:end])
+    rest = data[at:end]
+    if name in readers and not binary:
+        text = Text(rest)
         readers[name](file, text, name)
-        if readers[name] in (_read_nodes, _read_elements) and (more := text.left()):
-            raise ValueError(f"section ${name} holds {more} numbers more than it declares")
+        rest = text.data[text.at :]
+    if readers.get(name) in (_read_nodes, _read_elements) and rest.strip():
+        raise ValueError(f"section ${name} holds more than it declares")
     return end + len(closing)
 
 
