@@ -4,6 +4,7 @@
 #pragma once
 #include "material_gradients.h"
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <optional>
@@ -171,98 +172,78 @@ struct AdjointSystem {
   OptionalTensor projector, sliding;  // with contacts
 };
 
-// The solution, and the relative residual of every environment.
-using Solved = std::tuple<Tensor, Tensor>;
+// The multiplier, and of every environment the relative residuals of the symmetric system, and of that with friction (solver/
+// friction_adjoint.h), 0 where nothing slides; the latter undefined without contacts.
+struct Solved {
+  Tensor solution, error, friction;
+};
 
-// By the iterations of conjugate_gradients_, as many as it takes; the solution, and the progress at their end.
+// By the iterations of conjugate_gradients_ and those of friction, as many as it takes.
 template <class Backend>
-std::tuple<Tensor, Tensor> iterate(const Tensor& positions, const AdjointSystem& s,
-                                   const Tensor& stiffness, at::TensorList plan, double tolerance) {
+Solved iterate(const Tensor& positions, const AdjointSystem& s, const Tensor& stiffness,
+               at::TensorList plan, double tolerance) {
   const Tensor right = s.right.contiguous(), x = positions.contiguous();
   const Tensor solution = at::empty_like(right), direction = at::empty_like(right);
   const Tensor residual = right.clone();
-  const Tensor progress =
-      at::full({x.size(0), progress_count}, -1.0, x.options().dtype(at::kDouble));
-  conjugate_gradients_inplace<Backend>(solution, residual, direction, progress, x, s.inertia,
-                                       s.inverse, s.projector, stiffness, plan, s.sliding,
-                                       tolerance, adjoint_iterations);
-  return {solution, progress};
+  const at::TensorOptions numbers = x.options().dtype(at::kDouble);
+  const Tensor progress = at::full({x.size(0), progress_count}, -1.0, numbers);
+  OptionalTensor friction;
+  if (s.sliding) friction = at::zeros({x.size(0), friction_count}, numbers);
+  solve_conjugate<Backend>({solution, residual, direction, progress, x, s.inertia, s.inverse,
+                          s.projector, stiffness, plan, s.sliding, right, friction},
+                         tolerance, (s.sliding ? 2 : 1) * adjoint_iterations);
+  return {solution, progress.select(1, progress_error),
+          friction ? friction->select(1, friction_error) : Tensor()};
 }
 
 template <class Backend>
-Solved conjugate_gradients(const Tensor& positions, const Tensor& right, const Tensor& inertia,
+std::tuple<Tensor, Tensor> conjugate_gradients(const Tensor& positions, const Tensor& right, const Tensor& inertia,
                            const Tensor& inverse, const OptionalTensor& projector,
                            const Tensor& stiffness, at::TensorList plan,
                            const OptionalTensor& sliding, double tolerance) {
   check_positions(positions, "positions");
   check_state(right, positions, "right", "N");
-  const auto [solution, progress] = iterate<Backend>(
-      positions, {right, inertia, inverse, projector, sliding}, stiffness, plan, tolerance);
-  return {solution, progress.select(1, progress_error).contiguous()};
+  const Solved found = iterate<Backend>(positions, {right, inertia, inverse, projector, sliding},
+                                        stiffness, plan, tolerance);
+  return {found.solution, sliding ? at::maximum(found.error, found.friction)
+                                  : found.error.contiguous()};
 }
 
-// The solution with what stands in where there is none: torchpd/adjoint.py.
+// The solution with what stands in where there is none, and the warnings: torchpd/adjoint.py.
 inline Tensor mend(const AdjointTensors& t, const AdjointSystem& s, double time_step,
-                   const Tensor& solution, const Tensor& error) {
+                   const Solved& found) {
   static const auto op =
-      find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, const Tensor&, const Tensor&,
-                     const OptionalTensor&, at::TensorList, at::TensorList, double)>(
-          "torchpd::mend_adjoint");
-  return op.call(solution, error, t.after, s.right, s.inverse, s.projector, t.material, t.plan,
-                 time_step);
+      find_op<Tensor(const Tensor&, const Tensor&, const OptionalTensor&, const Tensor&,
+                     const Tensor&, const Tensor&, const OptionalTensor&, at::TensorList,
+                     at::TensorList, double)>("torchpd::mend_adjoint");
+  const OptionalTensor friction =
+      found.friction.defined() ? OptionalTensor(found.friction) : OptionalTensor();
+  return op.call(found.solution, found.error, friction, t.after, s.right, s.inverse, s.projector,
+                 t.material, t.plan, time_step);
 }
 
-// The multiplier where vertices slide against friction, from the solution of what is symmetric: torchpd/sliding.py.
-inline Tensor slide(const AdjointTensors& t, const AdjointSystem& s, const Tensor& solution,
-                    const Tensor& error) {
-  static const auto op =
-      find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, const Tensor&, const Tensor&,
-                     const Tensor&, const Tensor&, const Tensor&, at::TensorList)>(
-          "torchpd::slide_adjoint");
-  return op.call(solution, error, t.after, s.inertia, s.inverse, *s.projector, *s.sliding,
-                 t.material[place_in_material("stiffness")], t.plan);
+// Whether a solve of any environment has failed. One copy, which waits for a GPU, and takes less than kernels that make one number
+// of it.
+inline bool some_failed(const Solved& found, double tolerance) {
+  const Tensor errors =
+      found.friction.defined() ? at::cat({found.error, found.friction}) : found.error;
+  const Tensor here = errors.to(at::kCPU).contiguous();
+  const double* const error = here.const_data_ptr<double>();
+  return std::any_of(error, error + here.numel(),
+                     [&](double e) { return e > adjoint_failed * tolerance; });
 }
 
-// What a solve leaves to be done: whether that of any environment has failed, and whether anything slides.
-struct Left {
-  bool failed = true, slides = true;
-};
-
-// One copy, which waits for a GPU, and takes less than kernels that make one number of it.
-inline Left look(const Tensor& progress, const OptionalTensor& sliding, double tolerance) {
-  Tensor numbers = progress.flatten();
-  if (sliding) numbers = at::cat({numbers, sliding->ne(0.0).any().to(at::kDouble).view({1})});
-  const Tensor here = numbers.to(at::kCPU);
-  const double* const number = here.const_data_ptr<double>();
-  Left left{false, sliding && number[progress.numel()] != 0};
-  for (std::int64_t at = progress_error; at < progress.numel(); at += progress_count)
-    left.failed = left.failed || number[at] > adjoint_failed * tolerance;
-  return left;
-}
-
-// The multiplier, its relative residual of every environment, and what slides where friction has a part in it: where a solve
-// has failed it has none.
+// The multiplier, and its relative residual of every environment.
 template <class Backend>
-std::tuple<Tensor, Tensor, OptionalTensor> solve(const AdjointTensors& t, const AdjointSystem& s,
-                                                 double time_step) {
+std::tuple<Tensor, Tensor> solve(const AdjointTensors& t, const AdjointSystem& s,
+                                 double time_step) {
   const double tolerance =
       t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
-  auto [solution, progress] =
+  const Solved found =
       iterate<Backend>(t.after, s, t.material[place_in_material("stiffness")], t.plan, tolerance);
-  const Tensor error = progress.select(1, progress_error);
   // a recording cannot ask, and does all of it
-  const Left left = Backend::recording(t.after) ? Left{} : look(progress, s.sliding, tolerance);
-  OptionalTensor sliding = s.sliding;
-  if (left.failed) {
-    solution = mend(t, s, time_step, solution, error);
-    const Tensor solved = error.le(adjoint_failed * tolerance).view({-1, 1, 1, 1});
-    if (sliding) sliding = at::where(solved, *sliding, 0.0);
-  }
-  if (left.slides && sliding) {
-    const AdjointSystem known{s.right, s.inertia, s.inverse, s.projector, sliding};
-    solution = slide(t, known, solution, error);
-  }
-  return {solution, error, sliding};
+  const bool mends = Backend::recording(t.after) || some_failed(found, tolerance);
+  return {mends ? mend(t, s, time_step, found) : found.solution, found.error};
 }
 
 using Wanted =
@@ -294,13 +275,13 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
   const bool touching = projector.size(0) > 0;
   const OptionalTensor free = touching ? OptionalTensor(projector) : OptionalTensor();
   const OptionalTensor slips = touching ? OptionalTensor(sliding) : OptionalTensor();
-  const auto [solution, error, slid] =
+  const auto [solution, error] =
       solve<Backend>(t, {right, inertia, inverse, free, slips}, time_step);
   Tensor elastic;
   PassedOn passed_on;
   if (touching) {
     elastic = elastic_product(t, solution);
-    passed_on = {grad_positions, elastic, projector, stuck, slid};
+    passed_on = {grad_positions, elastic, projector, stuck, sliding};
   }
   auto [x, v, multiplier] = adjoint_result<Backend>(
       solution, error, grad_velocities, material[place_in_material("masses")],

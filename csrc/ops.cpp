@@ -119,12 +119,9 @@ TORCH_LIBRARY(torchpd, m) {
       "rollout_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
       "after_velocities, Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, "
       "Tensor[] plan, *, float time_step, bool[]? wanted=None) -> Tensor[]");
-  // their kernels, for every device, come from Python
+  // its kernel, for every device, comes from Python
   with_plan(
-      "slide_adjoint(Tensor solution, Tensor error, Tensor after, Tensor inertia, Tensor inverse, "
-      "Tensor projector, Tensor sliding, Tensor stiffness, Tensor[] plan) -> Tensor");
-  with_plan(
-      "mend_adjoint(Tensor solution, Tensor error, Tensor after, Tensor right, Tensor inverse, "
+      "mend_adjoint(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor right, Tensor inverse, "
       "Tensor? projector, Tensor[] material, Tensor[] plan, *, float time_step) -> Tensor");
   with_plan(
       "adjoint_system(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
@@ -149,7 +146,7 @@ TORCH_LIBRARY(torchpd, m) {
       "conjugate_gradients_(Tensor(a!) solution, Tensor(b!) residual, Tensor(c!) direction, "
       "Tensor(d!) "
       "progress, Tensor positions, Tensor inertia, Tensor inverse, Tensor? projector, Tensor "
-      "stiffness, Tensor[] plan, Tensor? sliding=None, *, float tolerance, int iterations) -> ()");
+      "stiffness, Tensor[] plan, *, float tolerance, int iterations) -> ()");
   m.def("nearest_rotation(Tensor matrices) -> Tensor");
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }

@@ -258,7 +258,7 @@ struct ConjugateTensors {
   OptionalTensor projector;
   Tensor stiffness;
   at::TensorList plan;
-  OptionalTensor sliding;
+  OptionalTensor sliding, right, friction;  // all or none
 };
 
 template <class Backend, class T>
@@ -290,7 +290,11 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
   call.inverse = of_vertices(inverse, "inverse", "of the diagonal [m/N], 0 for what is held");
   call.positions = x.const_data_ptr<T>();
   call.projector = p.defined() ? p.const_data_ptr<T>() : nullptr;
-  call.sliding = slides.defined() ? slides.const_data_ptr<T>() : nullptr;
+  if (slides.defined()) {
+    call.sliding = slides.const_data_ptr<T>();
+    call.right = t.right->const_data_ptr<T>();
+    call.friction = t.friction->mutable_data_ptr<double>();
+  }
   call.solution = t.solution.mutable_data_ptr<T>();
   call.residual = t.residual.mutable_data_ptr<T>();
   call.direction = t.direction.mutable_data_ptr<T>();
@@ -301,12 +305,23 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
 }
 
 template <class Backend>
+void solve_conjugate(const ConjugateTensors& t, double tolerance, std::int64_t iterations) {
+  if (t.projector) check_projector(*t.projector, t.positions);
+  if (t.sliding) check_sliding(*t.sliding, t.positions);
+  TORCH_CHECK_VALUE(tolerance >= 0, "tolerance must be >= 0, got ", tolerance);
+  if (t.positions.scalar_type() == at::kFloat) {
+    conjugate_typed<Backend, float>(t, tolerance, iterations);
+  } else {
+    conjugate_typed<Backend, double>(t, tolerance, iterations);
+  }
+}
+
+template <class Backend>
 void conjugate_gradients_inplace(const Tensor& solution, const Tensor& residual,
                                  const Tensor& direction, const Tensor& progress,
                                  const Tensor& positions, const Tensor& inertia,
                                  const Tensor& inverse, const OptionalTensor& projector,
-                                 const Tensor& stiffness, at::TensorList plan,
-                                 const OptionalTensor& sliding, double tolerance,
+                                 const Tensor& stiffness, at::TensorList plan, double tolerance,
                                  std::int64_t iterations) {
   check_positions(positions, "positions");
   const Place place{positions.device()};
@@ -320,18 +335,11 @@ void conjugate_gradients_inplace(const Tensor& solution, const Tensor& residual,
   check_array(progress, at::kDouble, positions.size(0), progress_count, place, "progress",
               "r . z, |right side|, 1 while it goes on or -1 at the start, relative residual",
               "make it for this batch");
-  if (projector) check_projector(*projector, positions);
-  if (sliding) check_sliding(*sliding, positions);
-  TORCH_CHECK_VALUE(tolerance >= 0, "tolerance must be >= 0, got ", tolerance);
   TORCH_CHECK_VALUE(iterations >= 0 && iterations <= std::numeric_limits<int>::max(),
                     "iterations must be in [0, 2^31), got ", iterations);
-  const ConjugateTensors tensors{solution, residual,  direction, progress, positions, inertia,
-                                 inverse,  projector, stiffness, plan,     sliding};
-  if (positions.scalar_type() == at::kFloat) {
-    conjugate_typed<Backend, float>(tensors, tolerance, iterations);
-  } else {
-    conjugate_typed<Backend, double>(tensors, tolerance, iterations);
-  }
+  solve_conjugate<Backend>({solution, residual, direction, progress, positions, inertia, inverse,
+                          projector, stiffness, plan, {}, {}, {}},
+                         tolerance, iterations);
   for (const Tensor& t : {solution, residual, direction, progress}) {
     if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
   }

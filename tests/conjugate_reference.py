@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpd.multilevel import has_levels, reference_of_levels
 
-__all__ = ["System", "conjugate_gradients"]
+__all__ = ["System", "conjugate_gradients", "stabilised_gradients"]
 
 Map = Callable[[Tensor], Tensor]
 
@@ -52,6 +52,29 @@ def conjugate_gradients(
     return solution, residual, rho.flatten()
 
 
+def stabilised_gradients(
+    product: Map, precondition: Map, right: Tensor, tolerance: float, most: int = 2000
+) -> tuple[Tensor, int]:
+    """Solve for one environment, [1, V, 3], by BiCGStab (van der Vorst 1992); the solution, and its products."""
+    solution, residual = torch.zeros_like(right), right.clone()
+    direction, rho = residual, _dot(residual, residual)
+    for products in range(2, most, 2):
+        step_direction = precondition(direction)
+        image = product(step_direction)
+        step = rho / _dot(right, image)
+        half = residual - step * image
+        smoothing = precondition(half)
+        smoothed = product(smoothing)
+        weight = _dot(smoothed, half) / _dot(smoothed, smoothed)
+        solution = solution + step * step_direction + weight * smoothing
+        residual = half - weight * smoothed
+        if bool(_dot(residual, residual) <= tolerance**2 * _dot(right, right)):
+            return solution, products
+        last, rho = rho, _dot(right, residual)
+        direction = residual + (rho / last) * (step / weight) * (direction - weight * image)
+    return solution, most
+
+
 @dataclass(frozen=True)
 class System:
     """H of a step's objective, on what moves: P (inertia + elastic Hessian) P, and the diagonal for it."""
@@ -84,6 +107,22 @@ class System:
         def product(field: Tensor) -> Tensor:
             elastic = ops.hessian_product(positions, field.contiguous(), self.stiffness, self.plan)
             return self.allowed(torch.addcmul(elastic, inertia, field))
+
+        return product
+
+    def friction_product_at(self, positions: Tensor, sliding: Tensor) -> Map:
+        """What vertices that slide make of H: see csrc/solver/friction_adjoint.h."""
+        along, normal, across, bend, lean = sliding.unbind(-2)
+        inertia = self.inertia.unsqueeze(-1)
+
+        def part(vector: Tensor, field: Tensor) -> Tensor:
+            return (vector * field).sum(-1, keepdim=True)
+
+        def product(field: Tensor) -> Tensor:
+            pressed = field + normal * part(along, field)
+            elastic = ops.hessian_product(positions, pressed, self.stiffness, self.plan)
+            turned = (across - lean) * part(across, field) - bend * part(bend, field)
+            return self.allowed(elastic + inertia * field + turned)
 
         return product
 

@@ -198,7 +198,7 @@ def test_the_result(own: bool, dtype: torch.dtype, device: torch.device) -> None
 def test_the_result_with_contacts(dtype: torch.dtype, device: torch.device) -> None:
     """A vertex that friction holds moves with its start, by what contacts let through of dL/dx' + dL/dv' / h - K l.
 
-    One that slides has the turning of its slip, across it.
+    One that slides has the turning of its slip, across it, but where the solve has failed.
     """
     sim, (x, _) = small(dtype, device)
     h = sim.time_step
@@ -216,7 +216,9 @@ def test_the_result_with_contacts(dtype: torch.dtype, device: torch.device) -> N
     assert all(t[1].isnan().all() for t in found)
     passed = (projector * (g + w / h - elastic).unsqueeze(-2)).sum(-1)
     wanted = without[0] + torch.where(stuck[..., None], passed, 0.0)
-    across = sliding[..., 2, :]
+    assert errors[2] > pd.adjoint.ADJOINT_TOLERANCE[dtype]
+    across = sliding[..., 2, :].clone()
+    across[2] = 0.0
     wanted = wanted + across * (across * multiplier).sum(-1, keepdim=True)
     assert torch.allclose(found[0][::2], wanted[::2], rtol=10 * ULP[dtype], atol=1e4 * ULP[dtype])
     plain = ~stuck & (across == 0.0).all(-1)

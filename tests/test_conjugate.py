@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from conjugate_reference import System, conjugate_gradients
+from conjugate_reference import System, conjugate_gradients, stabilised_gradients
 from devices import missing_gpu
 from torch import Tensor
 
@@ -323,6 +323,88 @@ def test_what_slides_is_harder_to_turn(shape: str, dtype: torch.dtype, device: t
     )
     assert float((found - wanted).norm() / wanted.norm()) < 300 * tolerance
     assert float((plain - wanted).norm() / wanted.norm()) > 1e-2
+
+
+def sliding_on(s: System, right: Tensor, push: float = 0.5) -> Tensor:
+    """Every third vertex slides, with everything that a surface which curves adds; nothing does in the last environment."""
+    vectors = noise((*right.shape[:2], 5, 3), right.dtype, 7).to(right)
+    root = (1.0 / s.inverse.clamp(min=1e-30)).sqrt()[..., None, None]
+    scale = torch.tensor([push, 1.0, 0.0, 0.0, 0.0]).to(right)[:, None] + root * torch.tensor(
+        [0.0, 0.0, 0.5, 0.1, 0.05]
+    ).to(right)[:, None]
+    sliding = torch.where((s.inverse != 0)[..., None, None], scale * vectors, 0.0)
+    # a direction off the surface has no part in anything
+    for number in (0, 2, 3, 4):
+        sliding[:, :, number] = s.off_normals(sliding[:, :, number])
+    sliding[:, 1::3], sliding[:, 2::3], sliding[-1] = 0.0, 0.0, 0.0
+    return sliding
+
+
+def given_of(s: System, positions: Tensor, right: Tensor) -> tuple[Any, ...]:
+    return positions, right, s.inertia, s.inverse, s.projector, s.stiffness, s.plan
+
+
+@shapes("any", "several", "levels", "levels above one", "pairs", *MANY)
+def test_friction_is_solved_for(shape: str, dtype: torch.dtype, device: torch.device) -> None:
+    """What comes is G^T y of the system that is not symmetric; where nothing slides the bits of the one that is."""
+    options = SHAPES.get(shape, {"kernel": "block", "cells": BLOCKS[dtype].get(shape, CELLS)})
+    s, positions, right = system(dtype, device, contacts=True, **options)
+    sliding = sliding_on(s, right)
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-11
+    given = given_of(s, positions, right)
+    found, error = ops.conjugate_gradients(*given, sliding, tolerance=tolerance)
+    plain, _ = ops.conjugate_gradients(*given, tolerance=tolerance)
+    assert float(error.max()) <= 10 * tolerance
+    assert torch.equal(found[2], plain[2])
+    exact, x, b = system(torch.float64, device, contacts=True, cells=options.get("cells", CELLS))
+    for e in (0, 1):
+        wide, own = sliding[e : e + 1].double(), environment(exact, e)
+        y, products = stabilised_gradients(
+            own.friction_product_at(x[e : e + 1], wide), own.preconditioner(), b[e : e + 1], 1e-13
+        )
+        assert products < 2000
+        wanted = y + wide[..., 1, :] * (wide[..., 0, :] * y).sum(-1, keepdim=True)
+        assert float((found[e] - wanted[0]).norm() / wanted.norm()) < 100 * tolerance
+        assert float((plain[e] - wanted[0]).norm() / wanted.norm()) > 1e-2
+
+
+@shapes("any", "several", "levels", "pairs", *MANY)
+def test_friction_of_an_environment_has_the_same_bits_alone(
+    shape: str, dtype: torch.dtype, device: torch.device
+) -> None:
+    """Beside one that nothing slides in and one that is lost, on one thread or two, and by units of any size."""
+    options = SHAPES.get(shape, {"kernel": "block", "cells": BLOCKS[dtype].get(shape, CELLS)})
+    s, positions, right = system(dtype, device, contacts=True, **options)
+    sliding = sliding_on(s, right)
+    right[1] *= 2.0**40
+    positions[2] = float("nan")
+    threads = torch.get_num_threads()
+    together, _ = ops.conjugate_gradients(*given_of(s, positions, right), sliding, tolerance=1e-4)
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            for e in (0, 1):
+                own = environment(s, e)
+                given = given_of(own, positions[e : e + 1], right[e : e + 1])
+                alone, error = ops.conjugate_gradients(*given, sliding[e : e + 1], tolerance=1e-4)
+                assert float(error) <= 1e-3
+                assert torch.equal(alone[0], together[e])
+    finally:
+        torch.set_num_threads(threads)
+
+
+@shapes("any", "levels", *MANY)
+def test_friction_that_jams_is_an_error(shape: str, dtype: torch.dtype, device: torch.device) -> None:
+    """A vertex that its own friction presses ever harder: the residual says so, and what came is no worse than nothing."""
+    s, positions, right = system(dtype, device, contacts=True, **SHAPES[shape])
+    sliding = sliding_on(s, right, push=1e4)
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-11
+    given = given_of(s, positions, right)
+    found, error = ops.conjugate_gradients(*given, sliding, tolerance=tolerance)
+    plain, _ = ops.conjugate_gradients(*given, tolerance=tolerance)
+    assert torch.equal(found[2], plain[2])
+    assert float(error[:2].min()) > 1e3 * tolerance
+    assert found[:2].isfinite().all()
 
 
 @pytest.mark.parametrize(

@@ -84,23 +84,22 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
             (0 * x, f.clone(), f.clone(), progress, x, sim.masses, 1 / sim.masses, None, stiffness, plan),
             {"tolerance": 1e-3, "iterations": 2},
         ),
-        "conjugate_gradients": ((x, f, sim.masses, 1 / sim.masses, None, stiffness, plan), {"tolerance": 1e-3}),
+        "conjugate_gradients": (
+            (x, f, inertia, 1 / inertia, projector, stiffness, plan, 0.1 * sliding), {"tolerance": 1e-3},
+        ),
         "adjoint_system": ((f, direction, x, still, zero, 0.01 * f, material, plan), h),
         "contact_gradients": ((direction, f, f, direction, x, still, zero, 0.01 * f, material, plan), h),
         "adjoint_result": (
             (f, errors, direction, sim.masses, sim.damping, f, direction, projector, x[..., 0] > 0.1, sliding), h,
         ),
-        "slide_adjoint": (
-            (direction, 0 * errors, still, inertia, 1 / inertia, projector, 0.1 * sliding, stiffness, plan), {},
-        ),
-        "mend_adjoint": ((direction, errors, still, f, 1 / inertia, None, material, plan), h),
+        "mend_adjoint": ((direction, errors, 0 * errors, still, f, 1 / inertia, None, material, plan), h),
     }  # fmt: skip
 
 
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
     "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "rollout_vjp", "conjugate_gradients_",
-    "adjoint_system", "contact_gradients", "adjoint_result", "mend_adjoint", "slide_adjoint", "conjugate_gradients",
+    "adjoint_system", "contact_gradients", "adjoint_result", "mend_adjoint", "conjugate_gradients",
 )  # fmt: skip
 
 

@@ -9,11 +9,11 @@ the weighted diagonal, or with the multilevel preconditioner of a plan that has 
 the error of the step: iterate far enough, and look at the residual.
 
 A GPU solves every environment in one launch, however many iterations it takes (of half a million vertices and more in a
-few, as many as the plan and batch ask for), so a CUDA graph can record it.
+few, as many as the plan and batch ask for), so a CUDA graph can record it. An environment that is done does nothing.
 
 Contacts: the normal direction of a vertex that a contact holds is taken out of the system; a vertex that friction holds
-moves with its start, on a ball about its centre. What a vertex that slides against friction adds stands in
-`torchpd.sliding`, what contacts themselves get in csrc/solver/contact_gradients.h.
+moves with its start, on a ball about its centre. Where vertices slide against friction the system is not symmetric:
+csrc/solver/friction_adjoint.h. What contacts themselves get stands in csrc/solver/contact_gradients.h.
 """
 
 from __future__ import annotations
@@ -92,9 +92,18 @@ def _warn_of(failed: Tensor, error: Tensor) -> None:
     )
 
 
+def _warn_of_friction(failed: Tensor, error: Tensor) -> None:
+    warn_user(
+        f"torchpd: the adjoint of a step in which vertices slide is not solved in {int(failed.sum())} of "
+        f"{len(failed)} environments (relative residual {float(error[failed].max()):.1e}): friction jams there. Their "
+        "gradients are approximate."
+    )
+
+
 def mend_adjoint(
     solution: Tensor,
     error: Tensor,
+    friction: Tensor | None,
     after: Tensor,
     right: Tensor,
     inverse: Tensor,
@@ -106,11 +115,13 @@ def mend_adjoint(
 ) -> Tensor:
     """The multiplier l [B, V, 3]: where H turned out not to be positive that of constant rotations, with a warning.
 
-    While a CUDA graph records, nobody can ask whether a solve has failed, and there is no warning.
+    A warning says too where the system with friction is not solved: `solution` stays there. While a CUDA graph records,
+    nobody can ask whether a solve has failed, and there is no warning.
 
     Args:
-        solution: of the system with H [B, V, 3].
-        error: its relative residual [B].
+        solution: the multiplier that was found [B, V, 3].
+        error: the relative residual of the system with H [B].
+        friction: that of the system with friction [B], without contacts None.
         after: x' [B, V, 3].
         right: right side on what moves [B, V, 3].
         inverse: 1 / D, 0 where a vertex does not move, [V] or [B, V].
@@ -120,8 +131,13 @@ def mend_adjoint(
         time_step: h [s].
     """
     arrays, tolerance = list(plan), ADJOINT_TOLERANCE[right.dtype]
-    failed = error > _C.adjoint_failed * tolerance
-    if not is_recording(right) and bool(failed.any()):
+    limit = _C.adjoint_failed * tolerance
+    failed = error > limit
+    if not is_recording(right):
+        if friction is not None and bool((friction > limit).any()):
+            _warn_of_friction(friction > limit, friction)
+        if not bool(failed.any()):
+            return solution.clone()
         _warn_of(failed, error)
     # the curvature of what is slid on has no part in the majoriser
     inertia, _ = step_diagonal(arrays, material, time_step)

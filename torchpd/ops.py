@@ -12,7 +12,6 @@ from torch.utils._pytree import tree_leaves
 
 from .adjoint import mend_adjoint
 from .batching import rollout_vjp_rule, step_vjp_rule
-from .sliding import slide_adjoint
 from .tables import MATERIAL_TABLE
 from .vmap_rules import register_rule
 
@@ -161,11 +160,6 @@ def _(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
     return positions.new_empty(positions.shape), positions.new_empty(positions.shape[:1], dtype=torch.float64)
 
 
-@_register_fake("slide_adjoint")
-def _(solution: Tensor, *_: Any) -> Tensor:
-    return solution.new_empty(solution.shape)
-
-
 @_register_fake("mend_adjoint")
 def _(solution: Tensor, *_: Any, **__: Any) -> Tensor:
     return solution.new_empty(solution.shape)
@@ -204,11 +198,6 @@ def _(matrices: Tensor, direction: Tensor) -> Tensor:
 
 
 # ---- kernels
-
-
-@torch.library.impl("torchpd::slide_adjoint", ("cpu", "cuda"))
-def _(*args: Any) -> Tensor:
-    return slide_adjoint(*args)
 
 
 @torch.library.impl("torchpd::mend_adjoint", ("cpu", "cuda"))

@@ -115,7 +115,7 @@ class Simulator(Readable):
 
         Returns:
             The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
-            error follows that of the step), friction included, see `torchpd.sliding`, and for planes and spheres
+            error follows that of the step), friction included, see `torchpd.adjoint`, and for planes and spheres
             themselves; none for `start`. Forward mode and `torch.func.grad` are not provided.
         """
         forces = self.check_state(state, forces=forces)

@@ -2,7 +2,7 @@
 #pragma once
 #include "cpu/cycle.h"
 #include "cpu/sweep.h"
-#include "solver/conjugate.h"
+#include "solver/friction_adjoint.h"
 
 #include <algorithm>
 #include <cmath>
@@ -47,14 +47,33 @@ class Turnings {
   T* data_;
 };
 
+// Of BiCGStab: p, the first residual of a cycle, the correction of y, and the second product of an iteration.
+template <class T>
+struct FrictionVectors {
+  Quad<T>*search, *shadow, *correction, *smoothed;  // [vertices]
+
+  explicit FrictionVectors(std::int64_t vertices)
+      : storage_(allocate_zeroed(4 * vertices * sizeof(Quad<T>))) {
+    search = reinterpret_cast<Quad<T>*>(storage_.get());
+    shadow = search + vertices;
+    correction = shadow + vertices;
+    smoothed = correction + vertices;
+  }
+
+ private:
+  Storage storage_;
+};
+
 // What an environment is solved in, by all of a team.
 template <class T>
 struct ConjugateMemory {
   Workspace<Single<T>> vectors;
   Turnings<T> turnings;
   std::unique_ptr<Cycle<Single<T>>> cycle;  // of a plan with levels
+  FrictionVectors<T> friction;
 
-  explicit ConjugateMemory(const ConjugateCall<T>& call) : vectors(call), turnings(call.plan) {
+  explicit ConjugateMemory(const ConjugateCall<T>& call)
+      : vectors(call), turnings(call.plan), friction(call.friction ? call.plan.vertices : 0) {
     if (call.plan.levels.there()) cycle = std::make_unique<Cycle<Single<T>>>(call.plan.levels);
   }
 };
@@ -72,6 +91,7 @@ class ConjugatePass {
         w_(work.vectors),
         turnings_(work.turnings),
         cycle_(work.cycle.get()),
+        f_(work.friction),
         team_(team),
         sweep_{plan_, w_, scratch, team} {}
 
@@ -83,9 +103,10 @@ class ConjugatePass {
     load(numbers.begins);
     numbers.scale_by(1 / double(unit_));
     if (numbers.begins) begin(numbers);
-    for (int k = 0; k < call_.iterations && numbers.active && !team_.ended(plan_.vertices); ++k)
+    int k = 0;
+    for (; k < call_.iterations && numbers.active && !team_.ended(plan_.vertices); ++k)
       iterate(numbers);
-    store();
+    store(solve_friction(numbers, k));
     numbers.scale_by(double(unit_));
     if (team_.rank == 0) numbers.write(call_.progress + environment * progress_count);
     team_.barrier();
@@ -149,7 +170,9 @@ class ConjugatePass {
     team_.barrier();  // before the next sums stand there
   }
 
-  void iterate(Conjugate& numbers) {
+  // visit(vertex, elastic Hessian times the direction, sums)
+  template <class Visit>
+  void multiply(const Visit& visit) {
     const auto product = one_by_one([&](const auto& elements, int s) {
       using R = typename std::remove_cvref_t<decltype(elements)>::R;
       Vec3<R> dx[4], g[4];
@@ -158,7 +181,11 @@ class ConjugatePass {
                             elements.weight(s), g);
       elements.add(s, g);
     });
-    sweep_.template run<2>(0, product, [&](std::int64_t i, const Quad<T>& force, Sum& sums) {
+    sweep_.template run<2>(0, product, visit);
+  }
+
+  void iterate(Conjugate& numbers) {
+    multiply([&](std::int64_t i, const Quad<T>& force, Sum& sums) {
       const Quad<T> d = direction()[i];
       const Vec3<T> moved = conjugate_image(to_vec3(force), to_vec3(d), w_.inertia[i],
                                             w_.inverse[i] != T(0), projector(i), across(i));
@@ -184,6 +211,103 @@ class ConjugatePass {
     team_.barrier();
   }
 
+  // Goes on with friction, after so many products; returns whether it has.
+  bool solve_friction(const Conjugate& numbers, int products) {
+    if (!call_.friction || !adds_friction(numbers, call_.tolerance) || !some_slide())
+      return false;
+    FrictionSolve friction(nullptr, numbers.scale);
+    friction.begin(products, adjoint_iterations);
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      f_.correction[i] = to_quad<T>(0, 0, 0);
+    while (friction.active() && !team_.ended(plan_.vertices)) advance(friction);
+    if (team_.rank == 0) friction.write(call_.friction + environment_ * friction_count);
+    return true;
+  }
+
+  // every thread looks for itself
+  bool some_slide() const {
+    for (std::int64_t i = 0; i < plan_.vertices; ++i) {
+      if (slides(sliding(i))) return true;
+    }
+    return false;
+  }
+
+  void advance(FrictionSolve& friction) {
+    const FrictionStage stage = friction.stage;
+    if (cycle_ && stage != FrictionStage::residual)
+      precondition(stage == FrictionStage::first ? f_.search : residual());
+    const auto z = [&](std::int64_t i) {
+      if (stage == FrictionStage::residual) return solution()[i] + f_.correction[i];
+      if (cycle_) return cycle_->result()[i];
+      return w_.inverse[i] * (stage == FrictionStage::first ? f_.search : residual())[i];
+    };
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      direction()[i] = Lanes::value(press(to_vec3(z(i)), sliding(i)));
+    team_.barrier();
+    multiply([&](std::int64_t i, const Quad<T>& force, Sum& sums) {
+      const Quad<T> product =
+          Lanes::value(friction_image(to_vec3(force), to_vec3(z(i)), w_.inertia[i],
+                                      w_.inverse[i] != T(0), projector(i), sliding(i)));
+      if (stage == FrictionStage::residual) {
+        const Quad<T> rest = (T(1) / unit_) * read(call_.right, i) - product;
+        residual()[i] = rest;
+        sums.first = multiply_add(rest, rest, sums.first);
+      } else if (stage == FrictionStage::first) {
+        image()[i] = product;
+        sums.first = multiply_add(f_.shadow[i], product, sums.first);
+      } else {
+        f_.smoothed[i] = product;
+        sums.first = multiply_add(product, residual()[i], sums.first);
+        sums.second = multiply_add(product, product, sums.second);
+      }
+    });
+    const auto sum = total(0);
+    if (stage == FrictionStage::residual) return correct(friction, sum.first);
+    const bool first = stage == FrictionStage::first;
+    const T step = T(first ? friction.go(sum.first) : friction.smooth(sum.first, sum.second));
+    if (first && friction.stage == FrictionStage::residual) return;
+    const Quad<T>* const product = first ? image() : f_.smoothed;
+    each_part([&](std::int64_t i, Sum& sums) {
+      f_.correction[i] = multiply_add(step, z(i), f_.correction[i]);
+      const Quad<T> rest = subtract_product(residual()[i], step, product[i]);
+      residual()[i] = rest;
+      sums.first = multiply_add(rest, rest, sums.first);
+      sums.second = multiply_add(f_.shadow[i], rest, sums.second);
+    });
+    if (first) return;
+    const auto left = total(1);
+    const T keep = T(friction.judge(left.first, left.second, call_.tolerance));
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      f_.search[i] =
+          multiply_add(keep, subtract_product(f_.search[i], step, image()[i]), residual()[i]);
+    team_.barrier();
+  }
+
+  // With the true residual of y and its correction, by its |r|^2: begins a cycle, or ends.
+  void correct(FrictionSolve& friction, double square) {
+    const bool enters = friction.accept(square, call_.tolerance);
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      if (enters) solution()[i] = solution()[i] + f_.correction[i];
+      f_.correction[i] = to_quad<T>(0, 0, 0);
+      f_.search[i] = f_.shadow[i] = residual()[i];
+    }
+    team_.barrier();
+  }
+
+  // M of a field, for the result of the cycle
+  void precondition(const Quad<T>* field) {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      cycle_->input()[i] = field[i];
+    team_.barrier();
+    cycle_->run(team_);
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      Quad<T>& z = cycle_->result()[i];
+      z = Lanes::value(preconditioned(to_vec3(z), to_vec3(field[i]), w_.inverse[i],
+                                      plan_.levels.reference_inertia[i], projector(i)));
+    }
+    team_.barrier();
+  }
+
   // M of the residual, for `preconditioned_residual`; returns r . M r
   double apply_levels() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
@@ -204,16 +328,21 @@ class ConjugatePass {
     return cycle_ ? cycle_->result()[i] : w_.inverse[i] * residual()[i];
   }
 
+  const T* sliding(std::int64_t i) const {
+    return call_.sliding ? call_.sliding + slide_count * row(i) : nullptr;
+  }
   const T* across(std::int64_t i) const {
-    return call_.sliding ? call_.sliding + slide_count * row(i) + 3 * slide_across : nullptr;
+    return call_.sliding ? sliding(i) + 3 * slide_across : nullptr;
   }
   // of what contacts let through; null where all is
   const T* projector(std::int64_t i) const {
     return call_.projector ? call_.projector + 3 * row(i) : nullptr;
   }
 
-  void store() {
+  // `slides`: the multiplier is G^T of what was solved for
+  void store(bool slides) {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      if (slides) solution()[i] = Lanes::value(press(to_vec3(solution()[i]), sliding(i)));
       write(call_.solution, i, unit_ * solution()[i]);
       write(call_.residual, i, unit_ * residual()[i]);
       write(call_.direction, i, unit_ * direction()[i]);
@@ -261,6 +390,7 @@ class ConjugatePass {
   Workspace<Lanes>& w_;
   Turnings<T>& turnings_;
   const Cycle<Lanes>* cycle_;
+  FrictionVectors<T>& f_;
   const Team& team_;
   Sweep<Lanes> sweep_;
   std::int64_t environment_ = 0;

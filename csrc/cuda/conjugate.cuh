@@ -1,7 +1,7 @@
 // Runner of solver/conjugate.h: one launch, whatever it takes, behind that of the weights.
 #pragma once
 #include "cuda/conjugate_alone.cuh"
-#include "cuda/conjugate_team.cuh"
+#include "cuda/conjugate_launch.cuh"
 
 namespace pd {
 

@@ -1,6 +1,8 @@
 // Iterations of solver/conjugate.h where a block has the mesh of an environment in its shared memory.
 #pragma once
 #include "cuda/conjugate_sums.cuh"
+#include "cuda/friction_alone.cuh"
+#include "solver/adjoint.h"
 
 #include <algorithm>
 
@@ -11,11 +13,13 @@ struct ConjugateAlone {
   DeviceConjugate<T> call;
   FieldWork<T> product;  // of the direction
   T* image;              // [batch, vertices, 3], the product
+  FrictionVectors<T> friction;
 };
 
 // All iterations of an environment, until it is done: no other one enters, and nobody asks in between. A thread has the same
 // vertices from the first loop to the last, so what it writes of them in device memory it finds there.
-template <class T>
+// `Slides`: with friction.
+template <class T, bool Slides>
 __global__ void __launch_bounds__(conjugate_threads<T>)
     conjugate_alone(const __grid_constant__ ConjugateAlone<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
@@ -35,9 +39,13 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     }
   };
 
-  double largest[1] = {0};
+  // and whether any vertex slides
+  double largest[2] = {0, 0};
   each_slot([&](int, int, std::int64_t at) {
     largest[0] = Largest()(largest[0], largest_of(read3(call.residual + at)));
+    if constexpr (Slides) {
+      if (slides(call.sliding + slide_count * at)) largest[1] = 1;
+    }
   });
   across_block<Largest>(largest, warp_sums);
   const T unit = unit_near(T(largest[0]));
@@ -69,7 +77,9 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     fields(unsigned(8 * s), vectors);
     return vectors[1];
   };
-  for (int k = 0; k < call.iterations && numbers.active; ++k) {
+  int products = 0;
+  while (products < call.iterations && numbers.active) {
+    ++products;
     each_pair<2>(fields.patch, fields, rest_of<false>(fields.patch),
                  work.product.weights_of(environment), fields.entries, SolidHessian{});
     __syncthreads();
@@ -105,6 +115,15 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     });
     __syncthreads();
   }
+  if constexpr (Slides) {
+    if (largest[1] > 0 && adds_friction(numbers, call.tolerance)) {
+      FrictionSolve friction(nullptr, numbers.scale);
+      friction.begin(products, adjoint_iterations);
+      FrictionAlone<T>(work.product, call, work.friction, work.image, fields, unit, warp_sums)
+          .run(friction);
+      if (threadIdx.x == 0) friction.write(call.friction + environment * friction_count);
+    }
+  }
   each_slot([&](int s, int, std::int64_t at) {
     times(unit, call.residual, at);
     times(unit, call.solution, at);
@@ -117,8 +136,12 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
 
 template <class T>
 ConjugateAlone<T> arrange_alone(Arena& arena, const DeviceConjugate<T>& call) {
-  ConjugateAlone<T> work{call, arrange(arena, conjugate_field(call), 0), nullptr};
-  arena.place(work.image, call.batch * call.plan.vertices * 3);
+  ConjugateAlone<T> work{call, arrange(arena, conjugate_field(call), 0), nullptr, {}};
+  const std::int64_t count = call.batch * call.plan.vertices * 3;
+  arena.place(work.image, count);
+  FrictionVectors<T>& f = work.friction;
+  for (T** array : {&f.shadow, &f.correction, &f.smoothed})
+    arena.place(*array, call.friction ? count : 0);
   return work;
 }
 
@@ -128,7 +151,7 @@ void run_conjugate_alone(const DeviceConjugate<T>& call, void* memory, cudaStrea
   const ConjugateAlone<T> work = arrange_alone(arena, call);
   const DevicePlan<T>& plan = call.plan;
   weigh_field<false>(work.product, stream);
-  const auto kernel = conjugate_alone<T>;
+  const auto kernel = call.friction ? conjugate_alone<T, true> : conjugate_alone<T, false>;
   const std::size_t bytes = pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, 2);
   // Half as many threads where two blocks then share a multiprocessor, which is for many environments. How many there are in
   // this call does not enter, since the threads decide the order of sums.

@@ -14,8 +14,12 @@ struct ConjugateMemory {
   Quad<T>* residual;             // [vertices], w: 1 / D
   Quad<T>*direction, *other;     // [vertices], w: inertia; iterations alternate
   Quad<T>* shared_force;         // [slots], as FieldWork has it
-  // of parts: d . H d; |r|^2 and r . r / D; r . M r, and the largest number before
-  double *curvature, *squares, *weighted;
+  // of BiCGStab, where friction follows: the second product of an iteration [vertices], and of every environment, from launch to
+  // launch, the first residual of the cycle and the correction of y
+  Quad<T>*smoothed, *shadow, *correction;
+  // of parts: d . H d, or two numbers of a product with friction; |r|^2 and r . r / D, two again; r . M r, and before whether
+  // any vertex slides, and the largest number
+  double *products, *squares, *weighted;
   CycleMemory<T> cycle;  // with levels
 };
 
@@ -53,7 +57,7 @@ class ConjugateTeam {
         slots_(shared, plan_.most_slots),
         entries_(reinterpret_cast<Quad<T>*>(shared + slots_bytes(sizeof(T), plan_.most_slots, 2))),
         warp_sums_(warp_sums),
-        curvature_{memory.curvature, work.product_parts()},
+        curvature_{memory.products, work.product_parts()},
         squares_{memory.squares, work.vertex_parts()},
         weighted_{memory.weighted, work.vertex_parts()},
         largest_{memory.weighted, work.vertex_parts()},
@@ -67,15 +71,22 @@ class ConjugateTeam {
     if (!numbers.active) return;
     load(numbers.begins);
     numbers.scale_by(1 / double(unit_));
-    if (numbers.begins) begin(numbers);
-    for (int k = 0; k < call_.iterations && numbers.active; ++k) iterate(numbers);
+    iterate_all(numbers);
     store();
     numbers.scale_by(double(unit_));
     team_.barrier();  // before sums of the next environment stand where this one's were
     if (team_.thread() == 0) numbers.write(progress);
   }
 
- private:
+ protected:
+  // As many as there may be; returns how many they were.
+  __device__ int iterate_all(Conjugate& numbers) {
+    if (numbers.begins) begin(numbers);
+    int k = 0;
+    for (; k < call_.iterations && numbers.active; ++k) iterate(numbers);
+    return k;
+  }
+
   // visit(vertex) of every part of this block, after which leave(part)
   template <class Visit, class Leave>
   __device__ void each_part(int first, int count, const Visit& visit, const Leave& leave) {
@@ -192,6 +203,7 @@ class ConjugateTeam {
   // H times the next direction, which then is the last one, and the curvature along it
   __device__ void multiply() {
     double sum[1] = {0};
+    const auto next = [&](int i) { return direction(i); };
     const auto look = [&](int i, const Vec3<T>& elastic, const Vec3<T>& d) {
       const T inertia = last_[i].w;
       const Vec3<T> image = conjugate_image(elastic, d, inertia, m_.residual[i].w != T(0),
@@ -200,13 +212,22 @@ class ConjugateTeam {
       next_[i] = quad(d, inertia);
       sum[0] += wide_dot(d, image);
     };
-    const auto leave = [&](int part) {
+    multiply(next, look, [&](int part) {
       curvature_.leave(part, sum, warp_sums_);
       sum[0] = 0;
-    };
+    });
+    Quad<T>* const last = last_;
+    last_ = next_;
+    next_ = last;
+    turns_ = false;
+  }
+
+  // Of a field, what(vertex): look(vertex, elastic product, field) at all vertices of this block, after whose parts leave(part)
+  template <class What, class Look, class Leave>
+  __device__ void multiply(const What& what, const Look& look, const Leave& leave) {
 #pragma unroll 1
     for (int number = team_.rank(); number < plan_.patches; number += team_.blocks()) {
-      multiply(Patch<T>(plan_, number), look);
+      multiply_patch(Patch<T>(plan_, number), what, look);
       leave(number);
     }
     team_.barrier();
@@ -219,24 +240,20 @@ class ConjugateTeam {
             const int end = plan_.shared_start[i - first + 1];
             for (int at = plan_.shared_start[i - first]; at < end; ++at)
               force = force + vec3(m_.shared_force[plan_.shared_slot[at]]);
-            look(i, force, direction(i));
+            look(i, force, what(i));
           },
           [&](int part) { leave(plan_.patches + part); });
       team_.barrier();
     }
-    Quad<T>* const last = last_;
-    last_ = next_;
-    next_ = last;
-    turns_ = false;
   }
 
-  // of a patch: look(vertex, elastic product, direction) at those that it has alone
-  template <class Look>
-  __device__ void multiply(const Patch<T>& patch, const Look& look) {
+  // of a patch: look at the vertices that it has alone
+  template <class What, class Look>
+  __device__ void multiply_patch(const Patch<T>& patch, const What& what, const Look& look) {
     const Vec3<T> anchor = vec3(m_.x[patch.vertex(0)]);
     for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
       const int i = patch.vertex(s);
-      slots_.set(s, vec3(m_.x[i]) - anchor, direction(i));
+      slots_.set(s, vec3(m_.x[i]) - anchor, what(i));
     }
     __syncthreads();
     each_pair<2>(patch, slots_, rest_of<Computed>(patch), weights_, entries_, SolidHessian{});
@@ -305,120 +322,5 @@ class ConjugateTeam {
   T unit_ = T(1), keep_ = T(0);
   bool turns_ = false;
 };
-
-// The arrays of one of several teams.
-template <class T>
-__device__ ConjugateMemory<T> memory_of_team(const ConjugateTeams<T>& work, int team) {
-  ConjugateMemory<T> m = work.memory;
-  const std::int64_t vertices = std::int64_t(work.call.plan.vertices) * team;
-  for (Quad<T>** array : {&m.x, &m.solution, &m.image, &m.residual, &m.direction, &m.other})
-    *array += vertices;
-  m.shared_force += std::int64_t(work.call.plan.slots) * team;
-  m.curvature += std::int64_t(work.product_parts()) * team;
-  m.squares += 2 * std::int64_t(work.vertex_parts()) * team;
-  m.weighted += std::int64_t(work.vertex_parts()) * team;
-  if (work.call.plan.levels.there()) m.cycle = cycle_of_team(work.call.plan.levels, m.cycle, team);
-  return m;
-}
-
-template <class T, bool Leveled, bool Computed>
-__global__ void __launch_bounds__(conjugate_threads<T>)
-    conjugate_teams(const __grid_constant__ ConjugateTeams<T> work) {
-  extern __shared__ __align__(16) std::byte shared[];
-  __shared__ WarpSums warp_sums;
-  __shared__ Quad<T> cycle_sums[Leveled ? 4 * conjugate_threads<T> / warp_size : 1];
-  const int number = int(blockIdx.x) / work.blocks;
-  BlockTeam team(int(blockIdx.x) % work.blocks, work.blocks, work.counter + number);
-  const ConjugateMemory<T> memory = memory_of_team(work, number);
-  for (std::int64_t e = number; e < work.call.batch; e += work.teams)
-    ConjugateTeam<T, Leveled, Computed>(work, memory, e, team, shared, warp_sums, cycle_sums).run();
-}
-
-template <class T>
-struct ConjugateLaunch {
-  // Vertices of all teams: with more of them fewer teams of more blocks do as well, in less memory.
-  static constexpr std::int64_t most_vertices = std::int64_t(1) << 21;
-  // Vertices times iterations of a launch, some tenths of a second on an H100: a device that draws as well must not be kept
-  // longer. Those that follow go on where it has ended.
-  static constexpr std::int64_t most_work = std::int64_t(1) << 30;
-
-  const void* kernel;
-  int threads;
-  std::size_t shared;
-  Teams teams;
-
-  explicit ConjugateLaunch(const DeviceConjugate<T>& call)
-      : kernel(kernel_for(call.plan)),
-        threads(threads_of(call.plan)),
-        shared(pass_shared_bytes(sizeof(T), call.plan.most_slots, call.plan.most_entries, 2)),
-        teams(std::min(call.batch, std::max<std::int64_t>(1, most_vertices / call.plan.vertices)),
-              resident(), useful(call.plan)) {}
-
-  static int most_iterations(const DeviceConjugate<T>& call) {
-    const std::int64_t most = most_work / (call.batch * call.plan.vertices);
-    return int(std::clamp<std::int64_t>(most, 1, call.iterations));
-  }
-
- private:
-  static const void* kernel_for(const DevicePlan<T>& plan) {
-    if (!computes_rests(plan)) return function<false, false>();
-    return plan.levels.there() ? function<true, true>() : function<false, true>();
-  }
-  template <bool Leveled, bool Computed>
-  static const void* function() {
-    return reinterpret_cast<const void*>(conjugate_teams<T, Leveled, Computed>);
-  }
-  int resident() const {
-    const int blocks = resident_blocks(kernel, threads, shared);
-    if (blocks == 0) refuse_shared_memory(shared);
-    return blocks;
-  }
-  // The plan alone decides, since they set the order of sums: no more than there are pairs for, so that patches of a small
-  // mesh are worked on side by side; but the preconditioner wants few blocks that meet, of many threads.
-  static int threads_of(const DevicePlan<T>& plan) {
-    constexpr int most = conjugate_threads<T>, least = 64;
-    return plan.levels.there() ? most : std::clamp(int(whole_warps(plan.most_pairs)), least, most);
-  }
-  int useful(const DevicePlan<T>& plan) const {
-    const int levels = plan.levels.there() ? useful_blocks(plan.levels, threads) : 1;
-    return std::max({plan.patches, (plan.vertices + threads - 1) / threads, levels});
-  }
-};
-
-template <class T>
-ConjugateTeams<T> arrange_teams(Arena& arena, const DeviceConjugate<T>& call,
-                                const ConjugateLaunch<T>& launch) {
-  const Teams& teams = launch.teams;
-  ConjugateTeams<T> work{call, {}, {}, nullptr, teams.count, teams.blocks, launch.threads};
-  ConjugateMemory<T>& m = work.memory;
-  const std::int64_t count = teams.count, vertices = count * call.plan.vertices;
-  arena.place(work.counter, count);
-  work.product = arrange(arena, conjugate_field(call), count);
-  m.shared_force = work.product.shared_force;
-  for (Quad<T>** array : {&m.x, &m.solution, &m.image, &m.residual, &m.direction, &m.other})
-    arena.place(*array, vertices);
-  arena.place(m.curvature, count * work.product_parts());
-  arena.place(m.squares, 2 * count * work.vertex_parts());
-  arena.place(m.weighted, count * work.vertex_parts());
-  if (call.plan.levels.there()) arrange(arena, call.plan.levels, teams.count, m.cycle);
-  return work;
-}
-
-template <class T>
-void run_conjugate_teams(const DeviceConjugate<T>& call, void* memory, cudaStream_t stream) {
-  const ConjugateLaunch<T> launch(call);
-  Arena arena(memory);
-  ConjugateTeams<T> work = arrange_teams(arena, call, launch);
-  if (computes_rests(call.plan)) {
-    weigh_field<true>(work.product, stream);
-  } else {
-    weigh_field<false>(work.product, stream);
-  }
-  const int most = launch.most_iterations(call);
-  for (std::int64_t done = 0; done < call.iterations; done += most) {
-    work.call.iterations = int(std::min<std::int64_t>(most, call.iterations - done));
-    launch_teams(launch.kernel, work, work.counter, launch.threads, launch.shared, stream);
-  }
-}
 
 }  // namespace pd

@@ -287,8 +287,19 @@ enum ConjugateProgress : int {
   progress_count
 };
 
+// Numbers of an environment in the progress of the solve that follows where vertices slide against friction, zero before: what it
+// does next (FrictionStage), s . r of BiCGStab, the true residual relative to the right side, and products that are left.
+enum FrictionProgress : int {
+  friction_stage,
+  friction_product,
+  friction_error,
+  friction_left,
+  friction_count
+};
+
 // Iterations of conjugate gradients on (inertia + elastic Hessian) solution = right side, for each environment by itself;
-// preconditioned by a diagonal, or by a plan's levels where it has them.
+// preconditioned by a diagonal, or by a plan's levels where it has them. With `friction` those of solver/friction_adjoint.h follow
+// where something slides, and what it ends with is the multiplier.
 template <class T, class P = Plan<T>>
 struct ConjugateCall {
   P plan;
@@ -300,12 +311,14 @@ struct ConjugateCall {
       nullptr;  // [batch, vertices, 3, 3] of what contacts let through; may be null
   const T* sliding =
       nullptr;  // [batch, vertices, slide_count, 3], whose slide_across H has; may be null
-  T* solution = nullptr;  // [batch, vertices, 3] each, from zero
+  const T* right = nullptr;    // [batch, vertices, 3], with friction
+  double* friction = nullptr;  // [batch, friction_count]; null: no friction
+  T* solution = nullptr;       // [batch, vertices, 3] each, from zero
   T* residual = nullptr;
   T* direction = nullptr;
   double* progress = nullptr;  // [batch, progress_count]
   double tolerance = 0;        // of the residual, relative to the right side
-  int iterations = 0;
+  int iterations = 0;          // products, where friction follows
 };
 
 // The approximation of A^-1 of a vector for each vertex.

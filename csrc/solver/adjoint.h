@@ -255,8 +255,8 @@ struct AdjointVertex {
 };
 
 // -l . dr / d(x, v) of a vertex: dL/dx = m / h^2 (1 + damping h) l - dL/dv' / h, dL/dv = m / h l; one that friction holds moves
-// with its start, and l of one that slides has what its friction adds (torchpd/sliding.py). An environment whose solve could not
-// begin has no number for an answer.
+// with its start, and l of one that slides has what its friction adds (solver/friction_adjoint.h), but where the solve has failed,
+// which leaves friction out. An environment whose solve could not begin has no number for an answer.
 template <class T>
 struct AdjointAnswer {
   const AdjointResultCall<T>& call;
@@ -289,7 +289,7 @@ struct AdjointAnswer {
       const Mat3<T> free = {{{p[0], p[1], p[2]}, {p[3], p[4], p[5]}, {p[6], p[7], p[8]}}};
       sum = sum + free * (read(call.grad_positions) + before - read(call.elastic));
     }
-    if (call.sliding) {
+    if (call.sliding && error <= adjoint_failed * adjoint_tolerance<T>) {
       // the direction of slip turns with its start
       const T* p = call.sliding + 3 * (slide_count * at() + slide_across);
       const Vec3<T> across = {p[0], p[1], p[2]};

@@ -1,5 +1,5 @@
 // What a solved adjoint says of the contacts that hold a vertex: dL/dp = -l . dr/dp - lambda . dgap/dp for all that a plane or a
-// ball is made of. The system stands in torchpd/sliding.py; beside it are the gaps, n_k . x' - height or |x' - center| - radius,
+// ball is made of. The system stands in solver/friction_adjoint.h; beside it are the gaps, n_k . x' - height or |x' - center| - radius,
 // whose multipliers balance what the tangential directions leave of the loss,
 //
 //   lambda_k = m_k . q,   q = dL/dx' + dL/dv' / h - H l,   m_k dual to the normals: m_k . n_j = 1 for k = j, else 0.
