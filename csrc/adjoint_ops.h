@@ -1,5 +1,5 @@
 // The ops of a step's adjoint on either device. Of a Backend, beside what ops.h asks for: `adjoint_system`,
-// `contact_gradients` and `adjoint_result`, which run a call; and `recording(like)`, whether what is done is recorded for later,
+// `contact_gradients`, `adjoint_result` and `vertex_sum`, which run a call; and `recording(like)`, whether what is done is recorded for later,
 // where nobody can ask what comes out.
 #pragma once
 #include "material_gradients.h"
@@ -298,7 +298,7 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
         return gradients_for_contacts<Backend>(t, l, product, time_step,
                                                {wants("planes"), wants("spheres")});
       },
-      asked, time_step);
+      &sum_vertices<Backend>, asked, time_step);
   for (std::size_t i = 0; i < material.size(); ++i) {
     if (!wanted || wanted->get(i)) found.push_back(gradients.of(i));
   }

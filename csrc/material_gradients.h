@@ -1,6 +1,7 @@
 // Gradients of a step for the arrays of its material, once its adjoint is solved.
 #pragma once
 #include "find_op.h"
+#include "plan/vertex_sum.h"
 #include "solver/contact_gradients.h"
 #include "step_taken.h"
 
@@ -45,6 +46,26 @@ class Asked {
   Tensor is_;
 };
 
+// [batch, vertices, ...] to [batch, ...]. Those of torch add up in an order that follows from the batch.
+template <class Backend, class T>
+Tensor sum_vertices_typed(const Tensor& values) {
+  const Tensor from = values.contiguous();
+  std::vector<std::int64_t> shape = from.sizes().vec();
+  shape.erase(shape.begin() + 1);
+  const Tensor out = at::empty(shape, from.options());
+  if (out.numel() == 0) return out;
+  Backend::vertex_sum(VertexSumCall<T>{from.size(0), from.size(1), out.numel() / from.size(0),
+                                       from.const_data_ptr<T>(), out.mutable_data_ptr<T>()},
+                      out);
+  return out;
+}
+
+template <class Backend>
+Tensor sum_vertices(const Tensor& values) {
+  return values.scalar_type() == at::kFloat ? sum_vertices_typed<Backend, float>(values)
+                                            : sum_vertices_typed<Backend, double>(values);
+}
+
 // Whose gradients are wanted, of all contacts.
 struct WantedContacts {
   bool planes = true, spheres = true;
@@ -69,7 +90,7 @@ std::tuple<Tensor, Tensor> gradients_for_contacts_typed(const AdjointTensors& t,
   if (planes.numel() > 0) call.planes = planes.mutable_data_ptr<T>();
   if (spheres.numel() > 0) call.spheres = spheres.mutable_data_ptr<T>();
   if (call.planes || call.spheres) Backend::contact_gradients(call, multiplier);
-  return {planes.sum(1), spheres.sum(1)};
+  return {sum_vertices_typed<Backend, T>(planes), sum_vertices_typed<Backend, T>(spheres)};
 }
 
 template <class Backend>
@@ -85,14 +106,16 @@ std::tuple<Tensor, Tensor> gradients_for_contacts(const AdjointTensors& t, const
 // -l . dr/dp of every environment, for an array p of the material, from its formulas for all of them.
 class MaterialGradients {
  public:
-  // `elastic`: K l, undefined where nobody has worked it out; `contacts`: gradients_for_contacts by K l
+  // `elastic`: K l, undefined where nobody has worked it out; `contacts`: gradients_for_contacts by K l; `sum`: sum_vertices
   using Contacts = std::function<std::tuple<Tensor, Tensor>(const Tensor& elastic)>;
+  using Sum = Tensor (*)(const Tensor& values);
   MaterialGradients(const AdjointTensors& t, const Tensor& multiplier, const Tensor& elastic,
-                    Contacts contacts, const Asked& asked, double time_step)
+                    Contacts contacts, Sum sum, const Asked& asked, double time_step)
       : t_(t),
         multiplier_(multiplier),
         elastic_(elastic),
         contacts_(std::move(contacts)),
+        sum_(sum),
         asked_(asked),
         h_(time_step) {}
 
@@ -146,9 +169,9 @@ class MaterialGradients {
     return -(multiplier_ * pull).sum(-1);
   }
 
-  Tensor gravity() const { return (mass() * multiplier_).sum(1); }
+  Tensor gravity() const { return sum_(mass() * multiplier_); }
 
-  Tensor damping() const { return -(mass() * multiplier_ * rate()).sum({1, 2}); }
+  Tensor damping() const { return -sum_((mass() * multiplier_ * rate()).flatten(1)); }
 
   Tensor pin_stiffness() const {
     const Tensor stretch = pinned(t_.after) - material("pin_targets");
@@ -173,6 +196,7 @@ class MaterialGradients {
   const Tensor& multiplier_;
   const Tensor& elastic_;
   Contacts contacts_;
+  Sum sum_;
   const Asked& asked_;
   double h_;
   mutable std::optional<std::tuple<Tensor, Tensor>> of_contacts_;

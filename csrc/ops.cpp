@@ -63,6 +63,19 @@ struct Cpu {
   static void adjoint_result(const AdjointResultCall<double>& call, const Tensor&) {
     kernels().adjoint_result64(call, threads());
   }
+  template <class T>
+  static void vertex_sum(const VertexSumCall<T>& call, const Tensor&) {
+    at::parallel_for(0, call.batch, 1, [&](std::int64_t begin, std::int64_t end) {
+      for (std::int64_t e = begin; e < end; ++e) {
+        for (std::int64_t n = 0; n < call.numbers; ++n) {
+          const T* from = call.values + e * call.vertices * call.numbers + n;
+          double sum = 0;
+          for (std::int64_t i = 0; i < call.vertices; ++i) sum += double(from[i * call.numbers]);
+          call.out[e * call.numbers + n] = T(sum);
+        }
+      }
+    });
+  }
   static void rotation(const RotationCall<float>& call, const Tensor&) {
     kernels().rotation32(call, threads());
   }

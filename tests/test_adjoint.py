@@ -286,8 +286,8 @@ def test_nothing_is_mended_where_nothing_failed(error: float) -> None:
     plan, material = list(sim.plan.arrays), [array.detach() for array in sim.material()]
     x, right = state.positions, torch.ones_like(state.positions)
     errors, inverse = torch.full((2,), error, dtype=torch.float64), torch.ones(sim.vertices, dtype=torch.float64)
-    given = (inverse, None, material, plan)
-    found = torch.ops.torchpd.mend_adjoint(2.0 * right, errors, x, right, *given, time_step=sim.time_step)
+    given = (None, x, right, inverse, None, material, plan)
+    found = torch.ops.torchpd.mend_adjoint(2.0 * right, errors, *given, time_step=sim.time_step)
     assert torch.equal(found, 2.0 * right)
 
 

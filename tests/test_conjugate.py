@@ -325,7 +325,7 @@ def test_what_slides_is_harder_to_turn(shape: str, dtype: torch.dtype, device: t
     assert float((plain - wanted).norm() / wanted.norm()) > 1e-2
 
 
-def sliding_on(s: System, right: Tensor, push: float = 0.5) -> Tensor:
+def sliding_on(s: System, right: Tensor, push: float = 0.1) -> Tensor:
     """Every third vertex slides, with everything that a surface which curves adds; nothing does in the last environment."""
     vectors = noise((*right.shape[:2], 5, 3), right.dtype, 7).to(right)
     root = (1.0 / s.inverse.clamp(min=1e-30)).sqrt()[..., None, None]

@@ -24,7 +24,7 @@ from on_gpu import (
     threads_of,
 )
 from runs import moving, noise, same_bits, state_of
-from test_determinism import assert_same_bits, different_environments, run
+from test_determinism import assert_same_bits, count_sliding, different_environments, gradients, run
 from test_determinism import scene as scene_of_all_effects
 from torch import Tensor
 
@@ -67,6 +67,27 @@ def test_runs_and_batches_do_not_matter(
         assert_same_bits([t[item : item + 1] for t in together], alone)
     some = torch.tensor([5, 3, 4000, 16, 0], device=GPU)
     assert_same_bits(run(sim, state, forces, some), [t[some] for t in together])
+
+
+@pytest.mark.usefixtures("poisoned")
+@pytest.mark.filterwarnings("ignore:torchpd. the adjoint")
+@pytest.mark.parametrize("kernel", [*KERNELS, "levels"])
+def test_gradients_do_not_feel_their_batch(
+    kernel: str, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of an environment whose vertices slide against friction, by a method of its own, and of one where nothing does."""
+    dtype = DTYPES[precision]
+    monkeypatch.setitem(regimes._STREAM_TETS, dtype, 100)
+    options = {"solver": pd.Multilevel(), "iterations": 60} if kernel == "levels" else {"iterations": 400}
+    sim = on_gpu(scene_of_all_effects(), dtype, "stream" if kernel == "levels" else kernel, **options)
+    state, forces = unlike(sim, 500)
+    state.velocities[..., 0] += 1.0
+    state.velocities[::2, :, 1] = 5.0
+    assert len(count_sliding(sim, state, forces).bool().unique()) == 2
+    together = gradients(sim, state, forces, slice(500))
+    assert_same_bits(gradients(sim, state, forces, slice(500)), together)
+    for items in (slice(0, 1), slice(1, 2), slice(133, 134), slice(498, 500), slice(101, 300)):
+        assert_same_bits([t[items] for t in together], gradients(sim, state, forces, items))
 
 
 @pytest.mark.usefixtures("poisoned")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from conjugate_reference import conjugate_gradients
 from devices import require_gpu
 from on_gpu import DTYPES, GPU, KERNELS, device_work, relative, small_on_gpu
 from runs import noise
+from test_conjugate import MANY, environment, given_of, sliding_on, system
 from torch import Tensor
 
 import torchpd as pd
@@ -83,11 +85,8 @@ def test_a_recorded_training_step_is_that_of_python(kernel: str, precision: str)
 
 @pytest.mark.parametrize("kernel", WAYS)
 def test_backward_waits_once_a_step(kernel: str, precision: str) -> None:
-    """And once more for whether friction that slides is solved for, which here is none."""
+    """Whether or not anything slides."""
     sim, state = simulator(kernel, precision)
-    smooth = [getattr(sim, name).clone() for name in ("planes", "spheres")]
-    smooth[0][:, 4] = smooth[1][:, 4] = 0.0
-    sim.set_material(planes=smooth[0], spheres=smooth[1])
     training = Training(sim, state)  # of two steps
     training.run()
     with warnings.catch_warnings(record=True) as caught:
@@ -150,7 +149,7 @@ def test_a_solve_is_one_kernel_behind_its_weights(kernel: str, precision: str) -
 
 
 def test_a_recording_knows_sliding_friction(precision: str) -> None:
-    """It asks nobody whether anything slides, nor for how many iterations."""
+    """It asks nobody whether anything slides, nor for how many iterations: the bits are those of Python."""
     mesh = pd.shapes.box((0.4, 0.2, 0.2), (4, 2, 2))
     block = pd.Solid(mesh, youngs=2e4, density=1000.0)
     scene = pd.Scene(block, pd.Gravity(), pd.Ground(float(mesh.vertices[:, 1].min()), friction=0.3))
@@ -161,10 +160,45 @@ def test_a_recording_knows_sliding_friction(precision: str) -> None:
     graph, results = training.record()
     graph.replay()
     wanted = training.run()
-    limit = 1e-3 if precision == "float32" else 1e-6
-    assert all(relative(one, other) < limit for one, other in zip(results, wanted, strict=True))
+    assert all(torch.equal(one, other) for one, other in zip(results, wanted, strict=True))
     plain = pd.Simulator(pd.Scene(block, pd.Gravity(), pd.Ground(scene.grounds[0].height)), 1 / 60, 1000)
     assert relative(results[1], Training(plain.to(DTYPES[precision]).to(GPU), state).run()[1]) > 0.1
+
+
+@pytest.mark.parametrize("shape", ["pairs", "levels", *MANY])
+def test_friction_is_solved_for_in_the_same_launch(shape: str, precision: str) -> None:
+    """The weights, and one kernel for the symmetric part and for what friction adds, however many products they take."""
+    options = MANY.get(shape, {"levels": True} if shape == "levels" else {"kernel": "block", "cells": (9, 3, 3)})
+    s, positions, right = system(DTYPES[precision], GPU, contacts=True, **options)
+    sliding = sliding_on(s, right)
+
+    def solve() -> None:
+        torch.ops.torchpd.conjugate_gradients(*given_of(s, positions, right), sliding, tolerance=1e-4)
+
+    names = [name for name in device_work(solve) if "pd::" in name]
+    assert len(names) == 2
+    assert ("conjugate_alone" if shape == "pairs" else "conjugate_teams") in names[1]
+
+
+def test_friction_goes_on_in_the_next_launch(precision: str) -> None:
+    """So many vertices are solved for in several launches; alone in one, with the same bits."""
+    dtype = DTYPES[precision]
+    s, positions, right = system(dtype, GPU, contacts=True, kernel="stream", cells=(60, 26, 26))
+    sliding = sliding_on(s, right)
+    index = torch.arange(240, device=GPU) % len(right)
+    own = {name: getattr(s, name)[index] for name in ("inertia", "inverse", "stiffness", "projector")}
+    given = given_of(replace(s, **own), positions[index], right[index])
+    found: list[Tensor] = []
+
+    def solve() -> None:
+        found[:] = torch.ops.torchpd.conjugate_gradients(*given, sliding[index], tolerance=1e-5)
+
+    assert sum("conjugate_teams" in name for name in device_work(solve)) > 10
+    for e in range(len(right)):
+        given = given_of(environment(s, e), positions[e : e + 1], right[e : e + 1])
+        alone, error = torch.ops.torchpd.conjugate_gradients(*given, sliding[e : e + 1], tolerance=1e-5)
+        assert float(error) <= 1e-4
+        assert all(torch.equal(each, alone[0]) for each in found[0][e :: len(right)])
 
 
 @pytest.mark.parametrize(("cells", "batch"), [((47, 6, 6), 66), ((13, 8, 8), 66)])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from cases import Case, beam, sliver_mesh
-from runs import simulator
+from runs import noise, simulator
 
 import torchpd as pd
 from torchpd.extension import load_extension
@@ -93,6 +93,47 @@ def test_environments_do_not_feel_one_that_is_lost(
     found = torch.func.functional_call(sim, {"planes": planes}, (state,))
     others = torch.arange(batch) != 1
     assert_same_bits([t[others] for t in found], [t[others] for t in sound])
+
+
+def gradients(sim: pd.Simulator, state: pd.State, forces: torch.Tensor, items: slice) -> list[torch.Tensor]:
+    """Of a loss of each environment: for what it starts from, and for material of its own."""
+    names = ("gravity", "damping", "planes", "spheres")
+    starts = [t[items].detach().clone().requires_grad_() for t in (*state, forces)]
+    # as many rows as environments, the same ones
+    own = [getattr(sim, name).detach().expand(len(starts[0]), *getattr(sim, name).shape).clone() for name in names]
+    own = [t.requires_grad_() for t in own]
+    given = pd.State(starts[0], starts[1]), starts[2]
+    after = torch.func.functional_call(sim, dict(zip(names, own, strict=True)), given)
+    weight = noise(state.positions, 5)[items]
+    loss = (weight * after.positions).sum() + 0.01 * (weight * after.velocities).sum()
+    return list(torch.autograd.grad(loss, starts + own))
+
+
+def count_sliding(sim: pd.Simulator, state: pd.State, forces: torch.Tensor) -> torch.Tensor:
+    """Vertices of each environment that slide against friction."""
+    after = sim(state, forces).positions.detach()
+    material = [array.detach() for array in sim.material()]
+    *_, sliding = torch.ops.torchpd.adjoint_system(
+        after, after, after, *state, forces, material, list(sim.plan.arrays), time_step=sim.time_step
+    )
+    return (sliding[..., 0, :] != 0.0).any(-1).sum(-1)
+
+
+@pytest.mark.filterwarnings("ignore:torchpd. the adjoint")
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["Chebyshev", "Multilevel"])
+def test_gradients_of_an_item_do_not_feel_its_batch(solver: Any, dtype: torch.dtype, device: torch.device) -> None:
+    """Some slide against friction, and are solved for by another method; some do not."""
+    iterations = 60 if isinstance(solver, pd.Multilevel) else 400
+    sim = simulator(scene(), dtype, device, iterations=iterations, solver=solver)
+    state, forces = different_environments(sim, 9)
+    state.velocities[..., 0] += 1.0
+    state.velocities[5, :, 1] = 5.0
+    assert len(count_sliding(sim, state, forces).bool().unique()) == 2
+    together = gradients(sim, state, forces, slice(9))
+    for item in (0, 5, 8):
+        alone = gradients(sim, state, forces, slice(item, item + 1))
+        assert_same_bits([t[item : item + 1] for t in together], alone)
+    assert_same_bits(gradients(sim, state, forces, slice(9)), together)
 
 
 def test_order_of_the_batch_does_not_matter(dtype: torch.dtype, device: torch.device) -> None:

@@ -308,17 +308,6 @@ def test_friction_that_jams_is_said() -> None:
         torch.ops.torchpd.mend_adjoint(solution, solved, solved, *given, time_step=sim.time_step)
 
 
-def test_a_step_whose_friction_jams_warns() -> None:
-    """No scene that was tried jams: here the surface is, between the step and its adjoint, a hundred times as rough."""
-    sim = scene("ground")
-    state, push = motion(sim, 0.3)
-    material = [array.detach() for array in sim.material_at(None, 2)]
-    after = sim(state, push).positions.detach()
-    loss, plan = noise(push, 1), list(sim.plan.arrays)
-    material[-2] = material[-2] * torch.tensor([1.0, 1.0, 1.0, 1.0, 1e4], dtype=torch.float64)
-    torch.ops.torchpd.step_vjp(loss, 0.0 * loss, after, *state, push, material, plan, time_step=sim.time_step)
-
-
 def test_without_friction_nothing_is_added() -> None:
     """Nor where friction holds everything: the bits are those of the system without it."""
     for friction in (0.0, 5.0):

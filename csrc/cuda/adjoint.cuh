@@ -1,6 +1,6 @@
 // Runner of solver/adjoint.h and solver/contact_gradients.h.
 #pragma once
-#include "cuda/fields.cuh"
+#include "cuda/conjugate_sums.cuh"
 #include "solver/adjoint.h"
 #include "solver/contact_gradients.h"
 
@@ -39,6 +39,20 @@ __global__ void __launch_bounds__(field_threads)
   AdjointAnswer<T>{call, number / call.vertices, number % call.vertices}.give();
 }
 
+// A block for every number of every environment.
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    vertex_sum(const __grid_constant__ VertexSumCall<T> call) {
+  __shared__ WarpSums warp_sums;
+  const std::int64_t environment = blockIdx.x / call.numbers, number = blockIdx.x % call.numbers;
+  const T* from = call.values + environment * call.vertices * call.numbers + number;
+  double sum[1] = {0};
+  for (std::int64_t i = threadIdx.x; i < call.vertices; i += blockDim.x)
+    sum[0] += double(from[i * call.numbers]);
+  across_block<Add>(sum, warp_sums);
+  if (threadIdx.x == 0) call.out[blockIdx.x] = T(sum[0]);
+}
+
 template <class Call>
 void run_for_each(void (*kernel)(Call), const Call& call, std::int64_t count, Stream to) {
   const std::int64_t blocks = (count + field_threads - 1) / field_threads;
@@ -54,6 +68,13 @@ void run_adjoint_system(const DeviceAdjointSystem<T>& call, Stream to) {
 template <class T>
 void run_contact_gradients(const DeviceContactGradients<T>& call, Stream to) {
   run_for_each(contact_gradients<T>, call, call.step.batch * call.step.plan.vertices, to);
+}
+
+template <class T>
+void run_vertex_sum(const VertexSumCall<T>& call, Stream to) {
+  const unsigned blocks = blocks_of(call.batch * call.numbers);
+  vertex_sum<T><<<blocks, field_threads, 0, static_cast<cudaStream_t>(to)>>>(call);
+  check(cudaGetLastError());
 }
 
 template <class T>

@@ -9,5 +9,6 @@ template void run_conjugate(const DeviceConjugate<double>&, void*, Stream);
 template void run_adjoint_system(const DeviceAdjointSystem<double>&, Stream);
 template void run_contact_gradients(const DeviceContactGradients<double>&, Stream);
 template void run_adjoint_result(const AdjointResultCall<double>&, Stream);
+template void run_vertex_sum(const VertexSumCall<double>&, Stream);
 template void run_rotation(const RotationCall<double>&, Stream);
 }  // namespace pd

@@ -9,5 +9,6 @@ template void run_conjugate(const DeviceConjugate<float>&, void*, Stream);
 template void run_adjoint_system(const DeviceAdjointSystem<float>&, Stream);
 template void run_contact_gradients(const DeviceContactGradients<float>&, Stream);
 template void run_adjoint_result(const AdjointResultCall<float>&, Stream);
+template void run_vertex_sum(const VertexSumCall<float>&, Stream);
 template void run_rotation(const RotationCall<float>&, Stream);
 }  // namespace pd

@@ -1,5 +1,6 @@
 // The kernels as functions: no torch, no CUDA headers. Memory is the caller's; work goes to a stream and nobody waits.
 #pragma once
+#include "plan/vertex_sum.h"
 #include "plan/views.h"
 
 #include <cstdint>
@@ -89,6 +90,8 @@ template <class T>
 void run_contact_gradients(const DeviceContactGradients<T>& call, Stream stream);
 template <class T>
 void run_adjoint_result(const AdjointResultCall<T>& call, Stream stream);
+template <class T>
+void run_vertex_sum(const VertexSumCall<T>& call, Stream stream);
 
 template <class T>
 std::int64_t precondition_bytes(const PreconditionCall<T>& call);

@@ -59,6 +59,12 @@ struct Cuda {
     run_adjoint_result(call, c10::cuda::getCurrentCUDAStream().stream());
   }
 
+  template <class T>
+  static void vertex_sum(const VertexSumCall<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_vertex_sum(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
   static bool recording(const Tensor& like) {
     const c10::cuda::CUDAGuard guard(like.device());
     return c10::cuda::currentStreamCaptureStatusMayInitCtx() != c10::cuda::CaptureStatus::None;
