@@ -190,23 +190,24 @@ Solved iterate(const Tensor& positions, const AdjointSystem& s, const Tensor& st
   OptionalTensor friction;
   if (s.sliding) friction = at::zeros({x.size(0), friction_count}, numbers);
   solve_conjugate<Backend>({solution, residual, direction, progress, x, s.inertia, s.inverse,
-                          s.projector, stiffness, plan, s.sliding, right, friction},
-                         tolerance, (s.sliding ? 2 : 1) * adjoint_iterations);
+                            s.projector, stiffness, plan, s.sliding, right, friction},
+                           tolerance, (s.sliding ? 2 : 1) * adjoint_iterations);
   return {solution, progress.select(1, progress_error),
           friction ? friction->select(1, friction_error) : Tensor()};
 }
 
 template <class Backend>
-std::tuple<Tensor, Tensor> conjugate_gradients(const Tensor& positions, const Tensor& right, const Tensor& inertia,
-                           const Tensor& inverse, const OptionalTensor& projector,
-                           const Tensor& stiffness, at::TensorList plan,
-                           const OptionalTensor& sliding, double tolerance) {
+std::tuple<Tensor, Tensor> conjugate_gradients(const Tensor& positions, const Tensor& right,
+                                               const Tensor& inertia, const Tensor& inverse,
+                                               const OptionalTensor& projector,
+                                               const Tensor& stiffness, at::TensorList plan,
+                                               const OptionalTensor& sliding, double tolerance) {
   check_positions(positions, "positions");
   check_state(right, positions, "right", "N");
   const Solved found = iterate<Backend>(positions, {right, inertia, inverse, projector, sliding},
                                         stiffness, plan, tolerance);
-  return {found.solution, sliding ? at::maximum(found.error, found.friction)
-                                  : found.error.contiguous()};
+  return {found.solution,
+          sliding ? at::maximum(found.error, found.friction) : found.error.contiguous()};
 }
 
 // The solution with what stands in where there is none, and the warnings: torchpd/adjoint.py.

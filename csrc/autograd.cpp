@@ -174,6 +174,11 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
   }
 };
 
+// A gradient of all steps: what the loss does not depend on takes no memory.
+Tensor known(const Tensor& gradient, const Tensor& like) {
+  return gradient.defined() ? gradient : at::zeros({1}, like.options()).expand(like.sizes());
+}
+
 class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
  public:
   static variable_list forward(AutogradContext* context, const Tensor& positions,
@@ -181,6 +186,7 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
                                at::TensorList material, const Unvaried& rest) {
     const Outputs outputs = plain_rollout(positions, velocities, forces, material, rest.plan,
                                           rest.steps, rest.every, rest.numbers);
+    context->set_materialize_grads(false);
     return keep(context, positions, velocities, forces, outputs, std::get<1>(outputs), material,
                 rest);
   }
@@ -193,7 +199,7 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
     const bool forces = kept.forces.has_value();
     const c10::List<bool> wanted = Edges{context, forces ? 3u : 2u}.material(kept.material.size());
     const variable_list values = call_rollout_vjp(
-        grads[0], grads[1],
+        known(grads[0], kept.after), known(grads[1], kept.after),
         {kept.positions, kept.velocities, kept.forces, kept.after, kept.after_velocities},
         kept.material, kept.plan, context->saved_data["time_step"].toDouble(), wanted);
     variable_list result{values[0], values[1], forces ? values[2] : Tensor()};

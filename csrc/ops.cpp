@@ -134,7 +134,8 @@ TORCH_LIBRARY(torchpd, m) {
       "Tensor[] plan, *, float time_step, bool[]? wanted=None) -> Tensor[]");
   // its kernel, for every device, comes from Python
   with_plan(
-      "mend_adjoint(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor right, Tensor inverse, "
+      "mend_adjoint(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor right, "
+      "Tensor inverse, "
       "Tensor? projector, Tensor[] material, Tensor[] plan, *, float time_step) -> Tensor");
   with_plan(
       "adjoint_system(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "

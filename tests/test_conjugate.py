@@ -326,12 +326,13 @@ def test_what_slides_is_harder_to_turn(shape: str, dtype: torch.dtype, device: t
 
 
 def sliding_on(s: System, right: Tensor, push: float = 0.1) -> Tensor:
-    """Every third vertex slides, with everything that a surface which curves adds; nothing does in the last environment."""
+    """Every third vertex slides, on a surface that curves; in the last environment nothing does."""
     vectors = noise((*right.shape[:2], 5, 3), right.dtype, 7).to(right)
     root = (1.0 / s.inverse.clamp(min=1e-30)).sqrt()[..., None, None]
-    scale = torch.tensor([push, 1.0, 0.0, 0.0, 0.0]).to(right)[:, None] + root * torch.tensor(
-        [0.0, 0.0, 0.5, 0.1, 0.05]
-    ).to(right)[:, None]
+    scale = (
+        torch.tensor([push, 1.0, 0.0, 0.0, 0.0]).to(right)[:, None]
+        + root * torch.tensor([0.0, 0.0, 0.5, 0.1, 0.05]).to(right)[:, None]
+    )
     sliding = torch.where((s.inverse != 0)[..., None, None], scale * vectors, 0.0)
     # a direction off the surface has no part in anything
     for number in (0, 2, 3, 4):
@@ -395,7 +396,7 @@ def test_friction_of_an_environment_has_the_same_bits_alone(
 
 @shapes("any", "levels", *MANY)
 def test_friction_that_jams_is_an_error(shape: str, dtype: torch.dtype, device: torch.device) -> None:
-    """A vertex that its own friction presses ever harder: the residual says so, and what came is no worse than nothing."""
+    """Vertices that their own friction presses ever harder: the residual says so, and what came is finite."""
     s, positions, right = system(dtype, device, contacts=True, **SHAPES[shape])
     sliding = sliding_on(s, right, push=1e4)
     tolerance = 1e-5 if dtype == torch.float32 else 1e-11

@@ -72,10 +72,8 @@ def test_runs_and_batches_do_not_matter(
 @pytest.mark.usefixtures("poisoned")
 @pytest.mark.filterwarnings("ignore:torchpd. the adjoint")
 @pytest.mark.parametrize("kernel", [*KERNELS, "levels"])
-def test_gradients_do_not_feel_their_batch(
-    kernel: str, precision: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of an environment whose vertices slide against friction, by a method of its own, and of one where nothing does."""
+def test_gradients_do_not_feel_their_batch(kernel: str, precision: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where vertices slide against friction, which has a method of its own, and where nothing does."""
     dtype = DTYPES[precision]
     monkeypatch.setitem(regimes._STREAM_TETS, dtype, 100)
     options = {"solver": pd.Multilevel(), "iterations": 60} if kernel == "levels" else {"iterations": 400}

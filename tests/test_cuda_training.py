@@ -167,7 +167,7 @@ def test_a_recording_knows_sliding_friction(precision: str) -> None:
 
 @pytest.mark.parametrize("shape", ["pairs", "levels", *MANY])
 def test_friction_is_solved_for_in_the_same_launch(shape: str, precision: str) -> None:
-    """The weights, and one kernel for the symmetric part and for what friction adds, however many products they take."""
+    """The weights, and one kernel for the symmetric part and for friction, however many products they take."""
     options = MANY.get(shape, {"levels": True} if shape == "levels" else {"kernel": "block", "cells": (9, 3, 3)})
     s, positions, right = system(DTYPES[precision], GPU, contacts=True, **options)
     sliding = sliding_on(s, right)

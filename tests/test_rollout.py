@@ -7,8 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from adjoint_cases import body
 from cases import contact_block
 from runs import moving, same_bits, simulate, simulator, state_of, tensor_of
+from torch import Tensor
+from torch.utils import _pytree as pytree
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchpd as pd
 from torchpd.state import Info
@@ -224,3 +228,39 @@ def test_a_broken_environment_breaks_alone(value: float, batch: int, dtype: torc
         assert torch.equal(one[:, others], other[:, others])
     if not np.isfinite(value):
         assert not bool(found.positions[-1, 1].isfinite().all())
+
+
+class Allocations(TorchDispatchMode):
+    """Storages of results that have so many bytes, by their addresses."""
+
+    def __init__(self, least: int) -> None:
+        super().__init__()
+        self.least, self.found = least, set[int]()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        results = func(*args, **(kwargs or {}))
+        for leaf in pytree.tree_leaves(results):
+            if isinstance(leaf, Tensor) and leaf.untyped_storage().nbytes() >= self.least:
+                self.found.add(leaf.untyped_storage().data_ptr())
+        return results
+
+
+def test_every_state_is_kept_once() -> None:
+    """On the way back only what a loss depends on has a gradient of all steps."""
+    sim, state = body(iterations=100)
+    state.velocities.requires_grad_()
+    kept: dict[int, int] = {}
+
+    def keep(saved: Tensor) -> Tensor:
+        kept[saved.untyped_storage().data_ptr()] = saved.untyped_storage().nbytes()
+        return saved
+
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda saved: saved):
+        track = sim.rollout(state, 24)
+    size = track.positions.numel() * track.positions.element_size()
+    assert sum(size <= count for count in kept.values()) == 2
+    loss = track.positions[-1].sum()
+    with Allocations(size) as allocations:
+        torch.autograd.grad(loss, state.velocities)
+    known = {t.untyped_storage().data_ptr() for t in (track.positions, track.velocities)}
+    assert len(allocations.found - known) == 1

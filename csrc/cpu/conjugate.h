@@ -213,8 +213,7 @@ class ConjugatePass {
 
   // Goes on with friction, after so many products; returns whether it has.
   bool solve_friction(const Conjugate& numbers, int products) {
-    if (!call_.friction || !adds_friction(numbers, call_.tolerance) || !some_slide())
-      return false;
+    if (!call_.friction || !adds_friction(numbers, call_.tolerance) || !some_slide()) return false;
     FrictionSolve friction(nullptr, numbers.scale);
     friction.begin(products, adjoint_iterations);
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)

@@ -71,10 +71,10 @@ class FrictionAlone {
     multiply(stage);
     double sums[2] = {0, 0};
     each_slot([&](int s, int i, std::int64_t at) {
-      const Vec3<T> image = friction_image(
-          sum_entries(fields_.entries, call_.plan.slot_row[s]), z(stage, i, at), inertia_[i],
-          inverse_[i] != T(0), call_.projector ? call_.projector + 3 * at : nullptr,
-          call_.sliding + slide_count * at);
+      const Vec3<T> image = friction_image(sum_entries(fields_.entries, call_.plan.slot_row[s]),
+                                           z(stage, i, at), inertia_[i], inverse_[i] != T(0),
+                                           call_.projector ? call_.projector + 3 * at : nullptr,
+                                           call_.sliding + slide_count * at);
       if (stage == FrictionStage::residual) {
         const Vec3<T> rest = per_unit_ * read3(call_.right + at) - image;
         write3(call_.residual + at, rest);
@@ -96,8 +96,7 @@ class FrictionAlone {
     const T* const product = first ? image_ : v_.smoothed;
     double left[2] = {0, 0};
     each_slot([&](int, int i, std::int64_t at) {
-      write3(v_.correction + at,
-             multiply_add(step, z(stage, i, at), read3(v_.correction + at)));
+      write3(v_.correction + at, multiply_add(step, z(stage, i, at), read3(v_.correction + at)));
       const Vec3<T> rest = subtract_product(read3(call_.residual + at), step, read3(product + at));
       write3(call_.residual + at, rest);
       left[0] += wide_dot(rest, rest);
@@ -107,8 +106,7 @@ class FrictionAlone {
     across_block<Add>(left, warp_sums_);
     const T keep = T(friction.judge(left[0], left[1], call_.tolerance));
     each_slot([&](int, int, std::int64_t at) {
-      const Vec3<T> last =
-          subtract_product(read3(call_.direction + at), step, read3(image_ + at));
+      const Vec3<T> last = subtract_product(read3(call_.direction + at), step, read3(image_ + at));
       write3(call_.direction + at, multiply_add(keep, last, read3(call_.residual + at)));
     });
   }

@@ -204,8 +204,7 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
 
   // M of a field, for the result of the cycle
   __device__ void precondition(const Quad<T>* field) {
-    each_part(
-        0, plan_.vertices, [&](int i) { cycle_.set(i, vec3(field[i])); }, [](int) {});
+    each_part(0, plan_.vertices, [&](int i) { cycle_.set(i, vec3(field[i])); }, [](int) {});
     team_.barrier();
     cycle_.run();
     each_part(
