@@ -406,3 +406,12 @@ def test_quick_run_on_a_gpu(tmp_path: Path) -> None:
         assert row["scene"] in ended.stdout
     for parts in result["call_microseconds"].values():
         assert parts.keys() == {"host", "graph", "kernels"}
+
+
+def test_a_cube_slides_or_rests_for_its_gradients() -> None:
+    """As its rows say: most of the vertices below slide in one scene, and none in the other."""
+    benchmark = importlib.import_module("friction_gradients")
+    rows = [benchmark.training_row(2, 2, speed, torch.device("cpu"), 0.0) for speed in (3.0, 0.0)]
+    assert rows[0]["slide"] >= 4.0
+    assert rows[1]["slide"] == 0.0
+    assert all(row["vertices"] == 27 and 0.0 < row["forward"] < row["both"] for row in rows)

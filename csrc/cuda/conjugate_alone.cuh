@@ -39,7 +39,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     }
   };
 
-  // and whether any vertex slides
+  // the largest number, and whether any vertex slides
   double largest[2] = {0, 0};
   each_slot([&](int, int, std::int64_t at) {
     largest[0] = Largest()(largest[0], largest_of(read3(call.residual + at)));
