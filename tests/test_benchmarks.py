@@ -408,6 +408,7 @@ def test_quick_run_on_a_gpu(tmp_path: Path) -> None:
         assert parts.keys() == {"host", "graph", "kernels"}
 
 
+@pytest.mark.usefixtures("on_path")
 def test_a_cube_slides_or_rests_for_its_gradients() -> None:
     """As its rows say: most of the vertices below slide in one scene, and none in the other."""
     benchmark = importlib.import_module("friction_gradients")
