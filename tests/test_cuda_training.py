@@ -185,7 +185,7 @@ def test_friction_goes_on_in_the_next_launch(precision: str) -> None:
     dtype = DTYPES[precision]
     s, positions, right = system(dtype, GPU, contacts=True, kernel="stream", cells=(60, 26, 26))
     sliding = sliding_on(s, right)
-    index = torch.arange(240, device=GPU) % len(right)
+    index = torch.arange(960, device=GPU) % len(right)
     own = {name: getattr(s, name)[index] for name in ("inertia", "inverse", "stiffness", "projector")}
     given = given_of(replace(s, **own), positions[index], right[index])
     found: list[Tensor] = []
