@@ -76,7 +76,7 @@ def run_scene(number: int) -> Row:
 
 
 def residual_of(problem: StepProblem, u: NDArray[np.float64]) -> float:
-    return float(np.linalg.norm(problem.residual(u)) / np.linalg.norm(problem.residual(problem.course())))
+    return problem.relative_residual(u)
 
 
 def judge(problem: StepProblem, u: NDArray[np.float64]) -> Row:

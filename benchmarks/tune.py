@@ -133,7 +133,7 @@ def run_scene(number: int, error: float, dtype: torch.dtype) -> Row:
     row.update(solver=str(promise.solver), iterations=promise.iterations, attained=promise.attained)
     row.update(promised=promise.error, studied=promise.studied_error, milliseconds=promise.milliseconds)
     row.update(studied_errors=promise.trials[-1].errors, studied_residuals=promise.trials[-1].residuals)
-    row.update(error_per_residual=promise.error_per_residual)
+    row.update(error_per_residual=promise.error_per_residual, unseen_error=promise.unseen_error)
     row.update(judge(sim, other))
     row["held"] = not row["errors"] or max(row["errors"]) <= promise.error
     row["budget"] = judge_budget(sim, start, other)
@@ -169,8 +169,8 @@ def suspects(row: Row) -> list[bool]:
     # rows without one: the least that it can be
     studied = zip(row["studied_errors"], row["studied_residuals"], strict=True)
     least = max((error / residual for error, residual in studied if residual > 0.0), default=0.0)
-    ratio = row.get("error_per_residual", least)
-    return [not ratio * residual <= row["promised"] for residual in row["residuals"]]
+    ratio, unseen = row.get("error_per_residual", least), row.get("unseen_error", 0.0)
+    return [not max(ratio * residual, unseen) <= row["promised"] for residual in row["residuals"]]
 
 
 def summary(rows: list[Row]) -> Row:

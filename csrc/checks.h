@@ -173,7 +173,6 @@ inline Settings settings_of(const Numbers& n, bool given, std::int64_t steps, st
   s.tolerance = n.tolerance;
   s.delay = int(std::min(n.delay, most));
   s.weighted = n.weighted;
-  s.report = n.report;
   return s;
 }
 

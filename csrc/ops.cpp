@@ -33,6 +33,12 @@ struct Cpu {
   static void field(const FieldCall<double>& call, const Tensor&) {
     kernels().field64(call, threads());
   }
+  static void report(const ReportCall<float>& call, const Tensor&) {
+    kernels().report32(call, threads());
+  }
+  static void report(const ReportCall<double>& call, const Tensor&) {
+    kernels().report64(call, threads());
+  }
   static void precondition(const PreconditionCall<float>& call, const Tensor&) {
     kernels().precondition32(call, threads());
   }

@@ -1,6 +1,6 @@
 // What every op does on either device: checks, views, one call of the backend.
 //
-// A Backend has `Plan<T>`, the plan that its kernels see; `plan_view<T>(arrays, place)`; and `step`, `field`,
+// A Backend has `Plan<T>`, the plan that its kernels see; `plan_view<T>(arrays, place)`; and `step`, `report`, `field`,
 // `precondition`, `conjugate` and `rotation`, which run a call on the device of the tensor they are given.
 #pragma once
 #include "checks.h"
@@ -73,6 +73,14 @@ inline Tensor info_for(const Tensor& positions, at::IntArrayRef records) {
   return at::empty(shape, positions.options().dtype(at::kDouble));
 }
 
+// Fills in what a step of one record leaves blank in its rows, see step_report.h.
+template <class Backend>
+void report_step(const StepTensors& taken, const Numbers& n);
+
+// The rollout, step by step where they are recorded, with reports, see step_report.h.
+template <class Backend>
+void report_rollout(const StepTensors& t, const Numbers& n, const Settings& settings);
+
 template <class Backend>
 Outputs step(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
              const OptionalTensor& start, at::TensorList material, at::TensorList plan,
@@ -84,8 +92,9 @@ Outputs step(const Tensor& positions, const Tensor& velocities, const OptionalTe
                   delay,    weighted,   tolerance, inertial,   report};
   const Tensor x = at::empty(positions.sizes(), positions.options()), v = at::empty_like(x);
   const Tensor info = info_for(positions, {});
-  run_step<Backend>({positions, velocities, forces, start, material, plan, x, v, info},
-                    settings_of(n, start.has_value(), 1, 1));
+  const StepTensors tensors{positions, velocities, forces, start, material, plan, x, v, info};
+  run_step<Backend>(tensors, settings_of(n, start.has_value(), 1, 1));
+  if (report) report_step<Backend>(tensors, n);
   return {x, v, info};
 }
 
@@ -109,9 +118,14 @@ void step_inplace(const Tensor& positions, const Tensor& velocities, const Tenso
     const bool same = is_at(positions) || is_at(velocities);
     return same && iterations > 0 ? given : OptionalTensor(given->clone());
   };
-  run_step<Backend>({positions, velocities, copied(forces), copied(start), material, plan,
-                     positions, velocities, info},
-                    settings_of(n, start.has_value(), 1, 1));
+  // what a report looks back to
+  const auto kept = [&](const Tensor& t) { return report ? t.clone() : t; };
+  StepTensors tensors{kept(positions), kept(velocities), copied(forces),
+                      copied(start),   material,         plan,
+                      positions,       velocities,       info};
+  if (report && tensors.forces) tensors.forces = tensors.forces->clone();
+  run_step<Backend>(tensors, settings_of(n, start.has_value(), 1, 1));
+  if (report) report_step<Backend>(tensors, n);
   // so that autograd notices when it needs what has been overwritten
   for (const Tensor& t : {positions, velocities, info}) {
     if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
@@ -132,13 +146,15 @@ Outputs rollout(const Tensor& positions, const Tensor& velocities, const Optiona
   const Tensor x =
       at::empty({records, positions.size(0), positions.size(1), 3}, positions.options());
   const Tensor v = at::empty_like(x), info = info_for(positions, {records});
-  run_step<Backend>({positions, velocities, forces, {}, material, plan, x, v, info}, settings);
+  const StepTensors tensors{positions, velocities, forces, {}, material, plan, x, v, info};
+  report ? report_rollout<Backend>(tensors, n, settings) : run_step<Backend>(tensors, settings);
   return {x, v, info};
 }
 
 template <class Backend, class T>
 void field_typed(Field field, const Tensor& positions, const Tensor& direction,
-                 const Tensor& stiffness, at::TensorList plan, const Tensor& out) {
+                 const Tensor& stiffness, at::TensorList plan, const Tensor& out,
+                 const Tensor& displacement = {}) {
   FieldCall<T, typename Backend::template Plan<T>> call;
   const Place place{positions.device()};
   call.plan = Backend::template plan_view<T>(plan, place);
@@ -152,6 +168,7 @@ void field_typed(Field field, const Tensor& positions, const Tensor& direction,
                                   "Young's modulus [Pa]");
   call.positions = x.const_data_ptr<T>();
   call.direction = d.defined() ? d.const_data_ptr<T>() : nullptr;
+  call.displacement = displacement.defined() ? displacement.const_data_ptr<T>() : nullptr;
   call.out = out.mutable_data_ptr<T>();
   if (call.batch > 0) Backend::field(call, out);
 }
@@ -303,3 +320,5 @@ void register_ops(torch::Library& m) {
 }
 
 }  // namespace pd
+
+#include "step_report.h"

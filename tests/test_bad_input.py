@@ -212,9 +212,9 @@ def test_stiffness_of_a_diagonal_is_checked(sim: pd.Simulator) -> None:
 def test_step_in_place_checks_what_it_writes(sim: pd.Simulator) -> None:
     x, v = sim.rest_state(2)
     rest = (None, None, sim.material(), list(sim.plan.arrays))
-    info = torch.empty(2, 6, dtype=torch.float64)
+    info = torch.empty(2, 7, dtype=torch.float64)
     for bad in (info[:1], info.float(), info[:, :5], info.T.contiguous().T):
-        with pytest.raises(ValueError, match=r"info must be a contiguous float64 \[2, 6\], got"):
+        with pytest.raises(ValueError, match=r"info must be a contiguous float64 \[2, 7\], got"):
             ops.step_(x, v, bad, *rest, **numbers(sim))
     for state in ((x.mT.contiguous().mT, v), (x, v.mT.contiguous().mT)):
         with pytest.raises(ValueError, match="step_: positions and velocities must be contiguous"):

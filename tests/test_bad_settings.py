@@ -181,10 +181,10 @@ def test_targets_of_every_step_are_a_function(sim: pd.Simulator) -> None:
         sim(state, targets=targets)
 
 
-@pytest.mark.parametrize("info", [True, "all", np.zeros((2, 6))])
+@pytest.mark.parametrize("info", [True, "all", np.zeros((2, 7))])
 def test_what_is_no_info_is_refused(info: Any, sim: pd.Simulator) -> None:
     with pytest.raises(
-        TypeError, match=rf"step_: info must be None or a float64 tensor \[2, 6\] .* {type(info).__name__}"
+        TypeError, match=rf"step_: info must be None or a float64 tensor \[2, 7\] .* {type(info).__name__}"
     ):
         sim.step_(sim.rest_state(2), info=info)
 

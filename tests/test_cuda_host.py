@@ -51,7 +51,7 @@ def calls_of(sim: pd.Simulator, state: pd.State) -> dict[str, Calls]:
     forces, own = noise(state.positions), state.clone()
     held, centres = state.positions[:, pin.vertices].clone(), sim.spheres[..., 0, :3].expand(3, -1).clone()
     goals = {pin: held, ball: torch.cat([centres, 0.1 + centres], dim=-1)}
-    rows = torch.empty((3, 6), dtype=torch.float64, device=sim.device)
+    rows = torch.empty((3, 7), dtype=torch.float64, device=sim.device)
     leaf = state.positions.clone().requires_grad_()
     steps: Calls = {
         "forces": lambda: sim(state, forces),
@@ -152,7 +152,7 @@ def test_a_step_in_place_holds_no_memory(runner: str, precision: str) -> None:
     """Nothing of torch's after fifty of them, and meanwhile never more than one needs."""
     sim, state = simulator_of(runner, DTYPES[precision])
     gc.collect()
-    rows = torch.empty((3, 6), dtype=torch.float64, device=GPU)
+    rows = torch.empty((3, 7), dtype=torch.float64, device=GPU)
 
     def peak_of(count: int) -> int:
         torch.cuda.reset_peak_memory_stats(GPU)

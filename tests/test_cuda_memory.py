@@ -32,7 +32,7 @@ def bytes_taken(sim: pd.Simulator, batch: int) -> int:
     """Of torch's memory by a step in place, which holds nothing else; as asked for, before the allocator rounds it."""
     rest = sim.rest_state(batch)
     state = pd.State(rest.positions + 0.01 * noise(rest.positions, 1), noise(rest.positions, 2))
-    rows = torch.empty((batch, 6), dtype=torch.float64, device=GPU)
+    rows = torch.empty((batch, 7), dtype=torch.float64, device=GPU)
     sim.step_(state, info=rows)
     torch.cuda.synchronize()
     gc.collect()  # not while it is measured

@@ -35,7 +35,7 @@ def settings_of(runner: str) -> dict[str, Any]:
 
 def ways_to_step(sim: pd.Simulator, own: pd.State, state: pd.State) -> dict[str, Callable[[], Any]]:
     """Those that write their results elsewhere, and those that overwrite `own`."""
-    rows = torch.empty((len(state.positions), 6), dtype=torch.float64, device=GPU)
+    rows = torch.empty((len(state.positions), 7), dtype=torch.float64, device=GPU)
     return {
         "a step": lambda: sim(state),
         "a rollout": lambda: sim.rollout(state, 3),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 import pytest
@@ -225,3 +226,137 @@ def test_residual_tells_the_error(device: torch.device) -> None:
         assert later_error < 0.3 * error
     assert max(seen[-1]) <= 1e-11
     assert float(info.energy) == pytest.approx(problem.energy(solution), rel=1e-12)
+
+
+def cube(youngs: float, *parts: pd.scene.Part) -> pd.Scene:
+    body = pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (4, 4, 4)), youngs, 1000.0)
+    return pd.Scene(body, *parts)
+
+
+def settled(sim: pd.Simulator, steps: int = 30) -> pd.State:
+    """After steps of which every second forgets the velocities."""
+    state = sim.rest_state()
+    for _ in range(steps):
+        state = sim(state)
+        state = sim(pd.State(state.positions, torch.zeros_like(state.velocities)))
+    return state
+
+
+SQUEEZE = (pd.Sphere((-0.08, 0.1, 0.1), 0.1, friction=1.0), pd.Sphere((0.28, 0.1, 0.1), 0.1, friction=1.0))
+
+
+@pytest.mark.parametrize("youngs", [1e5, 1e7, 1e9])
+@pytest.mark.parametrize("contacts", [(pd.Ground(friction=0.5),), SQUEEZE], ids=["rest", "grasp"])
+def test_what_is_solved_reads_as_solved(
+    dtype: torch.dtype, device: torch.device, youngs: float, contacts: tuple[pd.scene.Part, ...]
+) -> None:
+    """At rest on the ground, and held between two balls by friction: whatever is left is rounding of E x."""
+    sim = pd.Simulator(cube(youngs, pd.Gravity(), *contacts), 1 / 60, 500, dtype=dtype, progress=False).to(device)
+    state = settled(sim)
+    after, info = sim(state, return_info=True)
+    # it lies or hangs there: by half a second of steps it would have fallen half a metre
+    assert float(after.positions[..., 1].min()) > -0.05
+    assert float(after.velocities.abs().max()) < 1e-2
+    assert float(info.residual) < 1e-3
+    assert int(info.inverted) == 0
+
+
+@pytest.mark.parametrize("parts", [(), (pd.Gravity(),)], ids=["drift", "fall"])
+@pytest.mark.parametrize("youngs", [1e-3, 1e5, 1e9])
+def test_what_flies_without_a_force_has_no_residual(
+    dtype: torch.dtype, device: torch.device, youngs: float, parts: tuple[pd.scene.Part, ...]
+) -> None:
+    """However fast: all forces there are come from rounding."""
+    sim = pd.Simulator(cube(youngs, *parts), 1 / 60, 20, dtype=dtype, progress=False).to(device)
+    state = sim.rest_state()
+    state.velocities[:] = torch.tensor([100.0, -3.0, 0.1])
+    for _ in range(3):
+        state, info = sim(state, return_info=True)
+        assert float(info.residual) == 0.0
+
+
+@pytest.mark.parametrize("youngs", [1e3, 1e5, 1e7, 1e9])
+def test_what_is_not_solved_reads_as_that(dtype: torch.dtype, device: torch.device, youngs: float) -> None:
+    """A stretched body that is let go, in no iteration: all of its forces are unbalanced."""
+    sim = pd.Simulator(cube(youngs), 1 / 60, 0, dtype=dtype, progress=False).to(device)
+    state = sim.rest_state()
+    state.positions[..., 0] *= 1.1
+    _, info = sim(state, return_info=True)
+    # less the rounding, of 1e-6 of E x, which a tenth of it is strained
+    assert float(info.residual) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_report_changes_nothing_and_is_the_same_in_any_batch(dtype: torch.dtype, device: torch.device) -> None:
+    """Of steps, of steps in place, and of the recorded ones of a rollout, whose sphere moves."""
+    ball = pd.Sphere((0.1, 0.31, 0.1), 0.1, friction=0.3)
+    sim = pd.Simulator(cube(3e4, pd.Gravity(), pd.Ground(friction=0.4), ball), 1 / 60, 12, dtype=dtype, progress=False)
+    state = moving(sim.to(device), 9)
+    targets = {ball: torch.tensor([0.1, 0.31, 0.1, 0.1, -0.2, 0.0], dtype=dtype, device=device)}
+    after, info = sim(state, targets=targets, return_info=True)
+    assert torch.equal(sim(state, targets=targets).positions, after.positions)
+    alone = sim(pd.State(*(part[4:5] for part in state)), targets=targets, return_info=True)[1]
+    assert all(torch.equal(column[4:5], own) for column, own in zip(info, alone, strict=True))
+    rows, overwritten = torch.empty(9, 7, dtype=torch.float64, device=device), state.clone()
+    sim.step_(overwritten, targets=targets, info=rows)
+    assert all(torch.equal(a, b) for a, b in zip(pd.Info.from_rows(rows), info, strict=True))
+    every = sim.rollout(state, 7, targets=targets, return_info=True)
+    assert torch.equal(sim.rollout(state, 7, targets=targets).positions, every.positions)
+    assert all(torch.equal(column[0], own) for column, own in zip(every.info, info, strict=True))
+    third = sim.rollout(state, 7, 3, targets=targets, return_info=True)
+    assert torch.equal(third.positions, every.positions[2::3])
+    assert all(torch.equal(a, b[2::3]) for a, b in zip(third.info, every.info, strict=True))
+
+
+def says(what: str, device: torch.device) -> AbstractContextManager[object]:
+    """On a CPU; a GPU would have to be waited for."""
+    return pytest.warns(pd.SceneWarning, match=what) if device.type == "cpu" else nullcontext()
+
+
+def test_inverted_elements_are_counted(dtype: torch.dtype, device: torch.device) -> None:
+    """Those of det F <= 0: none of a body that turns, all of a mirrored one, some where a vertex is pulled through."""
+    sim = pd.Simulator(cube(1e3), 1e-6, 0, dtype=dtype, progress=False).to(device)
+    state = sim.rest_state(3)
+    state.positions[0] = state.positions[0] @ torch.tensor(
+        [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=dtype, device=device
+    )
+    state.positions[1, :, 0] *= -1.0
+    state.positions[2, 0] += 0.15
+    with says("384 of 384 tetrahedra of environment 1", device):
+        _, info = sim(state, return_info=True)
+    x = state.positions[2].double().cpu().numpy()
+    edges = x[sim.scene.solids[0].mesh.tets]
+    folded = int((np.linalg.det(edges[:, 1:] - edges[:, :1]) <= 0.0).sum())
+    assert 0 < folded < len(sim.stiffness)
+    assert info.inverted.tolist() == [0, len(sim.stiffness), folded]
+    assert info.inverted.dtype == torch.int64
+    assert sim.rollout(state, 1).info.inverted.tolist() == [[-1, -1, -1]]
+
+
+def test_a_soft_body_that_rests_folded_says_so(device: torch.device) -> None:
+    """A block of 5 kPa, dropped, lies still and is `converged`: with elements inside out, as many as det F <= 0."""
+    mesh = pd.shapes.box((0.3, 0.3, 0.3), (4, 4, 4))
+    scene = pd.Scene(pd.Solid(mesh, 5e3, 1000.0), pd.Gravity(), pd.Ground(friction=0.5))
+    sim = pd.Simulator(scene, 1 / 60, 200, tolerance=1e-3, progress=False).to(device)
+    state = sim.rest_state()
+    state.velocities[..., 1] = -2.0
+    state = sim.rollout(state, 120, 120).state()
+    with says("turned inside out", device):
+        after, info = sim(state, return_info=True)
+    corners = after.positions[0].double().cpu().numpy()[mesh.tets]
+    expected = int((np.linalg.det(corners[:, 1:] - corners[:, :1]) <= 0.0).sum())
+    assert expected > 0
+    assert bool(info.converged)
+    assert int(info.inverted) == expected
+
+
+def test_info_of_before_inversions_were_counted(dtype: torch.dtype, device: torch.device) -> None:
+    """Six fields, and rows of six columns: of an unknown number."""
+    sim = simulate(dtype, device)
+    _, info = sim(moving(sim), return_info=True)
+    assert int(pd.Info(*info[:6]).inverted) == -1
+    rows = torch.stack([column.double() for column in info[:6]], dim=-1)
+    old = pd.Info.from_rows(rows)
+    assert all(torch.equal(a, b) for a, b in zip(old[:6], info[:6], strict=True))
+    assert old.inverted.tolist() == [-1, -1, -1]
+    with pytest.raises(ValueError, match=r"info must be a contiguous float64 \[3, 7\]"):
+        sim.step_(moving(sim), info=rows)

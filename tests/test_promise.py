@@ -6,7 +6,6 @@ import copy
 import math
 import pickle
 from collections.abc import Callable
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -46,7 +45,11 @@ def test_residuals_are_watched(tuned: tuple[pd.Simulator, Promise]) -> None:
     assert max(chosen.errors) == chosen.error
     breaking = min((trial for trial in promise.trials if trial.error > promise.error), key=lambda trial: trial.error)
     pairs = [pair for trial in (chosen, breaking) for pair in zip(trial.errors, trial.residuals, strict=True)]
-    assert max(e - promise.error_per_residual * r for e, r in pairs) == pytest.approx(0.0, abs=1e-12)
+    excess = [e - max(promise.error_per_residual * r, promise.unseen_error) for e, r in pairs]
+    assert max(excess) == pytest.approx(0.0, abs=1e-12)
+    # where rounding hides the forces
+    assert promise.unseen_error == max(e for e, r in pairs if r == 0.0)
+    assert promise.estimate(info._replace(residual=torch.zeros(1))).item() == pytest.approx(promise.unseen_error)
     assert promise.residual_limit <= max(breaking.residuals) * promise.error / breaking.error
     assert promise.estimate(info)[0] == pytest.approx(promise.error_per_residual * float(info.residual[0]))
     doubted = info._replace(residual=torch.tensor([2.0 * promise.residual_limit, math.nan]))
@@ -148,23 +151,25 @@ def test_a_promise_for_a_time_is_watched_as_well(dtype: torch.dtype, monkeypatch
     for _ in range(30):
         state, info = sim(state, return_info=True)
         assert bool(promise.holds(info))
-        # of such a residual rounding is the larger part
-        assert float(promise.estimate(info)) <= promise.error + promise.rounding
+        # of such a residual rounding is the larger part, or it is 0 and says no more than in the study
+        assert float(promise.estimate(info)) <= max(promise.error + promise.rounding, promise.unseen_error)
+        assert promise.unseen_error <= broken.error
     sim.iterations = broken.iterations // 2
     info = sim(state, return_info=True)[1]
     assert not bool(promise.holds(info))
     assert float(promise.estimate(info)) > promise.error
 
 
-@pytest.mark.parametrize(("left", "limit"), [(0.0, 5.0), (4.0, 2.0)], ids=["rounding", "hidden by it"])
-def test_residuals_of_rounding_may_be_larger(left: float, limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In units of a rounding: the study allows two, the promise ten. What rounding only hides is no rounding."""
-    monkeypatch.setattr(tuning._Study, "roundings", [10.0])
+def test_a_residual_of_nothing_is_no_error_of_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounding hides what is left there. The nearest trial that breaks the promise says nothing, a further one does."""
+    monkeypatch.setattr(tuning._Study, "roundings", [0.0, 0.0])
     study = object.__new__(tuning._Study)
-    object.__setattr__(study, "exact", [SimpleNamespace(uncertainty=0.0)])
-    chosen = Trial(pd.Chebyshev(), 20, left, (1.0,), (left,))
-    breaks = Trial(pd.Chebyshev(), 10, 22.0, (4.0,), (22.0,))
-    assert tuning._residual_limit(study, [breaks, chosen], 10.0) == (limit, 5.5)
+    solver = pd.Chebyshev()
+    chosen = Trial(solver, 20, 4.0, (0.0, 1.0), (3.0, 4.0))
+    silent = Trial(solver, 10, 12.0, (0.0, 0.0), (12.0, 11.0))
+    telling = Trial(solver, 5, 30.0, (0.0, 4.0), (6.0, 30.0))
+    # twice the residual of the chosen one, which is more than 4 * 10 / 30; 30 / 4; and the error that breaks it unseen
+    assert tuning._residual_limit(study, [telling, silent, chosen], 10.0) == (2.0, 7.5, 12.0)
 
 
 def test_an_audit_is_told_where_pins_are() -> None:

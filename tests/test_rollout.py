@@ -26,7 +26,7 @@ def test_step_in_place_is_the_step(dtype: torch.dtype, device: torch.device) -> 
         state = moving(sim, batch)
         forces = 0.1 * state.velocities
         expected, info = sim(state, forces, start="inertial", return_info=True)
-        rows = torch.full((batch, 6), float("nan"), dtype=torch.float64, device=device)
+        rows = torch.full((batch, 7), float("nan"), dtype=torch.float64, device=device)
         addresses = [t.data_ptr() for t in state]
         sim.step_(state, forces, start="inertial", info=rows)
         assert same_bits(state, expected)

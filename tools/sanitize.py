@@ -81,7 +81,7 @@ def step_all_ways(sim: pd.Simulator, batch: int) -> None:
     sim(state, forces, start="inertial", return_info=True)
     sim(state, start=state.positions + 0.001)
     sim.rollout(state, 3, 2, forces=forces, return_info=True)
-    rows = torch.empty((batch, 6), dtype=torch.float64, device=state.positions.device)
+    rows = torch.empty((batch, 7), dtype=torch.float64, device=state.positions.device)
     own = pd.State(*(t.clone() for t in state))
     sim.step_(own, info=rows)
     sim.set_material(

@@ -14,7 +14,7 @@ from .solvers import Chebyshev, Jacobi, Multilevel
 from .state import Info, State, Track
 from .tetrahedralize import tetrahedralize
 from .version import __version__
-from .warn import TuningWarning
+from .warn import SceneWarning, TuningWarning
 
 if load_extension()[0] is not None:
     from .capture import CapturedStep
@@ -74,6 +74,7 @@ __all__ = [
     "Reactions",
     "RigidPieces",
     "Scene",
+    "SceneWarning",
     "Simulator",
     "Solid",
     "Sphere",

@@ -5,7 +5,7 @@ converged step:
 
     position   |u - u*| / |u_0 - u*|                over all vertices, u = x_{t+1} - x_t
     energy     (E(u) - E(u*)) / (E(u_0) - E(u*))    of the objective of the step
-    residual   |grad E(u)| / |grad E(h v)|          what contacts balance left out, as in `Info.residual`
+    residual   what is not balanced of the forces, relative to them: `StepProblem.relative_residual`, `Info.residual`
 
 The converged step of `exact_steps` has no friction, which has no energy to go down; `settled_steps` has it.
 """
@@ -113,12 +113,11 @@ class ExactStep:
         off = displacement - self.solution
         with np.errstate(all="ignore"):
             energies = [problem.energy(u) for u in (displacement, self.first, self.solution)]
-            residual, course = (np.linalg.norm(problem.residual(u)) for u in (displacement, problem.course()))
             lift = energies[1] - energies[2]
             found = Errors(
                 self.position_error(displacement),
                 (energies[0] - energies[2]) / lift if lift > 0.0 else 0.0,
-                float(residual / course) if course > 0.0 else 0.0,
+                problem.relative_residual(displacement),
                 float(np.linalg.norm(off, axis=1).max()),
             )
         return Errors(*(value if np.isfinite(value) else np.inf for value in found))

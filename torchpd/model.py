@@ -24,6 +24,7 @@ from .material_changes import (
 )
 from .model_checks import check_batch, check_state, check_time_step, check_tolerance, positions_of, report_resolution
 from .multilevel import has_levels
+from .notices import Notices, warn_of_overlaps
 from .pins import PIN_HARD
 from .placing import check_wanted_device, is_recording, move_plan, plan_anew, plan_for_solver, plan_on
 from .plan import Plan, compile_plan
@@ -93,7 +94,7 @@ class Model(nn.Module):
         report_resolution(values, dtype)
         self.anchors = Anchors(scene)
         self.pinned = values.pinned
-        self._seen_rest, self._seen_pins = Seen(), Seen()
+        self._seen_rest, self._seen_pins, self._notices = Seen(), Seen(), Notices(self)
         with ordinary():
             self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
             self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
@@ -102,6 +103,7 @@ class Model(nn.Module):
                 self.register_parameter(name, nn.Parameter(arrays[name], requires_grad=False))
             self.register_buffer(PIN_HARD, arrays[PIN_HARD])
         read_pins(self)
+        warn_of_overlaps(scene)
         self.choice: Choice | None = None  # of "auto"
         if _is_auto(solver):
             self._choose_solver(None if iterations is None else self.iterations)

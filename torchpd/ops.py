@@ -17,7 +17,7 @@ from .vmap_rules import register_rule
 
 __all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_tangents"]
 
-INFO_WIDTH = 6
+INFO_WIDTH = 7
 
 _ops = torch.ops.torchpd
 

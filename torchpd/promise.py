@@ -51,6 +51,7 @@ class Promise:
     milliseconds: float  # median of sim(state), of the batch that tune saw, on the machine where it ran
     residual_limit: float  # `info.residual` above which the promise is not to be relied on
     error_per_residual: float  # largest ratio in the study
+    unseen_error: float  # largest in the study of a step whose residual is 0, with as many iterations or hardly fewer
     time_step: float  # s
     dtype: torch.dtype
     device: str
@@ -115,11 +116,13 @@ class Promise:
         return beyond
 
     def estimate(self, info: Info) -> Tensor:
-        """Error of the step [B] that its residual may hide, at the largest ratio of the study; NaN without a report.
+        """Error of the step [B] that its residual may hide; NaN without a report.
 
-        High rather than low: it exceeds `error` on one in three steps that keep the promise; an `audit` tells which.
+        At the largest ratio of the study, and no less than its steps had whose residual was 0, where rounding hides
+        forces: of stiff bodies in float32 that may be an error that matters. High rather than low: in float32 it
+        exceeds `error` on one in three steps that keep the promise; an `audit` tells which.
         """
-        return _info(info, "estimate").residual * self.error_per_residual
+        return (_info(info, "estimate").residual * self.error_per_residual).clamp(min=self.unseen_error)
 
     def covers(self, sim: Simulator) -> bool:
         """Whether the simulator still has the settings and the material that were promised for; awaits a GPU."""

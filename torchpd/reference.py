@@ -250,7 +250,7 @@ class StepProblem:
         return self.project(guess, guess)
 
     def course(self) -> Array:
-        """h v, on the pins and out of the contacts: where residuals are measured from."""
+        """h v, on the pins and out of the contacts."""
         guess = self._hold(self.time_step * self.velocities)
         return self.project(guess, guess)
 
@@ -291,6 +291,16 @@ class StepProblem:
         scale = (self.weighted_diagonal if diagonal is None else diagonal)[:, None]
         stepped = displacement - self.gradient(displacement) / scale
         return np.asarray(scale * (displacement - self.project(stepped, displacement)))
+
+    def relative_residual(self, displacement: Array, diagonal: Array | None = None) -> float:
+        """|r| / max(|f|, |r|), |f|^2 = sum_i |a_i (u_i - s_i)|^2 + |e_i|^2 of inertia, weight, springs and of elements.
+
+        `Info.residual`, which takes off what rounding may be of r.
+        """
+        left = float(np.linalg.norm(self.residual(displacement, diagonal)))
+        pull = np.where(self.free[:, None], self.weight[:, None] * (displacement - self.target), 0.0)
+        forces = float(np.hypot(np.linalg.norm(pull), np.linalg.norm(self.gradient(displacement) - pull)))
+        return left / max(left, forces) if left > 0.0 else 0.0
 
 
 def _push_out(displacement: Array, normals: Array, gaps: Array, motion: Array, friction: float) -> Array:

@@ -38,7 +38,7 @@ class Iterates:
     """The end of an iteration and what it went through."""
 
     displacement: Array  # [V, 3] u_K, aligned as the start was
-    residual: float  # |r(u_K)| / |r(x + h v)|, with the diagonal of the iteration
+    residual: float  # `StepProblem.relative_residual` of u_K, with the diagonal of the iteration
     iterations: int  # carried out
     restarts: list[int] = field(default_factory=list)  # iterations k whose check found the energy risen
     energies: list[tuple[int, float]] = field(default_factory=list)  # (k, E(u_k)) at every check
@@ -132,9 +132,7 @@ def _iterate(
                 result.converged = True
                 break
     result.displacement = problem.align(current)
-    scale = float(np.linalg.norm(problem.residual(problem.course(), diagonal)))
-    last = float(np.linalg.norm(problem.residual(result.displacement, diagonal)))
-    result.residual = last / scale if scale > 0.0 else 0.0
+    result.residual = problem.relative_residual(result.displacement, diagonal)
     return result
 
 

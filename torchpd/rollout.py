@@ -79,6 +79,7 @@ def _constant_material(sim: Simulator, call: Rollout) -> list[Tensor]:
 
 def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
     refuse_tangents(*call.state, call.forces if isinstance(call.forces, Tensor) else None, *material)
+    sim._notices.before(sim, call.state, material, report=call.report)
     # the op has a derivative where it records every state, as its adjoint needs them
     thinned = call.every > 1 and call.tracks_gradient(material)
     found = torch.ops.torchpd.rollout(
@@ -95,6 +96,9 @@ def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
         # copies, since all states are kept for the adjoint: not by these, and not to change with them
         found = [out[call.every - 1 :: call.every].clone(memory_format=torch.contiguous_format) for out in found]
     positions, velocities, rows = found
+    if call.report and not torch.compiler.is_compiling():
+        for reached, row in zip(positions, rows, strict=True):
+            sim._notices.after(sim, reached, row)
     return Track(positions, velocities, Info.from_rows(rows))
 
 

@@ -66,7 +66,8 @@ def _no_part(part: object) -> TypeError:
 class Scene:
     """Bodies and effects, in any order. Compiled once by `Simulator`.
 
-    Several bodies share gravity, grounds and spheres, and do not meet: they pass through each other and themselves.
+    Several bodies share gravity, grounds and spheres, and do not meet: they pass through each other and themselves. A
+    `Simulator` gives a `SceneWarning` where they overlap at rest, and once at a reported step after which they do.
 
     Args:
         parts: `Solid`, `Pin`, `Gravity`, `Ground`, `Sphere`, `Damping`. At least one `Solid`; at most one `Gravity`

@@ -111,7 +111,7 @@ class Simulator(Readable):
             start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
                 The first two are moved out of contacts and along rigid motions; bodies that planes would squeeze there
                 by more than is gained start from x instead.
-            return_info: also how the solve went; costs two more local steps, no synchronisation.
+            return_info: also how the solve went; costs some ten iterations more, no synchronisation.
 
         Returns:
             The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
@@ -130,6 +130,7 @@ class Simulator(Readable):
         `Info.from_rows`."""
         given, inertial = _first_iterate(start, state[0])
         refuse_tangents(*state, forces, *material)
+        self._notices.before(self, state, material, report=report)
         positions, velocities, rows = _ops.step(
             state[0],
             state[1],
@@ -139,6 +140,8 @@ class Simulator(Readable):
             list(self.plan.arrays),
             **self.numbers(inertial=inertial, report=report),
         )
+        if report:
+            self._notices.after(self, positions, rows)
         return State(positions, velocities), rows
 
     @torch.no_grad()
@@ -156,7 +159,7 @@ class Simulator(Readable):
         If an exception ends it, as Ctrl-C does, each environment is either before the step or after it.
 
         Args:
-            info: rows [B, 6] float64 to fill in, see `Info.from_rows`; None leaves out residual and energy.
+            info: rows [B, 7] float64 to fill in, see `Info.from_rows`; None leaves out residual, energy and inverted.
         """
         forces = self.check_state(state, forces=forces)
         if state[0].requires_grad or state[1].requires_grad:
@@ -169,6 +172,8 @@ class Simulator(Readable):
                 f"{type(info).__name__}"
             )
         given, inertial = _first_iterate(start, state[0])
+        material = self.material_at(targets, state[0].shape[0])
+        self._notices.before(self, state, material, report=info is not None)
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(
             state[0],
@@ -176,10 +181,12 @@ class Simulator(Readable):
             rows,
             forces,
             given,
-            self.material_at(targets, state[0].shape[0]),
+            material,
             list(self.plan.arrays),
             **self.numbers(inertial=inertial, report=info is not None),
         )
+        if info is not None:
+            self._notices.after(self, state[0], info)
 
     def rollout(
         self,
@@ -211,7 +218,7 @@ class Simulator(Readable):
                 `rollout(rollout(state, 5).state(), 4, first=5)` does. For where spheres were, a function of targets is
                 asked for the step before, too; others are moved on by an addition for each step before.
             start: first iterate of every step, "velocity" or "inertial".
-            return_info: fill in residual and energy of the recorded steps; NaN otherwise, see `Info`.
+            return_info: fill in residual, energy and inverted of the recorded steps, see `Info`.
             progress: show a bar, for which a GPU finishes a piece of about 0.1 s before the next one begins.
 
         Returns:

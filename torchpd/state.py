@@ -72,11 +72,14 @@ class Info(NamedTuple):
     Nothing here has a gradient: for one of an energy there is `Simulator.energy`, of the state that the step reached.
 
     Attributes:
-        residual: |grad E| / |grad E at x + h v| of the step's objective E, less what contacts balance: 1 is no better
-            than where the body would fly to, and as residuals weigh short waves, an error may be larger or smaller; at
-            rest, where rounding is all that there is, it is about 1, of stiff bodies up to ten and more. NaN unless it
-            was asked for (`return_info`), and where what is not finite, or negative, of state and material reaches the
-            step: not of a contact that nothing touches, nor a mass that a spring outweighs.
+        residual: what neither pins nor contacts balance of the step's forces, over those forces, from 0 (solved, to
+            rounding) to 1 (nothing balances): with r = grad E less that, f_i = a_i (u_i - s_i) of inertia, weight and
+            springs, and e_i of elements, (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)). S x is every
+            stiffness times position, csrc/solver/report.h: rounding that no iterations remove, so that where forces are
+            smaller, as of what drifts, or weighs little beside E x, the residual is 0. Residuals weigh short waves, so
+            the error of positions may be larger or smaller. NaN unless it was asked for (`return_info`), and where what
+            is not finite, or negative, of state and material reaches the step: not of a contact that nothing touches,
+            nor a mass that a spring outweighs.
         energy: the objective E at the last iterate [J], elastic energy and m / (2 h^2) |x - y|^2: what a solve lowers.
             Not the mechanical energy, which `Simulator.energy` gives. NaN unless asked for.
         iterations: that were used.
@@ -86,6 +89,8 @@ class Info(NamedTuple):
             them, so it may be there while the residual is large.
         rho: spectral radius that the schedule used. Of `Multilevel` 1 - q / s, where q A_0 <= A <= s A_0 and M was made
             of A_0: 0 where M fits, near 1 where it does not (`Simulator.prepare_solver` makes it anew).
+        inverted: tetrahedra with det F <= 0 at the end of the step, turned inside out or flat. A body may come to rest
+            with some, converged, in a folded minimum of its energy. -1 unless asked for.
     """
 
     residual: Tensor
@@ -94,12 +99,14 @@ class Info(NamedTuple):
     restarts: Tensor
     converged: Tensor
     rho: Tensor
+    inverted: Tensor = torch.tensor(-1)  # of files from before it was counted
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:
-        """From the rows [..., 6] that the ops return."""
-        residual, energy, iterations, restarts, converged, rho = rows.unbind(-1)
-        return cls(residual, energy, iterations.long(), restarts.long(), converged.bool(), rho)
+        """From the rows [..., 7] that the ops return, or those of 6 columns from before `inverted`."""
+        residual, energy, iterations, restarts, converged, rho, *counted = rows.unbind(-1)
+        inverted = counted[0] if counted else torch.full_like(rho, -1.0)
+        return cls(residual, energy, iterations.long(), restarts.long(), converged.bool(), rho, inverted.long())
 
 
 class Track(NamedTuple):

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .accuracy import ROUNDINGS, ExactStep, exact_steps, settled_steps
+from .accuracy import ExactStep, exact_steps, settled_steps
 from .automatic import runs
 from .checks import check_has_values, check_scalar, check_whole
 from .contenders import safe_solvers
@@ -409,15 +409,20 @@ def _wait_for(sim: Simulator) -> None:
 # ---- the choice
 
 
+def _tells(study: _Study, trial: Trial, promised: float) -> bool:
+    """Whether a trial breaks the promise and its residuals say so: they are 0 where rounding is all that they have."""
+    return promised < study.worst(trial) < math.inf and max(trial.residuals) > 0.0
+
+
 def _with_broken(study: _Study, trials: list[Trial], promised: float) -> list[Trial]:
-    """The trials, the chosen one last, and where none of them breaks the promise some of fewer iterations that do."""
-    if any(promised < study.worst(trial) < math.inf for trial in trials):
+    """The trials, the chosen one last; where none breaks the promise and says so, with some of fewer iterations."""
+    if any(_tells(study, trial, promised) for trial in trials):
         return trials
     solver, low, high = trials[-1].solver, 0, min(trial.iterations for trial in trials)
     added = [study.trial(solver, low)]
     while high - low > max(1, high // 8):
         added.append(study.trial(solver, (low + high) // 2))
-        breaks = study.worst(added[-1]) > promised
+        breaks = _tells(study, added[-1], promised)
         low, high = (added[-1].iterations, high) if breaks else (low, added[-1].iterations)
     return [*added, *trials]
 
@@ -427,22 +432,27 @@ def _most_accurate(study: _Study, timed: list[tuple[list[Trial], float]]) -> tup
     return min(timed, key=lambda pair: (study.worst(pair[0][-1]), pair[1]))
 
 
-def _residual_limit(study: _Study, trials: list[Trial], promised: float) -> tuple[float, float]:
-    """The residual at which the error is the promised one, and the largest error per residual.
+def _residual_limit(study: _Study, trials: list[Trial], promised: float) -> tuple[float, float, float]:
+    """The residual at which the error is the promised one, the largest error per residual, and that of a residual of 0.
 
     The chosen trial says it if its errors are near the promise. They may be far below, or beyond rounding nothing at
-    all, where few iterations do much; then the nearest trial that breaks the promise says more.
+    all, where few iterations do much; then the nearest trial that breaks the promise, and shows it, says more.
     """
     chosen = trials[-1]
-    breaking = [trial for trial in trials if promised < study.worst(trial) < math.inf]
-    asked = [chosen, *sorted(breaking, key=study.worst)[:1]]
-    limits = [max(trial.residuals) * promised / study.worst(trial) for trial in asked if study.worst(trial) > 0.0]
-    ratios = [e / r for trial in asked for e, r in zip(study.visible(trial), trial.residuals, strict=True) if r > 0.0]
-    # The studied states themselves keep the promise, and so do others like them. Where nothing but rounding was left
-    # residuals scatter more, and the promise grants more of it than the study.
-    rounded = all(error <= step.uncertainty for error, step in zip(chosen.errors, study.exact, strict=True))
-    like = ROUNDINGS / _STUDIED_ROUNDINGS if rounded else SAFETY
-    return max(min(limits, default=0.0), like * max(chosen.residuals)), max(ratios, default=0.0)
+    breaking = sorted((trial for trial in trials if promised < study.worst(trial) < math.inf), key=study.worst)
+    telling = [trial for trial in breaking if max(trial.residuals) > 0.0]
+    asked = [chosen, *breaking[:1], *telling[:1]]
+    limits = [
+        max(trial.residuals) * promised / study.worst(trial)
+        for trial in asked
+        if study.worst(trial) > 0.0 and max(trial.residuals) > 0.0
+    ]
+    pairs = [pair for trial in asked for pair in zip(study.visible(trial), trial.residuals, strict=True)]
+    ratio = max((error / residual for error, residual in pairs if residual > 0.0), default=0.0)
+    near = len(chosen.errors) * len(asked[:2])
+    unseen = max((error for error, residual in pairs[:near] if residual == 0.0), default=0.0)
+    # the studied states themselves keep the promise, and so do others like them
+    return max(min(limits, default=0.0), SAFETY * max(chosen.residuals)), ratio, unseen
 
 
 def _promise(
@@ -461,7 +471,7 @@ def _promise(
     reachable = min(max(left, min(study.roundings)), 1.0)
     promised = error if attained and error is not None else reachable
     trials = _with_broken(study, trials, promised)
-    limit, ratio = _residual_limit(study, trials, promised)
+    limit, ratio, unseen = _residual_limit(study, trials, promised)
     return Promise(
         asked_error=error,
         asked_milliseconds=milliseconds,
@@ -474,6 +484,7 @@ def _promise(
         milliseconds=cost,
         residual_limit=limit,
         error_per_residual=ratio,
+        unseen_error=unseen,
         time_step=sim.time_step,
         dtype=sim.dtype,
         device=str(sim.device),

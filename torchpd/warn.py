@@ -7,9 +7,13 @@ import traceback
 import warnings
 from types import FrameType
 
-__all__ = ["TuningWarning", "warn_user"]
+__all__ = ["SceneWarning", "TuningWarning", "warn_user"]
 
 _NOT_USERS = (__package__, "torch", "")  # code that torch generates has no name
+
+
+class SceneWarning(UserWarning):
+    """A scene or a state that a step takes as it is, though it is hardly meant: overlaps, inverted elements."""
 
 
 class TuningWarning(UserWarning):

@@ -14,6 +14,8 @@ struct Kernels {
   void (*step64)(const StepCall<double>&, int threads);
   void (*field32)(const FieldCall<float>&, int threads);
   void (*field64)(const FieldCall<double>&, int threads);
+  void (*report32)(const ReportCall<float>&, int threads);
+  void (*report64)(const ReportCall<double>&, int threads);
   void (*rotation32)(const RotationCall<float>&, int threads);
   void (*rotation64)(const RotationCall<double>&, int threads);
   void (*precondition32)(const PreconditionCall<float>&, int threads);

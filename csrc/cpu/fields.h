@@ -25,6 +25,8 @@ class FieldPass {
       vertex_field<1, 3>(environment, SolidGradient<false>{});
     } else if (call_.field == Field::diagonal) {
       vertex_field<1, 1>(environment, SolidDiagonal{});
+    } else if (call_.field == Field::report) {
+      vertex_field<1, 3>(environment, SolidReport{});
     } else if (call_.field == Field::hessian_product) {
       vertex_field<2, 3>(environment, SolidHessian{});
     } else if (call_.field == Field::element_energy) {
@@ -47,10 +49,11 @@ class FieldPass {
     return to_quad(p[0], p[1], p[2]);
   }
 
-  // Positions go to u relative to each patch's first vertex through the origin, as in a step.
+  // Positions relative to each patch's first vertex, and on top of them what they are displaced by, as in a step.
   void load(std::int64_t environment) {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
       if (call_.positions) w_.x[i] = read(call_.positions, environment, i);
+      if (call_.displacement) w_.u[i] = read(call_.displacement, environment, i);
       if (call_.direction) w_.before[i] = read(call_.direction, environment, i);
     }
     const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;

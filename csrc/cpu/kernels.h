@@ -4,6 +4,7 @@
 #include "cpu/conjugate.h"
 #include "cpu/fields.h"
 #include "cpu/multilevel_stepper.h"
+#include "cpu/report.h"
 #include "cpu/stepper.h"
 
 #include <algorithm>
@@ -239,6 +240,8 @@ const Kernels PD_KERNELS = {PD_NAME,
                             &step_any<double>,
                             &field_any<float>,
                             &field_any<double>,
+                            &report_any<float>,
+                            &report_any<double>,
                             &rotation_any<float>,
                             &rotation_any<double>,
                             &precondition_any<float>,

@@ -38,7 +38,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     this->weigh();
     compare_with_reference();
     for (int t = 0; t < set_.steps; ++t) {
-      multilevel_step(*this, set_);
+      multilevel_step(*this);
       if (this->is_ended()) return;
       if ((t + 1) % set_.every == 0) this->store((t + 1) / set_.every - 1);
       this->move_balls();

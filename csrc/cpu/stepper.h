@@ -140,30 +140,6 @@ class Stepper {
   // Whether the call is to end now; then nothing of this step counts.
   bool is_ended() const { return team_.ended(std::int64_t(plan_.vertices) * width); }
 
-  // The gradient on the straight course x + h v is what residuals are relative to, whatever the first iterate.
-  void measure_course() {
-    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      w_.u[i] = vertex(i).first(contacts_, Real(h_) * w_.velocity[i]);
-    }
-    measure();
-    for (int lane = 0; lane < width; ++lane) course_[lane] = Lanes::lane(residual_, lane);
-  }
-
-  // |grad E|^2 without what contacts balance, and E
-  void measure() {
-    team_.barrier();
-    sweep_.run(0, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
-      const auto v = vertex(i);
-      sums.energy = v.add_energy(w_.u[i], sums.energy);
-      const Value residual = v.unbalanced(contacts_, w_.u[i], force);
-      sums.first = multiply_add(residual, residual, sums.first);
-    });
-    const auto sum = total(0);
-    energy_ = sum.energy;
-    residual_ = sum.first;
-    team_.barrier();
-  }
-
   void finish() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
       w_.x[i] = w_.x[i] + w_.u[i];
@@ -330,16 +306,12 @@ class Stepper {
     if (!call_.info || team_.rank != 0) return;
     for (int lane = 0; lane < width && in_.first + lane < call_.batch; ++lane) {
       double* row = call_.info + (first_row + in_.first + lane) * info_count;
-      const double last = Lanes::lane(residual_, lane);
-      const double energy = Lanes::lane(energy_, lane);
-      const double residual = relative_residual(last, course_[lane], energy, least_[lane]);
-      row[info_residual] = set_.report ? residual : NAN;
-      row[info_energy] = set_.report ? energy : NAN;
+      row[info_residual] = row[info_energy] = NAN;
       row[info_iterations] = used_[lane];
       row[info_restarts] = schedule_[lane].restarts;
-      row[info_converged] =
-          done_[lane] && least_[lane] >= 0 && !(set_.report && residual != residual);
+      row[info_converged] = done_[lane] && least_[lane] >= 0;
       row[info_rho] = schedule_[lane].rho;
+      row[info_inverted] = -1;
     }
   }
 
@@ -360,8 +332,7 @@ class Stepper {
   Contacts<Real> contacts_;
   Value gravity_ = {};
   Real damping_{T(0)}, omega_{T(1)}, active_{T(1)};
-  Wide energy_ = Wide(0.0), residual_ = Wide(0.0);
-  double least_[width] = {}, course_[width] = {};
+  double least_[width] = {};
   Schedule schedule_[width];
   double coming_[width] = {};  // the next omega
   SoftStop stop_[width];

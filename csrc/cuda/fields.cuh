@@ -72,6 +72,7 @@ struct PatchFields {
     for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
       Vec3<T> x = {T(0), T(0), T(0)};
       if (field.positions) x = at(field.positions, s) - at(field.positions, 0);
+      if (field.displacement) x = x + at(field.displacement, s);
       if constexpr (Fields == 2) {
         both.set(s, x, at(field.direction, s));
       } else {
@@ -223,6 +224,8 @@ void run_field_with(const FieldWork<T>& work, cudaStream_t stream) {
       return run_vertices<Computed, SolidGradient<false>, 1, 3>(work, stream);
     case Field::diagonal:
       return run_vertices<Computed, SolidDiagonal, 1, 1>(work, stream);
+    case Field::report:
+      return run_vertices<Computed, SolidReport, 1, 3>(work, stream);
     case Field::hessian_product:
       return run_vertices<Computed, SolidHessian, 2, 3>(work, stream);
     case Field::element_energy:

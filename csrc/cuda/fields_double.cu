@@ -1,5 +1,6 @@
 #include "cuda/adjoint.cuh"
 #include "cuda/conjugate.cuh"
+#include "cuda/report.cuh"
 
 namespace pd {
 template std::int64_t field_bytes(const DeviceField<double>&);
@@ -10,5 +11,6 @@ template void run_adjoint_system(const DeviceAdjointSystem<double>&, Stream);
 template void run_contact_gradients(const DeviceContactGradients<double>&, Stream);
 template void run_adjoint_result(const AdjointResultCall<double>&, Stream);
 template void run_vertex_sum(const VertexSumCall<double>&, Stream);
+template void run_report(const DeviceReport<double>&, Stream);
 template void run_rotation(const RotationCall<double>&, Stream);
 }  // namespace pd

@@ -1,5 +1,6 @@
 #include "cuda/adjoint.cuh"
 #include "cuda/conjugate.cuh"
+#include "cuda/report.cuh"
 
 namespace pd {
 template std::int64_t field_bytes(const DeviceField<float>&);
@@ -10,5 +11,6 @@ template void run_adjoint_system(const DeviceAdjointSystem<float>&, Stream);
 template void run_contact_gradients(const DeviceContactGradients<float>&, Stream);
 template void run_adjoint_result(const AdjointResultCall<float>&, Stream);
 template void run_vertex_sum(const VertexSumCall<float>&, Stream);
+template void run_report(const DeviceReport<float>&, Stream);
 template void run_rotation(const RotationCall<float>&, Stream);
 }  // namespace pd

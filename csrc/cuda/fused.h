@@ -174,33 +174,6 @@ class FusedRunner {
 
   PD_DEVICE bool finished() const { return finished_; }
 
-  // The gradient on the straight course x + h v is what residuals are relative to, whatever the first iterate.
-  PD_DEVICE void measure_course() {
-    each_slot([&](int s) { move(s, v_.at(s).first(contacts_, v_.straight(s, h_))); });
-    moved_ = true;
-    measure();
-    if (threadIdx.x == 0) control_.progress.course = control_.progress.residual;
-  }
-
-  // |grad E|^2 without what contacts balance, and E
-  PD_DEVICE void measure() {
-    settle();
-    __syncthreads();
-    pass<false>(
-        SolidGradient<true>{}, [] {}, false,
-        [&](const Seat& at, const Seen& seen, const Vec3<T>& force) {
-          if (!at.owned()) return;
-          energy_ += seen.energy();
-          first_ += seen.residual(contacts_, force);
-        });
-    sums_.all_reduce({energy_, first_, 0}, 2, Add{});
-    if (threadIdx.x == 0) {
-      control_.progress.energy = sums_.total(0);
-      control_.progress.residual = sums_.total(1);
-    }
-    __syncthreads();
-  }
-
   PD_DEVICE void finish() {
     if constexpr (Clustered) __syncthreads();
     each_slot([&](int s) { v_.finish(s, h_); });

@@ -12,7 +12,7 @@ namespace pd::inline PD_TARGET {
 // What decides how an environment goes on.
 struct Progress {
   Schedule schedule;
-  double least, energy, residual, course;  // least: smallest a / D; residual and course: squares
+  double least;  // smallest a / D
   SoftStop stop;
   int used;  // iterations
   bool done;
@@ -97,15 +97,12 @@ struct Inputs {
   PD_DEVICE void write_info(int record, const Progress& progress) const {
     if (!call->info) return;
     double* to = call->info + (record * call->batch + environment) * info_count;
-    const bool report = call->settings.report;
-    const double residual =
-        relative_residual(progress.residual, progress.course, progress.energy, progress.least);
-    to[info_residual] = report ? residual : NAN;
-    to[info_energy] = report ? progress.energy : NAN;
+    to[info_residual] = to[info_energy] = NAN;
     to[info_iterations] = progress.used;
     to[info_restarts] = progress.schedule.restarts;
-    to[info_converged] = progress.done && progress.least >= 0 && !(report && residual != residual);
+    to[info_converged] = progress.done && progress.least >= 0;
     to[info_rho] = progress.schedule.rho;
+    to[info_inverted] = -1;
   }
 };
 

@@ -94,6 +94,12 @@ template <class T>
 void run_vertex_sum(const VertexSumCall<T>& call, Stream stream);
 
 template <class T>
+using DeviceReport = ReportCall<T, DevicePlan<T>>;
+
+template <class T>
+void run_report(const DeviceReport<T>& call, Stream stream);
+
+template <class T>
 std::int64_t precondition_bytes(const PreconditionCall<T>& call);
 template <class T>
 void run_precondition(const PreconditionCall<T>& call, void* memory, Stream stream);

@@ -102,14 +102,4 @@ PD_HD void write3(T* p, const Vec3<T>& a) {
   p[2] = a.z;
 }
 
-// Each thread has one environment: the policy for physics that the CPU runs in SIMD lanes.
-template <class T>
-struct Thread {
-  using Scalar = T;
-  using Real = T;
-  using Value = Vec3<T>;
-  PD_HD static Vec3<T> vec3(const Value& a) { return a; }
-  PD_HD static Value value(const Vec3<T>& a) { return a; }
-};
-
 }  // namespace pd::inline PD_TARGET

@@ -52,7 +52,7 @@ class MultilevelRunner {
       sums.value[0] += pass_over_patch(
           w_, patch, shared_, SolidGradient<true>{}, [&](int i) { return w_.v.see(i); },
           [&](int i, const auto& seen, const Vec3<T>& force) { look_at(i, seen, force, sums); });
-      write_sums<Visit::measure>(sums, m_.patch_sums + patch * sums_count);
+      write_sums<Visit::update>(sums, m_.patch_sums + patch * sums_count);
     }
     team_.barrier();
     // those of this thread, on the way to the shared vertices

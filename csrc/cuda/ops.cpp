@@ -32,6 +32,12 @@ struct Cuda {
   }
 
   template <class T>
+  static void report(const DeviceReport<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_report(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+  template <class T>
   static void precondition(const PreconditionCall<T>& call, const Tensor& like) {
     run(like, call, precondition_bytes<T>, run_precondition<T>);
   }

@@ -113,41 +113,6 @@ class SeveralRunner {
 
   PD_DEVICE bool finished() const { return finished_; }
 
-  // The gradient on the straight course x + h v is what residuals are relative to, whatever the first iterate.
-  PD_DEVICE void measure_course() {
-    each_slot([&](const Seat& seat, int i) {
-      move(i, v_.at(i).first(contacts(seat.environment), v_.straight(i, h_)));
-    });
-    measure();
-    each_environment([&](int e) {
-      Progress& progress = course_[e].progress;
-      if (lane() == 0) progress.course = progress.residual;
-    });
-    __syncthreads();
-  }
-
-  // |grad E|^2 without what contacts balance, and E
-  PD_DEVICE void measure() {
-    settle();
-    __syncthreads();
-    each_pair<true>(SolidGradient<true>{});
-    __syncthreads();
-    each_slot([&](const Seat& seat, int i) {
-      const Seen seen = v_.see(i);
-      const Vec3<T> force = force_on(seat);
-      leave(energy_sum, i, seen.energy());
-      leave(change_sum, i, seen.residual(contacts(seat.environment), force));
-    });
-    __syncthreads();
-    each_environment([&](int e) {
-      const double energy = energy_of(e), residual = over_vertices(change_sum, e, Add{});
-      if (lane() != 0) return;
-      course_[e].progress.energy = energy;
-      course_[e].progress.residual = residual;
-    });
-    __syncthreads();
-  }
-
   PD_DEVICE void finish() {
     each_slot([&](const Seat&, int i) { v_.finish(i, h_); });
   }

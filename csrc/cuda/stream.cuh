@@ -108,7 +108,7 @@ class StreamRunner {
     if (set_.multilevel()) run_comparison(call_, outer_, stream_);
     for (int t = 0; t < set_.steps; ++t) {
       if (set_.multilevel()) {
-        multilevel_step(*this, set_);
+        multilevel_step(*this);
       } else {
         step(*this, set_);
       }
@@ -152,17 +152,6 @@ class StreamRunner {
 
   // environments that are done skip what is still launched: asking would mean waiting
   bool finished() const { return false; }
-
-  void measure_course() {
-    vertices<VertexTask::course>(0);
-    pass<Visit::measure>(0);
-    decide<Decision::course>(0);
-  }
-
-  void measure() {
-    pass<Visit::measure>(0);
-    decide<Decision::measure>(0);
-  }
 
   void finish() { vertices<VertexTask::finish>(0); }
 
@@ -272,8 +261,7 @@ template <class T, bool Touching>
 void allow_shared_memory(std::size_t bytes) {
   for (const auto kernel :
        {stream_patches<Visit::weigh, T, Touching>, stream_patches<Visit::update, T, Touching>,
-        stream_patches<Visit::update_guarded, T, Touching>,
-        stream_patches<Visit::measure, T, Touching>}) {
+        stream_patches<Visit::update_guarded, T, Touching>}) {
     if (resident_blocks(reinterpret_cast<const void*>(kernel), pass_threads, bytes) == 0)
       refuse_shared_memory(bytes);
   }

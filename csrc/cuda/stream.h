@@ -112,11 +112,11 @@ struct StreamWork {
 PD_HD bool alternates(const Settings& settings) { return !(settings.tolerance > 0); }
 
 // What a pass does with a vertex once the force of the elements on it is known.
-enum class Visit { weigh, update, update_guarded, measure };
+enum class Visit { weigh, update, update_guarded };
 
 template <Visit What>
 struct ElementOf {
-  using type = SolidGradient<What == Visit::update_guarded || What == Visit::measure>;
+  using type = SolidGradient<What == Visit::update_guarded>;
 };
 template <>
 struct ElementOf<Visit::weigh> {
@@ -146,9 +146,6 @@ PD_DEVICE void visit(const StreamWork<T, Touching>& w, unsigned i,
   double (&sum)[sums_count] = sums.value;
   if constexpr (What == Visit::weigh) {
     sum[0] = Least{}(sum[0], w.v.weigh(i, force.x));
-  } else if constexpr (What == Visit::measure) {
-    sum[0] += seen.energy();
-    sum[1] += seen.residual(w.contacts, force);
   } else {
     if constexpr (What == Visit::update_guarded) sum[0] += seen.energy();
     if (!alternates(w.settings())) sum[2] += seen.square_of_way();
@@ -273,7 +270,7 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
 }
 
 // What follows from the sums of a pass, an environment a block.
-enum class Decision { start, weigh, iterate, course, measure };
+enum class Decision { start, weigh, iterate };
 
 template <Decision What, class T>
 __global__ void __launch_bounds__(decide_threads)
@@ -288,7 +285,7 @@ __global__ void __launch_bounds__(decide_threads)
     for (int row = threadIdx.x; row < call.sum_rows(); row += blockDim.x) {
       for (int n = 0; n < sums_count; ++n) sums.value[n] = Op{}(sums.value[n], w.sum_row(row)[n]);
     }
-    write_sums<What == Decision::weigh ? Visit::weigh : Visit::measure>(sums, total);
+    write_sums<What == Decision::weigh ? Visit::weigh : Visit::update>(sums, total);
   }
   if (threadIdx.x != 0) return;
   const Settings& set = call.step.settings;
@@ -301,10 +298,8 @@ __global__ void __launch_bounds__(decide_threads)
     p.used = set.tolerance > 0 ? 0 : set.iterations;
     if (set.tolerance > 0) p.stop = {w.in.fall()};
     p.done = false;
-    // read with the rest, whether or not anybody has measured them
-    if (!set.report) p.energy = p.residual = p.course = 0;
     omega[0] = p.schedule.next(0);
-  } else if constexpr (What == Decision::iterate) {
+  } else {
     const bool soft = set.tolerance > 0;
     if (p.done) return;
     p.used += soft;
@@ -314,9 +309,6 @@ __global__ void __launch_bounds__(decide_threads)
     if (p.schedule.wants_energy(k)) p.schedule.check(total[0]);
     // where nothing is asked in between, until the next look at the energy
     for (int next = k + 2; !soft && next <= k + guard_period; ++next) set_omega(next);
-  } else {
-    p.energy = total[0];
-    (What == Decision::course ? p.course : p.residual) = total[1];
   }
 }
 
@@ -340,7 +332,7 @@ __global__ void __launch_bounds__(vertex_threads)
 
 // ---- vertex by vertex
 
-enum class VertexTask { load, predict, course, start, finish, store };
+enum class VertexTask { load, predict, start, finish, store };
 
 template <VertexTask What, class T, bool Touching>
 __global__ void __launch_bounds__(vertex_threads)
@@ -356,8 +348,6 @@ __global__ void __launch_bounds__(vertex_threads)
   if (i >= w.plan.vertices) return;
   if constexpr (What == VertexTask::load) w.v.load(i, w.in, i, w.h);
   if constexpr (What == VertexTask::predict) w.v.predict(i, w.in, i, w.h);
-  if constexpr (What == VertexTask::course)
-    w.v.set(i, w.v.at(i).first(w.contacts, w.v.straight(i, w.h)));
   if constexpr (What == VertexTask::start) {
     const Vec3<T> u = w.v.first(i, w.in, i, w.contacts);
     w.v.set(i, u);

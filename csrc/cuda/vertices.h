@@ -20,12 +20,6 @@ struct Vertices {
       return 0.5 * double((twice.x + twice.y) + twice.z);
     }
 
-    // square of what is left of the gradient
-    PD_DEVICE double residual(const Contacts<T>& contacts, const Vec3<T>& force) const {
-      const Vec3<T> r = vertex.unbalanced(contacts, u, force);
-      return double(dot(r, r));
-    }
-
     // |u - s|^2, with which a soft stop compares
     PD_DEVICE double square_of_way() const {
       const Vec3<T> way = u - vertex.target;

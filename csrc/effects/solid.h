@@ -165,4 +165,32 @@ struct SolidDiagonal {
   }
 };
 
+// Shares of an element that its four corners add up for a report: a quarter of its energy [J]; w V |grad N_c|^2 |x|, the force
+// that a relative error of positions is multiplied by [N]; and a quarter where det F <= 0. Padding has no weight and counts nothing.
+struct SolidReport {
+  static constexpr int strip = 1;
+
+  template <int N, class Elements>
+  PD_HD void run(const Elements& elements) const {
+    using R = typename Elements::R;
+    using T = scalar_of<R>;
+    const R none(T(0)), quarter(T(0.25));
+    for (int s = 0; s < N; ++s) {
+      Vec3<R> x[4], n[4], share[4];
+      elements.corners(s, 0, x);
+      shape_gradients(elements.rest(s), n);
+      const R weight = elements.weight(s);
+      const Mat3<R> f = deformation_gradient(x, elements.rest(s)), d = f - nearest_rotation(f);
+      const R energy = (R(T(0.125)) * weight) * frobenius(d, d);
+      const auto inverted = determinant(f) <= none && weight > none;
+      R size = none;
+      for (int c = 0; c < 4; ++c) size = -lesser(-size, -dot(x[c], x[c]));
+      size = square_root(size);
+      for (int c = 0; c < 4; ++c)
+        share[c] = {energy, (weight * dot(n[c], n[c])) * size, select(inverted, quarter, none)};
+      elements.add(s, share);
+    }
+  }
+};
+
 }  // namespace pd::inline PD_TARGET

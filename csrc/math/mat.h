@@ -62,6 +62,11 @@ PD_HD Mat3<R> select(const Mask& take, const Mat3<R>& a, const Mat3<R>& b) {
 }
 
 template <class R>
+PD_HD R determinant(const Mat3<R>& a) {
+  return dot(a.row[0], cross(a.row[1], a.row[2]));
+}
+
+template <class R>
 PD_HD Mat3<R> cofactor(const Mat3<R>& a) {
   return {{cross(a.row[1], a.row[2]), cross(a.row[2], a.row[0]), cross(a.row[0], a.row[1])}};
 }

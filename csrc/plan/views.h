@@ -151,14 +151,13 @@ struct Settings {
   double tolerance = 0;   // relative error that ends an environment's iterations; 0: never
   int delay = 0;          // iterations before the classic schedule accelerates
   bool weighted = true;   // the diagonal that cannot diverge, else the plain one
-  bool report = false;    // residual and energy cost two more local steps
 
   PD_HD bool multilevel() const { return schedule >= ScheduleKind::lbfgs; }
   // by L-BFGS
   PD_HD bool learns() const { return multilevel() && schedule != ScheduleKind::momentum; }
 };
 
-// Numbers of an info row, double each.
+// Numbers of an info row, double each. A step leaves residual and energy NaN and inverted -1; a report fills them in.
 enum InfoField : int {
   info_residual,
   info_energy,
@@ -166,6 +165,7 @@ enum InfoField : int {
   info_restarts,
   info_converged,
   info_rho,
+  info_inverted,
   info_count
 };
 
@@ -194,7 +194,8 @@ enum class Field : int {
   hessian_product,
   element_energy,
   element_energy_product,
-  diagonal
+  diagonal,
+  report  // see SolidReport
 };
 
 template <class T, class P = Plan<T>>
@@ -205,9 +206,45 @@ struct FieldCall {
   std::int64_t batch = 0;
   bool weighted = false;         // with l_e, by the diagonal
   const T* positions = nullptr;  // [batch, vertices, 3], by all but the diagonal
+  const T* displacement =
+      nullptr;  // [batch, vertices, 3] on top of the positions, whose sum is not rounded; may be null
   const T* direction = nullptr;  // [batch, vertices, 3], by the products
   T* out =
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, vertices] of the diagonal
+};
+
+// Sums over the vertices of an environment that a report is made of, see solver/report.h.
+enum ReportSum : int {
+  report_energy,
+  report_unbalanced,
+  report_force,
+  report_rounding,
+  report_inverted,
+  report_wrong,
+  report_sums
+};
+
+// Vertices that one row of sums covers.
+constexpr int report_chunk = 256;
+
+// What a step that was taken says of itself, by the user's numbers of vertices.
+template <class T, class P = Plan<T>>
+struct ReportCall {
+  P plan;
+  Material<T> material;
+  Values<T> elastic;  // [vertices] diagonal of elasticity, as the step had it
+  std::int64_t batch = 0;
+  double time_step = 0;
+  const T* positions = nullptr;  // [batch, vertices, 3] each, at the start of the step
+  const T* velocities = nullptr;
+  const T* forces = nullptr;        // may be null
+  const T* displacement = nullptr;  // u
+  const T* elastic_gradient = nullptr;
+  const T* elements = nullptr;  // Field::report
+  double* sums = nullptr;       // [batch, chunks, report_sums]
+  double* info = nullptr;       // [batch, info_count], of the step, whose blanks are filled in
+
+  PD_HD int chunks() const { return (plan.vertices + report_chunk - 1) / report_chunk; }
 };
 
 // The system of a step's adjoint, by the user's numbers of vertices.

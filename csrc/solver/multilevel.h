@@ -39,14 +39,12 @@ namespace pd::inline PD_TARGET {
 #pragma nv_exec_check_disable
 #endif
 template <class Runner>
-PD_HD void multilevel_step(Runner& run, const Settings& settings) {
+PD_HD void multilevel_step(Runner& run) {
   run.predict();
-  if (settings.report) run.measure_course();
   run.start();
   run.align();
   run.descend();  // multilevel_iterations
   run.align();
-  if (settings.report) run.measure();
   run.finish();
 }
 

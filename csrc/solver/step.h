@@ -18,15 +18,6 @@
 
 namespace pd::inline PD_TARGET {
 
-// What is left of the gradient, relative to the gradient on the straight course, of their squares: NaN where one of them or the
-// energy is no number, or `least` a / D below 0, as of negative stiffness or mass.
-PD_HD double relative_residual(double last, double course, double energy, double least) {
-  if (least < 0 || !(absolute(energy) < HUGE_VAL)) return NAN;
-  if (course > 0 && course < HUGE_VAL) return sqrt(last / course);
-  if (course == 0 && last > 0) return HUGE_VAL;
-  return course == 0 && last == 0 ? 0.0 : NAN;
-}
-
 // The soft stop of an environment: whether the error that is left, by the changes of iterations, is within a tolerance of the way
 // |u - s| from the targets: what elasticity and contacts have done, the same however fast all vertices move together.
 struct SoftStop {
@@ -60,16 +51,14 @@ PD_HD double square_of_fall(int vertices, double time_step, const Vec3<R>& gravi
 template <class Runner>
 PD_HD void step(Runner& run, const Settings& settings) {
   run.predict();  // targets s: where inertia, forces and springs would take each vertex
-  if (settings.report) run.measure_course();
-  run.start();  // first iterate, on the pins and out of the contacts
-  run.align();  // pieces that pins leave loose: exact along rigid motions
+  run.start();    // first iterate, on the pins and out of the contacts
+  run.align();    // pieces that pins leave loose: exact along rigid motions
   for (int k = 0; k < settings.iterations; ++k) {
     // local step on every element, then one Jacobi iteration on every vertex, accelerated and projected
     run.iterate(k);
     if (run.finished()) break;
   }
   run.align();
-  if (settings.report) run.measure();
   run.finish();  // new positions and velocities
 }
 

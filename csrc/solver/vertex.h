@@ -51,6 +51,16 @@ PD_HD V accelerate(const V& u, const V& before, const V& gradient, const R& desc
   return multiply_add(omega, subtract_product(u, descent, gradient) - before, before);
 }
 
+// One environment alone: the policy for physics that the CPU's steps run in SIMD lanes.
+template <class T>
+struct Thread {
+  using Scalar = T;
+  using Real = T;
+  using Value = Vec3<T>;
+  PD_HD static Vec3<T> vec3(const Value& a) { return a; }
+  PD_HD static Value value(const Vec3<T>& a) { return a; }
+};
+
 // One vertex during a step, in each of the environments that Lanes runs side by side: Real is one number of each, Value one
 // vector, with vec3() and value() between Value and Vec3<Real>. Displacements u count from x.
 // `Touching`: the scene has contacts. Without them not even the question whether there are any is compiled.
@@ -72,7 +82,8 @@ struct Vertex {
   }
 
   // `u` out of the contacts; `around`: see effects/contact.h
-  PD_HD Value project(const Contacts<Real>& contacts, const Value& u, const Value& around) const {
+  template <class Obstacles>
+  PD_HD Value project(const Obstacles& contacts, const Value& u, const Value& around) const {
     if constexpr (!Touching) return u;
     return hold(
         u, Lanes::value(contacts.project(Lanes::vec3(x), Lanes::vec3(u), Lanes::vec3(around))));
@@ -118,7 +129,8 @@ struct Vertex {
   }
 
   // the part of dE/du that neither a pin nor a contact balances: D times the way of a plain iteration
-  PD_HD Value unbalanced(const Contacts<Real>& contacts, const Value& u, const Value& force) const {
+  template <class Obstacles>
+  PD_HD Value unbalanced(const Obstacles& contacts, const Value& u, const Value& force) const {
     const Real none(T(0)), one(T(1));
     const Value zero = Lanes::value({none, none, none}), free = gradient(u, force);
     if constexpr (!Touching) return hold(zero, free);

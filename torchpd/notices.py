@@ -1,0 +1,144 @@
+"""What a step takes as it comes though hardly anybody means it, said once each: bodies that overlap, starts inside a
+contact, inverted elements.
+
+A look costs the CPU little beside a step; a GPU would have to be waited for, so nobody looks there, nor at what torch
+traces or maps. Copies of a simulator, of which studies make many, say nothing.
+"""
+
+from __future__ import annotations
+
+import weakref
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from .material import MATERIAL_ROWS
+from .overlaps import Overlap, find_overlaps
+from .warn import SceneWarning, warn_user
+
+if TYPE_CHECKING:
+    from .model import Model
+    from .scene import Scene
+    from .state import State
+
+__all__ = ["Notices", "warn_of_overlaps"]
+
+_ROUNDINGS = 10.0  # of positions, which no contact is sure to keep
+_PLANES, _SPHERES, _GRAVITY = (list(MATERIAL_ROWS).index(name) for name in ("planes", "spheres", "gravity"))
+_ALONE = "bodies do not collide with each other: move them apart, or keep them apart by Ground and Sphere"
+
+
+def warn_of_overlaps(scene: Scene) -> None:
+    """Say which bodies overlap at rest, where they are made."""
+    if len(scene.solids) > 1:
+        _say_overlaps(find_overlaps([solid.mesh for solid in scene.solids]), "at rest")
+
+
+def _say_overlaps(found: list[Overlap], where: str) -> None:
+    if found:
+        pairs = ", ".join(f"{o.first} and {o.second} ({o.points} points of their surfaces)" for o in found[:3])
+        more = f" and {len(found) - 3} pairs more" if len(found) > 3 else ""
+        warn_user(f"Simulator: bodies {pairs}{more} overlap {where}, and {_ALONE}", SceneWarning)
+
+
+class Notices:
+    """What a simulator has said."""
+
+    def __init__(self, sim: Model | None = None) -> None:
+        self._sim = None if sim is None else weakref.ref(sim)
+        self._said: set[str] = set()
+        self._started = False
+        self._reports = self._next = 0  # reports with boxes that overlap, and that of the next look
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Notices:
+        return Notices()
+
+    def __reduce__(self) -> tuple[type[Notices], tuple[()]]:
+        return Notices, ()
+
+    def before(self, sim: Model, state: State, material: list[Tensor], *, report: bool) -> None:
+        """Look at where the first step starts, and every one that reports."""
+        if not (report or not self._started) or "inside" in self._said or not self._looks(sim, state[0]):
+            return
+        arrays = [material[row].detach() for row in (_PLANES, _SPHERES, _GRAVITY)]
+        if any(len(a) not in (1, len(state[0])) for a, dims in zip(arrays, (3, 3, 2), strict=True) if a.dim() == dims):
+            return  # which the step refuses
+        self._started = True
+        positions, (planes, spheres, gravity) = state[0].detach(), arrays
+        depth = _depth(sim, positions, planes, spheres)
+        # no deeper than gravity falls in a step, nor than rounding puts what rests
+        allowed = sim.time_step**2 * gravity.norm(dim=-1).reshape(-1, 1)
+        size = torch.finfo(sim.dtype).eps * positions.abs().amax(dim=(1, 2)).unsqueeze(1)
+        inside = depth > torch.maximum(allowed, _ROUNDINGS * size)
+        if not bool(inside.any()):
+            return
+        self._said.add("inside")
+        environment = int(inside.any(dim=1).nonzero()[0])
+        deepest = float(depth[environment].max())
+        warn_user(
+            f"Simulator: {int(inside[environment].sum())} vertices of environment {environment} start a step inside a "
+            f"ground or sphere, up to {deepest:.2g} m deep. The step puts them out, and velocities are what it moves "
+            f"vertices by over its duration, about {deepest / sim.time_step:.2g} m/s there: start outside, or set the "
+            "velocities after that step to 0",
+            SceneWarning,
+        )
+
+    def after(self, sim: Model, positions: Tensor, rows: Tensor) -> None:
+        """Look at a step that reports: positions [B, V, 3] and rows [B, 7]."""
+        if not self._looks(sim, positions):
+            return
+        inverted = rows[:, -1]
+        if "inverted" not in self._said and bool((inverted > 0).any()):
+            self._said.add("inverted")
+            worst = int(inverted.argmax())
+            warn_user(
+                f"Simulator: {int(inverted[worst])} of {sim.stiffness.shape[-1]} tetrahedra of environment {worst} are "
+                "turned inside out or flat at the end of a step (info.inverted). A body that is too soft for its load, "
+                "or starts crushed, may stay folded like that, and be converged",
+                SceneWarning,
+            )
+        if len(sim.scene.solids) > 1 and "overlap" not in self._said:
+            self._look_for_overlaps(sim, positions.detach())
+
+    def _look_for_overlaps(self, sim: Model, positions: Tensor) -> None:
+        """In the first environment where boxes of bodies overlap; at the first such report, the second, the fourth."""
+        ranges = [sim.scene.vertex_range(solid) for solid in sim.scene.solids]
+        low = torch.stack([positions[:, part].amin(dim=1) for part in ranges], dim=1)  # [B, bodies, 3]
+        high = torch.stack([positions[:, part].amax(dim=1) for part in ranges], dim=1)
+        meet = (low[:, :, None] < high[:, None]).all(dim=-1)
+        meet = (meet & meet.transpose(1, 2)).sum(dim=(1, 2)) > len(ranges)
+        if not bool(meet.any()):
+            return
+        self._reports += 1
+        if self._reports < self._next:
+            return
+        self._next = 2 * self._reports
+        environment = int(meet.nonzero()[0])
+        places = positions[environment].double().numpy()
+        if found := find_overlaps([solid.mesh for solid in sim.scene.solids], [places[part] for part in ranges]):
+            self._said.add("overlap")
+            _say_overlaps(found, f"in environment {environment} at the end of a step")
+
+    def _looks(self, sim: Model, positions: Tensor) -> bool:
+        if torch.compiler.is_compiling() or type(positions) not in (Tensor, nn.Parameter):
+            return False
+        if positions.shape[1:] != sim.rest_positions.shape or not len(positions):
+            return False
+        if positions.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(positions):
+            return False
+        return self._sim is not None and self._sim() is sim
+
+
+def _depth(sim: Model, positions: Tensor, planes: Tensor, spheres: Tensor) -> Tensor:
+    """How far every vertex lies inside of a contact at the start of a step [B, V] m; pinned ones go where pins want."""
+    planes, spheres = (array if array.dim() == 3 else array[None] for array in (planes, spheres))
+    depth = positions.new_zeros(positions.shape[:2])
+    for plane in planes.unbind(1):
+        depth = torch.maximum(depth, plane[:, 3, None] - (positions * plane[:, None, :3]).sum(dim=-1))
+    for sphere in spheres.unbind(1):
+        start = (sphere[:, :3] - sphere[:, 5:])[:, None]
+        depth = torch.maximum(depth, sphere[:, 3, None] - (positions - start).norm(dim=-1))
+    depth[:, np.asarray(sim.scene._pinned())] = 0.0
+    return depth
