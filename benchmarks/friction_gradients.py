@@ -5,7 +5,7 @@ squares of the new positions, and forces, velocities and stiffness are asked for
 medians, device awaited: forward and both as Python calls them, then in a CUDA graph, and what the device starts
 for both. The last row compares the memory of a rollout of ten steps with that of a loop.
 
-    python benchmarks/friction_gradients.py --device cuda
+    python benchmarks/friction_gradients.py --device cuda --out benchmarks/results/friction-gradients-cuda.json
     PYTHONPATH=../other-checkout python benchmarks/friction_gradients.py --device cuda
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 from gpu_timing import event_times, graph_times
-from machine import measure
+from machine import describe_run, measure, write_result
 
 import torchpd as pd
 
@@ -119,11 +119,13 @@ def main() -> None:
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 64, 1024])
     parser.add_argument("--cells", type=int, nargs="+", default=[4, 9], help="of an edge of the cube (%(default)s)")
     parser.add_argument("--seconds", type=float, default=0.3, help="of each time (%(default)g)")
+    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
     options = parser.parse_args()
     print(f"torchpd of {Path(pd.__file__).parent}, on {options.device}")
     device = torch.device(options.device)
     if device.type == "cuda":
         print(torch.cuda.get_device_name(device))
+    rows: list[Row] = []
     for speed in (3.0, 0.0):
         for cells in options.cells:
             for batch in options.batches:
@@ -131,9 +133,13 @@ def main() -> None:
                 ratio = {"both / forward": row["both"] / row["forward"]}
                 if "recorded both" in row:
                     ratio["recorded"] = row["recorded both"] / row["recorded forward"]
-                print(", ".join(f"{name} {value:.4g}" for name, value in {**row, **ratio}.items()), flush=True)
+                rows.append({**row, **ratio})
+                print(", ".join(f"{name} {value:.4g}" for name, value in rows[-1].items()), flush=True)
     if device.type == "cuda":
-        print(", ".join(f"{name} {value:,}" for name, value in memory_row(4096, device).items()))
+        rows.append(memory_row(4096, device))
+        print(", ".join(f"{name} {value:,}" for name, value in rows[-1].items()))
+    if options.out:
+        write_result(options.out, {"schema": 1, **describe_run(device, torch.get_num_threads()), "rows": rows})
 
 
 if __name__ == "__main__":
