@@ -6,6 +6,7 @@ medians, device awaited: forward and both as Python calls them, then in a CUDA g
 for both. The last row compares the memory of a rollout of ten steps with that of a loop.
 
     python benchmarks/friction_gradients.py --device cuda --out benchmarks/results/friction-gradients-cuda.json
+    python benchmarks/friction_gradients.py --device cuda --adjoint multilevel     # which takes kernel "stream"
     PYTHONPATH=../other-checkout python benchmarks/friction_gradients.py --device cuda
 """
 
@@ -26,11 +27,14 @@ STEPS = 10  # of a rollout
 Row = dict[str, Any]
 
 
-def cube(cells: int, batch: int, speed: float, device: torch.device) -> tuple[pd.Simulator, pd.State]:
+def cube(
+    cells: int, batch: int, speed: float, device: torch.device, adjoint: str = "solver"
+) -> tuple[pd.Simulator, pd.State]:
     """On the ground, that fast along it for a few steps by now."""
     body = pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (cells, cells, cells)), 1e5, density=1000.0)
     scene = pd.Scene(body, pd.Gravity(), pd.Damping(0.5), pd.Ground(0.0, friction=0.4))
-    sim = pd.Simulator(scene, 1 / 60, 64, progress=False, batch=batch).to(device)
+    kernel = "stream" if adjoint == "multilevel" else "auto"
+    sim = pd.Simulator(scene, 1 / 60, 64, progress=False, batch=batch, adjoint=adjoint, kernel=kernel).to(device)
     state = sim.rest_state(batch)
     state.velocities[..., 0] = speed * torch.linspace(1.0, 1.2, batch, device=device)[:, None]
     with torch.no_grad():
@@ -60,8 +64,10 @@ def launches(work: Any) -> int:
     return sum(e.device_type == torch.autograd.DeviceType.CUDA for e in profile.events())
 
 
-def training_row(cells: int, batch: int, speed: float, device: torch.device, seconds: float) -> Row:
-    sim, state = cube(cells, batch, speed, device)
+def training_row(
+    cells: int, batch: int, speed: float, device: torch.device, seconds: float, adjoint: str = "solver"
+) -> Row:
+    sim, state = cube(cells, batch, speed, device, adjoint)
     row: Row = {"vertices": sim.vertices, "batch": batch, "slide": sliding_vertices(sim, state)}
     forces, v = torch.zeros_like(state.positions).requires_grad_(), state.velocities.clone().requires_grad_()
     start, inputs = type(state)(state.positions, v), [forces, v, sim.stiffness.requires_grad_()]
@@ -120,6 +126,7 @@ def main() -> None:
     parser.add_argument("--cells", type=int, nargs="+", default=[4, 9], help="of an edge of the cube (%(default)s)")
     parser.add_argument("--seconds", type=float, default=0.3, help="of each time (%(default)g)")
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--adjoint", choices=("solver", "multilevel"), default="solver", help="(%(default)s)")
     options = parser.parse_args()
     print(f"torchpd of {Path(pd.__file__).parent}, on {options.device}")
     device = torch.device(options.device)
@@ -129,7 +136,7 @@ def main() -> None:
     for speed in (3.0, 0.0):
         for cells in options.cells:
             for batch in options.batches:
-                row = training_row(cells, batch, speed, device, options.seconds)
+                row = training_row(cells, batch, speed, device, options.seconds, options.adjoint)
                 ratio = {"both / forward": row["both"] / row["forward"]}
                 if "recorded both" in row:
                     ratio["recorded"] = row["recorded both"] / row["recorded forward"]

@@ -3,10 +3,13 @@
 A held bar swings, float32, time step 1/60 s; the loss is the sum of squares of the new positions, and the velocities
 before are asked for their gradients. Chebyshev takes 64 guarded iterations, 256 from 1e6 Pa on, and 16 times as many on
 the two large meshes of --large; Multilevel takes 16. Times are medians, as Python calls it, device awaited; on a GPU
-both ways in a CUDA graph besides.
+both ways in a CUDA graph besides. --adjoint multilevel adds rows of Chebyshev whose gradients have the preconditioner
+of Multilevel, on a GPU with kernel "stream"; --cells and --youngs choose other bars, with as many iterations as small
+ones.
 
     python benchmarks/gradients.py --threads 1
     python benchmarks/gradients.py --device cuda --threads 16 --large
+    python benchmarks/gradients.py --cells 38 15 15 --cells 74 25 25 --youngs 1e5 --adjoint solver multilevel
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -44,16 +48,25 @@ def iterations_of(solver: str, cells: tuple[int, int, int], youngs: float) -> in
 
 
 def measure_scene(
-    cells: tuple[int, int, int], batch: int, youngs: float, solver: str, device: torch.device, seconds: float
+    cells: tuple[int, int, int],
+    batch: int,
+    youngs: float,
+    solver: str,
+    device: torch.device,
+    seconds: float,
+    adjoint: str = "solver",
 ) -> Row:
     """One row of the result."""
     scene = GpuScene("bar", cells, batch)
     sim = pd.Simulator(
         scene.build(), 1 / 60, iterations_of(solver, cells, youngs), solver=SOLVERS[solver](), progress=False,
-        batch=batch,
+        batch=batch, kernel="stream" if adjoint == "multilevel" and device.type == "cuda" else "auto",
     ).to(device)  # fmt: skip
     sim.set_material(stiffness=sim.stiffness * (youngs / float(sim.stiffness.max())))
     sim.prepare_solver()
+    begin = time.perf_counter()
+    sim.adjoint = adjoint
+    making = time.perf_counter() - begin
     state = scene.start(sim)
     state.velocities.requires_grad_()
 
@@ -70,6 +83,7 @@ def measure_scene(
     row = {
         "vertices": sim.vertices, "batch": batch, "youngs": youngs, "solver": solver, "iterations": sim.iterations,
         "kernel": sim.plan.kernel, "forward": once, "backward": all_of_it - once, "recorded": None,
+        "adjoint": adjoint, "making": making,
     }  # fmt: skip
     if device.type == "cuda":
         row["recorded"] = 1e3 * statistics.median(graph_times(both, repetitions=3, seconds=seconds))
@@ -80,7 +94,10 @@ def line_of(row: Row) -> str:
     """For a reader."""
     times = " | ".join(f"{row[name]:.3g}" for name in TIMES if row[name] is not None)
     share = row["backward"] / row["forward"]
-    return f"| {row['batch']} x {row['vertices']} | {row['youngs']:.0e} Pa | {row['solver']} | {times} | {share:.2g} |"
+    solver = row["solver"]
+    if row["adjoint"] == "multilevel":
+        solver += f", multilevel adjoint made in {row['making']:.2g} s"
+    return f"| {row['batch']} x {row['vertices']} | {row['youngs']:.0e} Pa | {solver} | {times} | {share:.2g} |"
 
 
 def main() -> None:
@@ -89,14 +106,30 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
     parser.add_argument("--seconds", type=float, default=0.5, help="of timing a scene (%(default)g)")
     parser.add_argument("--large", action="store_true", help="also 10 and 103 thousand vertices")
+    parser.add_argument("--cells", type=int, nargs=3, action="append", help="of one bar, in place of the usual ones")
+    parser.add_argument("--youngs", type=float, nargs="+", default=YOUNGS, help="Pa (%(default)s)")
+    parser.add_argument("--solver", choices=SOLVERS, nargs="+", default=list(SOLVERS), help="(%(default)s)")
+    parser.add_argument(
+        "--adjoint", choices=("solver", "multilevel"), nargs="+", default=["solver"], help="(%(default)s)"
+    )
     parser.add_argument("--out", type=Path, help="file for the result (JSON)")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     device = torch.device(options.device)
     scenes = SCENES + LARGE if options.large else SCENES
-    jobs = [(*scene, youngs, solver) for scene in scenes for youngs in YOUNGS for solver in SOLVERS]
+    if options.cells:
+        scenes = tuple((tuple(cells), 1) for cells in options.cells)
+    jobs = [
+        (scene, (youngs, solver), adjoint)
+        for scene in scenes
+        for youngs in options.youngs
+        for solver in options.solver
+        for adjoint in options.adjoint
+        if solver != "Multilevel" or adjoint == "solver"
+    ]
     rows = [
-        measure_scene(*job, device, options.seconds) for job in tqdm(jobs, desc="measuring", unit="row", leave=False)
+        measure_scene(*scene, *kind, device, options.seconds, adjoint)
+        for scene, kind, adjoint in tqdm(jobs, desc="measuring", unit="row", leave=False)
     ]
     heads = [head for name, head in TIMES.items() if rows[0][name] is not None]
     print("| " + " | ".join(["batch x vertices", "Young's modulus", "solver", *heads, "backward / forward"]) + " |")

@@ -427,3 +427,6 @@ def test_what_a_gradient_costs() -> None:
         assert row["forward"] > 0
         assert row["backward"] > 0
         assert line_of({**row, "forward": 2.0, "backward": 3.0}) == f"| 2 x 12 | 1e+05 Pa | {solver} | 2 | 3 | 1.5 |"
+    row = measure_scene((2, 1, 1), 1, 1e5, "Chebyshev", torch.device("cpu"), 0.0, "multilevel")
+    assert row["backward"] > 0
+    assert "| Chebyshev, multilevel adjoint made in 2 s |" in line_of({**row, "making": 2.0})

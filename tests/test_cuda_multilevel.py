@@ -313,6 +313,34 @@ def test_gradients_are_those_of_the_cpu() -> None:
         assert relative(gpu, cpu) <= 1e-7
 
 
+@pytest.mark.usefixtures("most_direct")
+@pytest.mark.parametrize("name", ["sliding", "box"])
+def test_gradients_of_any_solver_may_have_the_preconditioner(name: str) -> None:
+    """Those of the CPU without it; the same bits alone, in a batch and in a CUDA graph; the step's bits stay."""
+    case = CASES[name]()
+    options = {"iterations": 60 if name == "box" else 1000, "solver": pd.Chebyshev()}
+    cpu = simulator(case, torch.float64, "cpu", **options)
+    sim, plain = (
+        simulator(case, torch.float64, GPU, kernel="stream", adjoint=adjoint, **options)
+        for adjoint in ("multilevel", "solver")
+    )
+    start = state_of(case, sim, 3)
+    factor = torch.linspace(0.5, 1.5, 3, dtype=torch.float64, device=GPU)[:, None, None]
+    state = pd.State(start.positions, factor * start.velocities)
+    assert same_bits(sim(state), plain(state))
+
+    def gradient(sim: pd.Simulator, state: pd.State) -> torch.Tensor:
+        velocities = state.velocities.clone().requires_grad_()
+        after = sim(pd.State(state.positions, velocities)).positions
+        return torch.autograd.grad((after - sim.rest_positions).square().sum(), velocities)[0]
+
+    found = gradient(sim, state)
+    assert relative(found, gradient(plain, state)) <= 1e-7
+    assert relative(found, gradient(cpu, pd.State(*(part.cpu() for part in state)))) <= 1e-7
+    for e in range(3):
+        assert torch.equal(gradient(sim, pd.State(*(part[e : e + 1] for part in state)))[0], found[e])
+
+
 def test_there_and_back_and_through_a_file(tmp_path: Path) -> None:
     """Inertia and stiffness that it was made of go along, in the order of the user's vertices."""
     cpu, start = small(torch.float64, solver=pd.Multilevel("momentum"))

@@ -180,6 +180,14 @@ def test_batch_comes_back_and_older_files_have_none(file: Path) -> None:
         assert loaded.choice is not None
 
 
+def test_older_files_have_no_preconditioner_of_gradients(file: Path) -> None:
+    rewrite(file, lambda _, record: record.pop("adjoint"))
+    assert pd.Simulator.load(file).adjoint == "solver"
+    rewrite(file, lambda _, record: record.update(adjoint="cholesky"))
+    with pytest.raises(ValueError, match=r"damaged: .*adjoint must be"):
+        pd.Simulator.load(file)
+
+
 def test_saving_what_was_loaded_gives_the_same_file(tmp_path: Path) -> None:
     pd.Simulator(everything(), iterations=3).save(tmp_path / "one")
     pd.Simulator.load(tmp_path / "one").save(tmp_path / "two")

@@ -13,6 +13,7 @@ import torchpd as pd
 from torchpd import model, placing
 from torchpd.gpu import H100
 from torchpd.material import in_order, material_of
+from torchpd.multilevel import has_levels
 from torchpd.plan import Plan, compile_plan
 from torchpd.regimes import choose_plan
 
@@ -68,6 +69,31 @@ def test_a_solver_whose_plan_does_not_fit_is_refused(on_gpu: pd.Simulator, monke
     assert sim.plan is moved[0]
     assert sim.plan.for_levels
     assert asked == sim.plan.bytes + STEP
+
+
+def test_gradients_by_levels_need_the_kernel_that_reads_them(
+    on_gpu: pd.Simulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With patches for the solver; a kernel that cannot is refused by name, and nothing changes."""
+    sim, plan = on_gpu, on_gpu.plan
+    monkeypatch.setattr(placing, "free_memory", lambda _: 10**9)
+    monkeypatch.setattr(Plan, "to", lambda self, device: self)
+    assert plan.kernel == "block"
+    said = r"""adjoint="multilevel" needs kernel="stream" on a GPU, got kernel='auto', which is "block" for this"""
+    with pytest.raises(ValueError, match=said):
+        sim.adjoint = "multilevel"
+    assert (sim.adjoint, sim.plan) == ("solver", plan)
+    sim.kernel = "stream"
+    sim.adjoint = "multilevel"
+    assert (sim.plan.kernel, sim.plan.for_levels, has_levels(sim.plan.arrays)) == ("stream", False, True)
+    own = sim.plan
+    with pytest.raises(ValueError, match="got kernel='block'"):
+        sim.kernel = "block"
+    assert (sim.kernel, sim.plan) == ("stream", own)
+    sim.solver = pd.Multilevel()
+    assert (sim.plan.for_levels, has_levels(sim.plan.arrays)) == (True, True)
+    sim.solver = pd.Chebyshev()
+    assert (sim.plan.for_levels, has_levels(sim.plan.arrays)) == (False, True)
 
 
 def test_a_batch_whose_plan_does_not_fit_is_refused(on_gpu: pd.Simulator, monkeypatch: pytest.MonkeyPatch) -> None:

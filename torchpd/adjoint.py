@@ -5,7 +5,8 @@ At a converged step r(x') = a (x' - x - s) + dE/dx'(x') = 0 on the vertices that
     H l = dL/dx' + dL/dv' / h,     dL/dp = -l . dr/dp          for every input p of the step,
 
 H the exact Hessian of the step's objective (the rotations' derivative included), solved by conjugate gradients with
-the weighted diagonal, or with the multilevel preconditioner of a plan that has one. The error of the gradient follows
+the weighted diagonal, or with the multilevel preconditioner of a plan that has one: `Multilevel` makes it, and any
+solver with `Simulator(adjoint="multilevel")`. The error of the gradient follows
 the error of the step: iterate far enough, and look at the residual.
 
 A GPU solves every environment in one launch, however many iterations it takes (of half a million vertices and more in a

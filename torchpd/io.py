@@ -27,7 +27,7 @@ from .embedding import Embedding
 from .material import named_arrays
 from .mesh import TetMesh, TriMesh, trusted
 from .mesh_checks import store
-from .multilevel import precondition_plan, reference_of_levels
+from .multilevel import has_levels, precondition_plan, reference_of_levels
 from .scene import Part, Scene
 from .simulator import Simulator
 from .solvers import Chebyshev, Jacobi, Multilevel, Solver
@@ -67,7 +67,7 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         tensors.update(_tensors(f"part.{number}", _part_arrays(part)))
     material = named_arrays(sim)
     tensors.update({f"material.{name}": value.detach().cpu().contiguous() for name, value in material.items()})
-    if isinstance(sim.solver, Multilevel):
+    if has_levels(sim.plan.arrays):
         reference = zip(_REFERENCE, reference_of_levels(sim.plan.arrays), strict=True)
         tensors.update({f"solver.{name}": value.cpu().contiguous() for name, value in reference})
     record: Record = {
@@ -78,6 +78,7 @@ def save_simulation(sim: Simulator, path: str | Path) -> None:
         "named_iterations": sim.named_iterations,
         "tolerance": sim.tolerance,
         "kernel": sim.kernel,
+        "adjoint": sim.adjoint,
         "batch": sim.batch,
         "dtype": str(sim.dtype).removeprefix("torch."),
         "solver": {"kind": type(sim.solver).__name__, **dataclasses.asdict(sim.solver)},
@@ -220,12 +221,13 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
         tolerance=record["tolerance"],
         kernel=record.get("kernel", "auto"),  # files of before there was a choice
         batch=record.get("batch", former if former > 1 else None),
+        adjoint=record.get("adjoint", "solver"),
     )
     # the scene's values stay where a file has none
     sim.set_material(**{name: tensors[f"material.{name}"] for name in record.get("material", _FIRST_ARRAYS)})
     for name in record["trained"]:
         getattr(sim, name).requires_grad_()
-    if isinstance(sim.solver, Multilevel):
+    if has_levels(sim.plan.arrays):
         stiffness, inertia = (tensors[f"solver.{name}"] for name in _REFERENCE)
         if not all(map(torch.equal, (stiffness, inertia), reference_of_levels(sim.plan.arrays))):
             sim.plan = precondition_plan(sim.plan, sim.scene.values(), stiffness, inertia)

@@ -22,15 +22,22 @@ from .material_changes import (
     read_pins,
     replace_material,
 )
-from .model_checks import check_batch, check_state, check_time_step, check_tolerance, positions_of, report_resolution
-from .multilevel import has_levels
+from .model_checks import (
+    check_adjoint,
+    check_batch,
+    check_state,
+    check_time_step,
+    check_tolerance,
+    positions_of,
+    report_resolution,
+)
 from .notices import Notices, warn_of_overlaps
 from .pins import PIN_HARD
-from .placing import check_wanted_device, is_recording, move_plan, plan_anew, plan_for_solver, plan_on
+from .placing import check_wanted_device, is_recording, move_plan, plan_anew, plan_for_solver, plan_on, serves
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
-from .solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Multilevel, Solver, check_solver
+from .solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Solver, check_solver
 from .state import State
 from .targets import Anchors, Targets
 from .written import Seen
@@ -74,6 +81,7 @@ class Model(nn.Module):
         tolerance: float = 0.0,
         kernel: str = "auto",
         batch: int | None = None,
+        adjoint: str = "solver",
         progress: bool = True,
     ) -> None:
         super().__init__()
@@ -89,6 +97,7 @@ class Model(nn.Module):
         self.promise: Promise | None = None  # of `tune`
         self._kernel = check_kernel(kernel)
         self._batch = check_batch(batch)
+        self._adjoint = check_adjoint(adjoint)
         self.progress = progress
         values = scene.values()
         report_resolution(values, dtype)
@@ -233,14 +242,30 @@ class Model(nn.Module):
         before = self._solver, self.choice
         self._solver, self.choice = check_solver(solver, self.device), None
         self.named_iterations = self.named_iterations  # to another solver the same number is another promise
-        if isinstance(solver, Multilevel) == has_levels(self.plan.arrays):
-            return None
         try:
-            self._prepare()
+            if not serves(self, self.plan):
+                self._prepare()
         except BaseException:
             self._solver, self.choice = before
             raise
         return None
+
+    @property
+    def adjoint(self) -> str:
+        """What preconditions gradients, "solver" or "multilevel"; that matrix is made when it is set, and kept."""
+        return self._adjoint
+
+    @adjoint.setter
+    def adjoint(self, adjoint: str) -> None:
+        before = self._adjoint
+        self._adjoint = check_adjoint(adjoint)
+        try:
+            if not serves(self, self.plan):
+                check_has_values("adjoint", self.device)
+                self._prepare()
+        except BaseException:
+            self._adjoint = before
+            raise
 
     def _choose_solver(self, iterations: int | None) -> None:
         """What "auto" does, see `choose_solver`."""
@@ -262,7 +287,7 @@ class Model(nn.Module):
         self._choose_solver(None if own else self.iterations)
 
     def prepare_solver(self) -> None:
-        """Make anew what the solver prepares of the material: the preconditioner of `Multilevel`, the choice of "auto".
+        """Make anew what the material decides: the preconditioner of `Multilevel` or `adjoint`, the choice of "auto".
 
         Worth it after the material has changed much, evenly or not, or time_step has, which `Info.rho` and
         `Info.residual` tell, and for "auto" an `UnsolvedWarning`. `set_material` does it by itself only when it pins
@@ -321,12 +346,11 @@ class Model(nn.Module):
                 tetrahedra are partly full (`mesh.fill`) multiply `sim.stiffness` instead. Columns of contacts have
                 names too, to be given in place of `planes` and `spheres`: `friction` [C + S] of grounds, then spheres,
                 `height` [C] and `radius` [S] in m, each also one number, or [B, 1] for all of an environment. Shapes
-                and values are checked here, once, and that
-                batches agree with each other and with those of the arrays that stay. Pins that hold others, or much
-                harder, make the matrix of `Multilevel` anew, see `prepare_solver`. A body that hard pins clamped, and
-                no longer do in some environment, makes the plan anew, on a GPU as `to` does. Capture a captured step
-                again then. Where the default iterations, or those of "auto", become far too few an `UnsolvedWarning`
-                says so, once.
+                and values are checked here, once, and that batches agree with each other and with those of the arrays
+                that stay. Pins that hold others, or much harder, make the matrix of `Multilevel`, or of `adjoint`,
+                anew, see `prepare_solver`. A body that hard pins clamped, and no longer do in some environment, makes
+                the plan anew, on a GPU as `to` does. Capture a captured step again then. Where the default iterations,
+                or those of "auto", become far too few an `UnsolvedWarning` says so, once.
         """
         replace_material(self, "set_material", arrays)
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from .scene import SceneValues
 
 __all__ = [
+    "ADJOINTS",
+    "check_adjoint",
     "check_batch",
     "check_positive_number",
     "check_state",
@@ -31,8 +33,17 @@ __all__ = [
 ]
 
 
+ADJOINTS = ("solver", "multilevel")  # what preconditions the adjoint of a step
 _COARSEST = 1e-4  # of an edge: what positions are resolved to
 _LONGEST_STEP = {torch.float32: 1e12, torch.float64: 1e100}  # s
+
+
+def check_adjoint(adjoint: str) -> str:
+    """The preconditioner of gradients, one of `ADJOINTS`."""
+    if adjoint not in ADJOINTS:
+        names = " or ".join(f'"{name}"' for name in ADJOINTS)
+        raise ValueError(f"Simulator: adjoint must be {names}, got {adjoint!r}")
+    return adjoint
 
 
 def check_batch(batch: int | None) -> int | None:

@@ -18,7 +18,15 @@ from .plan import Plan, compiling
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE
 
-__all__ = ["has_levels", "has_strangers", "precondition_plan", "reference_of", "reference_of_levels", "without_levels"]
+__all__ = [
+    "Reference",
+    "has_levels",
+    "has_strangers",
+    "precondition_plan",
+    "reference_of",
+    "reference_of_levels",
+    "without_levels",
+]
 
 # Two dense products there take less time than the many short phases of a cycle: each of those waits for all blocks.
 # With many environments, of a block or two each, the cycle's fewer numbers take less, but for a mesh of one patch.

@@ -15,7 +15,7 @@ from . import _C
 from .diagonal import pinned_vertices
 from .gpu import free_memory, properties_of, refuse_full_memory, seen_devices, step_bytes, why_not
 from .material import environments_of_material, in_order, material_of
-from .multilevel import has_levels, precondition_plan, reference_of, reference_of_levels, without_levels
+from .multilevel import Reference, has_levels, precondition_plan, reference_of, reference_of_levels, without_levels
 from .plan import Plan, compile_plan, with_loose_pieces
 from .regimes import choose_plan
 from .solvers import Multilevel
@@ -34,6 +34,7 @@ __all__ = [
     "plan_for_solver",
     "plan_on",
     "plan_that_holds",
+    "serves",
 ]
 
 Pieces = NDArray[np.bool_]
@@ -98,16 +99,38 @@ def _compile(sim: Model, dtype: torch.dtype, device: torch.device, loose: Pieces
     return choose_plan(values, dtype, gpu, sim.kernel, levels=levels, batch=sim.batch, progress=sim.progress)
 
 
+def _wants_levels(sim: Model) -> bool:
+    """Whether steps or gradients use a multilevel preconditioner."""
+    return isinstance(sim.solver, Multilevel) or sim.adjoint == "multilevel"
+
+
+def _has_patches_for(sim: Model, plan: Plan) -> bool:
+    """Whether the patches serve the solver: a GPU wants others for a multilevel solver, whatever gradients use."""
+    return plan.kernel is None or plan.for_levels == isinstance(sim.solver, Multilevel)
+
+
+def serves(sim: Model, plan: Plan) -> bool:
+    """Whether a plan has what the solver and gradients of a simulator use."""
+    return _has_patches_for(sim, plan) and has_levels(plan.arrays) == _wants_levels(sim)
+
+
+def _with_levels(sim: Model, plan: Plan, reference: Reference) -> Plan:
+    """The plan with a multilevel preconditioner; of a GPU's kernels only one reads it."""
+    if plan.kernel not in (None, "stream"):
+        raise ValueError(
+            f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={sim.kernel!r}, which is '
+            f'"{plan.kernel}" for this scene; set kernel="stream", or leave adjoint at "solver"'
+        )
+    return precondition_plan(plan, sim.scene.values(), *reference, progress=sim.progress)
+
+
 def plan_for_solver(sim: Model, material: Sequence[Tensor], plan: Plan | None = None) -> Plan:
-    """The plan of a simulator, or the one given, for its solver, with what the solver prepares of a material."""
-    wants = isinstance(sim.solver, Multilevel)
+    """The plan of a simulator, or the one given, for its solver, with the preconditioner of a material if one is used."""
     plan = without_levels(sim.plan if plan is None else plan)
-    # kernels of a GPU want other patches for a multilevel solver than for the others
-    if plan.kernel is not None and wants != plan.for_levels:
+    if not _has_patches_for(sim, plan):
         plan = _compile(sim, sim.dtype, sim.device)
-    if wants:
-        reference = reference_of(sim.plan, material, sim.time_step)
-        plan = precondition_plan(plan, sim.scene.values(), *reference, progress=sim.progress)
+    if _wants_levels(sim):
+        plan = _with_levels(sim, plan, reference_of(sim.plan, material, sim.time_step))
     return move_plan(sim, plan, sim.device)
 
 
@@ -161,7 +184,7 @@ def is_recording(device: torch.device) -> bool:
 def plan_anew(sim: Model, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
     """The plan of a simulator for a precision and a device, on the CPU; `loose`: its pieces that can move rigidly."""
     plan = _compile(sim, dtype, device, loose)
-    if not isinstance(sim.solver, Multilevel):
+    if not _wants_levels(sim):
         return plan
     # what M was made of goes along, as into a file; coming from "meta" the values are lost
     if sim.device.type == "meta":
@@ -170,7 +193,7 @@ def plan_anew(sim: Model, dtype: torch.dtype, device: torch.device, loose: Piece
         reference = reference_of(source, arrays, sim.time_step)
     else:
         reference = reference_of_levels(sim.plan.arrays)
-    return precondition_plan(plan, sim.scene.values(), *reference, progress=sim.progress)
+    return _with_levels(sim, plan, reference)
 
 
 def plan_on(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:

@@ -71,6 +71,9 @@ class Simulator(Readable):
             come, and an environment has the same bits in all of them, but takes longer in some; thread blocks of the
             smallest meshes in float32 are for the batch that comes. None: not known: a small mesh gets "block", which
             is for many, and "auto" chooses for one. `sim.batch` may be set later. Changes nothing on the CPU.
+        adjoint: what preconditions the linear system of a gradient. "solver": what the solver has, a diagonal or the
+            matrix of `Multilevel`. "multilevel": that matrix beside any solver, made when it is set; docs/accuracy.md
+            says when it pays. A GPU needs kernel="stream" for it. `sim.adjoint` may be set later.
         progress: show a bar while a large scene compiles, for another device too.
     """
 

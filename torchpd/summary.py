@@ -11,6 +11,7 @@ from .checks import NO_VALUES
 from .forecast import FAR_TOO_FEW, forecast, is_bound
 from .gpu import step_bytes
 from .material import environments_of_material
+from .multilevel import has_levels
 from .plan import any_of
 from .regimes import shared_bytes
 from .solvers import Chebyshev, Multilevel, Solver
@@ -71,15 +72,16 @@ def _promise_lines(sim: Simulator) -> list[str]:
 
 
 def _preconditioner_lines(sim: Simulator) -> list[str]:
-    """Levels and bytes of what `Multilevel` prepared."""
+    """Levels and bytes of what `Multilevel`, or gradients, have prepared."""
     plan = sim.plan
-    if not isinstance(sim.solver, Multilevel):
+    if not has_levels(plan.arrays):
         return []
+    whose = "" if isinstance(sim.solver, Multilevel) else " of gradients"
     _, _, nodes, _, _, below, direct = plan.level_sizes.tolist()
     steps = [f"{plan.vertices} vertices", *(f"{count} nodes" for count in (nodes, below) if count)]
     solved = "solved directly" if direct else "the last solved directly"
     own = sum(array.numel() * array.element_size() for array in plan.arrays[-len(MULTILEVEL_TABLE) :])
-    return [f"preconditioner: {' > '.join(steps)}, {solved}; {own:,} B of the plan"]
+    return [f"preconditioner{whose}: {' > '.join(steps)}, {solved}; {own:,} B of the plan"]
 
 
 def _effect_lines(sim: Simulator) -> list[str]:
@@ -151,7 +153,7 @@ def _kernel_lines(sim: Simulator) -> list[str]:
     # those whose plan is the same for every batch
     fixed = sim.kernel in ("cluster", "stream") and not plan.for_levels
     batch = f"; for a batch of {sim.batch}" if sim.batch and not fixed else ""
-    asked = "" if plan.for_levels else f"; Simulator(..., kernel=...) may ask for {others}"
+    asked = "" if has_levels(plan.arrays) else f"; Simulator(..., kernel=...) may ask for {others}"
     return [
         f"kernel {kernel}: {launches}",
         f"mesh: {patches}, {shared}, {block:,} B of shared memory a thread block",
