@@ -4,12 +4,11 @@ A held bar swings, float32, time step 1/60 s; the loss is the sum of squares of 
 before are asked for their gradients. Chebyshev takes 64 guarded iterations, 256 from 1e6 Pa on, and 16 times as many on
 the two large meshes of --large; Multilevel takes 16. Times are medians, as Python calls it, device awaited; on a GPU
 both ways in a CUDA graph besides. --adjoint multilevel adds rows of Chebyshev whose gradients have the preconditioner
-of Multilevel, on a GPU with kernel "stream"; --cells and --youngs choose other bars, with as many iterations as small
-ones.
+of Multilevel, on a GPU with kernel "stream"; --cells and --youngs choose other bars.
 
     python benchmarks/gradients.py --threads 1
     python benchmarks/gradients.py --device cuda --threads 16 --large
-    python benchmarks/gradients.py --cells 38 15 15 --cells 74 25 25 --youngs 1e5 --adjoint solver multilevel
+    python benchmarks/gradients.py --cells 40 15 15 --cells 74 25 25 --youngs 1e5 --adjoint solver multilevel
 """
 
 from __future__ import annotations

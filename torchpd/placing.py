@@ -125,7 +125,7 @@ def _with_levels(sim: Model, plan: Plan, reference: Reference) -> Plan:
 
 
 def plan_for_solver(sim: Model, material: Sequence[Tensor], plan: Plan | None = None) -> Plan:
-    """The plan of a simulator, or the one given, for its solver, with the preconditioner of a material if one is used."""
+    """The plan of a simulator, or the one given, with what its solver and gradients use of a material."""
     plan = without_levels(sim.plan if plan is None else plan)
     if not _has_patches_for(sim, plan):
         plan = _compile(sim, sim.dtype, sim.device)
