@@ -146,7 +146,8 @@ def main() -> None:
         rows.append(memory_row(4096, device))
         print(", ".join(f"{name} {value:,}" for name, value in rows[-1].items()))
     if options.out:
-        write_result(options.out, {"schema": 1, **describe_run(device, torch.get_num_threads()), "rows": rows})
+        settings = {"adjoint": options.adjoint, **describe_run(device, torch.get_num_threads())}
+        write_result(options.out, {"schema": 1, **settings, "rows": rows})
 
 
 if __name__ == "__main__":
