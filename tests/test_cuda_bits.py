@@ -31,6 +31,7 @@ from torch import Tensor
 import torchpd as pd
 from torchpd import regimes
 from torchpd.gpu import properties_of
+from torchpd.ops import INFO_WIDTH
 from torchpd.state import Info
 
 require_gpu()
@@ -229,7 +230,7 @@ def test_rollout_is_repeated_steps(kernel: str, batch: int, precision: str) -> N
     state, forces = unlike(sim, batch)
     track = sim.rollout(state, 7, 2, forces=forces, return_info=True)
     inplace = pd.State(*(t.clone() for t in state))
-    rows = torch.full((batch, 6), float("nan"), dtype=torch.float64, device=GPU)
+    rows = torch.full((batch, INFO_WIDTH), float("nan"), dtype=torch.float64, device=GPU)
     for step in range(6):
         state, info = sim(state, forces, return_info=True)
         sim.step_(inplace, forces, info=rows)

@@ -13,6 +13,7 @@ from on_gpu import DTYPES, GPU, KERNELS, host_waits, small_on_gpu
 from runs import noise, same_bits
 
 import torchpd as pd
+from torchpd.ops import INFO_WIDTH
 from torchpd.state import Info
 
 require_gpu()
@@ -109,7 +110,7 @@ def test_info_is_that_of_the_last_replay(kernel: str, precision: str) -> None:
     sim, start = small_on_gpu(DTYPES[precision], kernel)
     sim.tolerance = 0.1
     own, eager = twins(start, 2)
-    rows = torch.full((3, 6), float("nan"), dtype=torch.float64, device=GPU)
+    rows = torch.full((3, INFO_WIDTH), float("nan"), dtype=torch.float64, device=GPU)
     step = sim.capture(own, return_info=True)
     energies = []
     for _ in range(3):

@@ -316,7 +316,7 @@ def test_gradients_are_those_of_the_cpu() -> None:
 @pytest.mark.usefixtures("most_direct")
 @pytest.mark.parametrize("name", ["sliding", "box"])
 def test_gradients_of_any_solver_may_have_the_preconditioner(name: str) -> None:
-    """Those of the CPU without it; the same bits alone, in a batch and in a CUDA graph; the step's bits stay."""
+    """Those of the CPU without it; the same bits alone and in a batch; the step's bits stay."""
     case = CASES[name]()
     options = {"iterations": 60 if name == "box" else 1000, "solver": pd.Chebyshev()}
     cpu = simulator(case, torch.float64, "cpu", **options)

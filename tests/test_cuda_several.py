@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from torch import Tensor
 
 import torchpd as pd
 from torchpd import _C
+from torchpd.diagonal import step_diagonal
 from torchpd.gpu import H100, properties_of
 from torchpd.material import MATERIAL_ROWS
 
@@ -90,6 +92,15 @@ def both(contacts: bool, **options: Any) -> tuple[pd.Simulator, pd.Simulator, pd
     return sim, other, state
 
 
+def taken_off(sim: pd.Simulator, before: pd.State, after: pd.State, dtype: torch.dtype) -> Tensor:
+    """The most that `Info.residual` leaves out as rounding [B]: 4 eps of every stiffness times the largest position."""
+    _, diagonal = step_diagonal(list(sim.plan.arrays), sim.material(), sim.time_step)
+    size = (after.positions.amax(1) - after.positions.amin(1)).norm(dim=-1) + after.positions.abs().amax((1, 2))
+    inertial = sim.step_gradient(before, after) - sim.gradient(after)  # a (u - s), a part of the forces
+    rounding = 4 * torch.finfo(dtype).eps * 2 * size * diagonal.norm(dim=-1)
+    return rounding / inertial.flatten(1).norm(dim=-1)
+
+
 @pytest.mark.parametrize("contacts", [False, True])
 @pytest.mark.parametrize("solver", [pd.Jacobi(), pd.Chebyshev(), pd.Chebyshev("classic", rho=0.95, delay=3)])
 def test_blocks_of_several_agree_with_float64(solver: pd.Jacobi | pd.Chebyshev, contacts: bool, tmp_path: Path) -> None:
@@ -102,7 +113,11 @@ def test_blocks_of_several_agree_with_float64(solver: pd.Jacobi | pd.Chebyshev, 
     assert relative(found.positions, expected.positions) < 1e-5
     assert torch.equal(found.info.iterations, expected.info.iterations)
     assert relative(found.info.energy, expected.info.energy) < 1e-4
-    assert relative(found.info.residual, expected.info.residual) < 1e-3
+    left = expected.info.residual - found.info.residual
+    states = [moved(state, GPU, torch.float64), *(expected.state(record) for record in range(3))]
+    for record, (before, after) in enumerate(pairwise(states)):
+        allowed = 1e-3 * expected.info.residual[record] + taken_off(other, before, after, torch.float32)
+        assert bool((left[record].abs() <= allowed).all())
     assert torch.equal(sim.rollout(state, 3).positions, found.positions)
 
 

@@ -19,7 +19,7 @@ from torchpd.scene import SceneValues
 def test_another_kernel_makes_the_plan_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU; where it does not fit everything stays."""
 
-    def compiled(sim: pd.Simulator, dtype: torch.dtype, _: torch.device) -> Plan:
+    def compiled(sim: pd.Simulator, dtype: torch.dtype, *_: object) -> Plan:
         if sim.kernel == "cluster":
             raise ValueError("does not fit")
         return choose_plan(sim.scene.values(), dtype, H100, sim.kernel, progress=False)
@@ -43,7 +43,7 @@ def test_another_kernel_makes_the_choice_of_auto_anew(monkeypatch: pytest.Monkey
     """Multilevel runs with "stream" alone, so "auto" leaves it where another kernel is asked for."""
     asked = []
 
-    def compiled(sim: pd.Simulator, dtype: torch.dtype, _: torch.device) -> Plan:
+    def compiled(sim: pd.Simulator, dtype: torch.dtype, *_: object) -> Plan:
         asked.append((sim.kernel, type(sim.solver)))
         levels = isinstance(sim.solver, pd.Multilevel)
         return choose_plan(sim.scene.values(), dtype, H100, sim.kernel, levels=levels, progress=False)
@@ -64,7 +64,7 @@ def test_another_kernel_makes_the_choice_of_auto_anew(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("setting", ["kernel", "batch"])
 def test_a_plan_made_in_inference_mode_can_be_learnt_with(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(placing, "_compile", lambda sim, dtype, _: choose_plan(sim.scene.values(), dtype, H100))
+    monkeypatch.setattr(placing, "_compile", lambda sim, dtype, *_: choose_plan(sim.scene.values(), dtype, H100))
     sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e4)), 1 / 60, 8, progress=False)
     sim.plan = choose_plan(sim.scene.values(), torch.float32, H100)
     with torch.inference_mode():

@@ -182,6 +182,28 @@ def test_a_preconditioner_lets_go_too(let_go: str) -> None:
         assert float((found[1] - hung[0]).norm() / hung.norm()) <= 1e-6
 
 
+def test_springs_of_another_batch_bring_their_masks() -> None:
+    sim = simulator(pd.Ground(-1.0))
+    for batch in (2, 5):
+        springs = torch.full((batch, len(LEFT)), torch.inf)
+        springs[1:] = 1e3
+        sim.set_material(pin_stiffness=springs, masses=sim.rest_positions.new_ones(batch, sim.vertices))
+        assert sim.pin_hard.tolist() == springs.isinf().tolist()
+
+
+def test_springs_that_are_written_to_count_in_the_next_step() -> None:
+    """Beside pins that are hard, for which springs as the ops take them are kept from step to step."""
+    sim, other = (simulator() for _ in range(2))
+    mask = torch.arange(len(LEFT)) == 0
+    for each in (sim, other):
+        each.set_material(pin_stiffness=torch.full((len(LEFT),), 1e3).masked_fill(mask, torch.inf))
+    state = sim(sim.rest_state())
+    with torch.no_grad():
+        sim.pin_stiffness.mul_(100.0)
+    other.set_material(pin_stiffness=torch.full((len(LEFT),), 1e5).masked_fill(mask, torch.inf))
+    assert torch.equal(sim(state).positions, other(state).positions)
+
+
 def test_gradients_of_springs_and_targets_where_masks_differ() -> None:
     """By central differences; a hard pin's spring has no gradient, its target the one of what it holds."""
     sim = simulator(youngs=2e4, iterations=400)

@@ -78,7 +78,8 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
             )
     if hard is not None:
         checked[PIN_HARD] = check_hard(owner, hard, sim.pin_hard)
-    check_batches(owner, checked, named_arrays(sim))
+    hard_of_springs = {PIN_HARD: checked["pin_stiffness"]} if "pin_stiffness" in checked else {}
+    check_batches(owner, hard_of_springs | checked, named_arrays(sim))
     if "pin_stiffness" in checked:
         checked |= _pins_apart(sim, owner, checked["pin_stiffness"], checked.get(PIN_HARD))
     with ordinary():
@@ -165,8 +166,9 @@ class _Found(NamedTuple):
     """What somebody found who looked at the mask of hard pins."""
 
     some: bool  # whether any pin may be hard
-    springs: Tensor | None = None  # where all are hard: springs, whatever their numbers,
+    springs: Tensor | None = None  # those that `held` was made of,
     held: Tensor | None = None  # as the ops take them
+    version: int | None = None  # of the springs; None where all pins are hard, whatever the springs
 
 
 def held_springs(sim: Model, springs: Tensor) -> Tensor:
@@ -176,12 +178,14 @@ def held_springs(sim: Model, springs: Tensor) -> Tensor:
     if torch.compiler.is_compiling():
         return hold_exactly(springs, hard)
     seen = sim._seen_pins
-    some, known, held = seen.found if seen.holds(hard) else _look_at_pins(sim, springs, hard)
+    some, known, held, version = seen.found if seen.holds(hard) else _look_at_pins(sim, springs, hard)
     if not some:
         return springs
     learned = springs.requires_grad and torch.is_grad_enabled()
     # what a CUDA graph records shall see later masks
     if known is not springs or held is None or learned or (springs.is_cuda and is_recording(springs.device)):
+        return hold_exactly(springs, hard)
+    if version is not None and springs._version != version:
         return hold_exactly(springs, hard)
     return held
 
@@ -211,8 +215,9 @@ def _look_at_pins(sim: Model, springs: Tensor, hard: Tensor, *, wait: bool = Fal
         plan = loosened_plan(sim, mask)
         sim.plan = plan_that_holds(sim, plan, mask.all(0))
         # streams wait for what sets the material, but not for what another one has made in a step
-        if plain is hard and type(springs) is nn.Parameter and bool(mask.all()) and (wait or not hard.is_cuda):
-            found = _Found(True, springs, hold_exactly(springs, hard))
+        if plain is hard and type(springs) is nn.Parameter and found.some and (wait or not hard.is_cuda):
+            version = None if bool(mask.all()) else springs._version
+            found = _Found(True, springs, hold_exactly(springs, hard), version)
     if plain is hard:
         sim._seen_pins.remember(hard, found)
     return found
