@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 from torch.nn.utils.parametrize import register_parametrization
 
 import torchpd as pd
@@ -57,6 +59,24 @@ def test_a_simulator_of_an_earlier_version_takes_its_steps(load: Any, steps: Any
     assert sim.pin_hard.sum(1).tolist() == [9, 9]
     assert not sim.pin_stiffness[:, :9].any()
     assert sim.pin_stiffness.detach()[:, 9:].tolist() == [[50.0, 50.0, 50.0, 50.0], [50.0, 50.0, 50.0, 20.0]]
+
+
+@pytest.mark.parametrize("how", ["state_dict", "file"])
+def test_pins_that_an_earlier_version_let_go_stay_free(how: str, tmp_path: Path) -> None:
+    """By 0 N/m beside pins with inf, in one of two environments."""
+    source = FILES / ("state_dict.pt" if how == "state_dict" else "simulation.safetensors")
+    if how == "state_dict":
+        older = torch.load(source, weights_only=True)
+        older["pin_stiffness"][1, :9] = 0.0
+        sim = pd.Simulator(scene(), 1 / 60, iterations=16)
+        sim.load_state_dict(older)
+    else:
+        with safe_open(source, framework="pt") as file:
+            tensors, metadata = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
+        tensors["material.pin_stiffness"][1, :9] = 0.0
+        save_file(tensors, tmp_path / source.name, metadata=metadata)
+        sim = pd.Simulator.load(tmp_path / source.name)
+    assert sim.pin_hard.sum(1).tolist() == [9, 0]
 
 
 class Exp(torch.nn.Module):

@@ -28,6 +28,7 @@ from .material import named_arrays
 from .mesh import TetMesh, TriMesh, trusted
 from .mesh_checks import store
 from .multilevel import has_levels, precondition_plan, reference_of_levels
+from .pins import PIN_HARD
 from .scene import Part, Scene
 from .simulator import Simulator
 from .solvers import Chebyshev, Jacobi, Multilevel, Solver
@@ -224,7 +225,10 @@ def _build(record: Record, tensors: _Tensors) -> Simulator:
         adjoint=record.get("adjoint", "solver"),
     )
     # the scene's values stay where a file has none
-    sim.set_material(**{name: tensors[f"material.{name}"] for name in record.get("material", _FIRST_ARRAYS)})
+    material = {name: tensors[f"material.{name}"] for name in record.get("material", _FIRST_ARRAYS)}
+    if "pin_stiffness" in material:
+        material.setdefault(PIN_HARD, material["pin_stiffness"].isinf())
+    sim.set_material(**material)
     for name in record["trained"]:
         getattr(sim, name).requires_grad_()
     if has_levels(sim.plan.arrays):

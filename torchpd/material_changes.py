@@ -253,6 +253,9 @@ def load_material(
                 made = make(sim, "pin_stiffness", state_dict[original])
                 arrays |= {"pin_stiffness": made} if bool(made.isinf().any()) else {PIN_HARD: made.isinf()}
             check_saved(sim, owner, arrays)
+            if older and PIN_HARD not in arrays and bool(arrays.get("pin_stiffness", torch.zeros(())).isinf().any()):
+                # none of the present version has inf, so 0 there is a pin that was let go
+                arrays[PIN_HARD] = arrays["pin_stiffness"].isinf()
             if assign:
                 check_kinds(sim, owner, arrays)
             elif PIN_HARD in arrays:
