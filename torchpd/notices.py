@@ -1,8 +1,8 @@
 """What a step takes as it comes though hardly anybody means it, said once each: bodies that overlap, starts inside a
 contact, inverted elements.
 
-A look costs the CPU little beside a step; a GPU would have to be waited for, so nobody looks there, nor at what torch
-traces or maps. Copies of a simulator, of which studies make many, say nothing.
+Looks are cheap on a CPU. A GPU would have to be waited for, so nobody looks there, nor at what torch traces or maps.
+Copies of a simulator, of which studies make many, say nothing.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from .material import MATERIAL_ROWS
-from .overlaps import Overlap, find_overlaps
+from .overlaps import Overlap, boxes_meet, find_overlaps
 from .warn import SceneWarning, warn_user
 
 if TYPE_CHECKING:
@@ -62,12 +62,16 @@ class Notices:
         """Look at where the first step starts, and every one that reports."""
         if not (report or not self._started) or "inside" in self._said or not self._looks(sim, state[0]):
             return
-        arrays = [material[row].detach() for row in (_PLANES, _SPHERES, _GRAVITY)]
+        planes, spheres, gravity = arrays = [material[row].detach() for row in (_PLANES, _SPHERES, _GRAVITY)]
         if any(len(a) not in (1, len(state[0])) for a, dims in zip(arrays, (3, 3, 2), strict=True) if a.dim() == dims):
             return  # which the step refuses
         self._started = True
-        positions, (planes, spheres, gravity) = state[0].detach(), arrays
+        if not (planes.numel() or spheres.numel()):
+            return
+        positions = state[0].detach()
         depth = _depth(sim, positions, planes, spheres)
+        if not bool((depth > 0.0).any()):
+            return
         # no deeper than gravity falls in a step, nor than rounding puts what rests
         allowed = sim.time_step**2 * gravity.norm(dim=-1).reshape(-1, 1)
         size = torch.finfo(sim.dtype).eps * positions.abs().amax(dim=(1, 2)).unsqueeze(1)
@@ -105,18 +109,17 @@ class Notices:
     def _look_for_overlaps(self, sim: Model, positions: Tensor) -> None:
         """In the first environment where boxes of bodies overlap; at the first such report, the second, the fourth."""
         ranges = [sim.scene.vertex_range(solid) for solid in sim.scene.solids]
-        low = torch.stack([positions[:, part].amin(dim=1) for part in ranges], dim=1)  # [B, bodies, 3]
-        high = torch.stack([positions[:, part].amax(dim=1) for part in ranges], dim=1)
-        meet = (low[:, :, None] < high[:, None]).all(dim=-1)
-        meet = (meet & meet.transpose(1, 2)).sum(dim=(1, 2)) > len(ranges)
-        if not bool(meet.any()):
+        starts, corners = [part.start for part in ranges], positions.numpy()
+        lows, highs = (end.reduceat(corners, starts, axis=1) for end in (np.minimum, np.maximum))  # [B, bodies, 3]
+        meet = boxes_meet(lows, highs)
+        if not meet.any():
             return
         self._reports += 1
         if self._reports < self._next:
             return
         self._next = 2 * self._reports
-        environment = int(meet.nonzero()[0])
-        places = positions[environment].double().numpy()
+        environment = int(meet.argmax())
+        places = corners[environment].astype(np.float64)
         if found := find_overlaps([solid.mesh for solid in sim.scene.solids], [places[part] for part in ranges]):
             self._said.add("overlap")
             _say_overlaps(found, f"in environment {environment} at the end of a step")
@@ -140,5 +143,6 @@ def _depth(sim: Model, positions: Tensor, planes: Tensor, spheres: Tensor) -> Te
     for sphere in spheres.unbind(1):
         start = (sphere[:, :3] - sphere[:, 5:])[:, None]
         depth = torch.maximum(depth, sphere[:, 3, None] - (positions - start).norm(dim=-1))
-    depth[:, np.asarray(sim.scene._pinned())] = 0.0
+    if sim.anchors.pinned:
+        depth[:, np.asarray(sim.scene._pinned())] = 0.0
     return depth

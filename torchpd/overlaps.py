@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import chain, combinations
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -13,10 +13,11 @@ from scipy.spatial import cKDTree
 from .mesh import TetMesh
 from .quality import shape_gradients
 
-__all__ = ["Overlap", "find_overlaps"]
+__all__ = ["Overlap", "boxes_meet", "find_overlaps"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 _PULL = 1e-3  # of the way from a corner to a centroid: bodies that reach into each other by less are not seen
 
@@ -37,13 +38,11 @@ def find_overlaps(meshes: Sequence[TetMesh], places: Sequence[Array] | None = No
     where their boxes overlap.
     """
     places = [mesh.vertices for mesh in meshes] if places is None else places
-    boxes = [(place.min(axis=0), place.max(axis=0)) for place in places]
+    lows, highs = (np.stack([end(place, axis=0) for place in places]) for end in (np.min, np.max))
     found = []
-    for first, second in combinations(range(len(meshes)), 2):
-        low = np.maximum(boxes[first][0], boxes[second][0])
-        high = np.minimum(boxes[first][1], boxes[second][1])
-        if not np.all(low < high):  # nor where something is no number
-            continue
+    for first, second in _near(lows, highs):
+        low = np.maximum(lows[first], lows[second])
+        high = np.minimum(highs[first], highs[second])
         points = sum(
             _count_inside(_points(meshes[one], places[one], low, high), places[other], meshes[other].tets, low, high)
             for one, other in ((first, second), (second, first))
@@ -51,6 +50,28 @@ def find_overlaps(meshes: Sequence[TetMesh], places: Sequence[Array] | None = No
         if points:
             found.append(Overlap(first, second, points))
     return found
+
+
+def boxes_meet(lows: Array, highs: Array) -> Mask:
+    """In which environments some boxes overlap [B], by their corners [B, bodies, 3]; not where these are no numbers."""
+    found = np.zeros(len(lows), dtype=np.bool_)
+    for first in range(lows.shape[1] - 1):
+        found |= _overlap_of(first, lows, highs).any(axis=1)
+    return found
+
+
+def _overlap_of(first: int, lows: Array, highs: Array) -> Mask:
+    """Whether the box of one body overlaps those of the later ones [B, bodies - 1 - first]."""
+    later, one = slice(first + 1, None), slice(first, first + 1)
+    low, high = np.maximum(lows[:, later], lows[:, one]), np.minimum(highs[:, later], highs[:, one])
+    return np.asarray((low < high).all(axis=-1))
+
+
+def _near(lows: Array, highs: Array) -> Iterator[tuple[int, int]]:
+    """Pairs of bodies whose boxes overlap, by the corners of these [bodies, 3]."""
+    for first in range(len(lows) - 1):
+        for later in np.flatnonzero(_overlap_of(first, lows[None], highs[None])):
+            yield first, first + 1 + int(later)
 
 
 def _points(mesh: TetMesh, place: Array, low: Array, high: Array) -> Array:
