@@ -311,6 +311,21 @@ def test_what_is_refused(case: str) -> None:
         call(sim, state)
 
 
+@pytest.mark.parametrize("name", ["stiffness", "planes", "gravity", "pin_targets"])
+@pytest.mark.parametrize("read", ["contact_forces", "reactions", "stress"])
+def test_material_of_other_environments_is_refused(name: str, read: str) -> None:
+    """As a step refuses it; nothing is stretched to as many as there are of the other."""
+    sim, state = small(torch.float64, batch=1)
+    array = getattr(sim, name).detach()
+    sim.set_material(**{name: array.expand(3, *array.shape)})
+    if read == "stress" and name != "stiffness":
+        assert len(sim.stress(state).cauchy) == 1
+        return
+    states = (state,) if read == "stress" else (state, state)
+    with pytest.raises(ValueError, match=rf"environments as the simulator's {name}, 3, got 1|{name} must be .* \[3, "):
+        getattr(sim, read)(*states)
+
+
 def test_targets_and_forces_are_those_of_the_step() -> None:
     """A ball that a target moves up lifts the cube: with its place the step balances, without it the ball is far."""
     ball = pd.Sphere((SIDE / 2, -1.2, SIDE / 2), 1.0, friction=0.8)

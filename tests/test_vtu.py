@@ -86,11 +86,19 @@ def test_a_motion(tmp_path: Path, kind: str) -> None:
     assert [float(row.get("timestep", "")) for row in collection] == [sim.time_step, 2 * sim.time_step]
 
 
+def test_names_of_fields_may_have_any_letters(tmp_path: Path) -> None:
+    sim, name = two_bodies(), 'f < "g" & h'
+    sim.write_vtu(tmp_path / "a.vtu", sim.rest_state(), point_data={name: np.zeros(16)})
+    root = ElementTree.parse(tmp_path / "a.vtu").getroot()
+    assert name in [array.get("Name") for array in root.iter("DataArray")]
+
+
 REFUSED: dict[str, tuple[str, dict[str, Any], type[Exception], str]] = {
     "ending": ("a.pvd", {}, ValueError, r"path must end in \.vtu .* a\.pvd"),
     "folder": ("none/a.vtu", {}, FileNotFoundError, "there is no folder"),
     "which": ("a.vtu", {"batch": 2}, ValueError, "environment=0"),
     "no such": ("a.vtu", {"environment": 1}, IndexError, r"environment must lie in 0\.\.0, got 1"),
+    "nobody": ("a.vtu", {"batch": 0}, ValueError, "at least one environment"),
     "shape": ("a.vtu", {"point_data": {"f": torch.zeros(3)}}, ValueError, r"point_data\['f'\] must be \[1, 16"),
     "name": ("a.vtu", {"point_data": {"velocity": torch.zeros(16)}}, ValueError, "'velocity', which every file has"),
 }

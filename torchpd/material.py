@@ -23,6 +23,7 @@ __all__ = [
     "PARTS_OF_ROWS",
     "check_array",
     "check_batches",
+    "check_environments",
     "check_hard",
     "check_material",
     "dims_of",
@@ -195,6 +196,16 @@ def check_batches(owner: str, new: Mapping[str, Tensor], kept: Mapping[str, Tens
             )
         if count != 1:
             first = count, name + stays
+
+
+def check_environments(name: str, batch: int, arrays: Mapping[str, Tensor]) -> None:
+    """Refuse material of other environments than those of a state, which `name` calls."""
+    for row, array in arrays.items():
+        if array.dim() > dims_of(row) and len(array) not in (1, batch):
+            raise ValueError(
+                f"{name} must have as many environments as the simulator's {row}, {len(array)}, got {batch}; "
+                "set_material takes another batch, or an array that all environments share"
+            )
 
 
 def environments_of_material(sim: Model) -> int:

@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
+from .material import check_environments
 from .model import Model
 from .readouts import ContactForces, Reactions, checked_call, contact_forces, reactions
 from .state import State
@@ -88,7 +89,9 @@ class Readable(Model):
         Args:
             state: a `State`, or positions [B, V, 3].
         """
-        return stress(self.scene, self.positions_of(state), self.stiffness)
+        positions, stiffness = self.positions_of(state), self.stiffness
+        check_environments("state", len(positions), {"stiffness": stiffness})
+        return stress(self.scene, positions, stiffness)
 
     def vertex_average(self, values: Tensor) -> Tensor:
         """Average at every vertex of what its tetrahedra have, weighted by their rest volumes. Differentiable.

@@ -32,7 +32,7 @@ from .adjoint import AdjointCall, step_gradient
 from .checks import check_like, in_full
 from .diagonal import named_material, pinned_vertices, step_diagonal
 from .effects import Ground, Pin, Solid, Sphere
-from .material import MATERIAL_ROWS
+from .material import MATERIAL_ROWS, check_environments
 from .small_matrices import dot, inverse, length, product
 from .state import State
 from .targets import Targets
@@ -106,6 +106,7 @@ def checked_call(
     before, positions = sim.positions_of(state), sim.positions_of(after, "after")
     check_like("after", positions, before, "m")
     material = sim.material_at(targets, len(before))
+    check_environments("state", len(before), named_material(material))
     return AdjointCall(before, state[1], forces, positions, material, list(sim.plan.arrays), sim.time_step)
 
 

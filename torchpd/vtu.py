@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .checks import as_array, check_finite, check_has_values, check_shape, check_target_file, check_whole
+from .material import check_environments
 from .scene import Scene
 from .state import State, Track
 from .stress import stress
@@ -92,6 +93,9 @@ def _records(sim: Model, states: States) -> tuple[list[State], bool]:
     batches = {len(state[0]) for state in found}
     if len(batches) != 1:
         raise ValueError(f"write_vtu: states must have one number of environments, got {sorted(batches)}")
+    if 0 in batches:
+        raise ValueError("write_vtu: states must have at least one environment, got none")
+    check_environments("write_vtu: states", len(found[0][0]), {"stiffness": sim.stiffness})
     return [State(*state) for state in found], alone
 
 
@@ -150,7 +154,10 @@ def _given(owner: str, data: Mapping[str, Any] | None, lead: tuple[int, ...], ch
         else:
             raise ValueError(f"{label} must be {[*lead, '...']} or {[count, '...']} for all, got {list(array.shape)}")
         array = array.reshape(len(array), count, -1) if array.ndim > 3 else array
-        found[name] = array.astype(np.uint8) if array.dtype == np.bool_ else array
+        # meshio writes names as they are
+        found[escape(str(name), {'"': "&quot;", "\n": "&#10;"})] = (
+            array.astype(np.uint8) if array.dtype == np.bool_ else array
+        )
     return found
 
 
