@@ -6,6 +6,7 @@
 
 #include <ATen/Parallel.h>
 
+#include <algorithm>
 #include <string>
 #include <vector>
 
@@ -71,7 +72,10 @@ struct Cpu {
   }
   template <class T>
   static void vertex_sum(const VertexSumCall<T>& call, const Tensor&) {
-    at::parallel_for(0, call.batch, 1, [&](std::int64_t begin, std::int64_t end) {
+    // as many environments for each thread as make waking it worth while
+    const std::int64_t grain =
+        at::internal::GRAIN_SIZE / std::max<std::int64_t>(1, call.vertices * call.numbers) + 1;
+    at::parallel_for(0, call.batch, grain, [&](std::int64_t begin, std::int64_t end) {
       for (std::int64_t e = begin; e < end; ++e) {
         for (std::int64_t n = 0; n < call.numbers; ++n) {
           const T* from = call.values + e * call.vertices * call.numbers + n;

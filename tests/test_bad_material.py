@@ -60,6 +60,7 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
         ),
         ({"pin_hard": 1.0}, TypeError, r"pin_hard must be bool, whether each pin is hard, got torch\.float32"),
         ({"pin_hard": "yes"}, TypeError, "pin_hard must be a bool or a bool tensor, got 'yes'"),
+        ({"pin_hard": None}, TypeError, "pin_hard must be a bool or a bool tensor, got None"),
         ({"pin_hard": [True, False]}, ValueError, r"pin_hard must be one bool, \[3\], .* got \[2\]; pins of the"),
         (
             {"pin_hard": torch.ones(2, 3) > 0, "masses": torch.ones(3, 27)},

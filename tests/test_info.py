@@ -286,6 +286,16 @@ def test_what_is_not_solved_reads_as_that(dtype: torch.dtype, device: torch.devi
     assert float(info.residual) == pytest.approx(1.0, abs=1e-3)
 
 
+def test_float32_hides_the_forces_of_something_stiff(dtype: torch.dtype, device: torch.device) -> None:
+    """A bar of 100 MPa weighs less than the rounding of E x: float64 alone tells that it is unsolved."""
+    mesh = pd.shapes.box((0.5, 0.1, 0.1), (10, 2, 2))
+    body = pd.Solid(mesh, 1e8, 1000.0)
+    held = pd.Pin(body, np.flatnonzero(mesh.vertices[:, 0] < mesh.vertices[:, 0].min() + 1e-6))
+    sim = pd.Simulator(pd.Scene(body, held, pd.Gravity()), 1 / 60, 4, dtype=dtype, progress=False).to(device)
+    residual = float(sim(sim.rest_state(), return_info=True)[1].residual)
+    assert residual == 0.0 if dtype == torch.float32 else residual > 0.5
+
+
 def test_a_report_changes_nothing_and_is_the_same_in_any_batch(dtype: torch.dtype, device: torch.device) -> None:
     """Of steps, of steps in place, and of the recorded ones of a rollout, whose sphere moves."""
     ball = pd.Sphere((0.1, 0.31, 0.1), 0.1, friction=0.3)

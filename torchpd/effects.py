@@ -68,7 +68,7 @@ def _per_element(name: str, value: ArrayLike, count: int, *, unit: str) -> Array
 
 
 def _longest_side(mesh: TetMesh) -> float:
-    """Of the boxes around the pieces of a mesh [m]; of the box around all of them where that is no long one."""
+    """Longest side of the boxes around the pieces of a mesh [m], or of the box around all if that is not too long."""
     points = mesh.vertices
     length = float(np.ptp(points, axis=0).max())
     if length <= _LONGEST:

@@ -68,7 +68,7 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
             part_of = f"; {PARTS_OF_ROWS[name]}" if name in PARTS_OF_ROWS else ""
             raise TypeError(f"{owner}: no array {name!r}; there are {names}{part_of}")
     arrays = whole_arrays(sim, owner, arrays)
-    hard: Tensor | float | None = arrays.pop(PIN_HARD, None)
+    replaces_hard, hard = PIN_HARD in arrays, arrays.pop(PIN_HARD, False)
     checked = {name: check_array(owner, name, value, getattr(sim, name)) for name, value in arrays.items()}
     for name, value in arrays.items():
         if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
@@ -76,7 +76,7 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
                 f"{owner} copies the numbers of {name}, so no gradient gets to what they were made of: give "
                 f'it to calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it'
             )
-    if hard is not None:
+    if replaces_hard:
         checked[PIN_HARD] = check_hard(owner, hard, sim.pin_hard)
     hard_of_springs = {PIN_HARD: checked["pin_stiffness"]} if "pin_stiffness" in checked else {}
     check_batches(owner, hard_of_springs | checked, named_arrays(sim))

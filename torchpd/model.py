@@ -331,10 +331,10 @@ class Model(nn.Module):
         says: for that `torch.func.functional_call` gives the simulator other arrays for one call, and a parametrization
         (`torch.nn.utils.parametrize`) for all. One that is there is written to through its `right_inverse`.
 
-        Pins are let go and grasped again by `pin_hard`, one bool, [P], [B, 1] or [B, P]: a pin that is not hard is a
-        spring of its `pin_stiffness`, and of 0 N/m nothing. A `pin_stiffness` without `pin_hard` says that too: inf is
-        hard and stored as 0, any other number is a spring; 0 for a pin that is hard is refused, as it does not say
-        whether that is let go.
+        `pin_hard` lets pins go and grasps again: one bool, [P], [B, 1] or [B, P]. A pin that is not hard is a spring of
+        its `pin_stiffness`, and 0 N/m holds nothing. A `pin_stiffness` without `pin_hard` decides too which pins are
+        hard: inf is, and is stored as 0; any other number is a spring. For a pin that is hard now 0 is refused, because
+        it does not say whether to let go.
 
             sim.set_material(pin_hard=holds[:, None])                     # [B] bool: some environments let go
             sim.set_material(pin_hard=True, pin_targets=where)            # grasp at [B, P, 3] m

@@ -57,8 +57,8 @@ class PinnedPieces:
     def loose(self, hard: Mask) -> Mask:
         """Whether each piece can move rigidly in any environment [pieces]; `hard` is [P] or [B, P].
 
-        Soft pins leave a piece all rigid motions, hard ones turns where they lie at a point or along a line: where the
-        spread of their positions has one eigenvalue at most that counts against the size of the piece.
+        Soft pins leave a piece all rigid motions. Hard ones leave it turns where they lie at a point or along a line:
+        then at most one eigenvalue of the spread of their positions counts against the size of the piece.
         """
         loose = np.ones(len(self.squares), dtype=np.bool_)
         if not len(self.points):

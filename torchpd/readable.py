@@ -67,9 +67,9 @@ class Readable(Model):
     ) -> Reactions:
         """Forces of pins on their vertices in the step from `state` to `after` [N].
 
-        Of a hard pin it is the gradient of the step's objective without pins, of a soft one k (target - x'). So a hard
-        pin has in it what contacts would do to its vertices, and what a step that is not solved leaves there; see
-        `ContactForces.residual` for the other vertices. Differentiable.
+        The force of a hard pin is the gradient of the step's objective without pins, that of a soft one
+        k (target - x'). The force of a hard pin therefore includes what contacts would do to its vertices, and what an
+        unsolved step leaves there; `ContactForces.residual` has that of the other vertices. Differentiable.
 
         Args:
             state, after, forces, targets, about: as in `contact_forces`.

@@ -7,9 +7,9 @@ At a solved step the gradient of its objective without pins, g, is what contacts
 Pins. A hard one puts g on its vertex, a soft one k (target - x'); r = g - pins is left for the contacts.
 
 Contacts. The normals n_k of at most three colliders act on a vertex, those with the smallest gaps. Their pushes p_k
-minimise |r - sum_k p_k n_k|, where each that pushes has p_k > 0 and gap_k < 4 max(p_k, n_k . r) / D: an iteration
-without it, or without any, might end inside. D is the diagonal of the step, and 4 bounds relaxation times acceleration,
-both below 2. Only where planes meet at flat angles are gaps of pushing contacts that large (see `Ground`). Several
+minimise |r - sum_k p_k n_k|. Each that pushes has p_k > 0 and gap_k < 4 max(p_k, n_k . r) / D, since no iteration
+without that push crosses a wider gap. D is the diagonal of the step, and 4 bounds relaxation times acceleration, both
+below 2. Only where planes meet at flat angles are gaps of pushing contacts that large (see `Ground`). Several
 together have p_k = m_k . r with the m_k dual to their normals, as in csrc/solver/contact_gradients.h. The rest t is
 tangential to all of them. Colliders share it in proportion to their friction mu_k p_k, and take no more than that
 together (Coulomb). So at a corner normals come first: friction gets no force that a normal can give. What contacts do
@@ -159,7 +159,7 @@ def _checked_point(about: Tensor, positions: Tensor) -> Tensor:
 
 
 def _wrench(forces: Tensor, positions: Tensor, about: Tensor) -> Wrench:
-    """Of forces [B, ..., n, 3] on vertices at positions [B, n, 3]."""
+    """Sum and torque of forces [B, ..., n, 3] on vertices at positions [B, n, 3]."""
     arms = (positions - about[:, None]).reshape(len(positions), *[1] * (forces.dim() - 3), *positions.shape[1:])
     torque = _tree_sum(torch.linalg.cross(arms.expand_as(forces), forces))
     return Wrench(_tree_sum(forces), torque, about)

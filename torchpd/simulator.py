@@ -37,10 +37,10 @@ class Simulator(Readable):
     leading batch, for each: `stiffness` [E] Pa, `masses` [V] kg, `gravity` [3] m/s^2, `damping` [] 1/s,
     `pin_stiffness` [P] N/m, `pin_targets` [P, 3] m, `planes` [C, 5] (unit normal, height, friction), `spheres` [S, 8]
     (centre, radius, friction, motion in a step). The buffer `pin_hard` [P] or [B, P] says which pins hold exactly; it
-    may change at run time, to let go and to grasp. `set_material` checks and replaces all of them. What an optimiser
-    writes, or `torch.func.functional_call` gives, no step checks, as that would wait for a GPU: where it is NaN, or
-    stiffness, masses or springs are negative, `Info.residual` is NaN (but see there for exceptions). Let an optimiser
-    learn the logarithm of those. The rest shape is compiled and not learned.
+    may change at run time, to let go and to grasp. `set_material` checks and replaces all of them. Steps do
+    not check what an optimiser writes or `torch.func.functional_call` gives, as that would wait for a GPU. Where it is
+    NaN, or stiffness, masses or springs are negative, `Info.residual` is NaN, with exceptions named there. Let an
+    optimiser learn the logarithm of those. The rest shape is compiled and not learned.
 
     It is made on the CPU, whatever torch's default device; `.to(...)` moves it.
 

@@ -28,7 +28,7 @@ def inverse(A: Tensor) -> Tensor:
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Of vectors [..., 3]."""
+    """Scalar product of vectors [..., 3]."""
     x, y, z = (a * b).unbind(-1)
     return x + y + z
 
@@ -39,5 +39,5 @@ def root(squared: Tensor) -> Tensor:
 
 
 def length(a: Tensor) -> Tensor:
-    """Of vectors [..., 3], with derivative zero at zero."""
+    """Length of vectors [..., 3], with derivative zero at zero."""
     return root(dot(a, a))

@@ -72,14 +72,16 @@ class Info(NamedTuple):
     Nothing here has a gradient: for one of an energy there is `Simulator.energy`, of the state that the step reached.
 
     Attributes:
-        residual: what neither pins nor contacts balance of the step's forces, over those forces, from 0 (solved, to
-            rounding) to 1 (nothing balances): with r = grad E less that, f_i = a_i (u_i - s_i) of inertia, weight and
-            springs, and e_i of elements, (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)). S x is every
-            stiffness times position, csrc/solver/report.h: rounding that no iterations remove, so that where forces are
-            smaller, as of what drifts, or weighs little beside E x, the residual is 0. Residuals weigh short waves, so
-            the error of positions may be larger or smaller. NaN unless it was asked for (`return_info`), and where what
-            is not finite, or negative, of state and material reaches the step: not of a contact that nothing touches,
-            nor a mass that a spring outweighs.
+        residual: the share of the step's forces that nothing balances, from 0 (solved, to rounding) to 1. It is
+            (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)): r is the part of grad E [N] that neither pins
+            nor contacts balance, f_i = a_i (u_i - s_i) the force of inertia, weight and springs on vertex i, and e_i
+            that of its elements. S x is every stiffness times position (csrc/solver/report.h), so that 4 eps |S x|
+            bounds the rounding that no iterations remove. Where all forces are smaller than that, the residual is 0
+            and tells nothing: in float32 a bar of 0.5 m and 100 MPa that starts to sag reads 0 at any number of
+            iterations. Take float64 there. Residuals weigh short waves, so the error of positions may be larger or
+            smaller. NaN unless it was asked for (`return_info`), and where state or material that the step uses are
+            not finite or negative. A contact that nothing touches is not used; a negative mass that a spring outweighs
+            does not show.
         energy: the objective E at the last iterate [J], elastic energy and m / (2 h^2) |x - y|^2: what a solve lowers.
             Not the mechanical energy, which `Simulator.energy` gives. NaN unless asked for.
         iterations: that were used.

@@ -47,7 +47,7 @@ class Turnings {
   T* data_;
 };
 
-// Of BiCGStab: p, the first residual of a cycle, the correction of y, and the second product of an iteration.
+// Vectors of BiCGStab: p, the first residual of a cycle, the correction of y, and the second product of an iteration.
 template <class T>
 struct FrictionVectors {
   Quad<T>*search, *shadow, *correction, *smoothed;  // [vertices]

@@ -170,7 +170,7 @@ class Helpers {
   std::condition_variable finished_;
 };
 
-// Of the calling thread. Those of a parent are lost and stay so: their threads do not exist here.
+// The helpers of the calling thread. Those of a forked parent are never deleted: their threads do not exist here.
 class OwnHelpers {
  public:
   ~OwnHelpers() {

@@ -130,9 +130,9 @@ struct Team {
   }
   // This member as a team of its own.
   Team alone() const { return {0, 1, nullptr, watch, calls}; }
-  // Whether to stop, after so much work [vertices]. Between two barriers all members get the same answer. Here, where nothing
-  // is half done, the calling thread goes on alone if other processes keep the others from their cores; shares change then,
-  // but no number, as none depends on the size of a team.
+  // Whether to stop, after so much work [vertices]. Between two barriers all members get the same answer. Nothing is half
+  // done here, so the calling thread goes on alone if other processes keep the others from their cores. Its share grows then,
+  // but no number changes, as none depends on the size of a team.
   bool ended(std::int64_t work) const {
     if (calls) watch->worked(work);
     if (shared && shared->splits()) {
