@@ -176,7 +176,8 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
 
 // A gradient of all steps: what the loss does not depend on takes no memory.
 Tensor known(const Tensor& gradient, const Tensor& like) {
-  return gradient.defined() ? gradient : at::zeros({1}, like.options()).expand(like.sizes());
+  return gradient.defined() ? gradient
+                            : at::zeros({1}, like.options()).expand_symint(like.sym_sizes());
 }
 
 class RolloutFunction : public torch::autograd::Function<RolloutFunction> {

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import torch
+from torch._dynamo.testing import CompileCounterWithBackend
 
 import torchpd as pd
 from torchpd.overlaps import find_overlaps
@@ -131,6 +132,16 @@ def test_what_contacts_do_themselves_is_not_said() -> None:
         low = np.flatnonzero(BOX.vertices[:, 1] < 0.01)
         held = pd.Simulator(pd.Scene(body, pd.Pin(body, low), GROUND), 1 / 60, 20, progress=False)
         held(held.rest_state(), return_info=True)
+
+
+def test_what_is_said_compiles_nothing_anew() -> None:
+    sim, compiled = on_ground(), CompileCounterWithBackend("eager")
+    step = torch.compile(lambda state: sim(state, return_info=True)[0].positions, backend=compiled)
+    step(sim.rest_state())
+    with pytest.warns(pd.SceneWarning, match="start a step inside"):
+        sim(sim.rest_state(), return_info=True)
+    step(sim.rest_state())
+    assert compiled.frame_count == 1
 
 
 def test_inverted_elements_are_said_once() -> None:

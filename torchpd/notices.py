@@ -60,7 +60,10 @@ class Notices:
 
     def before(self, sim: Model, state: State, material: list[Tensor], *, report: bool) -> None:
         """Look at where the first step starts, and every one that reports."""
-        if not (report or not self._started) or "inside" in self._said or not self._looks(sim, state[0]):
+        # first, so that no compiled step depends on what was said
+        if torch.compiler.is_compiling() or not (report or not self._started) or "inside" in self._said:
+            return
+        if not self._looks(sim, state[0]):
             return
         planes, spheres, gravity = arrays = [material[row].detach() for row in (_PLANES, _SPHERES, _GRAVITY)]
         if any(len(a) not in (1, len(state[0])) for a, dims in zip(arrays, (3, 3, 2), strict=True) if a.dim() == dims):
@@ -85,7 +88,7 @@ class Notices:
             f"Simulator: {int(inside[environment].sum())} vertices of environment {environment} start a step inside a "
             f"ground or sphere, up to {deepest:.2g} m deep. The step puts them out, and velocities are what it moves "
             f"vertices by over its duration, about {deepest / sim.time_step:.2g} m/s there: start outside, or set the "
-            "velocities after that step to 0",
+            "velocities after that step to 0; of a sphere that moves there give the velocity in targets, too",
             SceneWarning,
         )
 
