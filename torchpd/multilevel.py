@@ -45,7 +45,7 @@ def reference_of_levels(plan: Sequence[Tensor]) -> Reference:
     levels = dict(zip((row.name for row in MULTILEVEL_TABLE), plan[-len(MULTILEVEL_TABLE) :], strict=True))
     _, vertex_order, *_ = plan
     stored = levels["reference_inertia"]
-    return levels["reference_stiffness"], torch.empty_like(stored).index_copy(0, vertex_order.long(), stored)
+    return levels["reference_stiffness"], torch.zeros_like(stored).index_copy(0, vertex_order.long(), stored)
 
 
 def without_levels(plan: Plan) -> Plan:
