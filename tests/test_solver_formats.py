@@ -260,7 +260,7 @@ def test_corners_of_permas_stand_between_nodes_on_edges(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "old", "new", "words"),
     [
-        ("a.su2", "NELEM= 2", "NELEM= 3", "declares 3 cells, but 'NPOIN= 5' comes among them"),
+        ("a.su2", "NELEM= 2", "NELEM= 3", "declares 3 cells, but '0.0 0.0 0.0' follows them"),
         ("a.su2", "NMARK= 1", "NMARK= 2", "declares 2 markers, but 1 come"),
         ("a.dato", "$EXIT COMPONENT\n", "", "cut off"),
         ("a.su2", "NDIME= 3", "NZONE= 2\nNDIME= 3", "holds 2 zones"),
