@@ -35,15 +35,8 @@ class Thrower(nn.Module):
         return end.positions[..., 0].mean(dim=1)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--environments", type=int, default=64, help="of all ranks together")
-    parser.add_argument("--steps", type=int, default=10, help="of 1/60 s")
-    parser.add_argument("--updates", type=int, default=50, help="of the network")
-    options = parser.parse_args()
-
+def train(options: argparse.Namespace) -> None:
     gpu = torch.cuda.is_available()
-    dist.init_process_group("nccl" if gpu else "gloo")
     rank, ranks = dist.get_rank(), dist.get_world_size()
     device = torch.device("cuda", int(os.environ["LOCAL_RANK"])) if gpu else torch.device("cpu")
 
@@ -67,7 +60,17 @@ def main() -> None:
             print(f"update {update:3d}: off by {1000 * (mean / ranks).sqrt():6.1f} mm")
         optimiser.step()
     print(f"rank {rank}: mean damping {sim.damping.mean():.4f} 1/s, weights {model.module.network[0].weight.sum():.6f}")
-    dist.destroy_process_group()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--environments", type=int, default=64, help="of all ranks together")
+    parser.add_argument("--steps", type=int, default=10, help="of 1/60 s")
+    parser.add_argument("--updates", type=int, default=50, help="of the network")
+    options = parser.parse_args()
+    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    train(options)
+    dist.destroy_process_group()  # last: a model that still held the group would end its threads at exit
 
 
 if __name__ == "__main__":
