@@ -82,7 +82,7 @@ def test_train_distributed(tmp_path: Path) -> None:
             run = subprocess.run(
                 [*command, *program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
             )
-            # of some 60 runs on a busy machine three ended so, with one thread a rank: a second one tells whether it stays
+            # of some 60 runs on a busy machine three ended so: a second run tells whether it stays
             if "terminate called without an active exception" not in run.stderr:
                 break
         assert run.returncode == 0, run.stderr
