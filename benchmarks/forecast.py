@@ -57,12 +57,12 @@ def run_scene(number: int) -> Row:
     row: Row = {"scene": number, **facts, "uncertainty": exact.uncertainty}
     if not exact.moves(torch.float32) or not exact.uncertainty <= SURE:
         return {**row, "left_out": "no motion" if exact.uncertainty <= SURE else "no converged step to compare with"}
-    spectrum = spectrum_of(sim)
+    spectrum = spectrum_of(sim.compiled)
     assert spectrum is not None
     row.update(spectrum._asdict())
     for name, solver in SOLVERS.items():
         sim.solver = solver
-        expected = forecast(sim)
+        expected = forecast(sim.compiled)
         assert expected is not None
         row[name] = {"forecast": [expected.iterations(e) for e in ERRORS], "needed": counts_to(sim, state, exact)}
     sim.solver = "auto"

@@ -86,7 +86,7 @@ def errors_of(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> Errors:
 def run_scene(number: int) -> Row:
     rng = np.random.default_rng([SEED, number])
     facts, sim, state = random_landing(rng)
-    plain, levels = forecast(sim, pd.Chebyshev()), forecast(sim)
+    plain, levels = forecast(sim.compiled, pd.Chebyshev()), forecast(sim.compiled)
     assert plain is not None
     assert levels is not None
     mesh = sim.scene.solids[0].mesh
@@ -95,7 +95,7 @@ def run_scene(number: int) -> Row:
         **facts,
         "smallest_angle": float(np.degrees(smallest_dihedral(mesh.vertices, mesh.tets))),
     }
-    row |= {"uneven": is_uneven(sim), "Chebyshev": plain.iterations(AIM), "forecast": levels.iterations(AIM)}
+    row |= {"uneven": is_uneven(sim.compiled), "Chebyshev": plain.iterations(AIM), "forecast": levels.iterations(AIM)}
     if sim.vertices > MOST or row["Chebyshev"] < SOFT:
         return {**row, "left_out": "too large" if sim.vertices > MOST else "soft"}
     auto = pd.Simulator(sim.scene, sim.time_step, solver="auto", dtype=sim.dtype, progress=False)

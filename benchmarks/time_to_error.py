@@ -153,7 +153,7 @@ def run_case(
     timed: dict[str, tuple[Solver, int]] = {}
     for name, solver in SOLVERS.items():
         begin = time.perf_counter()
-        sim.solver, expected = solver, forecast(sim, solver)
+        sim.solver, expected = solver, forecast(sim.compiled, solver)
         row["solvers"][name] = own = {"setup_ms": 1e3 * (time.perf_counter() - begin)}
         own["iterations"], own["error"] = fewest(case, solver, most)
         own["forecast"] = None if expected is None else expected.iterations(ERROR)

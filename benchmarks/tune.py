@@ -94,7 +94,7 @@ def random_state(sim: pd.Simulator, rng: np.random.Generator) -> pd.State:
 @torch.no_grad()
 def judge(sim: pd.Simulator, state: pd.State) -> Row:
     """Errors of steps along the motion of the tuned simulator, and what the promise says of each."""
-    solved = settled_steps if has_friction(sim) else exact_steps
+    solved = settled_steps if has_friction(sim.compiled) else exact_steps
     errors, raw, trusted, audits, residuals = [], [], [], [], []
     for step in range(max(JUDGED_STEPS) + 1):
         after, info = sim(state, return_info=True)

@@ -16,9 +16,10 @@ from multilevel_cases import landing
 from runs import same_bits, state_of
 
 import torchpd as pd
-from torchpd import automatic, model
+from torchpd import automatic, settings
 from torchpd.accuracy import exact_steps
 from torchpd.automatic import AIM, CPU_CHEBYSHEV, MOST_OF_CHEBYSHEV, PATIENCE, Cost, multilevel_cost
+from torchpd.compiled import CompiledScene
 from torchpd.forecast import MOST_OF_LEVELS
 from torchpd.gpu import H100
 from torchpd.kernel_costs import iteration_microseconds
@@ -227,12 +228,12 @@ def test_few_environments_get_the_solver_that_was_faster(size: str, monkeypatch:
     subject = SUBJECTS["beam"]()
     mesh = subject.mesh({"1k": 5, "3k": 8, "10k": 12}[size])
 
-    def chebyshev_time(sim: pd.Simulator, batch: int) -> float:
-        plan = choose_plan(sim.scene.values(), sim.dtype, H100, batch=batch, progress=False)
+    def chebyshev_time(compiled: CompiledScene, batch: int) -> float:
+        plan = choose_plan(compiled.scene.values(), compiled.dtype, H100, batch=batch, progress=False)
         return iteration_microseconds(plan, len(mesh.tets), batch, H100)
 
-    def multilevel_time(sim: pd.Simulator, batch: int) -> float:
-        return multilevel_cost(sim.vertices, on_gpu=True).iteration(sim.vertices, batch)
+    def multilevel_time(compiled: CompiledScene, batch: int) -> float:
+        return multilevel_cost(compiled.vertices, on_gpu=True).iteration(compiled.vertices, batch)
 
     monkeypatch.setattr(automatic, "_chebyshev_time", chebyshev_time)
     monkeypatch.setattr(automatic, "_multilevel_time", multilevel_time)
@@ -287,11 +288,11 @@ def test_the_kernel_of_chebyshev_is_compared_whatever_ran_before(monkeypatch: py
     sim.plan = dataclasses.replace(sim.plan, for_levels=True)
     solvers = []
 
-    def fails(sim: pd.Simulator, *_: object) -> None:
-        solvers.append(sim.solver)
+    def fails(compiled: CompiledScene, *_: object) -> None:
+        solvers.append(compiled.solver)
         raise ArithmeticError
 
-    monkeypatch.setattr(model, "choose_solver", fails)
+    monkeypatch.setattr(settings, "choose_solver", fails)
     for choose in (lambda: setattr(sim, "solver", "auto"), sim.prepare_solver):
         with pytest.raises(ArithmeticError):
             choose()

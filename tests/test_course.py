@@ -35,7 +35,7 @@ def test_it_is_that_of_the_reference(dtype: torch.dtype, device: torch.device) -
     )
     pins = sim.pin_targets[: len(held.vertices)].detach() + 0.02
     targets = {held: pins, ball: torch.tensor([0.2, -0.05, 0.05, 0.0, 0.6, 0.0]).to(pins)}
-    found = course_of(sim, state, targets).cpu().double()
+    found = course_of(sim.plan, sim.material_at(targets, 3), sim.time_step, state).cpu().double()
     for item in range(3):
         expected = torch.tensor(problem_of(sim, state, item, targets=targets).course())
         torch.testing.assert_close(found[item], expected, rtol=0, atol=8 * torch.finfo(dtype).eps)
@@ -62,5 +62,6 @@ def test_nothing_is_in_the_way() -> None:
     state = sim.rest_state(2)
     state.velocities[..., 0] = torch.rand(2, sim.vertices, dtype=torch.float64)
     free = sim.rest_positions[:, 0] > 0.0
-    assert torch.equal(course_of(sim, state)[:, free], H * state.velocities[:, free])
-    assert not bool(course_of(sim, state)[:, ~free].any())
+    found = course_of(sim.plan, sim.material(), sim.time_step, state)
+    assert torch.equal(found[:, free], H * state.velocities[:, free])
+    assert not bool(found[:, ~free].any())

@@ -14,8 +14,9 @@ from runs import noise, plan_of, simulator, small
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.gpu import properties_of, step_bytes
+from torchpd.gpu import properties_of
 from torchpd.ops import INFO_WIDTH
+from torchpd.placing import step_bytes
 from torchpd.tables import DEVICE_SIZES
 
 require_gpu()
@@ -59,10 +60,10 @@ def test_a_step_takes_what_it_is_said_to(contacts: bool, kernel: str, precision:
     case = body(contacts, (24, 6, 6) if kernel == "far" else (8, 3, 3))
     sim = on_gpu(case, DTYPES[precision], kernel, iterations=2)
     for batch in batches():
-        assert step_bytes(sim, sim.plan, batch, GPU) == bytes_taken(sim, batch)
+        assert step_bytes(sim.compiled, sim.plan, batch, GPU) == bytes_taken(sim, batch)
     own = sim.stiffness * torch.linspace(0.5, 2.0, 7, dtype=sim.dtype, device=GPU)[:, None]
     sim.set_material(stiffness=own)
-    assert step_bytes(sim, sim.plan, 7, GPU) == bytes_taken(sim, 7)
+    assert step_bytes(sim.compiled, sim.plan, 7, GPU) == bytes_taken(sim, 7)
 
 
 @pytest.mark.parametrize("cells", [(2, 1, 1), (2, 2, 2), (3, 3, 3), (4, 4, 4)])
@@ -74,7 +75,7 @@ def test_environments_that_share_blocks_take_no_more_than_is_said(cells: tuple[i
     most = int(found[1].replace(",", ""))
     for batch in (1, 7, 529, 1025, 1585, 3169, 4225, 8185, 20_000):
         taken = bytes_taken(sim, batch)
-        assert step_bytes(sim, sim.plan, batch, GPU) == taken
+        assert step_bytes(sim.compiled, sim.plan, batch, GPU) == taken
         assert taken <= most
 
 
@@ -89,7 +90,7 @@ def test_a_step_of_the_multilevel_solver_takes_what_it_is_said_to(
         solver = pd.Multilevel(outer)
         sim = simulator(body(contacts), DTYPES[precision], GPU, solver=solver, batch=batch, iterations=2)
         for count in batches():
-            assert step_bytes(sim, sim.plan, count, GPU) == bytes_taken(sim, count)
+            assert step_bytes(sim.compiled, sim.plan, count, GPU) == bytes_taken(sim, count)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -108,7 +109,7 @@ def test_print_says_how_much(kernel: str) -> None:
 def test_a_plan_that_is_still_on_the_cpu_tells_it_too() -> None:
     """Before anything moves."""
     sim, _ = small(torch.float32, GPU)
-    assert step_bytes(sim, sim.plan.to("cpu"), 3, GPU) == step_bytes(sim, sim.plan, 3, GPU) > 0
+    assert step_bytes(sim.compiled, sim.plan.to("cpu"), 3, GPU) == step_bytes(sim.compiled, sim.plan, 3, GPU) > 0
 
 
 def test_more_blocks_than_32_bits_count_are_refused() -> None:

@@ -13,7 +13,9 @@ import pytest
 import torch
 
 import torchpd as pd
-from torchpd import model
+from torchpd import settings
+from torchpd.automatic import Choice
+from torchpd.compiled import CompiledScene
 from torchpd.forecast import UnsolvedWarning, forecast
 
 
@@ -63,7 +65,7 @@ CHANGES: dict[str, Callable[[pd.Simulator], object]] = {
 def test_a_change_that_leaves_the_default_far_too_few_is_said_once(owner: str) -> None:
     sim = beam()
     (message,) = said(lambda: CHANGES[owner](sim))
-    expected = forecast(sim)
+    expected = forecast(sim.compiled)
     assert expected is not None
     assert expected.error(64) > 0.1
     assert f"{owner.strip()}: 64 iterations now leave an error of about {expected.error(64):.1g} of a step" in message
@@ -79,7 +81,7 @@ def test_auto_says_that_it_would_choose_anew(owner: str) -> None:
     assert message.endswith("sim.prepare_solver() chooses anew")
     # which makes it right, and worth a warning again
     sim.prepare_solver()
-    expected = forecast(sim)
+    expected = forecast(sim.compiled)
     assert expected is not None
     assert expected.error(sim.iterations) <= 1e-3
     sim.solver, sim.choice = pd.Chebyshev(), sim.choice
@@ -162,11 +164,11 @@ def test_what_cannot_matter_costs_no_forecast(monkeypatch: pytest.MonkeyPatch) -
     """Loops that move pins, take shorter steps or have been warned."""
     asked: list[str | None] = []
 
-    def counted(sim: pd.Simulator, changed: str | None, enough: float) -> bool:
+    def counted(scene: CompiledScene, choice: Choice | None, changed: str | None) -> bool:
         asked.append(changed)
         return changed == "set_material"
 
-    monkeypatch.setattr(model, "warn_of_few_iterations", counted)
+    monkeypatch.setattr(settings, "warn_of_few_iterations", counted)
     sim = beam()
     assert asked == [None]
     sim.set_material(pin_targets=sim.pin_targets + 0.1, gravity=torch.zeros(3))

@@ -40,7 +40,7 @@ def test_the_spectrum_bounds_the_smallest_eigenvalue() -> None:
     half = torch.tensor(problem.weighted_diagonal[free]).rsqrt()
     matrix = torch.tensor(problem.matrix[free][:, free].toarray())
     smallest = float(torch.linalg.eigvalsh(half[:, None] * matrix * half)[0])
-    found = spectrum_of(sim)
+    found = spectrum_of(sim.compiled)
     assert found is not None
     assert found.least <= found.slow <= smallest
     # the lowest mode bends, which costs it little elastic energy; a body without pins has exactly the mean of a / D
@@ -49,9 +49,9 @@ def test_the_spectrum_bounds_the_smallest_eigenvalue() -> None:
 
 def test_the_worst_environment_counts() -> None:
     sim = beam(1e4)
-    soft = spectrum_of(sim)
+    soft = spectrum_of(sim.compiled)
     sim.set_material(stiffness=sim.stiffness * torch.tensor([1.0, 100.0, 1.0])[:, None])
-    both = spectrum_of(sim)
+    both = spectrum_of(sim.compiled)
     assert soft is not None
     assert both is not None
     # mu = a / (a + stiffness part)
@@ -59,7 +59,7 @@ def test_the_worst_environment_counts() -> None:
 
 
 def test_a_tolerance_beyond_the_iterations_is_said() -> None:
-    expected = forecast(beam(1e6, 5, iterations=64))
+    expected = forecast(beam(1e6, 5, iterations=64).compiled)
     assert expected is not None
     text = repr(beam(1e6, 5, iterations=64, tolerance=1e-3))
     assert f"tolerance 0.001 asks for {expected.words(1e-3)} iterations: few steps will meet it in 64" in text
@@ -71,10 +71,10 @@ def test_a_tolerance_beyond_the_iterations_is_said() -> None:
 def test_rates_are_those_of_the_textbook(least: float) -> None:
     """Jacobi: 1 - theta mu. Chebyshev: (1 - sqrt(1 - rho^2)) / rho. Both lose one decade in ln 10 / -ln rate."""
     sim, spectrum = beam(1e5), Spectrum(least, least)
-    plain = forecast(sim, pd.Jacobi(), spectrum)
+    plain = forecast(sim.compiled, pd.Jacobi(), spectrum)
     assert plain is not None
     assert plain.rate == pytest.approx(-math.log(1.0 - least))
-    fast = forecast(sim, pd.Chebyshev(relaxation=1.0), spectrum)
+    fast = forecast(sim.compiled, pd.Chebyshev(relaxation=1.0), spectrum)
     rho = 1.0 - least
     assert fast is not None
     assert fast.rate == pytest.approx(-math.log((1.0 - math.sqrt(1.0 - rho**2)) / rho))
@@ -82,7 +82,7 @@ def test_rates_are_those_of_the_textbook(least: float) -> None:
     assert fast.error(fast.iterations(1e-2)) <= 1e-2 < fast.error(fast.iterations(1e-2) - 1)
     # momentum for another radius than the true one: slower, with less as with more
     for wrong in (1.0 - 4.0 * least, 1.0 - 0.1 * least):
-        other = forecast(sim, pd.Chebyshev("classic", rho=wrong, diagonal="weighted"), spectrum)
+        other = forecast(sim.compiled, pd.Chebyshev("classic", rho=wrong, diagonal="weighted"), spectrum)
         assert other is not None
         assert other.rate < fast.rate
 
@@ -94,7 +94,7 @@ def test_a_step_takes_about_what_was_forecast(youngs: float, solver: Any) -> Non
     sim = beam(youngs, solver=solver)
     state = swinging(sim)
     exact = exact_steps(sim, state)[0]
-    expected = forecast(sim)
+    expected = forecast(sim.compiled)
     assert expected is not None
     count = expected.iterations(1e-3)
     errors = []
@@ -105,20 +105,20 @@ def test_a_step_takes_about_what_was_forecast(youngs: float, solver: Any) -> Non
 
 def test_nothing_is_said_where_nothing_is_known() -> None:
     sim = beam(1e5)
-    assert forecast(sim, pd.Jacobi(diagonal="plain")) is None
-    assert forecast(sim, pd.Chebyshev("classic", rho=0.9)) is None
+    assert forecast(sim.compiled, pd.Jacobi(diagonal="plain")) is None
+    assert forecast(sim.compiled, pd.Chebyshev("classic", rho=0.9)) is None
     solid = pd.Solid(pd.shapes.single_tet(), 1e5)
     held = pd.Simulator(pd.Scene(solid, pd.Pin(solid, [0, 1, 2, 3])))
-    assert spectrum_of(held) is None
+    assert spectrum_of(held.compiled) is None
     assert "expected:" not in repr(held)
-    assert spectrum_of(beam(1e5).to("meta")) is None
+    assert spectrum_of(beam(1e5).to("meta").compiled) is None
 
 
 def test_multilevel_does_not_care_about_the_mesh() -> None:
     """The same body, 3.4 times as fine: Chebyshev needs about so many times more, Multilevel the same."""
     coarse, fine = beam(1e6, 3), beam(1e6, 10)
     for solver, least, most in ((pd.Chebyshev(), 3.0, 3.8), (pd.Multilevel(), 0.93, 1.07)):
-        rates = [expected.rate for sim in (coarse, fine) if (expected := forecast(sim, solver)) is not None]
+        rates = [expected.rate for sim in (coarse, fine) if (expected := forecast(sim.compiled, solver)) is not None]
         assert least < rates[0] / rates[1] < most
 
 
@@ -128,7 +128,7 @@ def test_contacts_are_expected_to_take_multilevel_two_roots_of_what_chebyshev_ta
 
     def needed(solver: pd.Chebyshev | pd.Multilevel, *contacts: Any, mu: float = 1e-3, mesh: Any = even) -> float:
         sim = pd.Simulator(pd.Scene(pd.Solid(mesh, 1e6), *contacts), iterations=1)
-        expected = forecast(sim, solver, Spectrum(mu, mu))
+        expected = forecast(sim.compiled, solver, Spectrum(mu, mu))
         assert expected is not None
         return math.log(1e3) / expected.rate
 
@@ -164,7 +164,7 @@ def test_a_sliver_has_an_angle_below_five_degrees(degrees: float, sliver: bool) 
     assert smallest_dihedral(box.vertices, box.tets) == box.quality().min_dihedral.min()
     for meshes in ([flat], [box, flat]):
         sim = pd.Simulator(pd.Scene(*(pd.Solid(mesh, 1e6) for mesh in meshes)), iterations=1, progress=False)
-        assert [is_uneven(sim) for _ in range(2)] == [sliver, sliver]
+        assert [is_uneven(sim.compiled) for _ in range(2)] == [sliver, sliver]
 
 
 def test_a_body_of_very_different_stiffness_is_uneven() -> None:
@@ -172,12 +172,12 @@ def test_a_body_of_very_different_stiffness_is_uneven() -> None:
     mesh = pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2))
     soft, stiff = (pd.Solid(mesh, youngs) for youngs in (1e4, 1e6))
     sim = pd.Simulator(pd.Scene(soft, stiff), iterations=1, progress=False)
-    assert not is_uneven(sim)
+    assert not is_uneven(sim.compiled)
     factor = torch.ones(2, sim.stiffness.shape[-1])
     for most, uneven in ((29.0, False), (31.0, True)):
         factor[1, -1] = most
         sim.set_material(stiffness=factor * sim.stiffness.new_tensor([1e4]))
-        assert is_uneven(sim) == uneven
+        assert is_uneven(sim.compiled) == uneven
 
 
 def test_what_may_be_hard_to_multilevel_is_no_warning() -> None:

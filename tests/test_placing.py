@@ -10,7 +10,8 @@ import torch
 from runs import simulate, simulator, small_case
 
 import torchpd as pd
-from torchpd import model, placing
+from torchpd import placing, settings
+from torchpd.compiled import CompiledScene
 from torchpd.gpu import H100
 from torchpd.material import in_order, material_of
 from torchpd.multilevel import has_levels
@@ -32,10 +33,11 @@ def two_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
 def on_gpu(monkeypatch: pytest.MonkeyPatch) -> pd.Simulator:
     """A simulator that takes itself to be on a GPU, where a step of its batch wants STEP bytes each."""
     monkeypatch.setattr(placing, "properties_of", lambda _: H100)
-    monkeypatch.setattr(placing, "step_bytes", lambda sim, plan, batch, device: STEP * batch)
+    monkeypatch.setattr(placing, "step_bytes", lambda scene, plan, batch, device: STEP * batch)
     sim = simulate(torch.float32)
     sim.plan = choose_plan(sim.scene.values(), torch.float32, H100)
-    monkeypatch.setattr(pd.Simulator, "device", GPU)
+    for kind in (pd.Simulator, CompiledScene):
+        monkeypatch.setattr(kind, "device", GPU)
     values = sim.scene.values()
     # the ops would want the plan where the simulator says that it is
     plan, arrays = compile_plan(values, progress=False), in_order(material_of(values, torch.float32))
@@ -99,7 +101,7 @@ def test_gradients_by_levels_need_the_kernel_that_reads_them(
 def test_a_batch_whose_plan_does_not_fit_is_refused(on_gpu: pd.Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
     sim, plan = on_gpu, on_gpu.plan
     new = choose_plan(sim.scene.values(), torch.float32, H100, batch=7)
-    monkeypatch.setattr(model, "plan_anew", lambda *_: new)
+    monkeypatch.setattr(settings, "plan_anew", lambda *_: new)
 
     def change() -> None:
         sim.batch = 7
@@ -129,12 +131,12 @@ def test_a_body_that_is_let_go_gets_a_plan_once(on_gpu: pd.Simulator, monkeypatc
 def test_what_moves_to_a_gpu_has_to_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plan, material, and a step of the batch it is for."""
     monkeypatch.setattr(placing, "properties_of", lambda _: H100)
-    monkeypatch.setattr(placing, "step_bytes", lambda sim, plan, batch, device: STEP * batch)
+    monkeypatch.setattr(placing, "step_bytes", lambda scene, plan, batch, device: STEP * batch)
     for batch in (None, 3):
         sim = simulator(small_case(), torch.float64, batch=batch)
         plan = choose_plan(sim.scene.values(), torch.float64, H100, batch=batch)
         numbers = sum(array.numel() for array in (*sim.material(), sim.rest_positions))
-        asked = bytes_asked_for(lambda: placing.plan_on(sim, torch.float64, GPU), monkeypatch)  # noqa: B023
+        asked = bytes_asked_for(lambda: placing.plan_on(sim.compiled, torch.float64, GPU), monkeypatch)  # noqa: B023
         assert asked == plan.bytes + 8 * numbers + (batch or 1) * STEP
 
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 import torchpd as pd
-from torchpd import automatic, model, placing
+from torchpd import automatic, placing, settings
+from torchpd.compiled import CompiledScene
 from torchpd.forecast import Spectrum
 from torchpd.gpu import H100
 from torchpd.multilevel import precondition_plan, reference_of
@@ -19,7 +20,7 @@ from torchpd.scene import SceneValues
 def test_another_kernel_makes_the_plan_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU; where it does not fit everything stays."""
 
-    def compiled(sim: pd.Simulator, dtype: torch.dtype, *_: object) -> Plan:
+    def compiled(sim: pd.Simulator | CompiledScene, dtype: torch.dtype, *_: object) -> Plan:
         if sim.kernel == "cluster":
             raise ValueError("does not fit")
         return choose_plan(sim.scene.values(), dtype, H100, sim.kernel, progress=False)
@@ -43,7 +44,7 @@ def test_another_kernel_makes_the_choice_of_auto_anew(monkeypatch: pytest.Monkey
     """Multilevel runs with "stream" alone, so "auto" leaves it where another kernel is asked for."""
     asked = []
 
-    def compiled(sim: pd.Simulator, dtype: torch.dtype, *_: object) -> Plan:
+    def compiled(sim: pd.Simulator | CompiledScene, dtype: torch.dtype, *_: object) -> Plan:
         asked.append((sim.kernel, type(sim.solver)))
         levels = isinstance(sim.solver, pd.Multilevel)
         return choose_plan(sim.scene.values(), dtype, H100, sim.kernel, levels=levels, progress=False)
@@ -52,10 +53,10 @@ def test_another_kernel_makes_the_choice_of_auto_anew(monkeypatch: pytest.Monkey
     sim = pd.Simulator(pd.Scene(body, pd.Gravity(), pd.Ground(-1.0)), 1 / 60, solver="auto", progress=False)
     assert isinstance(sim.solver, pd.Multilevel)
     monkeypatch.setattr(placing, "_compile", compiled)
-    monkeypatch.setattr(placing, "move_plan", lambda sim, plan, device: plan)
-    monkeypatch.setattr(model, "move_plan", lambda sim, plan, device: plan)
-    monkeypatch.setattr(automatic, "spectrum_of", lambda sim: Spectrum(1e-6, 1e-6))
-    monkeypatch.setattr(automatic, "runs", lambda solver, sim: sim.kernel == "auto")
+    monkeypatch.setattr(placing, "move_plan", lambda scene, plan, device: plan)
+    monkeypatch.setattr(settings, "move_plan", lambda scene, plan, device: plan)
+    monkeypatch.setattr(automatic, "spectrum_of", lambda _: Spectrum(1e-6, 1e-6))
+    monkeypatch.setattr(automatic, "runs", lambda solver, scene: scene.kernel == "auto")
     values, reference = sim.scene.values(), reference_of(sim.plan, sim.material(), sim.time_step)
     sim.plan = precondition_plan(choose_plan(values, torch.float32, H100, levels=True), values, *reference)
     sim.kernel = "grid"
@@ -64,7 +65,7 @@ def test_another_kernel_makes_the_choice_of_auto_anew(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("setting", ["kernel", "batch"])
 def test_a_plan_made_in_inference_mode_can_be_learnt_with(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(placing, "_compile", lambda sim, dtype, *_: choose_plan(sim.scene.values(), dtype, H100))
+    monkeypatch.setattr(placing, "_compile", lambda own, dtype, *_: choose_plan(own.scene.values(), dtype, H100))
     sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e4)), 1 / 60, 8, progress=False)
     sim.plan = choose_plan(sim.scene.values(), torch.float32, H100)
     with torch.inference_mode():
@@ -83,7 +84,7 @@ def test_bars_show_for_another_device_too(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(placing, "properties_of", lambda _: H100)
     for progress in (True, False):
         sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e4)), 1 / 60, 8, progress=progress)
-        placing.plan_anew(sim, torch.float32, torch.device("cuda"))
+        placing.plan_anew(sim.compiled, torch.float32, torch.device("cuda"))
         assert shown.pop() == progress
         # nobody waits for those that the library makes for itself
         assert not plain_copy(sim).progress
@@ -100,12 +101,12 @@ def test_a_simulator_passes_its_batch_on(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(placing, "choose_plan", chosen)
     monkeypatch.setattr(placing, "properties_of", lambda _: H100)
     sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e4)), 1 / 60, 8, batch=3)
-    placing.plan_anew(sim, torch.float32, torch.device("cuda"))
+    placing.plan_anew(sim.compiled, torch.float32, torch.device("cuda"))
     assert asked == [3]
     sim.batch = 4
     assert asked == [3]  # no plan of a CPU knows of it
     monkeypatch.setattr(Plan, "kernel", "stream")
-    monkeypatch.setattr(model, "plan_anew", lambda sim, *_: chosen(sim.scene.values(), batch=sim.batch))
+    monkeypatch.setattr(settings, "plan_anew", lambda own, *_: chosen(own.scene.values(), batch=own.batch))
     sim.batch = 5
     assert asked == [3, 5]
     for wrong in (0, "x"):

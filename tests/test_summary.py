@@ -11,6 +11,7 @@ from runs import moving, same_bits, simulator
 
 import torchpd as pd
 from torchpd import summary
+from torchpd.compiled import CompiledScene
 from torchpd.gpu import Properties
 from torchpd.plan import Plan
 from torchpd.regimes import choose_plan
@@ -139,7 +140,7 @@ def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...], mo
 def test_print_says_what_a_step_takes_on_a_gpu(kernel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of each environment in the batch it was told, rounded up; but for a stream no more than those in work want."""
 
-    def taken(_: pd.Simulator, plan: Plan, batch: int, device: torch.device) -> int:
+    def taken(_: CompiledScene, plan: Plan, batch: int, device: torch.device) -> int:
         assert (plan.kernel, device.type) == (kernel, "cpu")
         return 1000 * min(batch, 9) + 1
 

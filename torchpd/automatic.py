@@ -10,18 +10,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 
+from .compiled import CompiledScene
 from .forecast import (
+    FAR_TOO_FEW,
     LANDING_ROOTS,
     MOST_OF_LEVELS,
     Forecast,
     Spectrum,
+    UnsolvedWarning,
     forecast,
     has_contacts,
     held_up_by,
+    is_bound,
     is_uneven,
     spectrum_of,
 )
@@ -29,11 +33,18 @@ from .gpu import H100
 from .kernel_costs import iteration_microseconds
 from .multilevel import MOST_DIRECT
 from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
+from .warn import warn_user
 
-if TYPE_CHECKING:
-    from .model import Model
-
-__all__ = ["AIM", "CPU_CHEBYSHEV", "Choice", "Cost", "choose_solver", "multilevel_cost", "runs"]
+__all__ = [
+    "AIM",
+    "CPU_CHEBYSHEV",
+    "Choice",
+    "Cost",
+    "choose_solver",
+    "multilevel_cost",
+    "runs",
+    "warn_of_few_iterations",
+]
 
 AIM = 1e-3  # error of a step that "auto" sets its iterations for
 MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes, and 99 of 100 steps in which a body lands
@@ -104,13 +115,13 @@ class Choice:
     capped: bool = False  # more would be wanted, but a step is to end
 
 
-def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
+def choose_solver(scene: CompiledScene, iterations: int | None) -> tuple[Solver, Choice]:
     """The solver for this scene and device, and why.
 
     Chebyshev gets a relaxation of min(1.9, 2 / (1 + mu)), which is best for a spectrum of [mu, 1].
 
     Args:
-        sim: scene, time step, material, device, and the batch to choose for.
+        scene: with time step, material, device, and the batch to choose for.
         iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error, but
             Chebyshev with friction and balls. None sets as many as are expected to reach an error of `AIM`, times
             `MARGIN`, up to `MOST_OF_CHEBYSHEV` or `MOST_OF_LEVELS`, and with a tolerance `PATIENCE` times that. On
@@ -121,34 +132,34 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     def chosen(enough: int, why: str, most: int = MOST_OF_CHEBYSHEV) -> Choice:
         if iterations is not None:
             return Choice(iterations, False, why)
-        times, capped = PATIENCE if sim.tolerance > 0.0 else 1, enough > most
+        times, capped = PATIENCE if scene.tolerance > 0.0 else 1, enough > most
         why += f'; "auto" takes no more than {most * times:,}' if capped else ""
         return Choice(min(enough, most) * times, True, why, capped)
 
-    spectrum = spectrum_of(sim)
+    spectrum = spectrum_of(scene)
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
     if spectrum is None:
         return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
-    if cause := held_up_by(sim):
-        plain = _known(forecast(sim, chebyshev, spectrum))
+    if cause := held_up_by(scene):
+        plain = _known(forecast(scene, chebyshev, spectrum))
         why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and {cause} may keep Multilevel from working"
         return chebyshev, chosen(_enough(plain), why)
-    plain, lasting, short = (_known(forecast(sim, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
+    plain, lasting, short = (_known(forecast(scene, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
     # the others know nothing of contacts
-    saves = has_contacts(sim) or short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
+    saves = has_contacts(scene) or short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
     multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
-    if not runs(multilevel, sim):
-        where = f"{sim.device} with kernel={sim.kernel!r}" if sim.device.type == "cuda" else str(sim.device)
+    if not runs(multilevel, scene):
+        where = f"{scene.device} with kernel={scene.kernel!r}" if scene.device.type == "cuda" else str(scene.device)
         return chebyshev, chosen(_enough(plain), f"{counts}, and Multilevel does not run on {where}")
-    batch = sim.batch or 1
-    ratio = _multilevel_time(sim, batch) / _chebyshev_time(sim, batch)
+    batch = scene.batch or 1
+    ratio = _multilevel_time(scene, batch) / _chebyshev_time(scene, batch)
     both = f"{counts}, or {levels.words(AIM)} of Multilevel, each as long as {ratio:.2g}"
     both += f" in a batch of {batch}" if batch > 1 else ""
     if iterations is None:
         count = float(levels.iterations(AIM))
         usual = LANDING_ROOTS * math.sqrt(plain.iterations(AIM))
-        if has_contacts(sim) and sim.tolerance > 0.0 and is_uneven(sim) and usual < count:
+        if has_contacts(scene) and scene.tolerance > 0.0 and is_uneven(scene) and usual < count:
             count = usual
             both += f"; with a tolerance about {round(usual)} where no sliver or soft part lands"
         better = count * ratio < plain.iterations(AIM)
@@ -160,20 +171,20 @@ def choose_solver(sim: Model, iterations: int | None) -> tuple[Solver, Choice]:
     return chebyshev, chosen(_enough(plain), both)
 
 
-def _chebyshev_time(sim: Model, batch: int) -> float:
+def _chebyshev_time(scene: CompiledScene, batch: int) -> float:
     """Microseconds of an iteration of so many environments, in float32, on a GPU with its own plan on an H100.
 
     So are those of Multilevel, whatever the GPU and precision are: only their ratio matters.
     """
-    if sim.plan.kernel is None:
-        return CPU_CHEBYSHEV.iteration(sim.vertices, batch)
-    return iteration_microseconds(sim.plan, sim.stiffness.shape[-1], batch, H100, torch.float32)
+    if scene.plan.kernel is None:
+        return CPU_CHEBYSHEV.iteration(scene.vertices, batch)
+    return iteration_microseconds(scene.plan, scene.named["stiffness"].shape[-1], batch, H100, torch.float32)
 
 
-def _multilevel_time(sim: Model, batch: int) -> float:
+def _multilevel_time(scene: CompiledScene, batch: int) -> float:
     """The same of `Multilevel`."""
-    free = multilevel_cost(sim.vertices, on_gpu=sim.plan.kernel is not None).iteration(sim.vertices, batch)
-    return free * (ON_CONTACTS if has_contacts(sim) else 1.0)
+    free = multilevel_cost(scene.vertices, on_gpu=scene.plan.kernel is not None).iteration(scene.vertices, batch)
+    return free * (ON_CONTACTS if has_contacts(scene) else 1.0)
 
 
 def _known(expected: Forecast | None) -> Forecast:
@@ -193,10 +204,46 @@ def _relaxation(spectrum: Spectrum | None) -> float | None:
     return best if best < Chebyshev().numbers()["relaxation"] else None
 
 
-def runs(solver: Solver, sim: Model) -> bool:
-    """Whether there are kernels for the solver where the simulator is."""
+def runs(solver: Solver, scene: CompiledScene) -> bool:
+    """Whether there are kernels for the solver where the scene is."""
     try:
-        check_solver(solver, sim.device)
+        check_solver(solver, scene.device)
     except RuntimeError:
         return False
-    return sim.device.type != "cuda" or not isinstance(solver, Multilevel) or sim.kernel in ("auto", "stream")
+    return scene.device.type != "cuda" or not isinstance(solver, Multilevel) or scene.kernel in ("auto", "stream")
+
+
+def warn_of_few_iterations(scene: CompiledScene, choice: Choice | None, changed: str | None = None) -> bool:
+    """Say so when iterations that nobody named leave more than enough: who gave none may not know of them.
+
+    Args:
+        scene: with the default number of iterations, or that of "auto".
+        choice: of "auto", which was to leave `AIM`; ten times that may be left.
+        changed: what brought another material or time step; None when the simulator is made, or "auto" has chosen.
+
+    Returns:
+        Whether it was said.
+    """
+    enough, capped = (FAR_TOO_FEW, False) if choice is None else (10.0 * AIM, choice.capped)
+    if is_bound(scene) and (choice is None or capped):
+        return False  # most steps need far fewer
+    expected = forecast(scene)
+    if expected is None or expected.error(scene.iterations) <= enough:
+        return False
+    count, left = scene.iterations, expected.error(scene.iterations)
+    what, verb, ways = f"the default of {count} iterations", "leaves", "Give iterations=..., or take"
+    if changed is not None:
+        what, verb, ways = f"{count} iterations", "now leave", "Set sim.iterations, or take"
+    ways += ' solver="auto", or ask sim.tune(error=1e-2)'
+    if capped:
+        what, verb = f'the {count:,} iterations that "auto" takes at most', "leave"
+        ways = "Take a shorter time_step, or give iterations=..."
+    elif choice is not None:
+        what += ' that "auto" chose before'
+        ways = "sim.prepare_solver() chooses anew"
+    warn_user(
+        f"{changed or 'Simulator'}: {what} {verb} an error of about {left:.1g} of a step here (1: nothing solved); "
+        f"{expected.words(1e-2)} reach 1e-2. {ways}",
+        UnsolvedWarning,
+    )
+    return True

@@ -53,4 +53,4 @@ def safe_solvers(sim: Simulator, state: State) -> dict[str, Solver]:
     """Those that cannot diverge and run where the simulator is, the default first."""
     here = {name: c for name, c in CONTENDERS.items() if c.safe and sim.device.type in c.devices}
     made = {name: here[name].make(sim, state) for name in sorted(here, key=lambda name: name != DEFAULT)}
-    return {name: solver for name, solver in made.items() if runs(solver, sim)}
+    return {name: solver for name, solver in made.items() if runs(solver, sim.compiled)}

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from .material import MATERIAL_ROWS
+from .diagonal import named_material, pinned_vertices
+from .plan import Plan
 from .state import State
-from .targets import Targets
-
-if TYPE_CHECKING:
-    from .model import Model
 
 __all__ = ["course_of"]
 
 
 @torch.no_grad()
-def course_of(sim: Model, state: State, targets: Targets | None = None) -> Tensor:
+def course_of(plan: Plan, arrays: Sequence[Tensor], time_step: float, state: State) -> Tensor:
     """Displacements [B, V, 3] [m] of a step in which nothing is solved: x_0 - x of `Promise`, without friction.
 
     As `torchpd.reference.StepProblem.course`. The iterations of a step start from where rigid motions lead from there.
+
+    Args:
+        plan: of the scene.
+        arrays: the material of the step, with its targets, see `Simulator.material_at`.
+        time_step: h [s].
+        state: where the step starts.
     """
-    x, moved = state[0], sim.time_step * state[1]
-    material = dict(zip(MATERIAL_ROWS, sim.material_at(targets, len(x)), strict=True))
+    x, moved = state[0], time_step * state[1]
+    material = named_material(arrays)
     free = torch.ones_like(x[..., :1], dtype=torch.bool)
-    if len(sim.plan.pin_vertex):
-        vertices = sim.plan.vertex_order[sim.plan.pin_vertex.long()].long()
+    if len(plan.pin_vertex):
+        vertices = pinned_vertices(plan.arrays)
         hard = material["pin_stiffness"].isinf().expand(len(x), -1)[..., None]
         held = torch.where(hard, material["pin_targets"] - x[:, vertices], moved[:, vertices])
         moved, free = moved.index_copy(1, vertices, held), free.index_copy(1, vertices, ~hard)

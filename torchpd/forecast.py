@@ -18,19 +18,16 @@ Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, ch
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import torch
 
+from .compiled import CompiledScene
 from .diagonal import step_diagonal
+from .mesh import TetMesh
 from .quality import smallest_dihedral
 from .solvers import Chebyshev, Multilevel, Solver
-from .warn import warn_user
-
-if TYPE_CHECKING:
-    from .mesh import TetMesh
-    from .model import Model
 
 __all__ = [
     "Forecast",
@@ -43,7 +40,6 @@ __all__ = [
     "is_bound",
     "is_uneven",
     "spectrum_of",
-    "warn_of_few_iterations",
 ]
 
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
@@ -92,12 +88,12 @@ class Forecast(NamedTuple):
 
 
 @torch.no_grad()
-def spectrum_of(sim: Model) -> Spectrum | None:
+def spectrum_of(scene: CompiledScene) -> Spectrum | None:
     """From the present material and time step; None on "meta", where there are no values, and without a free vertex."""
-    if sim.device.type == "meta" or (sim.plan.kernel is None) != (sim.device.type == "cpu"):
+    if scene.device.type == "meta" or (scene.plan.kernel is None) != (scene.device.type == "cpu"):
         return None
-    inertia, diagonal = step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)
-    inertia, diagonal = (array.detach().double().reshape(-1, sim.vertices) for array in (inertia, diagonal))
+    inertia, diagonal = step_diagonal(scene.plan.arrays, scene.material, scene.time_step)
+    inertia, diagonal = (array.detach().double().reshape(-1, scene.vertices) for array in (inertia, diagonal))
     free = inertia.isfinite()
     if not bool(free.any()):
         return None
@@ -125,23 +121,23 @@ def _decay(eigenvalue: float, limit: float) -> float:
     return math.sqrt(limit) if discriminant <= 0.0 else (sum_of_roots + math.sqrt(discriminant)) / 2.0
 
 
-def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None = None) -> Forecast | None:
+def forecast(scene: CompiledScene, solver: Solver | None = None, spectrum: Spectrum | None = None) -> Forecast | None:
     """What to expect of a solver on this scene; None where nothing can be said.
 
     That is so for the plain diagonal, with which iterations may diverge, and where `spectrum_of` has nothing.
 
     Args:
-        sim: scene, time step and material.
-        solver: its own when None.
+        scene: with time step and material.
+        solver: that of the scene when None.
         spectrum: when known already.
     """
-    solver = sim.solver if solver is None else solver
-    spectrum = spectrum_of(sim) if spectrum is None else spectrum
+    solver = scene.solver if solver is None else solver
+    spectrum = spectrum_of(scene) if spectrum is None else spectrum
     numbers = solver.numbers()
     if spectrum is None or not numbers["weighted"]:
         return None
-    if isinstance(solver, Multilevel) and not has_contacts(sim):
-        body = max(len(solid.mesh.vertices) for solid in sim.scene.solids)
+    if isinstance(solver, Multilevel) and not has_contacts(scene):
+        body = max(len(solid.mesh.vertices) for solid in scene.scene.solids)
         reach = min(spectrum.slow * body ** (2.0 / 3.0), 1.0)
         decade = _LEVELS_LEAST + _LEVELS_SLOPE[solver.outer] * math.log10(1.0 / reach)
         return Forecast(math.log(10.0) / decade)
@@ -154,29 +150,29 @@ def forecast(sim: Model, solver: Solver | None = None, spectrum: Spectrum | None
     middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0
     left = max(_decay(slowest, limit), _decay(middle, limit), 1e-3)
     rate = -math.log(min(left, 1.0 - 1e-15))
-    lands = isinstance(solver, Multilevel) and solver.outer == "corotated" and not held_up_by(sim)
+    lands = isinstance(solver, Multilevel) and solver.outer == "corotated" and not held_up_by(scene)
     if lands:
         plain = math.log(1e3) / rate
         usual = LANDING_ROOTS * math.sqrt(plain)
-        rate = math.log(1e3) / (max(_LANDING_SHARE * plain, usual) if is_uneven(sim) else usual)
+        rate = math.log(1e3) / (max(_LANDING_SHARE * plain, usual) if is_uneven(scene) else usual)
     return Forecast(rate)
 
 
-def is_bound(sim: Model) -> bool:
-    """Whether the forecast for its solver is what its hardest steps need, and most of them less."""
-    return isinstance(sim.solver, Multilevel) and has_contacts(sim)
+def is_bound(scene: CompiledScene) -> bool:
+    """Whether the forecast for the solver of the scene is what its hardest steps need, and most of them less."""
+    return isinstance(scene.solver, Multilevel) and has_contacts(scene)
 
 
-def has_contacts(sim: Model) -> bool:
+def has_contacts(scene: CompiledScene) -> bool:
     """Whether the scene has anything to touch."""
-    return sim.planes.shape[-2] + sim.spheres.shape[-2] > 0
+    return scene.named["planes"].shape[-2] + scene.named["spheres"].shape[-2] > 0
 
 
-def is_uneven(sim: Model) -> bool:
+def is_uneven(scene: CompiledScene) -> bool:
     """Whether a body has tetrahedra with an angle below five degrees, or one that is 30 times as stiff as another."""
-    if any(_smallest_angle(solid.mesh) < _EVEN_ANGLE for solid in sim.scene.solids):
+    if any(_smallest_angle(solid.mesh) < _EVEN_ANGLE for solid in scene.scene.solids):
         return True
-    bodies = sim.stiffness.detach().split([len(solid.mesh.tets) for solid in sim.scene.solids], dim=-1)
+    bodies = scene.named["stiffness"].detach().split([len(solid.mesh.tets) for solid in scene.scene.solids], dim=-1)
     return any(bool((body.amax(-1) > _EVEN_STIFFNESS * body.amin(-1)).any()) for body in bodies)
 
 
@@ -186,49 +182,13 @@ def _smallest_angle(mesh: TetMesh) -> float:
     return _smallest_angles[mesh]
 
 
-def has_friction(sim: Model) -> bool:
+def has_friction(scene: CompiledScene) -> bool:
     """Whether any contact may hold a vertex by friction."""
-    return any(bool((getattr(sim, name)[..., 4] > 0.0).any()) for name in ("planes", "spheres"))
+    return any(bool((scene.named[name][..., 4] > 0.0).any()) for name in ("planes", "spheres"))
 
 
-def held_up_by(sim: Model) -> str:
+def held_up_by(scene: CompiledScene) -> str:
     """What may keep `Multilevel` from working: "friction", "a ball" (thin sheets buckle over it), or ""."""
-    if has_friction(sim):
+    if has_friction(scene):
         return "friction"
-    return "a ball" if sim.spheres.shape[-2] else ""
-
-
-def warn_of_few_iterations(sim: Model, changed: str | None = None, enough: float = FAR_TOO_FEW) -> bool:
-    """Say so when iterations that nobody named leave more than enough: who gave none may not know of them.
-
-    Args:
-        sim: with the default number of iterations, or that of "auto".
-        changed: what brought another material or time step; None when the simulator is made, or "auto" has chosen.
-        enough: the error that may be left.
-
-    Returns:
-        Whether it was said.
-    """
-    capped = sim.choice is not None and sim.choice.capped
-    if is_bound(sim) and (sim.choice is None or capped):
-        return False  # most steps need far fewer
-    expected = forecast(sim)
-    if expected is None or expected.error(sim.iterations) <= enough:
-        return False
-    count, left = sim.iterations, expected.error(sim.iterations)
-    what, verb, ways = f"the default of {count} iterations", "leaves", "Give iterations=..., or take"
-    if changed is not None:
-        what, verb, ways = f"{count} iterations", "now leave", "Set sim.iterations, or take"
-    ways += ' solver="auto", or ask sim.tune(error=1e-2)'
-    if capped:
-        what, verb = f'the {count:,} iterations that "auto" takes at most', "leave"
-        ways = "Take a shorter time_step, or give iterations=..."
-    elif sim.choice is not None:
-        what += ' that "auto" chose before'
-        ways = "sim.prepare_solver() chooses anew"
-    warn_user(
-        f"{changed or 'Simulator'}: {what} {verb} an error of about {left:.1g} of a step here (1: nothing solved); "
-        f"{expected.words(1e-2)} reach 1e-2. {ways}",
-        UnsolvedWarning,
-    )
-    return True
+    return "a ball" if scene.named["spheres"].shape[-2] else ""

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
 import torch
-
-if TYPE_CHECKING:
-    from .model import Model
-    from .plan import Plan
 
 __all__ = [
     "DOCTOR",
@@ -20,7 +15,6 @@ __all__ = [
     "properties_of",
     "refuse_full_memory",
     "seen_devices",
-    "step_bytes",
     "why_not",
 ]
 
@@ -87,27 +81,6 @@ def seen_devices() -> str:
     """In words, for who has asked for another one."""
     names = [f"cuda:{index} ({torch.cuda.get_device_name(index)})" for index in range(torch.cuda.device_count())]
     return f"torch sees {', '.join(names) or 'none'}; CUDA_VISIBLE_DEVICES says which ones it may see"
-
-
-def step_bytes(sim: Model, plan: Plan, batch: int, device: torch.device) -> int:
-    """Memory of a step beside plan, material and states, as the op takes it.
-
-    Args:
-        sim: whose solver and material the step has.
-        plan: of a GPU, with what the solver prepares; it may still be on the CPU.
-        batch: environments.
-        device: the GPU.
-    """
-    from . import _C  # the doctor works without it
-    from .multilevel import has_levels
-
-    real = torch.finfo(plan.dtype).bits // 8
-    levels = plan.level_sizes.numpy() if has_levels(plan.arrays) else np.empty(0, dtype=np.int32)
-    planes, spheres = sim.planes.shape[-2], sim.spheres.shape[-2]
-    own = sim.stiffness.dim() == 2 and len(sim.stiffness) == batch
-    schedule: int = sim.solver.numbers()["schedule"]
-    with torch.cuda.device(device):
-        return _C.step_bytes(real, plan.sizes.numpy(), levels, schedule, batch, planes, spheres, own)
 
 
 def free_memory(device: torch.device) -> int:

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from .pins import PIN_HARD, hold_exactly, split_springs
 from .scene import SceneValues
 from .tables import MATERIAL_TABLE
-
-if TYPE_CHECKING:
-    from .model import Model
 
 __all__ = [
     "ARRAYS",
@@ -70,8 +66,8 @@ def dims_of(name: str) -> int:
     return 1 if name == PIN_HARD else MATERIAL_ROWS[name].dims
 
 
-def named_arrays(sim: Model) -> dict[str, Tensor]:
-    """The arrays as the simulator keeps them: those that training may change, and which pins are hard."""
+def named_arrays(sim: nn.Module) -> dict[str, Tensor]:
+    """The arrays as a simulator keeps them: those that training may change, and which pins are hard."""
     return {name: getattr(sim, name) for name in ARRAYS}
 
 
@@ -208,6 +204,6 @@ def check_environments(name: str, batch: int, arrays: Mapping[str, Tensor]) -> N
             )
 
 
-def environments_of_material(sim: Model) -> int:
-    """How many environments the material of a simulator has numbers for; 1 where all share them."""
-    return max(len(array) if array.dim() > dims_of(name) else 1 for name, array in named_arrays(sim).items())
+def environments_of_material(arrays: Mapping[str, Tensor]) -> int:
+    """How many environments arrays of the material, by name, have numbers for; 1 where all share them."""
+    return max(len(array) if array.dim() > dims_of(name) else 1 for name, array in arrays.items())

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
 from .checks import check_has_values
+from .compiled import CompiledScene, ordinary
 from .diagonal import named_material
 from .material import (
     ARRAYS,
+    MATERIAL_ROWS,
     PARTS_OF_ROWS,
     check_array,
     check_batches,
@@ -22,54 +24,65 @@ from .material import (
     in_order,
     named_arrays,
     one_for_all_rows,
+    real_tensor,
 )
-from .material_parts import COLUMNS, whole_arrays
 from .multilevel import has_levels, has_strangers
 from .parametrized import invert, make, parametrization
-from .pins import PIN_HARD, hold_exactly, split_springs
-from .placing import is_recording, loosened_plan, plan_for_solver, plan_that_holds
+from .pins import PIN_HARD, split_springs
+from .placing import loosened_plan, plan_for_solver
 from .plan import Plan
 from .warn import warn_user
-from .written import Seen, has_numbers, plain_tensor
-
-if TYPE_CHECKING:
-    from .model import Model
 
 __all__ = [
+    "Change",
+    "check_change",
     "check_keys",
     "check_originals",
-    "held_springs",
     "load_material",
-    "ordinary",
-    "read_pins",
-    "replace_material",
+    "warn_of_new_parameters",
+    "write_change",
 ]
 
 # what decides how many iterations a step takes
 _OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)
+# of each name the arrays that have it, and where
+COLUMNS = {
+    "friction": {"planes": 4, "spheres": 4},
+    "height": {"planes": 3},
+    "radius": {"spheres": 3},
+}
+_THINGS = {"planes": "grounds", "spheres": "spheres"}
 
 
-@contextmanager
-def ordinary() -> Iterator[None]:
-    """For what a simulator keeps: tensors that are made in inference mode can never be changed or differentiated.
+class Change(NamedTuple):
+    """Arrays that are to be replaced, checked, and the plan that serves them."""
 
-    Those that name no device are for the CPU, whatever torch's default device.
-    """
-    with torch.inference_mode(False), torch.no_grad(), torch.device("cpu"):
-        yield
+    arrays: dict[str, Tensor]  # by name, as they will be
+    originals: dict[str, Tensor]  # of those that a parametrization makes
+    replaced: dict[str, Tensor]  # new parameters, and a new buffer, where nothing can be written over
+    plan: Plan
+    learned: list[str]  # those of another batch whose former parameter was learned
+
+    @property
+    def alters_rate(self) -> bool:
+        """Whether a step may take another number of iterations."""
+        return any(name in self.arrays for name in _OF_THE_RATE)
 
 
-def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False) -> None:
-    """What `set_material` and loading do, for whom errors name; `anew`: new parameters, nothing is written over."""
-    check_has_values(owner, sim.device)
+def check_change(
+    sim: nn.Module, scene: CompiledScene, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False
+) -> Change:
+    """What `set_material` and loading are to write, for whom errors name; `anew`: nothing is written over."""
+    check_has_values(owner, scene.device)
     for name in arrays:
         if name not in ARRAYS and name not in COLUMNS:
             names = ", ".join([*ARRAYS, *COLUMNS])
             part_of = f"; {PARTS_OF_ROWS[name]}" if name in PARTS_OF_ROWS else ""
             raise TypeError(f"{owner}: no array {name!r}; there are {names}{part_of}")
-    arrays = whole_arrays(sim, owner, arrays)
+    own = named_arrays(sim)
+    arrays = _whole_arrays(own, owner, arrays)
     replaces_hard, hard = PIN_HARD in arrays, arrays.pop(PIN_HARD, False)
-    checked = {name: check_array(owner, name, value, getattr(sim, name)) for name, value in arrays.items()}
+    checked = {name: check_array(owner, name, value, own[name]) for name, value in arrays.items()}
     for name, value in arrays.items():
         if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
             warn_user(
@@ -77,52 +90,54 @@ def replace_material(sim: Model, owner: str, arrays: Mapping[str, Tensor | float
                 f'it to calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it'
             )
     if replaces_hard:
-        checked[PIN_HARD] = check_hard(owner, hard, sim.pin_hard)
+        checked[PIN_HARD] = check_hard(owner, hard, own[PIN_HARD])
     hard_of_springs = {PIN_HARD: checked["pin_stiffness"]} if "pin_stiffness" in checked else {}
-    check_batches(owner, hard_of_springs | checked, named_arrays(sim))
+    check_batches(owner, hard_of_springs | checked, own)
     if "pin_stiffness" in checked:
-        checked |= _pins_apart(sim, owner, checked["pin_stiffness"], checked.get(PIN_HARD))
+        checked |= _pins_apart(own[PIN_HARD], owner, checked["pin_stiffness"], checked.get(PIN_HARD))
     with ordinary():
         originals = {}
         for name in [name for name in checked if is_parametrized(sim, name)]:
             originals[name], checked[name] = invert(owner, sim, name, checked[name])
-        parameters = {
-            name: nn.Parameter(tensor.clone(), requires_grad=getattr(sim, name).requires_grad)
+        reshaped = {name for name, tensor in checked.items() if tensor.shape != own[name].shape}
+        replaced = {
+            name: tensor.clone()
+            if name == PIN_HARD
+            else nn.Parameter(tensor.clone(), requires_grad=own[name].requires_grad)
             for name, tensor in checked.items()
-            if name != PIN_HARD and (anew or tensor.shape != getattr(sim, name).shape)
+            if name not in originals and (anew or name in reshaped)
         }
-        reshaped = [name for name, tensor in checked.items() if tensor.shape != getattr(sim, name).shape]
-        # before anything is replaced, because it may fail
-        plan = _plan_with(sim, checked)
-        if sim.promise is not None and any(not torch.equal(new, getattr(sim, n)) for n, new in checked.items()):
-            sim.promise.doubt(True)
-        for name, tensor in checked.items():
-            if name in originals:
-                parametrization(sim, name).original.copy_(originals[name])
-            elif name in parameters:
-                setattr(sim, name, parameters[name])
-            elif name == PIN_HARD and (anew or tensor.shape != sim.pin_hard.shape):
-                sim.pin_hard = tensor.clone()
+        learned = [name for name, tensor in replaced.items() if name in reshaped and tensor.requires_grad]
+        return Change(checked, originals, replaced, _plan_with(scene, own, checked), learned)
+
+
+def write_change(sim: nn.Module, change: Change) -> None:
+    """Replace the arrays of a simulator; its plan is the caller's to replace."""
+    with ordinary():
+        for name, tensor in change.arrays.items():
+            if name in change.originals:
+                parametrization(sim, name).original.copy_(change.originals[name])
+            elif name in change.replaced:
+                setattr(sim, name, change.replaced[name])
             else:
                 getattr(sim, name).copy_(tensor)
-    sim.plan = plan
-    read_pins(sim)
-    if any(name in checked for name in _OF_THE_RATE):
-        sim.judge_iterations(owner)
-    if learned := [name for name in reshaped if name in parameters and parameters[name].requires_grad]:
+
+
+def warn_of_new_parameters(change: Change) -> None:
+    """Say which parameters an optimiser does not know."""
+    if change.learned:
         warn_user(
-            f"the simulator has a new parameter for {' and '.join(learned)}, of another batch, which an optimiser "
-            "of the one before does not know: make the optimiser anew, or set the batch first"
+            f"the simulator has a new parameter for {' and '.join(change.learned)}, of another batch, which an "
+            "optimiser of the one before does not know: make the optimiser anew, or set the batch first"
         )
 
 
-def _pins_apart(sim: Model, owner: str, springs: Tensor, hard: Tensor | None) -> dict[str, Tensor]:
-    """Springs as they are stored, and which pins are hard: those given as inf, or those that `hard` says."""
+def _pins_apart(was: Tensor, owner: str, springs: Tensor, hard: Tensor | None) -> dict[str, Tensor]:
+    """Springs as they are stored, and which pins are hard: given as inf, or those that `hard` says; `was`: now."""
     stored, infinite = split_springs(springs)
     if hard is not None:
         _refuse_pins(f"{owner}: pin_stiffness is inf, which holds exactly, where {PIN_HARD} is False", infinite & ~hard)
         return {"pin_stiffness": stored, PIN_HARD: hard}
-    was = sim.pin_hard
     if was.dim() == 2 and was.shape != springs.shape:
         was = was.any(0)
     # what sim.pin_stiffness has there: who scales that must not let go unawares
@@ -140,20 +155,19 @@ def _refuse_pins(fault: str, bad: Tensor) -> None:
         raise ValueError(f"{fault}; at {places[0].tolist()} ({len(places)} in all)")
 
 
-def _plan_with(sim: Model, arrays: dict[str, Tensor]) -> Plan:
+def _plan_with(scene: CompiledScene, own: dict[str, Tensor], arrays: dict[str, Tensor]) -> Plan:
     """The plan that serves the material with some arrays replaced."""
     if "pin_stiffness" not in arrays and PIN_HARD not in arrays:
-        return sim.plan
-    own = named_arrays(sim)
-    now, was = in_order(own | arrays), in_order(own)
-    plan = loosened_plan(sim, arrays.get(PIN_HARD, sim.pin_hard))
+        return scene.plan
+    now = in_order(own | arrays)
+    plan = loosened_plan(scene, arrays.get(PIN_HARD, own[PIN_HARD]))
     if not has_levels(plan.arrays):
         return plan
     # what is held belongs to the structure of a preconditioner
-    held = _held_everywhere(was), _held_everywhere(now)
-    if torch.equal(*held) and not has_strangers(plan, now, sim.time_step):
+    held = _held_everywhere(scene.material), _held_everywhere(now)
+    if torch.equal(*held) and not has_strangers(plan, now, scene.time_step):
         return plan
-    return plan_for_solver(sim, now, plan)
+    return plan_for_solver(replace(scene, plan=plan, material=now))
 
 
 def _held_everywhere(material: list[Tensor]) -> Tensor:
@@ -162,68 +176,59 @@ def _held_everywhere(material: list[Tensor]) -> Tensor:
     return hard.all(0) if hard.dim() == 2 else hard
 
 
-class _Found(NamedTuple):
-    """What somebody found who looked at the mask of hard pins."""
-
-    some: bool  # whether any pin may be hard
-    springs: Tensor | None = None  # those that `held` was made of,
-    held: Tensor | None = None  # as the ops take them
-    version: int | None = None  # of the springs; None where all pins are hard, whatever the springs
+# ---- columns that have names in scenes: friction, height of grounds, radius of spheres
 
 
-def held_springs(sim: Model, springs: Tensor) -> Tensor:
-    """`pin_stiffness` as the ops take it: inf where a pin is hard. The plan follows what `pin_hard` lets go."""
-    hard = sim._buffers[PIN_HARD]  # nn.Module.__getattr__ takes as long as all the rest
-    assert hard is not None
-    if torch.compiler.is_compiling():
-        return hold_exactly(springs, hard)
-    seen = sim._seen_pins
-    some, known, held, version = seen.found if seen.holds(hard) else _look_at_pins(sim, springs, hard)
-    if not some:
-        return springs
-    learned = springs.requires_grad and torch.is_grad_enabled()
-    # what a CUDA graph records shall see later masks
-    if known is not springs or held is None or learned or (springs.is_cuda and is_recording(springs.device)):
-        return hold_exactly(springs, hard)
-    if version is not None and springs._version != version:
-        return hold_exactly(springs, hard)
-    return held
+def _whole_arrays(
+    own: Mapping[str, Tensor], owner: str, arrays: Mapping[str, Tensor | float]
+) -> dict[str, Tensor | float]:
+    """The arrays with the named columns written into those of the simulator; values are the caller's to check."""
+    whole = {name: value for name, value in arrays.items() if name not in COLUMNS}
+    for name in [name for name in arrays if name in COLUMNS]:
+        if given := [array for array in COLUMNS[name] if array in arrays]:
+            column = COLUMNS[name][given[0]]
+            raise TypeError(f"{owner}: give {name} or {given[0]}, whose column {column} it is, got both")
+        rows = {array: own[array].shape[-2] for array in COLUMNS[name]}
+        value = _column(own["planes"], owner, name, arrays[name], rows)
+        for array, part in zip(rows, value.split(list(rows.values()), dim=-1), strict=True):
+            if rows[array]:
+                now = whole.get(array, own[array].detach())
+                assert isinstance(now, Tensor)
+                whole[array] = _with_column(owner, name, array, now, part)
+    return whole
 
 
-def read_pins(sim: Model) -> None:
-    """What later steps need of pins, after these were set or moved: then no step has to wait for a GPU."""
-    sim._seen_pins = Seen()
-    if sim.anchors.pinned:
-        with ordinary():
-            _look_at_pins(sim, sim.pin_stiffness, sim.pin_hard, wait=True)
+def _column(like: Tensor, owner: str, name: str, value: Tensor | float, rows: Mapping[str, int]) -> Tensor:
+    """[rows] or [B, rows], in the precision and on the device of `like`."""
+    things, count = " and ".join(_THINGS[array] for array in rows), sum(rows.values())
+    if count == 0:
+        raise ValueError(f"{owner}: {name} is of {things}, and the scene has none")
+    tensor = real_tensor(owner, name, value)
+    if tensor.dim() > 2 or tensor.numel() == 0 or (tensor.dim() > 0 and tensor.shape[-1] not in (1, count)):
+        raise ValueError(
+            f"{owner}: {name} must be [{count}], or with a batch in front, got {list(tensor.shape)}; {things} of the "
+            f"scene: {count}"
+        )
+    return tensor.to(dtype=like.dtype, device=like.device).expand(*tensor.shape[:-1], count)
 
 
-def _look_at_pins(sim: Model, springs: Tensor, hard: Tensor, *, wait: bool = False) -> _Found:
-    """Let the plan follow a mask that lets more go than it knows of, and remember what was found.
-
-    Pieces get rigid motions then, and a preconditioner no longer holds what it held. A step reads the mask, for which
-    it awaits a GPU, only after somebody has written to it, and not where the plan holds nothing; with `wait` always.
-    """
-    loose, plain = sim.plan.loose, plain_tensor(hard)
-    if not wait and (loose is None or bool(loose.all())) and not has_levels(sim.plan.arrays):
-        return _Found(some=True)
-    if not has_numbers(plain) or is_recording(plain.device):
-        return _Found(some=True)
-    mask = plain.cpu().reshape(-1, plain.shape[-1])
-    found = _Found(some=bool(mask.any()))
-    with ordinary():
-        plan = loosened_plan(sim, mask)
-        sim.plan = plan_that_holds(sim, plan, mask.all(0))
-        # streams wait for what sets the material, but not for what another one has made in a step
-        if plain is hard and type(springs) is nn.Parameter and found.some and (wait or not hard.is_cuda):
-            version = None if bool(mask.all()) else springs._version
-            found = _Found(True, springs, hold_exactly(springs, hard), version)
-    if plain is hard:
-        sim._seen_pins.remember(hard, found)
-    return found
+def _with_column(owner: str, name: str, array: str, own: Tensor, value: Tensor) -> Tensor:
+    """The array [rows, width], or with a batch, with other numbers in one column."""
+    batches = [len(t) for t, dims in ((own, MATERIAL_ROWS[array].dims), (value, 1)) if t.dim() > dims]
+    if len(batches) == 2 and batches[0] != batches[1] and 1 not in batches:
+        raise ValueError(
+            f"{owner}: {name} is of {batches[1]} environments, but {array} are of {batches[0]}; give {array} instead"
+        )
+    if batches:
+        own, value = own.expand(max(batches), *own.shape[-2:]), value.expand(max(batches), value.shape[-1])
+    column = COLUMNS[name][array]
+    return torch.cat([own[..., :column], value[..., None], own[..., column + 1 :]], dim=-1)
 
 
-def check_kinds(sim: Model, owner: str, arrays: Mapping[str, Any]) -> None:
+# ---- loading
+
+
+def check_kinds(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
     """Refuse what a simulator cannot keep as it is: tensors of another precision or device."""
     for name, array in arrays.items():
         own = getattr(sim, name)
@@ -235,9 +240,14 @@ def check_kinds(sim: Model, owner: str, arrays: Mapping[str, Any]) -> None:
 
 
 def load_material(
-    sim: Model, state_dict: dict[str, Any], prefix: str, rest: tuple[Any, ...], load: Callable[..., None]
+    sim: nn.Module,
+    state_dict: dict[str, Any],
+    prefix: str,
+    rest: tuple[Any, ...],
+    replace_material: Callable[..., None],
+    load: Callable[..., None],
 ) -> None:
-    """Check values, and take arrays of every environment where a simulator had shared ones; then `load` as torch does.
+    """Check values, and replace by arrays of every environment where they were shared; then `load` as torch does.
 
     Takes the arguments of `Module._load_from_state_dict`.
     """
@@ -260,7 +270,7 @@ def load_material(
                 check_kinds(sim, owner, arrays)
             elif PIN_HARD in arrays:
                 arrays[PIN_HARD] = arrays[PIN_HARD].bool()  # as torch converts the others
-            replace_material(sim, owner, arrays, anew=assign)
+            replace_material(owner, arrays, anew=assign)
     except (TypeError, ValueError) as error:
         if not prefix:
             raise
@@ -271,12 +281,11 @@ def load_material(
         if "pin_stiffness" in arrays and is_parametrized(sim, "pin_stiffness"):
             state_dict[original] = parametrization(sim, "pin_stiffness").original.detach()
         elif "pin_stiffness" in arrays:
-            state_dict[prefix + "pin_stiffness"] = sim.pin_stiffness.detach()
+            state_dict[prefix + "pin_stiffness"] = named_arrays(sim)["pin_stiffness"].detach()
     load(state_dict, prefix, *rest)
-    read_pins(sim)
 
 
-def check_saved(sim: Model, owner: str, arrays: Mapping[str, Any]) -> None:
+def check_saved(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
     """Refuse what `set_material` would stretch, and torch refuses after arrays before it are written."""
     for name, array in arrays.items():
         if not isinstance(array, Tensor):
@@ -293,7 +302,7 @@ def check_saved(sim: Model, owner: str, arrays: Mapping[str, Any]) -> None:
             )
 
 
-def check_originals(sim: Model, state_dict: Mapping[str, Any]) -> None:
+def check_originals(sim: nn.Module, state_dict: Mapping[str, Any]) -> None:
     """Refuse what does not fit a parametrization, which torch finds out after arrays before it are written."""
     own = sim.state_dict()
     for name, array in state_dict.items():
@@ -307,7 +316,7 @@ def check_originals(sim: Model, state_dict: Mapping[str, Any]) -> None:
             )
 
 
-def check_keys(sim: Model, state_dict: Mapping[str, Any], *, strict: bool) -> None:
+def check_keys(sim: nn.Module, state_dict: Mapping[str, Any], *, strict: bool) -> None:
     """Refuse what is no state_dict and, where `strict`, one with other names, before anything is loaded."""
     if not isinstance(state_dict, Mapping):
         raise TypeError(

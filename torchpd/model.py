@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import torch
 from torch import Tensor, nn
 
-from .automatic import AIM, Choice, choose_solver
-from .checks import check_has_values, check_whole
-from .forecast import FAR_TOO_FEW, warn_of_few_iterations
+from .automatic import Choice
+from .checks import check_whole
+from .compiled import ordinary
 from .material import MATERIAL_ROWS, material_of
 from .material_changes import (
+    check_change,
     check_keys,
     check_originals,
-    held_springs,
     load_material,
-    ordinary,
-    read_pins,
-    replace_material,
+    warn_of_new_parameters,
+    write_change,
 )
 from .model_checks import (
     check_adjoint,
@@ -32,27 +31,41 @@ from .model_checks import (
     report_resolution,
 )
 from .notices import Notices, warn_of_overlaps
-from .pins import PIN_HARD
-from .placing import check_wanted_device, is_recording, move_plan, plan_anew, plan_for_solver, plan_on, serves
+from .pin_mask import PinMask, held_springs, look_at_pins, serves_any_mask
+from .pins import PIN_HARD, hold_exactly
+from .placing import check_wanted_device, is_recording
 from .plan import Plan, compile_plan
 from .regimes import check_kernel
 from .scene import Scene
+from .settings import (
+    EVERY_STEP,
+    NO_STEP,
+    Configuration,
+    choose,
+    choose_again,
+    is_auto,
+    judge,
+    moved,
+    prepare,
+    reconfigure,
+)
 from .solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Solver, check_solver
 from .state import State
 from .targets import Anchors, Targets
-from .written import Seen
+from .written import Seen, check_rest
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from .promise import Promise
-
 __all__ = ["Model"]
 
 _PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
-# Shortest and longest time step for which iterations need no warning, nor for what lies between: long ones are slow,
-# and short ones overshoot with a relaxation for long ones.
-_EVERY, _NONE = (0.0, math.inf), (math.inf, 0.0)
+
+
+class _Promise(Protocol):
+    """Of `tune`."""
+
+    def doubt(self, other: bool) -> None: ...
 
 
 class Model(nn.Module):
@@ -91,10 +104,10 @@ class Model(nn.Module):
         self._time_step = check_time_step(time_step, dtype)
         self.iterations = DEFAULT_ITERATIONS if iterations is None else iterations
         self._solver: Solver = Chebyshev()
-        automatic = solver is None or _is_auto(solver)
-        given = self._solver if automatic else check_solver(solver, torch.device("cpu"))
+        given = self._solver if solver is None or is_auto(solver) else check_solver(solver, torch.device("cpu"))
         self.tolerance = tolerance
-        self.promise: Promise | None = None  # of `tune`
+        self.promise: _Promise | None = None
+        self.choice: Choice | None = None  # of "auto"
         self._kernel = check_kernel(kernel)
         self._batch = check_batch(batch)
         self._adjoint = check_adjoint(adjoint)
@@ -103,7 +116,7 @@ class Model(nn.Module):
         report_resolution(values, dtype)
         self.anchors = Anchors(scene)
         self.pinned = values.pinned
-        self._seen_rest, self._seen_pins, self._notices = Seen(), Seen(), Notices(self)
+        self._seen_rest, self._seen_pins, self._notices = Seen(), Seen(), Notices(self, scene)
         with ordinary():
             self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
             self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
@@ -111,11 +124,10 @@ class Model(nn.Module):
             for name in MATERIAL_ROWS:
                 self.register_parameter(name, nn.Parameter(arrays[name], requires_grad=False))
             self.register_buffer(PIN_HARD, arrays[PIN_HARD])
-        read_pins(self)
+        self._read_pins()
         warn_of_overlaps(scene)
-        self.choice: Choice | None = None  # of "auto"
-        if _is_auto(solver):
-            self._choose_solver(None if iterations is None else self.iterations)
+        if is_auto(solver):
+            self._take(choose(self.compiled, None if iterations is None else self.iterations))
         else:
             self.solver = given
             self.named_iterations = iterations is not None
@@ -146,22 +158,7 @@ class Model(nn.Module):
 
     @batch.setter
     def batch(self, batch: int | None) -> None:
-        before = self._batch, self.plan
-        self._batch = check_batch(batch)
-        try:
-            self._plan_again()
-        except BaseException:
-            self._batch, self.plan = before
-            raise
-
-    def _plan_again(self) -> None:
-        """After what a GPU's plan and the choice of "auto" depend on has changed."""
-        # "auto" begins with a plan for Chebyshev
-        if self.plan.kernel is not None and not (self.choice is not None and self.plan.for_levels):
-            with ordinary():
-                self.plan = move_plan(self, plan_anew(self, self.dtype, self.device), self.device)
-        if self.choice is not None:
-            self._choose_again(self.choice)
+        self._reconfigure(batch=batch)
 
     @property
     def kernel(self) -> str:
@@ -170,14 +167,7 @@ class Model(nn.Module):
 
     @kernel.setter
     def kernel(self, kernel: str) -> None:
-        before = self._kernel, self.plan
-        self._kernel = check_kernel(kernel)
-        try:
-            if self.plan.kernel is not None:
-                self._plan_again()
-        except BaseException:
-            self._kernel, self.plan = before
-            raise
+        self._reconfigure(kernel=kernel)
 
     @property
     def time_step(self) -> float:
@@ -210,16 +200,12 @@ class Model(nn.Module):
     @named_iterations.setter
     def named_iterations(self, named: bool) -> None:
         self._named_iterations = named
-        self._judged_steps = _EVERY if named else _NONE
+        self._judged_steps = EVERY_STEP if named else NO_STEP
 
     def judge_iterations(self, changed: str | None) -> None:
         """Warn where iterations that nobody named are too few for what has `changed`, once; awaits a GPU until then."""
-        if self._judged_steps == _EVERY:
-            return
-        shortest, longest = _NONE if changed != "time_step" else self._judged_steps
-        self._judged_steps = _EVERY
-        if not warn_of_few_iterations(self, changed, FAR_TOO_FEW if self.choice is None else 10.0 * AIM):
-            self._judged_steps = min(shortest, self.time_step), max(longest, self.time_step)
+        if self._judged_steps != EVERY_STEP:
+            self._judged_steps = judge(self.compiled, changed).judged_steps
 
     @property
     def tolerance(self) -> float:
@@ -237,18 +223,7 @@ class Model(nn.Module):
 
     @solver.setter
     def solver(self, solver: Solver | Literal["auto"]) -> None:
-        if _is_auto(solver):
-            return self._choose_solver(None)
-        before = self._solver, self.choice
-        self._solver, self.choice = check_solver(solver, self.device), None
-        self.named_iterations = self.named_iterations  # to another solver the same number is another promise
-        try:
-            if not serves(self, self.plan):
-                self._prepare()
-        except BaseException:
-            self._solver, self.choice = before
-            raise
-        return None
+        self._reconfigure(solver=solver)
 
     @property
     def adjoint(self) -> str:
@@ -257,34 +232,49 @@ class Model(nn.Module):
 
     @adjoint.setter
     def adjoint(self, adjoint: str) -> None:
-        before = self._adjoint
-        self._adjoint = check_adjoint(adjoint)
-        try:
-            if not serves(self, self.plan):
-                check_has_values("adjoint", self.device)
-                self._prepare()
-        except BaseException:
-            self._adjoint = before
-            raise
+        self._reconfigure(adjoint=adjoint)
 
-    def _choose_solver(self, iterations: int | None) -> None:
-        """What "auto" does, see `choose_solver`."""
-        before = self.plan, self._solver, self.choice, self.iterations, self.named_iterations
-        try:
-            if self.plan.for_levels:
-                self.solver = Chebyshev()  # its kernel is one of the costs that are compared
-            self.solver, choice = choose_solver(self, iterations)
-            self.iterations, self.choice = choice.iterations, choice
-            self.named_iterations = not choice.sets_iterations
-            self.judge_iterations(None)
-        except BaseException:
-            self.plan, self._solver, self.choice, self.iterations, self.named_iterations = before
-            raise
+    @property
+    def compiled(self) -> Configuration:
+        """What modules below the simulator read: plan, material and settings of now."""
+        return self._with_material(self.material())
 
-    def _choose_again(self, choice: Choice) -> None:
-        """Iterations that somebody has set since stay."""
-        own = choice.sets_iterations and self.iterations == choice.iterations
-        self._choose_solver(None if own else self.iterations)
+    def _with_material(self, material: list[Tensor]) -> Configuration:
+        return Configuration(
+            scene=self.scene,
+            pinned=self.pinned,
+            plan=self.plan,
+            material=material,
+            time_step=self._time_step,
+            iterations=self._iterations,
+            tolerance=self._tolerance,
+            solver=self._solver,
+            adjoint=self._adjoint,
+            kernel=self._kernel,
+            batch=self._batch,
+            progress=self.progress,
+            choice=self.choice,
+            named_iterations=self._named_iterations,
+            judged_steps=self._judged_steps,
+        )
+
+    def _reconfigure(self, **changes: Any) -> None:
+        with ordinary():
+            self._take(reconfigure(self.compiled, **changes))
+
+    def _take(self, new: Configuration) -> None:
+        """Take over plan and settings, all of them at once."""
+        vars(self).update(
+            plan=new.plan,
+            choice=new.choice,
+            _solver=new.solver,
+            _adjoint=new.adjoint,
+            _kernel=new.kernel,
+            _batch=new.batch,
+            _iterations=new.iterations,
+            _named_iterations=new.named_iterations,
+            _judged_steps=new.judged_steps,
+        )
 
     def prepare_solver(self) -> None:
         """Make anew what the material decides: the preconditioner of `Multilevel` or `adjoint`, the choice of "auto".
@@ -295,27 +285,49 @@ class Model(nn.Module):
         again, and it takes 0.3 s for 8 thousand vertices, seconds for a million tetrahedra. Other solvers prepare
         nothing.
         """
-        check_has_values("prepare_solver", self.device)
-        before = self.plan
-        if self.choice is not None:
-            self._choose_again(self.choice)
-        if self.plan is before:
-            self._prepare()
-
-    def _prepare(self) -> None:
         with ordinary():
-            self.plan = plan_for_solver(self, self.material())
+            self._take(prepare(self.compiled))
 
     def material(self) -> list[Tensor]:
         """The differentiable arrays in the order of the ops, contiguous whatever a call or a parametrization gives.
 
-        Springs of pins that are hard are inf here.
+        Springs of pins that are hard are inf here. The plan follows what `pin_hard` lets go.
         """
         arrays = [getattr(self, name) for name in MATERIAL_ROWS]
         if self.anchors.pinned:
-            arrays[_PIN_STIFFNESS] = held_springs(self, arrays[_PIN_STIFFNESS])
+            arrays[_PIN_STIFFNESS] = self._held_springs(arrays)
         # to ask takes far less than contiguous(), which is 6 of the 40 us of a tiny step
         return [array if array.is_contiguous() else array.contiguous() for array in arrays]
+
+    def _held_springs(self, arrays: list[Tensor]) -> Tensor:
+        hard = self._buffers[PIN_HARD]  # nn.Module.__getattr__ takes as long as all the rest
+        assert hard is not None
+        if torch.compiler.is_compiling():
+            return hold_exactly(arrays[_PIN_STIFFNESS], hard)
+        seen = self._seen_pins
+        mask = seen.found if seen.holds(hard) else self._look_at_pins(arrays, hard)
+        return held_springs(mask, arrays[_PIN_STIFFNESS], hard)
+
+    def _look_at_pins(self, arrays: list[Tensor], hard: Tensor, *, wait: bool = False) -> PinMask:
+        """Let the plan follow a mask that lets more go than it knows of.
+
+        A step reads the mask, for which it awaits a GPU, only after somebody has written to it, and not where the plan
+        holds nothing; with `wait` always.
+        """
+        if not wait and serves_any_mask(self.plan):
+            return PinMask(some=True)
+        seen, self.plan = look_at_pins(self._with_material(arrays), hard, wait=wait)
+        if seen.holds(hard):
+            self._seen_pins = seen
+        mask: PinMask = seen.found
+        return mask
+
+    def _read_pins(self) -> None:
+        """What later steps need of pins, after these were set or moved: then no step has to wait for a GPU."""
+        self._seen_pins = Seen()
+        if self.anchors.pinned:
+            with ordinary():
+                self._look_at_pins([getattr(self, name) for name in MATERIAL_ROWS], self.pin_hard, wait=True)
 
     def __copy__(self) -> Self:
         """Torch lets no parametrized module be copied as a pickle would."""
@@ -352,7 +364,18 @@ class Model(nn.Module):
                 the plan anew, on a GPU as `to` does. Capture a captured step again then. Where the default iterations,
                 or those of "auto", become far too few an `UnsolvedWarning` says so, once.
         """
-        replace_material(self, "set_material", arrays)
+        self._replace_material("set_material", arrays)
+
+    def _replace_material(self, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False) -> None:
+        change = check_change(self, self.compiled, owner, arrays, anew=anew)
+        if self.promise is not None and any(not torch.equal(new, getattr(self, n)) for n, new in change.arrays.items()):
+            self.promise.doubt(True)
+        write_change(self, change)
+        self.plan = change.plan
+        self._read_pins()
+        if change.alters_rate:
+            self.judge_iterations(owner)
+        warn_of_new_parameters(change)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """As of `torch.nn.Module`, but all arrays or none: torch loads what it can before it refuses other names.
@@ -368,18 +391,26 @@ class Model(nn.Module):
         return super().load_state_dict(state_dict, strict, assign)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        load_material(self, state_dict, prefix, rest, super()._load_from_state_dict)
+        load_material(self, state_dict, prefix, rest, self._replace_material, super()._load_from_state_dict)
+        self._read_pins()
 
     def check_state(self, state: State, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:
         """Refuse what is no state, one of another precision or device, velocities and forces unlike its positions.
 
         Gives the forces of every environment; `fix` ends the errors about those of another shape.
         """
-        return check_state(self, state, forces=forces, fix=fix)
+        return check_state(self._checked_rest(), state, forces=forces, fix=fix)
 
     def positions_of(self, state: State | Tensor, name: str = "state") -> Tensor:
         """Positions of a state, or positions alone, after all checks: for what is not left to one op."""
-        return positions_of(self, state, name)
+        return positions_of(self._checked_rest(), state, name)
+
+    def _checked_rest(self) -> Tensor:
+        rest = self.rest_positions
+        seen = check_rest(self._seen_rest, rest, self.scene)
+        if seen is not self._seen_rest:
+            self._seen_rest = seen
+        return rest
 
     def numbers(self, *, inertial: bool, report: bool) -> dict[str, Any]:
         """The settings as keyword arguments of the ops."""
@@ -405,37 +436,27 @@ class Model(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
-        choice = self.choice
-        ends = {self.device.type, wanted.device.type}
-        # coming from "meta" there are no values to choose by
-        if choice is not None and len(ends) == 2 and "meta" not in ends:
-            # whatever it was, the other device may choose differently
-            iterations, self.solver = self.iterations, Chebyshev()
-            try:
-                return self._apply(fn, recurse)
-            finally:
-                self.iterations = iterations
-                self._choose_again(choice)
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
         check_time_step(self.time_step, wanted.dtype)
-        if wanted.device.type == "cuda":
-            check_solver(self.solver, wanted.device)
+        choice, ends = self.choice, {self.device.type, wanted.device.type}
         # digits that float32 has lost do not come back by widening, and "meta" keeps none
         loses_positions = wanted.dtype != self.dtype or self.device.type == "meta"
         with ordinary():
-            # first, because it may refuse
-            plan = plan_on(self, wanted.dtype, wanted.device)
+            # whatever it was, the other device may choose differently; coming from "meta" there are no values
+            if chooses := choice is not None and len(ends) == 2 and "meta" not in ends:
+                new = moved(reconfigure(self.compiled, solver=Chebyshev()), wanted.dtype, wanted.device)
+            else:
+                new = moved(self.compiled, wanted.dtype, wanted.device)
             super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
-            self.plan = plan
+            self._take(new)
             if loses_positions:
                 # the material may have been trained, and keeps the digits it has
                 values = self.scene.values()
                 report_resolution(values, wanted.dtype)
                 self.rest_positions = torch.tensor(values.rest_positions, dtype=wanted.dtype, device=wanted.device)
-        read_pins(self)
+        self._read_pins()
+        if chooses:
+            with ordinary():
+                self._take(choose_again(replace(self.compiled, choice=choice)))
         return self
-
-
-def _is_auto(solver: object) -> bool:
-    return isinstance(solver, str) and solver == "auto"

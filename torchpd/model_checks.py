@@ -5,20 +5,16 @@ from __future__ import annotations
 import math
 from functools import reduce
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .checks import check_like, check_whole, in_full, of_each
+from .scene import SceneValues
 from .state import State
 from .warn import warn_user
-from .written import check_rest
-
-if TYPE_CHECKING:
-    from .model import Model
-    from .scene import SceneValues
 
 __all__ = [
     "ADJOINTS",
@@ -109,16 +105,16 @@ def _number_or_nan(value: Any) -> float:
         return math.nan
 
 
-def check_state(sim: Model, state: State, *, forces: Tensor | None, fix: str) -> Tensor | None:
-    """What `Model.check_state` does."""
+def check_state(rest: Tensor, state: State, *, forces: Tensor | None, fix: str) -> Tensor | None:
+    """What `Model.check_state` does, by the rest positions [V, 3] of a simulator."""
     if not _is_pair(state):
         raise TypeError(
-            f"state must be a State, positions and velocities [B, {sim.vertices}, 3], got "
+            f"state must be a State, positions and velocities [B, {len(rest)}, 3], got "
             f"{_kind_of(state)}; rest_state() makes one"
         )
-    _check_kind(sim, "state", state[0])
+    _check_kind(rest, "state", state[0])
     if state[0].dim() == 0:  # whose batch is read before an op checks all of it
-        raise ValueError(f"positions must be [B, {sim.vertices}, 3], got []")
+        raise ValueError(f"positions must be [B, {len(rest)}, 3], got []")
     check_like("velocities", state[1], state[0], "m/s")
     if forces is None:
         return None
@@ -127,26 +123,24 @@ def check_state(sim: Model, state: State, *, forces: Tensor | None, fix: str) ->
     return forces
 
 
-def positions_of(sim: Model, state: State | Tensor, name: str) -> Tensor:
-    """What `Model.positions_of` does."""
+def positions_of(rest: Tensor, state: State | Tensor, name: str) -> Tensor:
+    """What `Model.positions_of` does, by the rest positions [V, 3] of a simulator."""
     alone = isinstance(state, Tensor)
     if not (alone or _is_pair(state)):
         raise TypeError(
-            f"{name} must be a State, positions and velocities [B, {sim.vertices}, 3], or positions alone, got "
+            f"{name} must be a State, positions and velocities [B, {len(rest)}, 3], or positions alone, got "
             f"{_kind_of(state)}"
         )
     positions = state if isinstance(state, Tensor) else state[0]
-    _check_kind(sim, name, positions)
-    if positions.dim() != 3 or positions.shape[1:] != sim.rest_positions.shape:
-        raise ValueError(f"{name} must be [B, {sim.vertices}, 3], got {list(positions.shape)}")
+    _check_kind(rest, name, positions)
+    if positions.dim() != 3 or positions.shape[1:] != rest.shape:
+        raise ValueError(f"{name} must be [B, {len(rest)}, 3], got {list(positions.shape)}")
     if not alone:
         check_like("velocities", state[1], positions, "m/s")
     return positions
 
 
-def _check_kind(sim: Model, name: str, positions: Tensor) -> None:
-    own = sim.rest_positions
-    check_rest(sim._seen_rest, own, sim.scene)
+def _check_kind(own: Tensor, name: str, positions: Tensor) -> None:
     if positions.dtype != own.dtype or positions.device != own.device:
         raise TypeError(
             f"{name} must be {own.dtype} on {own.device} like the simulator, got {positions.dtype} on "

@@ -8,7 +8,7 @@ Copies of a simulator, of which studies make many, say nothing.
 from __future__ import annotations
 
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,12 +16,9 @@ from torch import Tensor, nn
 
 from .material import MATERIAL_ROWS
 from .overlaps import Overlap, boxes_meet, find_overlaps
+from .scene import Scene
+from .state import State
 from .warn import SceneWarning, warn_user
-
-if TYPE_CHECKING:
-    from .model import Model
-    from .scene import Scene
-    from .state import State
 
 __all__ = ["Notices", "warn_of_overlaps"]
 
@@ -44,10 +41,11 @@ def _say_overlaps(found: list[Overlap], where: str) -> None:
 
 
 class Notices:
-    """What a simulator has said."""
+    """What a simulator, the `owner`, has said of its scene."""
 
-    def __init__(self, sim: Model | None = None) -> None:
-        self._sim = None if sim is None else weakref.ref(sim)
+    def __init__(self, owner: object = None, scene: Scene | None = None) -> None:
+        self._owner = None if owner is None else weakref.ref(owner)
+        self._scene = scene
         self._said: set[str] = set()
         self._started = False
         self._reports = self._next = 0  # reports with boxes that overlap, and that of the next look
@@ -58,12 +56,13 @@ class Notices:
     def __reduce__(self) -> tuple[type[Notices], tuple[()]]:
         return Notices, ()
 
-    def before(self, sim: Model, state: State, material: list[Tensor], *, report: bool) -> None:
+    def before(self, owner: object, state: State, material: list[Tensor], time_step: float, *, report: bool) -> None:
         """Look at where the first step starts, and every one that reports."""
         # first, so that no compiled step depends on what was said
         if torch.compiler.is_compiling() or not (report or not self._started) or "inside" in self._said:
             return
-        if not self._looks(sim, state[0]):
+        scene = self._looked_at(owner, state[0])
+        if scene is None:
             return
         planes, spheres, gravity = arrays = [material[row].detach() for row in (_PLANES, _SPHERES, _GRAVITY)]
         if any(len(a) not in (1, len(state[0])) for a, dims in zip(arrays, (3, 3, 2), strict=True) if a.dim() == dims):
@@ -72,12 +71,12 @@ class Notices:
         if not (planes.numel() or spheres.numel()):
             return
         positions = state[0].detach()
-        depth = _depth(sim, positions, planes, spheres)
+        depth = _depth(scene, positions, planes, spheres)
         if not bool((depth > 0.0).any()):
             return
         # no deeper than gravity falls in a step, nor than rounding puts what rests
-        allowed = sim.time_step**2 * gravity.norm(dim=-1).reshape(-1, 1)
-        size = torch.finfo(sim.dtype).eps * positions.abs().amax(dim=(1, 2)).unsqueeze(1)
+        allowed = time_step**2 * gravity.norm(dim=-1).reshape(-1, 1)
+        size = torch.finfo(positions.dtype).eps * positions.abs().amax(dim=(1, 2)).unsqueeze(1)
         inside = depth > torch.maximum(allowed, _ROUNDINGS * size)
         if not bool(inside.any()):
             return
@@ -87,31 +86,32 @@ class Notices:
         warn_user(
             f"Simulator: {int(inside[environment].sum())} vertices of environment {environment} start a step inside a "
             f"ground or sphere, up to {deepest:.2g} m deep. The step puts them out, and velocities are what it moves "
-            f"vertices by over its duration, about {deepest / sim.time_step:.2g} m/s there: start outside, or set the "
+            f"vertices by over its duration, about {deepest / time_step:.2g} m/s there: start outside, or set the "
             "velocities after that step to 0; of a sphere that moves there give the velocity in targets, too",
             SceneWarning,
         )
 
-    def after(self, sim: Model, positions: Tensor, rows: Tensor) -> None:
+    def after(self, owner: object, positions: Tensor, rows: Tensor) -> None:
         """Look at a step that reports: positions [B, V, 3] and rows [B, 7]."""
-        if not self._looks(sim, positions):
+        scene = self._looked_at(owner, positions)
+        if scene is None:
             return
         inverted = rows[:, -1]
         if "inverted" not in self._said and bool((inverted > 0).any()):
             self._said.add("inverted")
-            worst = int(inverted.argmax())
+            worst, tets = int(inverted.argmax()), sum(len(solid.mesh.tets) for solid in scene.solids)
             warn_user(
-                f"Simulator: {int(inverted[worst])} of {sim.stiffness.shape[-1]} tetrahedra of environment {worst} are "
+                f"Simulator: {int(inverted[worst])} of {tets} tetrahedra of environment {worst} are "
                 "turned inside out or flat at the end of a step (info.inverted). A body that is too soft for its load, "
                 "or starts crushed, may stay folded like that, and be converged",
                 SceneWarning,
             )
-        if len(sim.scene.solids) > 1 and "overlap" not in self._said:
-            self._look_for_overlaps(sim, positions.detach())
+        if len(scene.solids) > 1 and "overlap" not in self._said:
+            self._look_for_overlaps(scene, positions.detach())
 
-    def _look_for_overlaps(self, sim: Model, positions: Tensor) -> None:
+    def _look_for_overlaps(self, scene: Scene, positions: Tensor) -> None:
         """In the first environment where boxes of bodies overlap; at the first such report, the second, the fourth."""
-        ranges = [sim.scene.vertex_range(solid) for solid in sim.scene.solids]
+        ranges = [scene.vertex_range(solid) for solid in scene.solids]
         starts, corners = [part.start for part in ranges], positions.numpy()
         lows, highs = (end.reduceat(corners, starts, axis=1) for end in (np.minimum, np.maximum))  # [B, bodies, 3]
         meet = boxes_meet(lows, highs)
@@ -123,21 +123,23 @@ class Notices:
         self._next = 2 * self._reports
         environment = int(meet.argmax())
         places = corners[environment].astype(np.float64)
-        if found := find_overlaps([solid.mesh for solid in sim.scene.solids], [places[part] for part in ranges]):
+        if found := find_overlaps([solid.mesh for solid in scene.solids], [places[part] for part in ranges]):
             self._said.add("overlap")
             _say_overlaps(found, f"in environment {environment} at the end of a step")
 
-    def _looks(self, sim: Model, positions: Tensor) -> bool:
+    def _looked_at(self, owner: object, positions: Tensor) -> Scene | None:
+        """The scene, where there is something to look at."""
         if torch.compiler.is_compiling() or type(positions) not in (Tensor, nn.Parameter):
-            return False
-        if positions.shape[1:] != sim.rest_positions.shape or not len(positions):
-            return False
+            return None
         if positions.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(positions):
-            return False
-        return self._sim is not None and self._sim() is sim
+            return None
+        if self._owner is None or self._owner() is not owner or self._scene is None:
+            return None
+        vertices = sum(len(solid.mesh.vertices) for solid in self._scene.solids)
+        return self._scene if positions.shape[1:] == (vertices, 3) and len(positions) else None
 
 
-def _depth(sim: Model, positions: Tensor, planes: Tensor, spheres: Tensor) -> Tensor:
+def _depth(scene: Scene, positions: Tensor, planes: Tensor, spheres: Tensor) -> Tensor:
     """How far every vertex lies inside of a contact at the start of a step [B, V] m; pinned ones go where pins want."""
     planes, spheres = (array if array.dim() == 3 else array[None] for array in (planes, spheres))
     depth = positions.new_zeros(positions.shape[:2])
@@ -146,6 +148,6 @@ def _depth(sim: Model, positions: Tensor, planes: Tensor, spheres: Tensor) -> Te
     for sphere in spheres.unbind(1):
         start = (sphere[:, :3] - sphere[:, 5:])[:, None]
         depth = torch.maximum(depth, sphere[:, 3, None] - (positions - start).norm(dim=-1))
-    if sim.anchors.pinned:
-        depth[:, np.asarray(sim.scene._pinned())] = 0.0
+    if scene.pins:
+        depth[:, scene._pinned()] = 0.0
     return depth

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,17 +11,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import _C
+from .compiled import CompiledScene
 from .diagonal import pinned_vertices
-from .gpu import free_memory, properties_of, refuse_full_memory, seen_devices, step_bytes, why_not
-from .material import environments_of_material, in_order, material_of
+from .gpu import free_memory, properties_of, refuse_full_memory, seen_devices, why_not
+from .material import in_order, material_of
 from .multilevel import Reference, has_levels, precondition_plan, reference_of, reference_of_levels, without_levels
 from .plan import Plan, compile_plan, with_loose_pieces
 from .regimes import choose_plan
 from .solvers import Multilevel
 from .written import plain_tensor
-
-if TYPE_CHECKING:
-    from .model import Model
 
 __all__ = [
     "check_wanted_device",
@@ -35,6 +32,7 @@ __all__ = [
     "plan_on",
     "plan_that_holds",
     "serves",
+    "step_bytes",
 ]
 
 Pieces = NDArray[np.bool_]
@@ -85,69 +83,69 @@ def _same_plan(source: torch.device, target: torch.device) -> bool:
     return source == target or properties_of(source) == properties_of(target)
 
 
-def _compile(sim: Model, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
+def _compile(scene: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
     """The scene's plan for a device and the solver, on the CPU, without what the solver prepares."""
-    values = sim.scene.values()
+    values = scene.scene.values()
     # "meta" does not know which pins are hard
-    if loose is None and sim.device.type != "meta":
-        loose = values.pinned.loose(sim.pin_hard.cpu().numpy())
+    if loose is None and scene.device.type != "meta":
+        loose = values.pinned.loose(scene.named["pin_stiffness"].isinf().cpu().numpy())
     values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
-        return compile_plan(values, dtype=dtype, progress=sim.progress)
-    levels = isinstance(sim.solver, Multilevel)
+        return compile_plan(values, dtype=dtype, progress=scene.progress)
+    levels = isinstance(scene.solver, Multilevel)
     gpu = properties_of(device)
-    return choose_plan(values, dtype, gpu, sim.kernel, levels=levels, batch=sim.batch, progress=sim.progress)
+    return choose_plan(values, dtype, gpu, scene.kernel, levels=levels, batch=scene.batch, progress=scene.progress)
 
 
-def _wants_levels(sim: Model) -> bool:
+def _wants_levels(scene: CompiledScene) -> bool:
     """Whether steps or gradients use a multilevel preconditioner."""
-    return isinstance(sim.solver, Multilevel) or sim.adjoint == "multilevel"
+    return isinstance(scene.solver, Multilevel) or scene.adjoint == "multilevel"
 
 
-def _has_patches_for(sim: Model, plan: Plan) -> bool:
+def _has_patches_for(scene: CompiledScene, plan: Plan) -> bool:
     """Whether the patches serve the solver: a GPU wants others for a multilevel solver, whatever gradients use."""
-    return plan.kernel is None or plan.for_levels == isinstance(sim.solver, Multilevel)
+    return plan.kernel is None or plan.for_levels == isinstance(scene.solver, Multilevel)
 
 
-def serves(sim: Model, plan: Plan) -> bool:
-    """Whether a plan has what the solver and gradients of a simulator use."""
-    return _has_patches_for(sim, plan) and has_levels(plan.arrays) == _wants_levels(sim)
+def serves(scene: CompiledScene) -> bool:
+    """Whether the plan has what solver and gradients use."""
+    return _has_patches_for(scene, scene.plan) and has_levels(scene.plan.arrays) == _wants_levels(scene)
 
 
-def _with_levels(sim: Model, plan: Plan, reference: Reference) -> Plan:
+def _with_levels(scene: CompiledScene, plan: Plan, reference: Reference) -> Plan:
     """The plan with a multilevel preconditioner; of a GPU's kernels only one reads it."""
     if plan.kernel not in (None, "stream"):
         raise ValueError(
-            f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={sim.kernel!r}, which is '
+            f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={scene.kernel!r}, which is '
             f'"{plan.kernel}" for this scene; set kernel="stream", or leave adjoint at "solver"'
         )
-    return precondition_plan(plan, sim.scene.values(), *reference, progress=sim.progress)
+    return precondition_plan(plan, scene.scene.values(), *reference, progress=scene.progress)
 
 
-def plan_for_solver(sim: Model, material: Sequence[Tensor], plan: Plan | None = None) -> Plan:
-    """The plan of a simulator, or the one given, with what its solver and gradients use of a material."""
-    plan = without_levels(sim.plan if plan is None else plan)
-    if not _has_patches_for(sim, plan):
-        plan = _compile(sim, sim.dtype, sim.device)
-    if _wants_levels(sim):
-        plan = _with_levels(sim, plan, reference_of(sim.plan, material, sim.time_step))
-    return move_plan(sim, plan, sim.device)
+def plan_for_solver(scene: CompiledScene) -> Plan:
+    """The plan with what solver and gradients use, made of the material."""
+    plan = without_levels(scene.plan)
+    if not _has_patches_for(scene, plan):
+        plan = _compile(scene, scene.dtype, scene.device)
+    if _wants_levels(scene):
+        plan = _with_levels(scene, plan, reference_of(scene.plan, scene.material, scene.time_step))
+    return move_plan(scene, plan, scene.device)
 
 
-def loosened_plan(sim: Model, hard: Tensor) -> Plan:
-    """The plan of a simulator where pieces that a mask [P] or [B, P] lets go move rigidly too; its own if they do."""
-    before = sim.plan.loose
+def loosened_plan(scene: CompiledScene, hard: Tensor) -> Plan:
+    """The plan where pieces that a mask [P] or [B, P] lets go move rigidly too; the one that is there if they do."""
+    before = scene.plan.loose
     if before is None or bool(before.all()):
-        return sim.plan
-    loose = before | sim.pinned.loose(hard.cpu().numpy())
+        return scene.plan
+    loose = before | scene.pinned.loose(hard.cpu().numpy())
     if bool((loose == before).all()):
-        return sim.plan
-    if sim.plan.kernel is None:
-        return with_loose_pieces(sim.plan, replace(sim.scene.values(), loose=loose))
-    return move_plan(sim, plan_anew(sim, sim.dtype, sim.device, loose), sim.device)
+        return scene.plan
+    if scene.plan.kernel is None:
+        return with_loose_pieces(scene.plan, replace(scene.scene.values(), loose=loose))
+    return move_plan(scene, plan_anew(scene, scene.dtype, scene.device, loose), scene.device)
 
 
-def plan_that_holds(sim: Model, plan: Plan, hard: Tensor) -> Plan:
+def plan_that_holds(scene: CompiledScene, plan: Plan, hard: Tensor) -> Plan:
     """The plan whose preconditioner, if it has one, holds no pin but those that are hard in every environment [P].
 
     It is made of what the one before was made of, but for the pins that are let go: held by it they would not move.
@@ -159,21 +157,41 @@ def plan_that_holds(sim: Model, plan: Plan, hard: Tensor) -> Plan:
     freed = freed[inertia[freed].isinf()]
     if not len(freed):
         return plan
-    masses, damping = (plain_tensor(array.detach()) for array in (sim.masses, sim.damping))
-    drag = 1.0 + damping.max() * sim.time_step
-    inertia[freed] = masses.reshape(-1, plan.vertices).amax(0)[freed] / sim.time_step**2 * drag
-    plan = precondition_plan(plan, sim.scene.values(), stiffness, inertia, progress=sim.progress)
-    return move_plan(sim, plan, sim.device)
+    masses, damping = (plain_tensor(scene.named[name].detach()) for name in ("masses", "damping"))
+    drag = 1.0 + damping.max() * scene.time_step
+    inertia[freed] = masses.reshape(-1, plan.vertices).amax(0)[freed] / scene.time_step**2 * drag
+    plan = precondition_plan(plan, scene.scene.values(), stiffness, inertia, progress=scene.progress)
+    return move_plan(scene, plan, scene.device)
 
 
-def move_plan(sim: Model, plan: Plan, device: torch.device, material: int = 0) -> Plan:
+def move_plan(scene: CompiledScene, plan: Plan, device: torch.device, material: int = 0) -> Plan:
     """A plan on its device, where a GPU has room for it, for `material` bytes beside it and for a step."""
     if plan.device == device:
         return plan
     if device.type == "cuda":
-        needed = plan.bytes + material + step_bytes(sim, plan, sim.batch or environments_of_material(sim), device)
+        needed = plan.bytes + material + step_bytes(scene, plan, scene.environments, device)
         refuse_full_memory(needed, free_memory(device))
     return plan.to(device)
+
+
+def step_bytes(scene: CompiledScene, plan: Plan, batch: int, device: torch.device) -> int:
+    """Memory of a step beside plan, material and states, as the op takes it.
+
+    Args:
+        scene: whose solver and material the step has.
+        plan: of a GPU, with what the solver prepares; it may still be on the CPU.
+        batch: environments.
+        device: the GPU.
+    """
+    real = torch.finfo(plan.dtype).bits // 8
+    levels = plan.level_sizes.numpy() if has_levels(plan.arrays) else np.empty(0, dtype=np.int32)
+    planes, spheres, stiffness = (scene.named[name] for name in ("planes", "spheres", "stiffness"))
+    own = stiffness.dim() == 2 and len(stiffness) == batch
+    schedule: int = scene.solver.numbers()["schedule"]
+    with torch.cuda.device(device):
+        return _C.step_bytes(
+            real, plan.sizes.numpy(), levels, schedule, batch, planes.shape[-2], spheres.shape[-2], own
+        )
 
 
 def is_recording(device: torch.device) -> bool:
@@ -181,24 +199,24 @@ def is_recording(device: torch.device) -> bool:
     return torch.compiler.is_compiling() or (device.type == "cuda" and torch.cuda.is_current_stream_capturing())
 
 
-def plan_anew(sim: Model, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
-    """The plan of a simulator for a precision and a device, on the CPU; `loose`: its pieces that can move rigidly."""
-    plan = _compile(sim, dtype, device, loose)
-    if not _wants_levels(sim):
+def plan_anew(scene: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
+    """The plan for a precision and a device, on the CPU; `loose`: pieces that can move rigidly."""
+    plan = _compile(scene, dtype, device, loose)
+    if not _wants_levels(scene):
         return plan
     # what M was made of goes along, as into a file; coming from "meta" the values are lost
-    if sim.device.type == "meta":
-        arrays = in_order(material_of(sim.scene.values(), sim.dtype))
-        source = compile_plan(sim.scene.values(), dtype=sim.dtype, progress=False)
-        reference = reference_of(source, arrays, sim.time_step)
+    if scene.device.type == "meta":
+        arrays = in_order(material_of(scene.scene.values(), scene.dtype))
+        source = compile_plan(scene.scene.values(), dtype=scene.dtype, progress=False)
+        reference = reference_of(source, arrays, scene.time_step)
     else:
-        reference = reference_of_levels(sim.plan.arrays)
-    return _with_levels(sim, plan, reference)
+        reference = reference_of_levels(scene.plan.arrays)
+    return _with_levels(scene, plan, reference)
 
 
-def plan_on(sim: Model, dtype: torch.dtype, device: torch.device) -> Plan:
-    """The plan of a simulator for a precision and a device: its own moved there where that will do."""
-    same = dtype == sim.dtype and _same_plan(sim.device, device)
-    plan = sim.plan if same else plan_anew(sim, dtype, device)
-    numbers = sum(array.numel() for array in (*sim.material(), sim.rest_positions))
-    return move_plan(sim, plan, device, numbers * (torch.finfo(dtype).bits // 8))
+def plan_on(scene: CompiledScene, dtype: torch.dtype, device: torch.device) -> Plan:
+    """The plan for a precision and a device: the one that is there, moved, where that will do."""
+    same = dtype == scene.dtype and _same_plan(scene.device, device)
+    plan = scene.plan if same else plan_anew(scene, dtype, device)
+    numbers = sum(array.numel() for array in scene.material) + 3 * scene.vertices
+    return move_plan(scene, plan, device, numbers * (torch.finfo(dtype).bits // 8))

@@ -106,8 +106,9 @@ class Promise:
         further = copy.copy(sim)
         further.iterations, further.tolerance = 3 * self.iterations, 0.0
         solved: Tensor = further(state, forces, targets, start=after[0])[1]
+        material = sim.material_at(targets, len(state[0]))
         # displacements over the time step are velocities
-        first = course_of(sim, state, targets) / self.time_step
+        first = course_of(sim.plan, material, sim.time_step, state) / self.time_step
         error = (solved - after[1]).flatten(1).norm(dim=1)
         rounding = ROUNDINGS * torch.finfo(self.dtype).eps * state[0].flatten(1).norm(dim=1) / self.time_step
         # a body at rest has no error

@@ -8,19 +8,33 @@ from typing import Any
 
 from torch import Tensor
 
+from .adjoint import AdjointCall
+from .checks import check_has_values, check_like
+from .diagonal import named_material
 from .material import check_environments
 from .model import Model
-from .readouts import ContactForces, Reactions, checked_call, contact_forces, reactions
+from .readouts import ContactForces, Reactions, contact_forces, reactions
 from .state import State
 from .stress import Stress, stress, vertex_average
 from .targets import Targets
-from .vtu import States, write_vtu
+from .vtu import RestBody, States, write_vtu
 
 __all__ = ["Readable"]
 
 
 class Readable(Model):
     """What a `Simulator` tells about steps and states; docs/readouts.md is a guide."""
+
+    def checked_call(
+        self, state: State, after: State | Tensor, forces: Tensor | None, targets: Targets | None
+    ) -> AdjointCall:
+        """The step from a state to the positions `after`, all arguments checked."""
+        forces = self.check_state(state, forces=forces)
+        before, positions = self.positions_of(state), self.positions_of(after, "after")
+        check_like("after", positions, before, "m")
+        material = self.material_at(targets, len(before))
+        check_environments("state", len(before), named_material(material))
+        return AdjointCall(before, state[1], forces, positions, material, list(self.plan.arrays), self.time_step)
 
     def contact_forces(
         self,
@@ -54,7 +68,7 @@ class Readable(Model):
             >>> contacts = sim.contact_forces(state, after)
             >>> contacts.bodies[cube].force  # [B, 3] N, of a cube at rest its weight, upwards
         """
-        return contact_forces(self, checked_call(self, state, after, forces, targets), about)
+        return contact_forces(self.scene, self.checked_call(state, after, forces, targets), about)
 
     def reactions(
         self,
@@ -78,7 +92,7 @@ class Readable(Model):
             Forces in the order of `pin_targets` [B, P, 3] and on all vertices [B, V, 3], and by pin:
             `reactions.pins[pin].wrench.force` [B, 3] is what it carries. `pins` is empty where the scene has none.
         """
-        return reactions(self, checked_call(self, state, after, forces, targets), about)
+        return reactions(self.scene, self.checked_call(state, after, forces, targets), about)
 
     def stress(self, state: State | Tensor) -> Stress:
         """Cauchy stress [B, E, 3, 3] and von Mises stress [B, E] [Pa] of every tetrahedron, and its strain.
@@ -134,4 +148,6 @@ class Readable(Model):
         Returns:
             The path.
         """
-        return write_vtu(self, path, states, environment, times, point_data, cell_data)
+        check_has_values("write_vtu", self.device)
+        body = RestBody(self.scene, self.rest_positions, self.stiffness, self.time_step)
+        return write_vtu(body, self.positions_of, path, states, environment, times, point_data, cell_data)

@@ -23,22 +23,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from .adjoint import AdjointCall, step_gradient
-from .checks import check_like, in_full
+from .checks import in_full
 from .diagonal import named_material, pinned_vertices, step_diagonal
 from .effects import Ground, Pin, Solid, Sphere
-from .material import MATERIAL_ROWS, check_environments
+from .material import MATERIAL_ROWS
+from .scene import Scene
 from .small_matrices import dot, inverse, length, product
-from .state import State
-from .targets import Targets
-
-if TYPE_CHECKING:
-    from .model import Model
 
 __all__ = [
     "ContactForce",
@@ -46,7 +42,6 @@ __all__ = [
     "PinForce",
     "Reactions",
     "Wrench",
-    "checked_call",
     "contact_forces",
     "reactions",
 ]
@@ -98,18 +93,6 @@ class Reactions(NamedTuple):
     pins: dict[Pin, PinForce]  # by pin; empty without pins
 
 
-def checked_call(
-    sim: Model, state: State, after: State | Tensor, forces: Tensor | None, targets: Targets | None
-) -> AdjointCall:
-    """The step from a state to the positions `after`, all arguments checked."""
-    forces = sim.check_state(state, forces=forces)
-    before, positions = sim.positions_of(state), sim.positions_of(after, "after")
-    check_like("after", positions, before, "m")
-    material = sim.material_at(targets, len(before))
-    check_environments("state", len(before), named_material(material))
-    return AdjointCall(before, state[1], forces, positions, material, list(sim.plan.arrays), sim.time_step)
-
-
 # ---- sums
 
 
@@ -132,11 +115,11 @@ class _Body(NamedTuple):
     about: Tensor  # [B, 3] m
 
 
-def _bodies(sim: Model, positions: Tensor, masses: Tensor, about: Tensor | None) -> dict[Solid, _Body]:
+def _bodies(scene: Scene, positions: Tensor, masses: Tensor, about: Tensor | None) -> dict[Solid, _Body]:
     found: dict[Solid, _Body] = {}
     point = None if about is None else _checked_point(about, positions)
-    for solid in sim.scene.solids:
-        rows = sim.scene.vertex_range(solid)
+    for solid in scene.solids:
+        rows = scene.vertex_range(solid)
         own, weights = positions[:, rows], masses[..., rows, None]
         center = _tree_sum(weights * own) / _tree_sum(weights) if point is None else point
         found[solid] = _Body(rows, own, center)
@@ -182,15 +165,15 @@ def _pin_forces(call: AdjointCall) -> tuple[Tensor, Tensor]:
     return forces, gradient.index_add(1, pins, -forces)
 
 
-def reactions(sim: Model, call: AdjointCall, about: Tensor | None) -> Reactions:
+def reactions(scene: Scene, call: AdjointCall, about: Tensor | None) -> Reactions:
     """What `Simulator.reactions` does, for a checked call."""
     forces, _ = _pin_forces(call)
     vertices = pinned_vertices(call.plan)
     on_vertices = torch.zeros_like(call.after).index_add(1, vertices, forces)
-    bodies = _bodies(sim, call.after, named_material(call.material)["masses"], about)
+    bodies = _bodies(scene, call.after, named_material(call.material)["masses"], about)
     pins: dict[Pin, PinForce] = {}
-    for pin in sim.scene.pins:
-        rows = sim.scene.pin_range(pin)
+    for pin in scene.pins:
+        rows = scene.pin_range(pin)
         own = forces[:, rows]
         pins[pin] = PinForce(own, _wrench(own, call.after[:, vertices[rows]], bodies[pin.solid].about))
     return Reactions(forces, on_vertices, pins)
@@ -301,11 +284,11 @@ def _added(values: Tensor) -> Tensor:
     return total
 
 
-def contact_forces(sim: Model, call: AdjointCall, about: Tensor | None) -> ContactForces:
+def contact_forces(scene: Scene, call: AdjointCall, about: Tensor | None) -> ContactForces:
     """What `Simulator.contact_forces` does, for a checked call."""
     _, force = _pin_forces(call)
-    colliders: Sequence[Ground | Sphere] = (*sim.scene.grounds, *sim.scene.spheres)
-    bodies = _bodies(sim, call.after, named_material(call.material)["masses"], about)
+    colliders: Sequence[Ground | Sphere] = (*scene.grounds, *scene.spheres)
+    bodies = _bodies(scene, call.after, named_material(call.material)["masses"], about)
     if not colliders:
         none = torch.zeros_like(force)
         return ContactForces(none, force, _on_bodies(none, bodies), {})

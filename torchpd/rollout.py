@@ -79,7 +79,7 @@ def _constant_material(sim: Simulator, call: Rollout) -> list[Tensor]:
 
 def _piece(sim: Simulator, call: Rollout, material: list[Tensor]) -> Track:
     refuse_tangents(*call.state, call.forces if isinstance(call.forces, Tensor) else None, *material)
-    sim._notices.before(sim, call.state, material, report=call.report)
+    sim._notices.before(sim, call.state, material, sim.time_step, report=call.report)
     # the op has a derivative where it records every state, as its adjoint needs them
     thinned = call.every > 1 and call.tracks_gradient(material)
     found = torch.ops.torchpd.rollout(

@@ -12,10 +12,9 @@ from torch import Tensor
 from .adjoint import step_gradient
 from .capture import CapturedStep
 from .checks import check_like, check_whole
-from .material import MATERIAL_ROWS, environments_of_material
+from .material import MATERIAL_ROWS, environments_of_material, named_arrays
 from .ops import INFO_WIDTH, refuse_tangents
 from .readable import Readable
-from .readouts import checked_call
 from .rollout import PerStep, Rollout, roll
 from .solvers import Solver
 from .state import Info, State, Track
@@ -77,6 +76,8 @@ class Simulator(Readable):
         progress: show a bar while a large scene compiles, for another device too.
     """
 
+    promise: Promise | None
+
     def extra_repr(self) -> str:
         return describe(self)
 
@@ -87,7 +88,9 @@ class Simulator(Readable):
 
     def rest_state(self, batch: int | None = None) -> State:
         """Everything at rest [batch, V, 3], by default once for each environment of the material."""
-        count = environments_of_material(self) if batch is None else check_whole("batch", batch, minimum=0)
+        count = (
+            environments_of_material(named_arrays(self)) if batch is None else check_whole("batch", batch, minimum=0)
+        )
         shape = (count, -1, -1)
         positions = self.rest_positions.expand(shape).clone()
         return State(positions, torch.zeros_like(positions))
@@ -133,7 +136,7 @@ class Simulator(Readable):
         `Info.from_rows`."""
         given, inertial = _first_iterate(start, state[0])
         refuse_tangents(*state, forces, *material)
-        self._notices.before(self, state, material, report=report)
+        self._notices.before(self, state, material, self.time_step, report=report)
         positions, velocities, rows = _ops.step(
             state[0],
             state[1],
@@ -176,7 +179,7 @@ class Simulator(Readable):
             )
         given, inertial = _first_iterate(start, state[0])
         material = self.material_at(targets, state[0].shape[0])
-        self._notices.before(self, state, material, report=info is not None)
+        self._notices.before(self, state, material, self.time_step, report=info is not None)
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(
             state[0],
@@ -361,7 +364,7 @@ class Simulator(Readable):
             forces: as in `forward`.
             targets: as in `forward`.
         """
-        return step_gradient(checked_call(self, state, after, forces, targets))
+        return step_gradient(self.checked_call(state, after, forces, targets))
 
     # ---- files
 

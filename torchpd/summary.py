@@ -9,9 +9,8 @@ import torch
 from . import _C
 from .checks import NO_VALUES
 from .forecast import FAR_TOO_FEW, forecast, is_bound
-from .gpu import step_bytes
-from .material import environments_of_material
 from .multilevel import has_levels
+from .placing import step_bytes
 from .plan import any_of
 from .regimes import shared_bytes
 from .solvers import Chebyshev, Multilevel, Solver
@@ -49,11 +48,12 @@ def _solver_line(sim: Simulator) -> str:
 def _expectation_lines(sim: Simulator) -> list[str]:
     """Why "auto" chose, and what the iterations are worth."""
     lines = [] if sim.choice is None else [f"chosen because {sim.choice.why}"]
-    expected = forecast(sim)
+    scene = sim.compiled
+    expected = forecast(scene)
     if expected is not None:
         left = expected.error(sim.iterations)
         verdict = f"; {sim.iterations} leave about {left:.1g}: far too few" if left > FAR_TOO_FEW else ""
-        hardest = " where what is stiff lands" if is_bound(sim) else ""
+        hardest = " where what is stiff lands" if is_bound(scene) else ""
         counts = " and ".join(f"{error:g} after {expected.words(error)}" for error in (1e-2, 1e-3))
         lines.append(f"expected{hardest}: an error of {counts} iterations, from the weights alone{verdict}")
         if sim.tolerance and expected.iterations(sim.tolerance) > sim.iterations:
@@ -182,13 +182,14 @@ def _step_bytes(sim: Simulator, real: int) -> str:
     plan = sim.plan
     if plan.kernel is None:
         return f"{workspace_bytes(plan, real, sim.solver):,} B an environment during a step"
-    batch = sim.batch or environments_of_material(sim)
-    each = -(-step_bytes(sim, plan, batch, sim.device) // batch)
+    scene = sim.compiled
+    batch = scene.environments
+    each = -(-step_bytes(scene, plan, batch, sim.device) // batch)
     taken = f"{each:,} B an environment during a step{f' of {batch:,}' if batch > 1 else ''}"
     if plan.kernel == "stream":
         return taken
     # only those that the GPU has in work at a time take any
-    return f"{taken}, at most {step_bytes(sim, plan, _ANY_BATCH, sim.device):,} B in all"
+    return f"{taken}, at most {step_bytes(scene, plan, _ANY_BATCH, sim.device):,} B in all"
 
 
 def describe(sim: Simulator) -> str:

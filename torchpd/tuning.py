@@ -126,7 +126,7 @@ def tune(
     check_start(sim, start, forces)
     study = _prepare(_with_targets(sim, targets, len(start[0])), start, forces, error)
     # with friction steps may come to no end, which counts as error: then a target is not attained
-    if not has_friction(sim):
+    if not has_friction(sim.compiled):
         check_known(study.exact, _doubt(error))
     named: Mapping[str, Solver] = (
         _usual(sim, safe_solvers(study.sim, study.state))
@@ -147,7 +147,7 @@ def tune(
                 bar.update(1)
             trials, cost = _most_accurate(study, timed)
     promise = _promise(sim, study, start, trials, cost, error, milliseconds)
-    if candidates is None and has_friction(sim):
+    if candidates is None and has_friction(sim.compiled):
         promise = replace(promise, left_out="Multilevel, which friction leaves out, might: see candidates")
     sim.solver, sim.iterations, sim.tolerance, sim.promise = promise.solver, promise.iterations, 0.0, promise
     if not promise.attained:
@@ -164,7 +164,7 @@ def tune(
 
 def _usual(sim: Simulator, solvers: Mapping[str, Solver]) -> dict[str, Solver]:
     """Those that are studied if no others are named: friction may lead Multilevel astray in steps that are not."""
-    smooth = not has_friction(sim)
+    smooth = not has_friction(sim.compiled)
     return {name: solver for name, solver in solvers.items() if smooth or not isinstance(solver, Multilevel)}
 
 
@@ -193,7 +193,7 @@ def _prepare(sim: Simulator, start: State, forces: Tensor | None, error: float |
     everyone = _of_environments(some, list(range(len(items))) * len(states), len(items))
     state = State(*(torch.cat(parts) for parts in zip(*states, strict=True)))
     repeated = None if given is None else given.repeat(len(states), 1, 1)
-    if has_friction(sim):
+    if has_friction(sim.compiled):
         exact = settled_steps(everyone, state, forces=repeated, enough=_SETTLED * (error or _COARSE))
     else:
         exact = exact_steps(everyone, state, forces=repeated)
@@ -256,7 +256,7 @@ def _motion(sim: Simulator, start: State, forces: Tensor | None) -> list[State]:
     is not convex, which are few, and which all solvers leave slowly.
     """
     mover = copy.copy(sim)
-    if runs(Multilevel(), mover) and not has_friction(mover):
+    if runs(Multilevel(), mover.compiled) and not has_friction(mover.compiled):
         mover.solver, mover.iterations = Multilevel(), _MOVING
     else:
         mover.solver, mover.iterations = Chebyshev(), _MOVING_PLAINLY

@@ -11,7 +11,7 @@ from torch import Tensor
 from .accuracy import ExactStep
 from .checks import check_like
 from .diagonal import step_diagonal
-from .material import MATERIAL_ROWS, environments_of_material
+from .material import MATERIAL_ROWS, environments_of_material, named_arrays
 from .state import State
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def check_start(sim: Simulator, state: State, forces: Tensor | None) -> None:
         check_like("forces", forces, state[0], "N")
     if state[0].dim() != 3 or not len(state[0]):
         raise ValueError(f"tune: state must hold environments [B, V, 3], at least one, got {list(state[0].shape)}")
-    count = environments_of_material(sim)
+    count = environments_of_material(named_arrays(sim))
     if count not in (1, len(state[0])):
         raise ValueError(f"tune: state must have the {count} environments of the material, got {len(state[0])}")
     for name, part in zip(State._fields, state, strict=True):

@@ -1,0 +1,65 @@
+"""Which pins are hard, as steps need it: anybody may write into the mask, and the plan follows what it lets go."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from .compiled import CompiledScene, ordinary
+from .multilevel import has_levels
+from .pins import hold_exactly
+from .placing import is_recording, loosened_plan, plan_that_holds
+from .plan import Plan
+from .written import Seen, has_numbers, plain_tensor
+
+__all__ = ["PinMask", "held_springs", "look_at_pins", "serves_any_mask"]
+
+
+class PinMask(NamedTuple):
+    """What somebody found who looked at the mask of hard pins."""
+
+    some: bool  # whether any pin may be hard
+    springs: Tensor | None = None  # those that `held` was made of,
+    held: Tensor | None = None  # as the ops take them
+    version: int | None = None  # of the springs; None where all pins are hard, whatever the springs
+
+
+def held_springs(mask: PinMask, springs: Tensor, hard: Tensor) -> Tensor:
+    """`pin_stiffness` as the ops take it: inf where a pin is hard."""
+    some, known, held, version = mask
+    if not some:
+        return springs
+    learned = springs.requires_grad and torch.is_grad_enabled()
+    # what a CUDA graph records shall see later masks
+    if known is not springs or held is None or learned or (springs.is_cuda and is_recording(springs.device)):
+        return hold_exactly(springs, hard)
+    if version is not None and springs._version != version:
+        return hold_exactly(springs, hard)
+    return held
+
+
+def serves_any_mask(plan: Plan) -> bool:
+    """Whether a plan has nothing that depends on which pins are hard."""
+    return (plan.loose is None or bool(plan.loose.all())) and not has_levels(plan.arrays)
+
+
+def look_at_pins(scene: CompiledScene, hard: Tensor, *, wait: bool = False) -> tuple[Seen, Plan]:
+    """What the mask `hard` says, as `PinMask` in what was seen, and the plan that follows it; awaits a GPU.
+
+    Pieces that are let go get rigid motions, and a preconditioner no longer holds what it held. With `wait` later
+    steps, on whatever stream, may take the springs that are made here.
+    """
+    plain, springs = plain_tensor(hard), scene.named["pin_stiffness"]
+    if not has_numbers(plain) or is_recording(plain.device):
+        return Seen(found=PinMask(some=True)), scene.plan
+    rows = plain.cpu().reshape(-1, plain.shape[-1])
+    mask = PinMask(some=bool(rows.any()))
+    with ordinary():
+        plan = plan_that_holds(scene, loosened_plan(scene, rows), rows.all(0))
+        # streams wait for what sets the material, but not for what another one has made in a step
+        if plain is hard and type(springs) is nn.Parameter and mask.some and (wait or not hard.is_cuda):
+            version = None if bool(rows.all()) else springs._version
+            mask = PinMask(True, springs, hold_exactly(springs, hard), version)
+    return Seen(hard if plain is hard else None, mask), plan

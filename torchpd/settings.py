@@ -1,0 +1,146 @@
+"""Settings of a simulator and what follows from them: the plan, a preconditioner, the choice of "auto".
+
+A change makes another `Configuration` of the one before. What is refused on the way changes nothing, since a simulator
+takes over only what is complete.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from .automatic import Choice, choose_solver, warn_of_few_iterations
+from .checks import check_has_values
+from .compiled import CompiledScene
+from .model_checks import check_adjoint, check_batch
+from .placing import move_plan, plan_anew, plan_for_solver, plan_on, serves
+from .regimes import check_kernel
+from .solvers import Chebyshev, Solver, check_solver
+
+__all__ = [
+    "EVERY_STEP",
+    "NO_STEP",
+    "Configuration",
+    "choose",
+    "choose_again",
+    "is_auto",
+    "judge",
+    "moved",
+    "prepare",
+    "reconfigure",
+]
+
+# Shortest and longest time step for which iterations need no warning, nor for what lies between: long ones are slow,
+# and short ones overshoot with a relaxation for long ones.
+EVERY_STEP, NO_STEP = (0.0, math.inf), (math.inf, 0.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Configuration(CompiledScene):
+    """A compiled scene, and how its iterations came about."""
+
+    choice: Choice | None  # of "auto"
+    named_iterations: bool  # whether somebody has given their number: then no warning says that they are too few
+    judged_steps: tuple[float, float]  # time steps [s] for which iterations need no warning
+
+
+def is_auto(solver: object) -> bool:
+    """Whether a solver is to be chosen."""
+    return isinstance(solver, str) and solver == "auto"
+
+
+def reconfigure(now: Configuration, **changes: Any) -> Configuration:
+    """The configuration with another `batch`, `kernel`, `solver` or `adjoint`, and all that follows from it."""
+    for name, value in changes.items():
+        now = _CHANGES[name](now, value)
+    return now
+
+
+def _with_batch(now: Configuration, batch: int | None) -> Configuration:
+    return _planned_anew(replace(now, batch=check_batch(batch)))
+
+
+def _with_kernel(now: Configuration, kernel: str) -> Configuration:
+    now = replace(now, kernel=check_kernel(kernel))
+    return now if now.plan.kernel is None else _planned_anew(now)
+
+
+def _with_solver(now: Configuration, solver: Any) -> Configuration:
+    return choose(now, None) if is_auto(solver) else _solved_by(now, check_solver(solver, now.device))
+
+
+def _with_adjoint(now: Configuration, adjoint: str) -> Configuration:
+    now = replace(now, adjoint=check_adjoint(adjoint))
+    if serves(now):
+        return now
+    check_has_values("adjoint", now.device)
+    return replace(now, plan=plan_for_solver(now))
+
+
+_CHANGES: dict[str, Callable[[Configuration, Any], Configuration]] = {
+    "batch": _with_batch,
+    "kernel": _with_kernel,
+    "solver": _with_solver,
+    "adjoint": _with_adjoint,
+}
+
+
+def prepare(now: Configuration) -> Configuration:
+    """The configuration with what the material decides made anew, see `Simulator.prepare_solver`."""
+    check_has_values("prepare_solver", now.device)
+    new = choose_again(now)
+    return new if new.plan is not now.plan else replace(new, plan=plan_for_solver(new))
+
+
+def moved(now: Configuration, dtype: torch.dtype, device: torch.device) -> Configuration:
+    """The configuration with the plan of another precision or device, where the material will be."""
+    if device.type == "cuda":
+        check_solver(now.solver, device)
+    return replace(now, plan=plan_on(now, dtype, device))
+
+
+def judge(now: Configuration, changed: str | None) -> Configuration:
+    """Warn where iterations that nobody named are too few for what has `changed`, once; awaits a GPU until then."""
+    if now.judged_steps == EVERY_STEP:
+        return now
+    if warn_of_few_iterations(now, now.choice, changed):
+        return replace(now, judged_steps=EVERY_STEP)
+    shortest, longest = NO_STEP if changed != "time_step" else now.judged_steps
+    return replace(now, judged_steps=(min(shortest, now.time_step), max(longest, now.time_step)))
+
+
+def _planned_anew(now: Configuration) -> Configuration:
+    """After what a GPU's plan and the choice of "auto" depend on has changed."""
+    # "auto" begins with a plan for Chebyshev
+    if now.plan.kernel is not None and not (now.choice is not None and now.plan.for_levels):
+        now = replace(now, plan=move_plan(now, plan_anew(now, now.dtype, now.device), now.device))
+    return choose_again(now)
+
+
+def _solved_by(now: Configuration, solver: Solver) -> Configuration:
+    # to another solver the same number of iterations is another promise
+    judged = EVERY_STEP if now.named_iterations else NO_STEP
+    now = replace(now, solver=solver, choice=None, judged_steps=judged)
+    return now if serves(now) else replace(now, plan=plan_for_solver(now))
+
+
+def choose(now: Configuration, iterations: int | None) -> Configuration:
+    """What "auto" does, see `choose_solver`."""
+    if now.plan.for_levels:
+        now = _solved_by(now, Chebyshev())  # its kernel is one of the costs that are compared
+    solver, choice = choose_solver(now, iterations)
+    now = replace(_solved_by(now, solver), choice=choice, iterations=choice.iterations)
+    named = not choice.sets_iterations
+    return judge(replace(now, named_iterations=named, judged_steps=EVERY_STEP if named else NO_STEP), None)
+
+
+def choose_again(now: Configuration) -> Configuration:
+    """The choice of "auto" made anew where there is one; iterations that somebody has set since stay."""
+    if now.choice is None:
+        return now
+    own = now.choice.sets_iterations and now.iterations == now.choice.iterations
+    return choose(now, None if own else now.iterations)
