@@ -115,13 +115,13 @@ class Choice:
     capped: bool = False  # more would be wanted, but a step is to end
 
 
-def choose_solver(scene: CompiledScene, iterations: int | None) -> tuple[Solver, Choice]:
+def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solver, Choice]:
     """The solver for this scene and device, and why.
 
     Chebyshev gets a relaxation of min(1.9, 2 / (1 + mu)), which is best for a spectrum of [mu, 1].
 
     Args:
-        scene: with time step, material, device, and the batch to choose for.
+        compiled: with time step, material, device, and the batch to choose for.
         iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error, but
             Chebyshev with friction and balls. None sets as many as are expected to reach an error of `AIM`, times
             `MARGIN`, up to `MOST_OF_CHEBYSHEV` or `MOST_OF_LEVELS`, and with a tolerance `PATIENCE` times that. On
@@ -132,34 +132,38 @@ def choose_solver(scene: CompiledScene, iterations: int | None) -> tuple[Solver,
     def chosen(enough: int, why: str, most: int = MOST_OF_CHEBYSHEV) -> Choice:
         if iterations is not None:
             return Choice(iterations, False, why)
-        times, capped = PATIENCE if scene.tolerance > 0.0 else 1, enough > most
+        times, capped = PATIENCE if compiled.tolerance > 0.0 else 1, enough > most
         why += f'; "auto" takes no more than {most * times:,}' if capped else ""
         return Choice(min(enough, most) * times, True, why, capped)
 
-    spectrum = spectrum_of(scene)
+    spectrum = spectrum_of(compiled)
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
     if spectrum is None:
         return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
-    if cause := held_up_by(scene):
-        plain = _known(forecast(scene, chebyshev, spectrum))
+    if cause := held_up_by(compiled):
+        plain = _known(forecast(compiled, chebyshev, spectrum))
         why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and {cause} may keep Multilevel from working"
         return chebyshev, chosen(_enough(plain), why)
-    plain, lasting, short = (_known(forecast(scene, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
+    plain, lasting, short = (_known(forecast(compiled, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
     # the others know nothing of contacts
-    saves = has_contacts(scene) or short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
+    saves = has_contacts(compiled) or short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
     multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
-    if not runs(multilevel, scene):
-        where = f"{scene.device} with kernel={scene.kernel!r}" if scene.device.type == "cuda" else str(scene.device)
+    if not runs(multilevel, compiled):
+        where = (
+            f"{compiled.device} with kernel={compiled.kernel!r}"
+            if compiled.device.type == "cuda"
+            else str(compiled.device)
+        )
         return chebyshev, chosen(_enough(plain), f"{counts}, and Multilevel does not run on {where}")
-    batch = scene.batch or 1
-    ratio = _multilevel_time(scene, batch) / _chebyshev_time(scene, batch)
+    batch = compiled.batch or 1
+    ratio = _multilevel_time(compiled, batch) / _chebyshev_time(compiled, batch)
     both = f"{counts}, or {levels.words(AIM)} of Multilevel, each as long as {ratio:.2g}"
     both += f" in a batch of {batch}" if batch > 1 else ""
     if iterations is None:
         count = float(levels.iterations(AIM))
         usual = LANDING_ROOTS * math.sqrt(plain.iterations(AIM))
-        if has_contacts(scene) and scene.tolerance > 0.0 and is_uneven(scene) and usual < count:
+        if has_contacts(compiled) and compiled.tolerance > 0.0 and is_uneven(compiled) and usual < count:
             count = usual
             both += f"; with a tolerance about {round(usual)} where no sliver or soft part lands"
         better = count * ratio < plain.iterations(AIM)
@@ -171,20 +175,22 @@ def choose_solver(scene: CompiledScene, iterations: int | None) -> tuple[Solver,
     return chebyshev, chosen(_enough(plain), both)
 
 
-def _chebyshev_time(scene: CompiledScene, batch: int) -> float:
+def _chebyshev_time(compiled: CompiledScene, batch: int) -> float:
     """Microseconds of an iteration of so many environments, in float32, on a GPU with its own plan on an H100.
 
     So are those of Multilevel, whatever the GPU and precision are: only their ratio matters.
     """
-    if scene.plan.kernel is None:
-        return CPU_CHEBYSHEV.iteration(scene.vertices, batch)
-    return iteration_microseconds(scene.plan, scene.named["stiffness"].shape[-1], batch, H100, torch.float32)
+    if compiled.plan.kernel is None:
+        return CPU_CHEBYSHEV.iteration(compiled.vertices, batch)
+    return iteration_microseconds(compiled.plan, compiled.named["stiffness"].shape[-1], batch, H100, torch.float32)
 
 
-def _multilevel_time(scene: CompiledScene, batch: int) -> float:
+def _multilevel_time(compiled: CompiledScene, batch: int) -> float:
     """The same of `Multilevel`."""
-    free = multilevel_cost(scene.vertices, on_gpu=scene.plan.kernel is not None).iteration(scene.vertices, batch)
-    return free * (ON_CONTACTS if has_contacts(scene) else 1.0)
+    free = multilevel_cost(compiled.vertices, on_gpu=compiled.plan.kernel is not None).iteration(
+        compiled.vertices, batch
+    )
+    return free * (ON_CONTACTS if has_contacts(compiled) else 1.0)
 
 
 def _known(expected: Forecast | None) -> Forecast:
@@ -204,20 +210,20 @@ def _relaxation(spectrum: Spectrum | None) -> float | None:
     return best if best < Chebyshev().numbers()["relaxation"] else None
 
 
-def runs(solver: Solver, scene: CompiledScene) -> bool:
+def runs(solver: Solver, compiled: CompiledScene) -> bool:
     """Whether there are kernels for the solver where the scene is."""
     try:
-        check_solver(solver, scene.device)
+        check_solver(solver, compiled.device)
     except RuntimeError:
         return False
-    return scene.device.type != "cuda" or not isinstance(solver, Multilevel) or scene.kernel in ("auto", "stream")
+    return compiled.device.type != "cuda" or not isinstance(solver, Multilevel) or compiled.kernel in ("auto", "stream")
 
 
-def warn_of_few_iterations(scene: CompiledScene, choice: Choice | None, changed: str | None = None) -> bool:
+def warn_of_few_iterations(compiled: CompiledScene, choice: Choice | None, changed: str | None = None) -> bool:
     """Say so when iterations that nobody named leave more than enough: who gave none may not know of them.
 
     Args:
-        scene: with the default number of iterations, or that of "auto".
+        compiled: with the default number of iterations, or that of "auto".
         choice: of "auto", which was to leave `AIM`; ten times that may be left.
         changed: what brought another material or time step; None when the simulator is made, or "auto" has chosen.
 
@@ -225,12 +231,12 @@ def warn_of_few_iterations(scene: CompiledScene, choice: Choice | None, changed:
         Whether it was said.
     """
     enough, capped = (FAR_TOO_FEW, False) if choice is None else (10.0 * AIM, choice.capped)
-    if is_bound(scene) and (choice is None or capped):
+    if is_bound(compiled) and (choice is None or capped):
         return False  # most steps need far fewer
-    expected = forecast(scene)
-    if expected is None or expected.error(scene.iterations) <= enough:
+    expected = forecast(compiled)
+    if expected is None or expected.error(compiled.iterations) <= enough:
         return False
-    count, left = scene.iterations, expected.error(scene.iterations)
+    count, left = compiled.iterations, expected.error(compiled.iterations)
     what, verb, ways = f"the default of {count} iterations", "leaves", "Give iterations=..., or take"
     if changed is not None:
         what, verb, ways = f"{count} iterations", "now leave", "Set sim.iterations, or take"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -64,7 +65,7 @@ class CompiledScene:
         """Where states are."""
         return self.plan.device
 
-    @property
+    @cached_property
     def named(self) -> dict[str, Tensor]:
         """The material by name."""
         return named_material(self.material)

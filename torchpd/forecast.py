@@ -88,12 +88,12 @@ class Forecast(NamedTuple):
 
 
 @torch.no_grad()
-def spectrum_of(scene: CompiledScene) -> Spectrum | None:
+def spectrum_of(compiled: CompiledScene) -> Spectrum | None:
     """From the present material and time step; None on "meta", where there are no values, and without a free vertex."""
-    if scene.device.type == "meta" or (scene.plan.kernel is None) != (scene.device.type == "cpu"):
+    if compiled.device.type == "meta" or (compiled.plan.kernel is None) != (compiled.device.type == "cpu"):
         return None
-    inertia, diagonal = step_diagonal(scene.plan.arrays, scene.material, scene.time_step)
-    inertia, diagonal = (array.detach().double().reshape(-1, scene.vertices) for array in (inertia, diagonal))
+    inertia, diagonal = step_diagonal(compiled.plan.arrays, compiled.material, compiled.time_step)
+    inertia, diagonal = (array.detach().double().reshape(-1, compiled.vertices) for array in (inertia, diagonal))
     free = inertia.isfinite()
     if not bool(free.any()):
         return None
@@ -121,23 +121,25 @@ def _decay(eigenvalue: float, limit: float) -> float:
     return math.sqrt(limit) if discriminant <= 0.0 else (sum_of_roots + math.sqrt(discriminant)) / 2.0
 
 
-def forecast(scene: CompiledScene, solver: Solver | None = None, spectrum: Spectrum | None = None) -> Forecast | None:
+def forecast(
+    compiled: CompiledScene, solver: Solver | None = None, spectrum: Spectrum | None = None
+) -> Forecast | None:
     """What to expect of a solver on this scene; None where nothing can be said.
 
     That is so for the plain diagonal, with which iterations may diverge, and where `spectrum_of` has nothing.
 
     Args:
-        scene: with time step and material.
+        compiled: with time step and material.
         solver: that of the scene when None.
         spectrum: when known already.
     """
-    solver = scene.solver if solver is None else solver
-    spectrum = spectrum_of(scene) if spectrum is None else spectrum
+    solver = compiled.solver if solver is None else solver
+    spectrum = spectrum_of(compiled) if spectrum is None else spectrum
     numbers = solver.numbers()
     if spectrum is None or not numbers["weighted"]:
         return None
-    if isinstance(solver, Multilevel) and not has_contacts(scene):
-        body = max(len(solid.mesh.vertices) for solid in scene.scene.solids)
+    if isinstance(solver, Multilevel) and not has_contacts(compiled):
+        body = max(len(solid.mesh.vertices) for solid in compiled.scene.solids)
         reach = min(spectrum.slow * body ** (2.0 / 3.0), 1.0)
         decade = _LEVELS_LEAST + _LEVELS_SLOPE[solver.outer] * math.log10(1.0 / reach)
         return Forecast(math.log(10.0) / decade)
@@ -150,29 +152,31 @@ def forecast(scene: CompiledScene, solver: Solver | None = None, spectrum: Spect
     middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0
     left = max(_decay(slowest, limit), _decay(middle, limit), 1e-3)
     rate = -math.log(min(left, 1.0 - 1e-15))
-    lands = isinstance(solver, Multilevel) and solver.outer == "corotated" and not held_up_by(scene)
+    lands = isinstance(solver, Multilevel) and solver.outer == "corotated" and not held_up_by(compiled)
     if lands:
         plain = math.log(1e3) / rate
         usual = LANDING_ROOTS * math.sqrt(plain)
-        rate = math.log(1e3) / (max(_LANDING_SHARE * plain, usual) if is_uneven(scene) else usual)
+        rate = math.log(1e3) / (max(_LANDING_SHARE * plain, usual) if is_uneven(compiled) else usual)
     return Forecast(rate)
 
 
-def is_bound(scene: CompiledScene) -> bool:
+def is_bound(compiled: CompiledScene) -> bool:
     """Whether the forecast for the solver of the scene is what its hardest steps need, and most of them less."""
-    return isinstance(scene.solver, Multilevel) and has_contacts(scene)
+    return isinstance(compiled.solver, Multilevel) and has_contacts(compiled)
 
 
-def has_contacts(scene: CompiledScene) -> bool:
+def has_contacts(compiled: CompiledScene) -> bool:
     """Whether the scene has anything to touch."""
-    return scene.named["planes"].shape[-2] + scene.named["spheres"].shape[-2] > 0
+    return compiled.named["planes"].shape[-2] + compiled.named["spheres"].shape[-2] > 0
 
 
-def is_uneven(scene: CompiledScene) -> bool:
+def is_uneven(compiled: CompiledScene) -> bool:
     """Whether a body has tetrahedra with an angle below five degrees, or one that is 30 times as stiff as another."""
-    if any(_smallest_angle(solid.mesh) < _EVEN_ANGLE for solid in scene.scene.solids):
+    if any(_smallest_angle(solid.mesh) < _EVEN_ANGLE for solid in compiled.scene.solids):
         return True
-    bodies = scene.named["stiffness"].detach().split([len(solid.mesh.tets) for solid in scene.scene.solids], dim=-1)
+    bodies = (
+        compiled.named["stiffness"].detach().split([len(solid.mesh.tets) for solid in compiled.scene.solids], dim=-1)
+    )
     return any(bool((body.amax(-1) > _EVEN_STIFFNESS * body.amin(-1)).any()) for body in bodies)
 
 
@@ -182,13 +186,13 @@ def _smallest_angle(mesh: TetMesh) -> float:
     return _smallest_angles[mesh]
 
 
-def has_friction(scene: CompiledScene) -> bool:
+def has_friction(compiled: CompiledScene) -> bool:
     """Whether any contact may hold a vertex by friction."""
-    return any(bool((scene.named[name][..., 4] > 0.0).any()) for name in ("planes", "spheres"))
+    return any(bool((compiled.named[name][..., 4] > 0.0).any()) for name in ("planes", "spheres"))
 
 
-def held_up_by(scene: CompiledScene) -> str:
+def held_up_by(compiled: CompiledScene) -> str:
     """What may keep `Multilevel` from working: "friction", "a ball" (thin sheets buckle over it), or ""."""
-    if has_friction(scene):
+    if has_friction(compiled):
         return "friction"
-    return "a ball" if scene.named["spheres"].shape[-2] else ""
+    return "a ball" if compiled.named["spheres"].shape[-2] else ""

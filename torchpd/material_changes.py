@@ -64,16 +64,21 @@ class Change(NamedTuple):
     learned: list[str]  # those of another batch whose former parameter was learned
 
     @property
+    def alters_pins(self) -> bool:
+        """Whether pins are held otherwise."""
+        return "pin_stiffness" in self.arrays or PIN_HARD in self.arrays
+
+    @property
     def alters_rate(self) -> bool:
         """Whether a step may take another number of iterations."""
         return any(name in self.arrays for name in _OF_THE_RATE)
 
 
 def check_change(
-    sim: nn.Module, scene: CompiledScene, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False
+    sim: nn.Module, compiled: CompiledScene, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False
 ) -> Change:
     """What `set_material` and loading are to write, for whom errors name; `anew`: nothing is written over."""
-    check_has_values(owner, scene.device)
+    check_has_values(owner, compiled.device)
     for name in arrays:
         if name not in ARRAYS and name not in COLUMNS:
             names = ", ".join([*ARRAYS, *COLUMNS])
@@ -108,7 +113,7 @@ def check_change(
             if name not in originals and (anew or name in reshaped)
         }
         learned = [name for name, tensor in replaced.items() if name in reshaped and tensor.requires_grad]
-        return Change(checked, originals, replaced, _plan_with(scene, own, checked), learned)
+        return Change(checked, originals, replaced, _plan_with(compiled, own, checked), learned)
 
 
 def write_change(sim: nn.Module, change: Change) -> None:
@@ -155,19 +160,19 @@ def _refuse_pins(fault: str, bad: Tensor) -> None:
         raise ValueError(f"{fault}; at {places[0].tolist()} ({len(places)} in all)")
 
 
-def _plan_with(scene: CompiledScene, own: dict[str, Tensor], arrays: dict[str, Tensor]) -> Plan:
+def _plan_with(compiled: CompiledScene, own: dict[str, Tensor], arrays: dict[str, Tensor]) -> Plan:
     """The plan that serves the material with some arrays replaced."""
     if "pin_stiffness" not in arrays and PIN_HARD not in arrays:
-        return scene.plan
+        return compiled.plan
     now = in_order(own | arrays)
-    plan = loosened_plan(scene, arrays.get(PIN_HARD, own[PIN_HARD]))
+    plan = loosened_plan(compiled, arrays.get(PIN_HARD, own[PIN_HARD]))
     if not has_levels(plan.arrays):
         return plan
     # what is held belongs to the structure of a preconditioner
-    held = _held_everywhere(scene.material), _held_everywhere(now)
-    if torch.equal(*held) and not has_strangers(plan, now, scene.time_step):
+    held = _held_everywhere(compiled.material), _held_everywhere(now)
+    if torch.equal(*held) and not has_strangers(plan, now, compiled.time_step):
         return plan
-    return plan_for_solver(replace(scene, plan=plan, material=now))
+    return plan_for_solver(replace(compiled, plan=plan, material=now))
 
 
 def _held_everywhere(material: list[Tensor]) -> Tensor:

@@ -40,6 +40,7 @@ from .scene import Scene
 from .settings import (
     EVERY_STEP,
     NO_STEP,
+    SETTINGS,
     Configuration,
     choose,
     choose_again,
@@ -240,23 +241,9 @@ class Model(nn.Module):
         return self._with_material(self.material())
 
     def _with_material(self, material: list[Tensor]) -> Configuration:
-        return Configuration(
-            scene=self.scene,
-            pinned=self.pinned,
-            plan=self.plan,
-            material=material,
-            time_step=self._time_step,
-            iterations=self._iterations,
-            tolerance=self._tolerance,
-            solver=self._solver,
-            adjoint=self._adjoint,
-            kernel=self._kernel,
-            batch=self._batch,
-            progress=self.progress,
-            choice=self.choice,
-            named_iterations=self._named_iterations,
-            judged_steps=self._judged_steps,
-        )
+        own = {name: getattr(self, "_" + name) for name in SETTINGS}
+        kept = {name: getattr(self, name) for name in ("scene", "pinned", "plan", "choice", "progress")}
+        return Configuration(material=material, **kept, **own)
 
     def _reconfigure(self, **changes: Any) -> None:
         with ordinary():
@@ -264,17 +251,8 @@ class Model(nn.Module):
 
     def _take(self, new: Configuration) -> None:
         """Take over plan and settings, all of them at once."""
-        vars(self).update(
-            plan=new.plan,
-            choice=new.choice,
-            _solver=new.solver,
-            _adjoint=new.adjoint,
-            _kernel=new.kernel,
-            _batch=new.batch,
-            _iterations=new.iterations,
-            _named_iterations=new.named_iterations,
-            _judged_steps=new.judged_steps,
-        )
+        own = {"_" + name: getattr(new, name) for name in SETTINGS}
+        vars(self).update(own, plan=new.plan, choice=new.choice)
 
     def prepare_solver(self) -> None:
         """Make anew what the material decides: the preconditioner of `Multilevel` or `adjoint`, the choice of "auto".
@@ -371,8 +349,9 @@ class Model(nn.Module):
         if self.promise is not None and any(not torch.equal(new, getattr(self, n)) for n, new in change.arrays.items()):
             self.promise.doubt(True)
         write_change(self, change)
-        self.plan = change.plan
-        self._read_pins()
+        if change.alters_pins:
+            self.plan = change.plan
+            self._read_pins()
         if change.alters_rate:
             self.judge_iterations(owner)
         warn_of_new_parameters(change)

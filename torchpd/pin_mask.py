@@ -45,19 +45,19 @@ def serves_any_mask(plan: Plan) -> bool:
     return (plan.loose is None or bool(plan.loose.all())) and not has_levels(plan.arrays)
 
 
-def look_at_pins(scene: CompiledScene, hard: Tensor, *, wait: bool = False) -> tuple[Seen, Plan]:
+def look_at_pins(compiled: CompiledScene, hard: Tensor, *, wait: bool = False) -> tuple[Seen, Plan]:
     """What the mask `hard` says, as `PinMask` in what was seen, and the plan that follows it; awaits a GPU.
 
     Pieces that are let go get rigid motions, and a preconditioner no longer holds what it held. With `wait` later
     steps, on whatever stream, may take the springs that are made here.
     """
-    plain, springs = plain_tensor(hard), scene.named["pin_stiffness"]
+    plain, springs = plain_tensor(hard), compiled.named["pin_stiffness"]
     if not has_numbers(plain) or is_recording(plain.device):
-        return Seen(found=PinMask(some=True)), scene.plan
+        return Seen(found=PinMask(some=True)), compiled.plan
     rows = plain.cpu().reshape(-1, plain.shape[-1])
     mask = PinMask(some=bool(rows.any()))
     with ordinary():
-        plan = plan_that_holds(scene, loosened_plan(scene, rows), rows.all(0))
+        plan = plan_that_holds(compiled, loosened_plan(compiled, rows), rows.all(0))
         # streams wait for what sets the material, but not for what another one has made in a step
         if plain is hard and type(springs) is nn.Parameter and mask.some and (wait or not hard.is_cuda):
             version = None if bool(rows.all()) else springs._version

@@ -83,69 +83,71 @@ def _same_plan(source: torch.device, target: torch.device) -> bool:
     return source == target or properties_of(source) == properties_of(target)
 
 
-def _compile(scene: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
+def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
     """The scene's plan for a device and the solver, on the CPU, without what the solver prepares."""
-    values = scene.scene.values()
+    values = compiled.scene.values()
     # "meta" does not know which pins are hard
-    if loose is None and scene.device.type != "meta":
-        loose = values.pinned.loose(scene.named["pin_stiffness"].isinf().cpu().numpy())
+    if loose is None and compiled.device.type != "meta":
+        loose = values.pinned.loose(compiled.named["pin_stiffness"].isinf().cpu().numpy())
     values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
-        return compile_plan(values, dtype=dtype, progress=scene.progress)
-    levels = isinstance(scene.solver, Multilevel)
+        return compile_plan(values, dtype=dtype, progress=compiled.progress)
+    levels = isinstance(compiled.solver, Multilevel)
     gpu = properties_of(device)
-    return choose_plan(values, dtype, gpu, scene.kernel, levels=levels, batch=scene.batch, progress=scene.progress)
+    return choose_plan(
+        values, dtype, gpu, compiled.kernel, levels=levels, batch=compiled.batch, progress=compiled.progress
+    )
 
 
-def _wants_levels(scene: CompiledScene) -> bool:
+def _wants_levels(compiled: CompiledScene) -> bool:
     """Whether steps or gradients use a multilevel preconditioner."""
-    return isinstance(scene.solver, Multilevel) or scene.adjoint == "multilevel"
+    return isinstance(compiled.solver, Multilevel) or compiled.adjoint == "multilevel"
 
 
-def _has_patches_for(scene: CompiledScene, plan: Plan) -> bool:
+def _has_patches_for(compiled: CompiledScene, plan: Plan) -> bool:
     """Whether the patches serve the solver: a GPU wants others for a multilevel solver, whatever gradients use."""
-    return plan.kernel is None or plan.for_levels == isinstance(scene.solver, Multilevel)
+    return plan.kernel is None or plan.for_levels == isinstance(compiled.solver, Multilevel)
 
 
-def serves(scene: CompiledScene) -> bool:
+def serves(compiled: CompiledScene) -> bool:
     """Whether the plan has what solver and gradients use."""
-    return _has_patches_for(scene, scene.plan) and has_levels(scene.plan.arrays) == _wants_levels(scene)
+    return _has_patches_for(compiled, compiled.plan) and has_levels(compiled.plan.arrays) == _wants_levels(compiled)
 
 
-def _with_levels(scene: CompiledScene, plan: Plan, reference: Reference) -> Plan:
+def _with_levels(compiled: CompiledScene, plan: Plan, reference: Reference) -> Plan:
     """The plan with a multilevel preconditioner; of a GPU's kernels only one reads it."""
     if plan.kernel not in (None, "stream"):
         raise ValueError(
-            f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={scene.kernel!r}, which is '
+            f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={compiled.kernel!r}, which is '
             f'"{plan.kernel}" for this scene; set kernel="stream", or leave adjoint at "solver"'
         )
-    return precondition_plan(plan, scene.scene.values(), *reference, progress=scene.progress)
+    return precondition_plan(plan, compiled.scene.values(), *reference, progress=compiled.progress)
 
 
-def plan_for_solver(scene: CompiledScene) -> Plan:
+def plan_for_solver(compiled: CompiledScene) -> Plan:
     """The plan with what solver and gradients use, made of the material."""
-    plan = without_levels(scene.plan)
-    if not _has_patches_for(scene, plan):
-        plan = _compile(scene, scene.dtype, scene.device)
-    if _wants_levels(scene):
-        plan = _with_levels(scene, plan, reference_of(scene.plan, scene.material, scene.time_step))
-    return move_plan(scene, plan, scene.device)
+    plan = without_levels(compiled.plan)
+    if not _has_patches_for(compiled, plan):
+        plan = _compile(compiled, compiled.dtype, compiled.device)
+    if _wants_levels(compiled):
+        plan = _with_levels(compiled, plan, reference_of(compiled.plan, compiled.material, compiled.time_step))
+    return move_plan(compiled, plan, compiled.device)
 
 
-def loosened_plan(scene: CompiledScene, hard: Tensor) -> Plan:
+def loosened_plan(compiled: CompiledScene, hard: Tensor) -> Plan:
     """The plan where pieces that a mask [P] or [B, P] lets go move rigidly too; the one that is there if they do."""
-    before = scene.plan.loose
+    before = compiled.plan.loose
     if before is None or bool(before.all()):
-        return scene.plan
-    loose = before | scene.pinned.loose(hard.cpu().numpy())
+        return compiled.plan
+    loose = before | compiled.pinned.loose(hard.cpu().numpy())
     if bool((loose == before).all()):
-        return scene.plan
-    if scene.plan.kernel is None:
-        return with_loose_pieces(scene.plan, replace(scene.scene.values(), loose=loose))
-    return move_plan(scene, plan_anew(scene, scene.dtype, scene.device, loose), scene.device)
+        return compiled.plan
+    if compiled.plan.kernel is None:
+        return with_loose_pieces(compiled.plan, replace(compiled.scene.values(), loose=loose))
+    return move_plan(compiled, plan_anew(compiled, compiled.dtype, compiled.device, loose), compiled.device)
 
 
-def plan_that_holds(scene: CompiledScene, plan: Plan, hard: Tensor) -> Plan:
+def plan_that_holds(compiled: CompiledScene, plan: Plan, hard: Tensor) -> Plan:
     """The plan whose preconditioner, if it has one, holds no pin but those that are hard in every environment [P].
 
     It is made of what the one before was made of, but for the pins that are let go: held by it they would not move.
@@ -157,37 +159,37 @@ def plan_that_holds(scene: CompiledScene, plan: Plan, hard: Tensor) -> Plan:
     freed = freed[inertia[freed].isinf()]
     if not len(freed):
         return plan
-    masses, damping = (plain_tensor(scene.named[name].detach()) for name in ("masses", "damping"))
-    drag = 1.0 + damping.max() * scene.time_step
-    inertia[freed] = masses.reshape(-1, plan.vertices).amax(0)[freed] / scene.time_step**2 * drag
-    plan = precondition_plan(plan, scene.scene.values(), stiffness, inertia, progress=scene.progress)
-    return move_plan(scene, plan, scene.device)
+    masses, damping = (plain_tensor(compiled.named[name].detach()) for name in ("masses", "damping"))
+    drag = 1.0 + damping.max() * compiled.time_step
+    inertia[freed] = masses.reshape(-1, plan.vertices).amax(0)[freed] / compiled.time_step**2 * drag
+    plan = precondition_plan(plan, compiled.scene.values(), stiffness, inertia, progress=compiled.progress)
+    return move_plan(compiled, plan, compiled.device)
 
 
-def move_plan(scene: CompiledScene, plan: Plan, device: torch.device, material: int = 0) -> Plan:
+def move_plan(compiled: CompiledScene, plan: Plan, device: torch.device, material: int = 0) -> Plan:
     """A plan on its device, where a GPU has room for it, for `material` bytes beside it and for a step."""
     if plan.device == device:
         return plan
     if device.type == "cuda":
-        needed = plan.bytes + material + step_bytes(scene, plan, scene.environments, device)
+        needed = plan.bytes + material + step_bytes(compiled, plan, compiled.environments, device)
         refuse_full_memory(needed, free_memory(device))
     return plan.to(device)
 
 
-def step_bytes(scene: CompiledScene, plan: Plan, batch: int, device: torch.device) -> int:
+def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.device) -> int:
     """Memory of a step beside plan, material and states, as the op takes it.
 
     Args:
-        scene: whose solver and material the step has.
+        compiled: whose solver and material the step has.
         plan: of a GPU, with what the solver prepares; it may still be on the CPU.
         batch: environments.
         device: the GPU.
     """
     real = torch.finfo(plan.dtype).bits // 8
     levels = plan.level_sizes.numpy() if has_levels(plan.arrays) else np.empty(0, dtype=np.int32)
-    planes, spheres, stiffness = (scene.named[name] for name in ("planes", "spheres", "stiffness"))
+    planes, spheres, stiffness = (compiled.named[name] for name in ("planes", "spheres", "stiffness"))
     own = stiffness.dim() == 2 and len(stiffness) == batch
-    schedule: int = scene.solver.numbers()["schedule"]
+    schedule: int = compiled.solver.numbers()["schedule"]
     with torch.cuda.device(device):
         return _C.step_bytes(
             real, plan.sizes.numpy(), levels, schedule, batch, planes.shape[-2], spheres.shape[-2], own
@@ -199,24 +201,24 @@ def is_recording(device: torch.device) -> bool:
     return torch.compiler.is_compiling() or (device.type == "cuda" and torch.cuda.is_current_stream_capturing())
 
 
-def plan_anew(scene: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
+def plan_anew(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
     """The plan for a precision and a device, on the CPU; `loose`: pieces that can move rigidly."""
-    plan = _compile(scene, dtype, device, loose)
-    if not _wants_levels(scene):
+    plan = _compile(compiled, dtype, device, loose)
+    if not _wants_levels(compiled):
         return plan
     # what M was made of goes along, as into a file; coming from "meta" the values are lost
-    if scene.device.type == "meta":
-        arrays = in_order(material_of(scene.scene.values(), scene.dtype))
-        source = compile_plan(scene.scene.values(), dtype=scene.dtype, progress=False)
-        reference = reference_of(source, arrays, scene.time_step)
+    if compiled.device.type == "meta":
+        arrays = in_order(material_of(compiled.scene.values(), compiled.dtype))
+        source = compile_plan(compiled.scene.values(), dtype=compiled.dtype, progress=False)
+        reference = reference_of(source, arrays, compiled.time_step)
     else:
-        reference = reference_of_levels(scene.plan.arrays)
-    return _with_levels(scene, plan, reference)
+        reference = reference_of_levels(compiled.plan.arrays)
+    return _with_levels(compiled, plan, reference)
 
 
-def plan_on(scene: CompiledScene, dtype: torch.dtype, device: torch.device) -> Plan:
+def plan_on(compiled: CompiledScene, dtype: torch.dtype, device: torch.device) -> Plan:
     """The plan for a precision and a device: the one that is there, moved, where that will do."""
-    same = dtype == scene.dtype and _same_plan(scene.device, device)
-    plan = scene.plan if same else plan_anew(scene, dtype, device)
-    numbers = sum(array.numel() for array in scene.material) + 3 * scene.vertices
-    return move_plan(scene, plan, device, numbers * (torch.finfo(dtype).bits // 8))
+    same = dtype == compiled.dtype and _same_plan(compiled.device, device)
+    plan = compiled.plan if same else plan_anew(compiled, dtype, device)
+    numbers = sum(array.numel() for array in compiled.material) + 3 * compiled.vertices
+    return move_plan(compiled, plan, device, numbers * (torch.finfo(dtype).bits // 8))

@@ -24,6 +24,7 @@ from .solvers import Chebyshev, Solver, check_solver
 __all__ = [
     "EVERY_STEP",
     "NO_STEP",
+    "SETTINGS",
     "Configuration",
     "choose",
     "choose_again",
@@ -37,6 +38,10 @@ __all__ = [
 # Shortest and longest time step for which iterations need no warning, nor for what lies between: long ones are slow,
 # and short ones overshoot with a relaxation for long ones.
 EVERY_STEP, NO_STEP = (0.0, math.inf), (math.inf, 0.0)
+# what a simulator keeps of a `Configuration` beside plan, choice and material
+SETTINGS = (
+    "time_step", "iterations", "tolerance", "solver", "adjoint", "kernel", "batch", "named_iterations", "judged_steps",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
