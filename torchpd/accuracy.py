@@ -33,7 +33,7 @@ from .state import State
 from .targets import Targets
 
 if TYPE_CHECKING:
-    from .simulator import Simulator
+    from .stepper import Stepper
 
 __all__ = [
     "Errors",
@@ -136,7 +136,7 @@ def scene_without_friction(scene: Scene) -> Scene:
     return Scene(*parts)
 
 
-def frictionless(sim: Simulator, dtype: torch.dtype | None = None) -> Simulator:
+def frictionless(sim: Stepper, dtype: torch.dtype | None = None) -> Stepper:
     """A copy of the simulator with its present material, smooth contacts, and no stop before the last iteration."""
     with torch.inference_mode(False), torch.no_grad():
         twin = plain_copy(sim)
@@ -156,7 +156,7 @@ def select_state(state: State, items: list[int]) -> State:
 
 
 def problem_of(
-    sim: Simulator, state: State, item: int = 0, *, forces: Tensor | None = None, targets: Targets | None = None
+    sim: Stepper, state: State, item: int = 0, *, forces: Tensor | None = None, targets: Targets | None = None
 ) -> StepProblem:
     """The step of one environment in the reference, with the simulator's present material and without friction."""
     arrays = sim.material_at(targets, state[0].shape[0])
@@ -204,7 +204,7 @@ def _double(tensor: Tensor) -> Array:
 
 @torch.no_grad()
 def exact_steps(
-    sim: Simulator,
+    sim: Stepper,
     state: State,
     *,
     forces: Tensor | None = None,
@@ -240,7 +240,7 @@ def exact_steps(
 
 @torch.no_grad()
 def settled_steps(
-    sim: Simulator, state: State, *, forces: Tensor | None = None, enough: float = _SURE
+    sim: Stepper, state: State, *, forces: Tensor | None = None, enough: float = _SURE
 ) -> list[ExactStep]:
     """The step of every environment with its friction, where iterations from "velocity" come to rest.
 
@@ -287,9 +287,7 @@ def settled_steps(
 class _Search:
     """Looks for the converged steps of a batch; keeps the best of each environment."""
 
-    def __init__(
-        self, sim: Simulator, state: State, forces: Tensor | None, targets: Targets | None, start: str
-    ) -> None:
+    def __init__(self, sim: Stepper, state: State, forces: Tensor | None, targets: Targets | None, start: str) -> None:
         # the CPU has all solvers, whatever kernel a GPU was asked for
         self.twin = frictionless(sim)
         self.twin.solver = Chebyshev()

@@ -14,7 +14,7 @@ from .state import Info, State
 from .targets import Targets
 
 if TYPE_CHECKING:
-    from .simulator import Simulator
+    from .stepper import Stepper
 
 __all__ = ["CapturedStep"]
 
@@ -36,7 +36,7 @@ class CapturedStep:
 
     def __init__(
         self,
-        sim: Simulator,
+        sim: Stepper,
         state: State,
         forces: Tensor | None,
         targets: Targets | None,

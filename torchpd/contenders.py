@@ -12,7 +12,7 @@ from .spectrum import estimate_rho
 from .state import State
 
 if TYPE_CHECKING:
-    from .simulator import Simulator
+    from .stepper import Stepper
 
 __all__ = ["CONTENDERS", "DEFAULT", "DEFAULT_ITERATIONS", "Contender", "safe_solvers"]
 
@@ -24,12 +24,12 @@ class Contender:
     `make(sim, state)` may run trials from the state; `safe` ones cannot diverge, on any mesh and at any stiffness.
     """
 
-    make: Callable[[Simulator, State], Solver]
+    make: Callable[[Stepper, State], Solver]
     safe: bool
     devices: tuple[str, ...] = ("cpu", "cuda")  # where it runs
 
 
-def _classic(sim: Simulator, state: State) -> Solver:
+def _classic(sim: Stepper, state: State) -> Solver:
     """The schedule of the papers, with the two-stage estimate of rho that goes with it."""
     own = sim.solver
     sim.solver = Jacobi(diagonal="plain")
@@ -49,7 +49,7 @@ CONTENDERS: dict[str, Contender] = {
 DEFAULT = "guarded Chebyshev"  # what `Simulator(scene)` does
 
 
-def safe_solvers(sim: Simulator, state: State) -> dict[str, Solver]:
+def safe_solvers(sim: Stepper, state: State) -> dict[str, Solver]:
     """Those that cannot diverge and run where the simulator is, the default first."""
     here = {name: c for name, c in CONTENDERS.items() if c.safe and sim.device.type in c.devices}
     made = {name: here[name].make(sim, state) for name in sorted(here, key=lambda name: name != DEFAULT)}

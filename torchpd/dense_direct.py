@@ -17,7 +17,7 @@ from torch import Tensor
 from .baselines import factorised, refuse_contacts, two_stage_rho
 from .reference import StepProblem
 from .reference_solvers import classic_omegas
-from .simulator import Simulator
+from .stepper import Stepper
 
 __all__ = ["DENSE", "MOST_VERTICES", "DenseDirect"]
 
@@ -40,7 +40,7 @@ class DenseDirect:
         ValueError: the scene has contacts, or more than `MOST_VERTICES` vertices.
     """
 
-    def __init__(self, sim: Simulator, problem: StepProblem) -> None:
+    def __init__(self, sim: Stepper, problem: StepProblem) -> None:
         refuse_contacts(problem)
         vertices, free = len(problem.free), np.flatnonzero(problem.free)
         if vertices > MOST_VERTICES:

@@ -9,7 +9,7 @@ from torch.nn.modules.module import register_module_module_registration_hook
 from torch.nn.parallel import DistributedDataParallel
 
 from .material import MATERIAL_ROWS
-from .simulator import Simulator
+from .stepper import Stepper
 
 __all__ = ["keep_material_per_rank", "names_per_rank"]
 
@@ -44,7 +44,7 @@ def names_per_rank(module: nn.Module) -> list[str]:
     """Names of parameters and buffers of simulators in `module` that belong to a rank."""
     found = []
     for path, sim in module.named_modules():
-        if isinstance(sim, Simulator):
+        if isinstance(sim, Stepper):
             names = [name for name, _ in sim.named_buffers()]
             names += [name for name, array in sim.named_parameters() if not _is_shared(name, array)]
             found += [f"{path}.{name}" for name in names]

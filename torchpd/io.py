@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +22,17 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from .automatic import Choice
-from .checks import check_has_values, check_target_file
+from .checks import check_target_file
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .embedding import Embedding
-from .material import named_arrays
 from .mesh import TetMesh, TriMesh, trusted
 from .mesh_checks import store
-from .multilevel import has_levels, precondition_plan, reference_of_levels
 from .pins import PIN_HARD
 from .scene import Part, Scene
-from .simulator import Simulator
 from .solvers import Chebyshev, Jacobi, Multilevel, Solver
 from .version import __version__
 
-__all__ = ["FORMAT_VERSION", "load_simulation", "save_simulation"]
+__all__ = ["FORMAT_VERSION", "SavedSimulation", "load_simulation", "reading", "save_simulation"]
 
 FORMAT_VERSION = 2
 # of format 1, whose hard pins have inf for stiffness
@@ -51,55 +49,67 @@ _DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in (torch.float32,
 Record = dict[str, Any]
 
 
-def save_simulation(sim: Simulator, path: str | Path) -> None:
-    """Write scene, settings and current material of a simulator to one file.
+@dataclasses.dataclass(frozen=True, eq=False)
+class SavedSimulation:
+    """A simulation as values: what a file holds, and what `Simulator` is made of."""
+
+    scene: Scene
+    settings: dict[str, Any]  # arguments of `Simulator` by name
+    named_iterations: bool
+    choice: Choice | None  # of solver="auto", which is made anew on another device
+    material: dict[str, Tensor]  # arguments of `set_material` by name
+    trained: list[str]  # names of arrays that want a gradient
+    reference: tuple[Tensor, Tensor] | None  # stiffness and inertia that a preconditioner was made of
+
+
+def save_simulation(saved: SavedSimulation, path: str | Path) -> None:
+    """Write scene, settings and material to one file.
 
     Args:
-        sim: to be written, on any device.
+        saved: to be written, tensors on any device.
         path: of the file; an existing one is replaced. Any ending will do, `.safetensors` is usual.
     """
-    check_has_values("save", sim.device)
     target = check_target_file(path)
-    meshes = _distinct_meshes(sim.scene)
+    scene, settings = saved.scene, saved.settings
+    meshes = _distinct_meshes(scene)
     tensors: dict[str, Tensor] = {}
     for number, mesh in enumerate(meshes):
         tensors.update(_tensors(f"mesh.{number}", _mesh_arrays(mesh)))
-    for number, part in enumerate(sim.scene.parts):
+    for number, part in enumerate(scene.parts):
         tensors.update(_tensors(f"part.{number}", _part_arrays(part)))
-    material = named_arrays(sim)
-    tensors.update({f"material.{name}": value.detach().cpu().contiguous() for name, value in material.items()})
-    if has_levels(sim.plan.arrays):
-        reference = zip(_REFERENCE, reference_of_levels(sim.plan.arrays), strict=True)
+    tensors.update({f"material.{name}": value.detach().cpu().contiguous() for name, value in saved.material.items()})
+    if saved.reference is not None:
+        reference = zip(_REFERENCE, saved.reference, strict=True)
         tensors.update({f"solver.{name}": value.cpu().contiguous() for name, value in reference})
+    solver = settings["solver"]
     record: Record = {
         "format": FORMAT_VERSION,
         "written_by": f"torchpd {__version__}",
-        "time_step": sim.time_step,
-        "iterations": sim.iterations,
-        "named_iterations": sim.named_iterations,
-        "tolerance": sim.tolerance,
-        "kernel": sim.kernel,
-        "adjoint": sim.adjoint,
-        "batch": sim.batch,
-        "dtype": str(sim.dtype).removeprefix("torch."),
-        "solver": {"kind": type(sim.solver).__name__, **dataclasses.asdict(sim.solver)},
-        "choice": None if sim.choice is None else dataclasses.asdict(sim.choice),
+        **settings,
+        "dtype": str(settings["dtype"]).removeprefix("torch."),
+        "solver": {"kind": type(solver).__name__, **dataclasses.asdict(solver)},
+        "named_iterations": saved.named_iterations,
+        "choice": None if saved.choice is None else dataclasses.asdict(saved.choice),
         "meshes": [{"flipped": mesh.flipped} for mesh in meshes],
-        "parts": [_part_record(part, sim.scene, meshes) for part in sim.scene.parts],
-        "material": list(material),
-        "trained": [name for name, value in material.items() if value.requires_grad],
+        "parts": [_part_record(part, scene, meshes) for part in scene.parts],
+        "material": list(saved.material),
+        "trained": saved.trained,
     }
     save_file(tensors, target, metadata={_KEY: json.dumps(record)})
 
 
-def load_simulation(path: str | Path) -> Simulator:
-    """Read what `save_simulation` wrote, on the CPU. The scene is compiled anew.
-
-    Pins and spheres are new objects, `sim.scene.pins` and `sim.scene.spheres`, in the order in which they were given.
-    """
+def load_simulation(path: str | Path) -> SavedSimulation:
+    """Read what `save_simulation` wrote."""
     record, tensors = _read(Path(path))
+    with reading(path):
+        return _saved(record, tensors)
+
+
+@contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Say of errors that the content of a file raises that the file is damaged."""
     try:
-        return _build(record, tensors)
+        yield
     except _MissingTensorError as missing:
         raise ValueError(f"{path} is damaged: the tensor {missing.args[0]!r} is missing") from None
     except (KeyError, IndexError, TypeError, ValueError) as error:
@@ -209,37 +219,37 @@ def _record(path: Path, metadata: Mapping[str, str] | None) -> Record:
     return dict(record)
 
 
-def _build(record: Record, tensors: _Tensors) -> Simulator:
+def _saved(record: Record, tensors: _Tensors) -> SavedSimulation:
     choice = dict(record.get("choice") or {})
     former = choice.pop("batch", 1)  # of files of before simulators had one
     meshes = [_mesh(number, mesh, tensors) for number, mesh in enumerate(record["meshes"])]
-    sim = Simulator(
-        Scene(*_parts(record["parts"], meshes, tensors)),
-        time_step=record["time_step"],
-        iterations=record["iterations"],
-        solver=_solver(record["solver"]),
-        dtype=_DTYPES[record["dtype"]],
-        tolerance=record["tolerance"],
-        kernel=record.get("kernel", "auto"),  # files of before there was a choice
-        batch=record.get("batch", former if former > 1 else None),
-        adjoint=record.get("adjoint", "solver"),
-    )
+    settings = {
+        "time_step": record["time_step"],
+        "iterations": record["iterations"],
+        "solver": _solver(record["solver"]),
+        "dtype": _DTYPES[record["dtype"]],
+        "tolerance": record["tolerance"],
+        "kernel": record.get("kernel", "auto"),  # files of before there was a choice
+        "batch": record.get("batch", former if former > 1 else None),
+        "adjoint": record.get("adjoint", "solver"),
+    }
     # the scene's values stay where a file has none
     material = {name: tensors[f"material.{name}"] for name in record.get("material", _FIRST_ARRAYS)}
     if "pin_stiffness" in material:
         material.setdefault(PIN_HARD, material["pin_stiffness"].isinf())
-    sim.set_material(**material)
-    for name in record["trained"]:
-        getattr(sim, name).requires_grad_()
-    if has_levels(sim.plan.arrays):
+    reference = None
+    if isinstance(settings["solver"], Multilevel) or settings["adjoint"] == "multilevel":
         stiffness, inertia = (tensors[f"solver.{name}"] for name in _REFERENCE)
-        if not all(map(torch.equal, (stiffness, inertia), reference_of_levels(sim.plan.arrays))):
-            sim.plan = precondition_plan(sim.plan, sim.scene.values(), stiffness, inertia)
-    if choice:  # of "auto", which chooses anew on another device
-        sim.choice = Choice(**choice)
-    sim.named_iterations = record.get("named_iterations", True)  # files of before do not say
-    sim.judge_iterations("Simulator.load")
-    return sim
+        reference = stiffness, inertia
+    return SavedSimulation(
+        scene=Scene(*_parts(record["parts"], meshes, tensors)),
+        settings=settings,
+        named_iterations=record.get("named_iterations", True),  # files of before do not say
+        choice=Choice(**choice) if choice else None,
+        material=material,
+        trained=record["trained"],
+        reference=reference,
+    )
 
 
 def _solver(record: Record) -> Solver:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -12,14 +12,41 @@ from torch import Tensor
 from .accuracy import ROUNDINGS
 from .course import course_of
 from .material import fingerprint
+from .plan import Plan
 from .solvers import Solver
 from .state import Info, State
 from .targets import Targets
 
-if TYPE_CHECKING:
-    from .simulator import Simulator
-
 __all__ = ["Promise", "Trial"]
+
+
+class Tuned(Protocol):
+    """What a promise reads of a simulator."""
+
+    plan: Plan
+    iterations: int
+    tolerance: float
+
+    @property
+    def time_step(self) -> float: ...
+
+    @property
+    def solver(self) -> Solver: ...
+
+    @property
+    def dtype(self) -> torch.dtype: ...
+
+    @property
+    def device(self) -> torch.device: ...
+
+    @property
+    def promise(self) -> Any: ...
+
+    def material(self) -> list[Tensor]: ...
+
+    def material_at(self, targets: Targets | None, batch: int) -> list[Tensor]: ...
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any: ...
 
 
 class Trial(NamedTuple):
@@ -75,7 +102,7 @@ class Promise:
     @torch.no_grad()
     def audit(
         self,
-        sim: Simulator,
+        sim: Tuned,
         state: State,
         after: State,
         forces: Tensor | None = None,
@@ -125,7 +152,7 @@ class Promise:
         """
         return (_info(info, "estimate").residual * self.error_per_residual).clamp(min=self.unseen_error)
 
-    def covers(self, sim: Simulator) -> bool:
+    def covers(self, sim: Tuned) -> bool:
         """Whether the simulator still has the settings and the material that were promised for; awaits a GPU."""
         now = (sim.solver, sim.iterations, sim.time_step, sim.dtype, str(sim.device), sim.tolerance)
         other = self.other_material

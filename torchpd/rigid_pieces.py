@@ -20,8 +20,8 @@ from torch import Tensor
 from .checks import check_has_values, check_scalar, check_whole
 from .diagonal import step_diagonal
 from .multilevel import reference_of
-from .simulator import Simulator
 from .state import Info, State
+from .stepper import Stepper
 from .stiff_pieces import find_pieces
 
 if TYPE_CHECKING:
@@ -57,8 +57,8 @@ class RigidPieces:
         ValueError: a scene with contacts, without a free piece, with more than 256, or that does not fit into memory.
     """
 
-    def __init__(self, sim: Simulator, *, stiffer_than: float | None = None) -> None:
-        if not isinstance(sim, Simulator):
+    def __init__(self, sim: Stepper, *, stiffer_than: float | None = None) -> None:
+        if not isinstance(sim, Stepper):
             raise TypeError(f"RigidPieces: sim must be a Simulator, got {type(sim).__name__}")
         if sim.planes.shape[-2] or sim.spheres.shape[-2]:
             raise ValueError("RigidPieces: the scene has contacts, which rigid motions do not know of; use sim alone")
@@ -222,7 +222,7 @@ class RigidPieces:
         return falls
 
 
-def _look(sim: Simulator) -> list[tuple[Any, ...]]:
+def _look(sim: Stepper) -> list[tuple[Any, ...]]:
     """What tells without reading values whether anything was written: the objects, their versions and places."""
     arrays = [getattr(sim, name) for name in _MADE_OF]
     # tensors of inference mode count no versions

@@ -1,35 +1,32 @@
-"""The simulator: a compiled scene as an `nn.Module` that steps states."""
+"""The simulator: a compiled scene as an `nn.Module` that steps states, tunes and saves itself."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor
 
-from .adjoint import step_gradient
 from .capture import CapturedStep
-from .checks import check_like, check_whole
-from .material import MATERIAL_ROWS, environments_of_material, named_arrays
-from .ops import INFO_WIDTH, refuse_tangents
-from .readable import Readable
-from .rollout import PerStep, Rollout, roll
+from .checks import check_has_values
+from .io import SavedSimulation, load_simulation, reading, save_simulation
+from .material import named_arrays
+from .multilevel import has_levels, precondition_plan, reference_of_levels
+from .promise import Promise
 from .solvers import Solver
-from .state import Info, State, Track
+from .state import State
+from .stepper import Stepper
 from .summary import describe
 from .targets import Targets
-
-if TYPE_CHECKING:
-    from .promise import Promise
+from .tuning import tune
 
 __all__ = ["Simulator", "Targets"]
 
-_ops = torch.ops.torchpd
+_SETTINGS = ("time_step", "iterations", "solver", "dtype", "tolerance", "kernel", "batch", "adjoint")
 
 
-class Simulator(Readable):
+class Simulator(Stepper):
     """Steps a scene through time by implicit Euler, solved approximately by projective dynamics.
 
     The values that training may change are parameters (without gradient until asked), for all environments or, with a
@@ -79,163 +76,10 @@ class Simulator(Readable):
     promise: Promise | None
 
     def extra_repr(self) -> str:
-        return describe(self)
+        return describe(self, self.promise)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(\n  {self.extra_repr()}\n)"
-
-    # ---- states
-
-    def rest_state(self, batch: int | None = None) -> State:
-        """Everything at rest [batch, V, 3], by default once for each environment of the material."""
-        count = (
-            environments_of_material(named_arrays(self)) if batch is None else check_whole("batch", batch, minimum=0)
-        )
-        shape = (count, -1, -1)
-        positions = self.rest_positions.expand(shape).clone()
-        return State(positions, torch.zeros_like(positions))
-
-    def forward(
-        self,
-        state: State,
-        forces: Tensor | None = None,
-        targets: Targets | None = None,
-        start: str | Tensor = "velocity",
-        return_info: bool = False,
-    ) -> State | tuple[State, Info]:
-        """One time step.
-
-        Within `torch.autocast`, which changes no number of it, forces may be of half precision.
-
-        Args:
-            state: positions and velocities [B, V, 3] [m, m/s].
-            forces: on the vertices [B, V, 3] [N], or [V, 3] or [1, V, 3] for all environments; constant during the
-                step.
-            targets: where pins and spheres are at the end of the step [m]: by part, or one tensor [P, 3] or [B, P, 3]
-                for all pins together. A sphere takes its centre [3] or [B, 3], and with its velocity [6] or [B, 6],
-                which friction then drags vertices along with.
-            start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
-                The first two are moved out of contacts and along rigid motions; bodies that planes would squeeze there
-                by more than is gained start from x instead.
-            return_info: also how the solve went; costs some ten iterations more, no synchronisation.
-
-        Returns:
-            The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
-            error follows that of the step), friction included, see `torchpd.adjoint`, and for planes and spheres
-            themselves; none for `start`. Forward mode and `torch.func.grad` are not provided.
-        """
-        forces = self.check_state(state, forces=forces)
-        material = self.material_at(targets, state[0].shape[0])
-        after, rows = self.advance(state, forces, material, start, report=return_info)
-        return (after, Info.from_rows(rows)) if return_info else after
-
-    def advance(
-        self, state: State, forces: Tensor | None, material: list[Tensor], start: str | Tensor, *, report: bool
-    ) -> tuple[State, Tensor]:
-        """One step of a checked state and forces with a given material, see `material_at`: the next state, and rows for
-        `Info.from_rows`."""
-        given, inertial = _first_iterate(start, state[0])
-        refuse_tangents(*state, forces, *material)
-        self._notices.before(self, state, material, self.time_step, report=report)
-        positions, velocities, rows = _ops.step(
-            state[0],
-            state[1],
-            forces,
-            given,
-            material,
-            list(self.plan.arrays),
-            **self.numbers(inertial=inertial, report=report),
-        )
-        if report:
-            self._notices.after(self, positions, rows)
-        return State(positions, velocities), rows
-
-    @torch.no_grad()
-    def step_(
-        self,
-        state: State,
-        forces: Tensor | None = None,
-        targets: Targets | None = None,
-        start: str | Tensor = "velocity",
-        *,
-        info: Tensor | None = None,
-    ) -> None:
-        """One time step that overwrites the state, without gradients. Arguments as in `forward`.
-
-        If an exception ends it, as Ctrl-C does, each environment is either before the step or after it.
-
-        Args:
-            info: rows [B, 7] float64 to fill in, see `Info.from_rows`; None leaves out residual, energy and inverted.
-        """
-        forces = self.check_state(state, forces=forces)
-        if state[0].requires_grad or state[1].requires_grad:
-            raise ValueError(
-                "step_ overwrites the state, so it must not require gradients; detach it or call the simulator"
-            )
-        if not (info is None or isinstance(info, Tensor)):
-            raise TypeError(
-                f"step_: info must be None or a float64 tensor {[len(state[0]), INFO_WIDTH]} to fill in, got "
-                f"{type(info).__name__}"
-            )
-        given, inertial = _first_iterate(start, state[0])
-        material = self.material_at(targets, state[0].shape[0])
-        self._notices.before(self, state, material, self.time_step, report=info is not None)
-        rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
-        _ops.step_(
-            state[0],
-            state[1],
-            rows,
-            forces,
-            given,
-            material,
-            list(self.plan.arrays),
-            **self.numbers(inertial=inertial, report=info is not None),
-        )
-        if info is not None:
-            self._notices.after(self, state[0], info)
-
-    def rollout(
-        self,
-        state: State,
-        steps: int,
-        every: int = 1,
-        *,
-        forces: Tensor | PerStep | None = None,
-        targets: Targets | PerStep | None = None,
-        first: int = 0,
-        start: str = "velocity",
-        return_info: bool = False,
-        progress: bool = False,
-    ) -> Track:
-        """Many time steps.
-
-        Ctrl-C ends it within a second on a CPU, as any long step, and on a GPU with `progress`.
-
-        Args:
-            state: where to start.
-            steps: how many.
-            every: steps from one record to the next; the track has steps // every records.
-            forces: as in `forward`, constant, or a function of the step number.
-            targets: as in `forward`, constant (a sphere with a velocity goes on with it), or a function of the step
-                number. A sphere's centre that comes from a function without a velocity has that of its way from where
-                the sphere was at the end of the step before: where the scene has it before step 0 and after steps that
-                leave it out.
-            first: number of the first step, where this rollout goes on from another: `rollout(state, 9)` ends as
-                `rollout(rollout(state, 5).state(), 4, first=5)` does. For where spheres were, a function of targets is
-                asked for the step before, too; others are moved on by an addition for each step before.
-            start: first iterate of every step, "velocity" or "inertial".
-            return_info: fill in residual, energy and inverted of the recorded steps, see `Info`.
-            progress: show a bar, for which a GPU finishes a piece of about 0.1 s before the next one begins.
-
-        Returns:
-            Track of the recorded states.
-        """
-        steps, every = check_whole("steps", steps, minimum=0), check_whole("every", every, minimum=1)
-        first = check_whole("first", first, minimum=0)
-        if not _is_start(start):
-            raise ValueError(f'rollout: start must be "velocity" or "inertial", got {_in_short(start)}')
-        call = Rollout(state, steps, every, forces, targets, start, return_info, first)
-        return roll(self, call, progress=progress)
 
     def capture(
         self,
@@ -299,8 +143,6 @@ class Simulator(Readable):
             ValueError: states, forces or material that are not finite, a singular system, a scene without motion.
             RuntimeError: no converged step to compare with; solver and iterations stay.
         """
-        from .tuning import tune
-
         return tune(
             self,
             state,
@@ -313,91 +155,45 @@ class Simulator(Readable):
             progress=progress,
         )
 
-    # ---- energies
-
-    def energy(self, state: State | Tensor, targets: Targets | None = None) -> Tensor:
-        """Mechanical energy of each environment [B] [J], differentiable twice.
-
-        Elastic energy, springs of soft pins, weight (zero at the origin) and, for a `State`, kinetic energy.
-
-        Args:
-            state: a `State`, or positions [B, V, 3] alone.
-            targets: of pins, as in `forward`.
-        """
-        positions = self.positions_of(state)
-        refuse_tangents(positions)
-        material = dict(zip(MATERIAL_ROWS, self.material_at(targets, positions.shape[0]), strict=True))
-        energy = cast(Tensor, _ops.element_energy(positions, material["stiffness"], list(self.plan.arrays))).sum(-1)
-        weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
-        energy = energy - (material["masses"] * weight).sum(-1)
-        if len(self.plan.pin_vertex):
-            energy = energy + self._spring_energy(positions, material["pin_stiffness"], material["pin_targets"])
-        if not isinstance(state, Tensor):
-            energy = energy + 0.5 * (material["masses"] * state[1].square().sum(-1)).sum(-1)
-        return energy
-
-    def _spring_energy(self, positions: Tensor, stiffness: Tensor, targets: Tensor) -> Tensor:
-        vertices = self.plan.vertex_order[self.plan.pin_vertex.long()].long()
-        soft = torch.where(torch.isinf(stiffness), torch.zeros_like(stiffness), stiffness)
-        return 0.5 * (soft * (positions[:, vertices] - targets).square().sum(-1)).sum(-1)
-
-    def gradient(self, positions: State | Tensor) -> Tensor:
-        """Gradient of the elastic energy [B, V, 3] [N]: minus the elastic forces.
-
-        Args:
-            positions: [B, V, 3], or a `State`.
-        """
-        positions = self.positions_of(positions, "positions")
-        result: Tensor = _ops.gradient(positions, self.stiffness.contiguous(), list(self.plan.arrays))
-        return result
-
-    def step_gradient(
-        self, state: State, after: State | Tensor, forces: Tensor | None = None, targets: Targets | None = None
-    ) -> Tensor:
-        """Gradient of the objective of a step at some positions [B, V, 3] [N]: what a solve brings to zero.
-
-        Contacts do not enter: where one holds a vertex, its force remains, see `contact_forces`. Hard pins have none.
-
-        Args:
-            state: where the step starts.
-            after: the positions [B, V, 3] to judge, or a `State`, for example the next one.
-            forces: as in `forward`.
-            targets: as in `forward`.
-        """
-        return step_gradient(self.checked_call(state, after, forces, targets))
-
-    # ---- files
-
     def save(self, path: str | Path) -> None:
         """Write scene, settings and material to one file: safetensors with JSON metadata, no pickle."""
-        from .io import save_simulation
-
-        save_simulation(self, path)
+        check_has_values("save", self.device)
+        save_simulation(self._saved(), path)
 
     @staticmethod
     def load(path: str | Path) -> Simulator:
-        """Read what `save` wrote, on the CPU."""
-        from .io import load_simulation
+        """Read what `save` wrote, on the CPU. The scene is compiled anew.
 
-        return load_simulation(path)
+        Pins and spheres are new objects, `sim.scene.pins` and `sim.scene.spheres`, in the order in which they were
+        given.
+        """
+        saved = load_simulation(path)
+        with reading(path):
+            return _restored(saved)
+
+    def _saved(self) -> SavedSimulation:
+        material = named_arrays(self)
+        return SavedSimulation(
+            scene=self.scene,
+            settings={name: getattr(self, name) for name in _SETTINGS},
+            named_iterations=self.named_iterations,
+            choice=self.choice,
+            material=material,
+            trained=[name for name, value in material.items() if value.requires_grad],
+            reference=reference_of_levels(self.plan.arrays) if has_levels(self.plan.arrays) else None,
+        )
 
 
-def _first_iterate(start: str | Tensor, positions: Tensor) -> tuple[Tensor | None, bool]:
-    if isinstance(start, Tensor):
-        check_like("start", start, positions, "first iterate, m")
-        if start.requires_grad and torch.is_grad_enabled():
-            raise ValueError(
-                "start, the first iterate, requires a gradient, but a solved step does not depend on it: detach() it"
-            )
-        return start, False
-    if not _is_start(start):
-        raise ValueError(f'start must be "velocity", "inertial" or positions [B, V, 3], got {_in_short(start)}')
-    return None, start == "inertial"
-
-
-def _is_start(start: object) -> bool:
-    return isinstance(start, str) and start in ("velocity", "inertial")
-
-
-def _in_short(value: object) -> str:
-    return repr(value) if isinstance(value, str) else type(value).__name__
+def _restored(saved: SavedSimulation) -> Simulator:
+    sim = Simulator(saved.scene, **saved.settings)
+    sim.set_material(**saved.material)
+    for name in saved.trained:
+        getattr(sim, name).requires_grad_()
+    reference = saved.reference
+    # with the mesh it decides the bits of the preconditioner
+    if reference is not None and not all(map(torch.equal, reference, reference_of_levels(sim.plan.arrays))):
+        sim.plan = precondition_plan(sim.plan, sim.scene.values(), *reference)
+    sim.choice = saved.choice
+    sim.named_iterations = saved.named_iterations
+    sim.judge_iterations("Simulator.load")
+    return sim

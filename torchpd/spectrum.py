@@ -15,7 +15,7 @@ from .solvers import Chebyshev, Jacobi
 from .state import State
 
 if TYPE_CHECKING:
-    from .simulator import Simulator
+    from .stepper import Stepper
 
 __all__ = ["estimate_rho"]
 
@@ -23,19 +23,19 @@ _LARGEST = 0.99999
 _ops = torch.ops.torchpd
 
 
-def _diagonal(sim: Simulator) -> tuple[Tensor, Tensor]:
+def _diagonal(sim: Stepper) -> tuple[Tensor, Tensor]:
     weighted = sim.solver.numbers()["weighted"]
     return step_diagonal(sim.plan.arrays, sim.material(), sim.time_step, weighted=weighted)
 
 
-def _bound(sim: Simulator) -> float:
+def _bound(sim: Stepper) -> float:
     numbers = sim.solver.numbers()
     inertia, diagonal = _diagonal(sim)
     ratio = torch.where(torch.isinf(inertia), torch.ones_like(inertia), inertia / diagonal)
     return 1.0 - numbers["relaxation"] * float(ratio.min())
 
 
-def _power(sim: Simulator, state: State, iterations: int) -> float:
+def _power(sim: Stepper, state: State, iterations: int) -> float:
     """Largest |eigenvalue| of I - theta D^-1 H at the state, H the Hessian of the step's objective."""
     numbers = sim.solver.numbers()
     inertia, diagonal = (t.unsqueeze(-1) for t in _diagonal(sim))
@@ -53,20 +53,20 @@ def _power(sim: Simulator, state: State, iterations: int) -> float:
     return float(scale)
 
 
-def _trial(sim: Simulator, solver: Jacobi | Chebyshev, iterations: int) -> Simulator:
+def _trial(sim: Stepper, solver: Jacobi | Chebyshev, iterations: int) -> Stepper:
     """The same simulation, sharing plan and material, with another solver."""
     trial = copy.copy(sim)
     trial.solver, trial.iterations, trial.tolerance = solver, iterations, 0.0
     return trial
 
 
-def _residual(sim: Simulator, state: State, solver: Jacobi | Chebyshev, iterations: int) -> float:
+def _residual(sim: Stepper, state: State, solver: Jacobi | Chebyshev, iterations: int) -> float:
     _, info = _trial(sim, solver, iterations)(state, return_info=True)
     worst = float(cast(Tensor, info.residual).max())
     return worst if math.isfinite(worst) else math.inf
 
 
-def _two_stage(sim: Simulator, state: State, iterations: int) -> float:
+def _two_stage(sim: Stepper, state: State, iterations: int) -> float:
     """The pre-simulation of the source paper: a ratio of residuals, then trial runs around it."""
     numbers = sim.solver.numbers()
     diagonal: Literal["weighted", "plain"] = "weighted" if numbers["weighted"] else "plain"
@@ -81,7 +81,7 @@ def _two_stage(sim: Simulator, state: State, iterations: int) -> float:
     return best[1]
 
 
-def _check_state(sim: Simulator, state: State) -> None:
+def _check_state(sim: Stepper, state: State) -> None:
     check_has_values("estimate_rho", sim.device)
     positions = sim.positions_of(state)
     if not len(positions):
@@ -93,7 +93,7 @@ def _check_state(sim: Simulator, state: State) -> None:
 
 @torch.no_grad()
 def estimate_rho(
-    sim: Simulator,
+    sim: Stepper,
     state: State,
     method: Literal["two-stage", "power", "bound"] = "two-stage",
     *,

@@ -18,7 +18,8 @@ from .tables import MULTILEVEL_TABLE
 
 if TYPE_CHECKING:
     from .plan import Plan
-    from .simulator import Simulator
+    from .promise import Promise
+    from .stepper import Stepper
 
 __all__ = ["describe", "workspace_bytes"]
 
@@ -29,7 +30,7 @@ _ANY_BATCH = 2**31 - 1
 _TURNING_MODES = 24  # of the small problem of Multilevel("corotated"), see csrc/solver/corotation.h
 
 
-def _solver_line(sim: Simulator) -> str:
+def _solver_line(sim: Stepper) -> str:
     numbers = sim.solver.numbers()
     name = "Jacobi"
     if isinstance(sim.solver, Chebyshev):
@@ -45,7 +46,7 @@ def _solver_line(sim: Simulator) -> str:
     )
 
 
-def _expectation_lines(sim: Simulator) -> list[str]:
+def _expectation_lines(sim: Stepper) -> list[str]:
     """Why "auto" chose, and what the iterations are worth."""
     lines = [] if sim.choice is None else [f"chosen because {sim.choice.why}"]
     scene = sim.compiled
@@ -64,14 +65,14 @@ def _expectation_lines(sim: Simulator) -> list[str]:
     return lines
 
 
-def _promise_lines(sim: Simulator) -> list[str]:
-    if sim.promise is None:
+def _promise_lines(sim: Stepper, promise: Promise | None) -> list[str]:
+    if promise is None:
         return []
-    stale = "" if sim.promise.covers(sim) else "; settings have changed since, so it no longer holds"
-    return [f"tuned: {sim.promise}{stale}"]
+    stale = "" if promise.covers(sim) else "; settings have changed since, so it no longer holds"
+    return [f"tuned: {promise}{stale}"]
 
 
-def _preconditioner_lines(sim: Simulator) -> list[str]:
+def _preconditioner_lines(sim: Stepper) -> list[str]:
     """Levels and bytes of what `Multilevel`, or gradients, have prepared."""
     plan = sim.plan
     if not has_levels(plan.arrays):
@@ -84,7 +85,7 @@ def _preconditioner_lines(sim: Simulator) -> list[str]:
     return [f"preconditioner{whose}: {' > '.join(steps)}, {solved}; {own:,} B of the plan"]
 
 
-def _effect_lines(sim: Simulator) -> list[str]:
+def _effect_lines(sim: Stepper) -> list[str]:
     scene = sim.scene
     tets = sum(len(solid.mesh.tets) for solid in scene.solids)
     lines = [f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step an iteration"]
@@ -104,7 +105,7 @@ def _effect_lines(sim: Simulator) -> list[str]:
     return lines
 
 
-def _pin_lines(sim: Simulator) -> list[str]:
+def _pin_lines(sim: Stepper) -> list[str]:
     """Hard pins and springs: those of every environment first."""
     rows = sim.pin_hard.expand(1, -1) if sim.pin_hard.dim() == 1 else sim.pin_hard
     always, ever = int(rows.all(0).sum()), int(rows.any(0).sum())
@@ -118,7 +119,7 @@ def _pin_lines(sim: Simulator) -> list[str]:
     return lines
 
 
-def _pass_line(sim: Simulator) -> str:
+def _pass_line(sim: Stepper) -> str:
     plan = sim.plan
     shared = len(plan.shared_start) - 1
     second = f" and one over {shared} vertices that patches share" if shared else ""
@@ -137,7 +138,7 @@ _LAUNCHES = {
 _LEVEL_LAUNCHES = "some thread blocks an environment, all iterations in one launch"
 
 
-def _kernel_lines(sim: Simulator) -> list[str]:
+def _kernel_lines(sim: Stepper) -> list[str]:
     plan = sim.plan
     kernel = str(plan.kernel)
     block = shared_bytes(plan, sim.planes.shape[-2], sim.spheres.shape[-2])
@@ -177,7 +178,7 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     return real * (numbers + 32 * plan.vertices) + 8 * (sums + 2 * _TURNING_MODES**2)
 
 
-def _step_bytes(sim: Simulator, real: int) -> str:
+def _step_bytes(sim: Stepper, real: int) -> str:
     """Memory that a step takes beside plan, material and states."""
     plan = sim.plan
     if plan.kernel is None:
@@ -192,7 +193,7 @@ def _step_bytes(sim: Simulator, real: int) -> str:
     return f"{taken}, at most {step_bytes(scene, plan, _ANY_BATCH, sim.device):,} B in all"
 
 
-def describe(sim: Simulator) -> str:
+def describe(sim: Stepper, promise: Promise | None) -> str:
     """Lines for `print(sim)`: sizes, solver, effects, passes, memory."""
     plan = sim.plan
     material = sum(array.numel() * array.element_size() for array in sim.material())
@@ -206,7 +207,7 @@ def describe(sim: Simulator) -> str:
         return "\n  ".join([*lines, NO_VALUES])
     lines += [
         *_expectation_lines(sim),
-        *_promise_lines(sim),
+        *_promise_lines(sim, promise),
         *_preconditioner_lines(sim),
         *_effect_lines(sim),
         *([_pass_line(sim)] if plan.kernel is None else _kernel_lines(sim)),

@@ -38,7 +38,7 @@ from .tuning_checks import check_known, check_request, check_start
 from .warn import TuningWarning, warn_user
 
 if TYPE_CHECKING:
-    from .simulator import Simulator
+    from .stepper import Stepper
 
 __all__ = ["TuningWarning", "tune"]
 
@@ -66,7 +66,7 @@ _KNOWN = 0.1  # uncertainty of the converged steps, at most, where a time is ask
 class _Study:
     """What every trial needs."""
 
-    sim: Simulator  # its batch the studied states
+    sim: Stepper  # its batch the studied states
     state: State
     forces: Tensor | None
     exact: list[ExactStep]
@@ -100,7 +100,7 @@ class _Study:
 
 
 def tune(
-    sim: Simulator,
+    sim: Stepper,
     state: State | None = None,
     *,
     error: float | None = None,
@@ -162,7 +162,7 @@ def tune(
     return promise
 
 
-def _usual(sim: Simulator, solvers: Mapping[str, Solver]) -> dict[str, Solver]:
+def _usual(sim: Stepper, solvers: Mapping[str, Solver]) -> dict[str, Solver]:
     """Those that are studied if no others are named: friction may lead Multilevel astray in steps that are not."""
     smooth = not has_friction(sim.compiled)
     return {name: solver for name, solver in solvers.items() if smooth or not isinstance(solver, Multilevel)}
@@ -171,7 +171,7 @@ def _usual(sim: Simulator, solvers: Mapping[str, Solver]) -> dict[str, Solver]:
 # ---- the study
 
 
-def _with_targets(sim: Simulator, targets: Targets | None, batch: int) -> Simulator:
+def _with_targets(sim: Stepper, targets: Targets | None, batch: int) -> Stepper:
     """The simulator with pins and spheres where `targets` puts them."""
     if targets is None:
         return sim
@@ -182,7 +182,7 @@ def _with_targets(sim: Simulator, targets: Targets | None, batch: int) -> Simula
 
 
 @torch.no_grad()
-def _prepare(sim: Simulator, start: State, forces: Tensor | None, error: float | None) -> _Study:
+def _prepare(sim: Stepper, start: State, forces: Tensor | None, error: float | None) -> _Study:
     """States of the motion from `start`, with their converged steps; those that only fall are left out."""
     items = _environments(sim, len(start[0]))
     some = _of_environments(sim, items, len(start[0]))
@@ -218,7 +218,7 @@ def _rests(step: ExactStep, allowed: float) -> bool:
     return step.uncertainty > allowed and step.uncertainty * step.scale <= step.rounding(torch.float64)
 
 
-def _environments(sim: Simulator, batch: int) -> list[int]:
+def _environments(sim: Stepper, batch: int) -> list[int]:
     """Some environments of a batch, evenly spread, and the one whose system is worst conditioned."""
     items = set(np.linspace(0, batch - 1, _ENVIRONMENTS).round().astype(int).tolist())
     inertia, diagonal = step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)
@@ -228,7 +228,7 @@ def _environments(sim: Simulator, batch: int) -> list[int]:
     return sorted(items)
 
 
-def _other_ways(sim: Simulator, start: State) -> list[State]:
+def _other_ways(sim: Stepper, start: State) -> list[State]:
     """The start with its velocities turned about the normal of rough ground: what sticks when depends on the way."""
     planes = sim.planes.detach()
     if not bool((planes[..., 4] > 0.0).any()):
@@ -248,7 +248,7 @@ def _other_ways(sim: Simulator, start: State) -> list[State]:
     ]
 
 
-def _motion(sim: Simulator, start: State, forces: Tensor | None) -> list[State]:
+def _motion(sim: Stepper, start: State, forces: Tensor | None) -> list[State]:
     """The states before the steps `_STEPS`, solved well enough to be those of the true motion, and a few others.
 
     Turned ones have the same shape and speeds in other directions: as likely a motion, whose steps err in other modes.
@@ -286,7 +286,7 @@ def _left(rough: State, before: State, after: State, time_step: float) -> float:
     return float(left.max())
 
 
-def _of_environments(sim: Simulator, items: list[int], batch: int) -> Simulator:
+def _of_environments(sim: Stepper, items: list[int], batch: int) -> Stepper:
     """The simulator for some environments of a batch: material that each has its own of is picked."""
     own = {
         name: array.detach()[items]
@@ -305,7 +305,7 @@ Seek = Callable[[Solver], list[Trial]]
 
 
 def _for_error(
-    sim: Simulator, study: _Study, start: State, solvers: list[Solver], error: float, most: int, bar: tqdm[NoReturn]
+    sim: Stepper, study: _Study, start: State, solvers: list[Solver], error: float, most: int, bar: tqdm[NoReturn]
 ) -> tuple[list[Trial], float]:
     """The trials of the cheapest that reaches an error, and its milliseconds; of the best where none does.
 
@@ -328,7 +328,7 @@ def _for_error(
     return found[solver], costs[solver]
 
 
-def _affordable(sim: Simulator, start: State, solver: Solver, budget: float, most: int) -> int:
+def _affordable(sim: Stepper, start: State, solver: Solver, budget: float, most: int) -> int:
     """The most iterations that a time [ms] pays for, about."""
     few, many = 4, 20
     times = [_milliseconds(sim, start, Trial(solver, count, 0.0, ())) for count in (few, many)]
@@ -358,7 +358,7 @@ def _fewest(study: _Study, suffices: Callable[[Trial], bool], most: int) -> Seek
     return seek
 
 
-def _for_time(sim: Simulator, study: _Study, start: State, budget: float | None, most: int) -> Seek:
+def _for_time(sim: Stepper, study: _Study, start: State, budget: float | None, most: int) -> Seek:
     """The most iterations of a solver that a budget [ms] pays for, from the times of two counts.
 
     Fewer where that leaves nothing but rounding in any state: as many as bring all errors below it.
@@ -383,7 +383,7 @@ def _for_time(sim: Simulator, study: _Study, start: State, budget: float | None,
 
 
 @torch.no_grad()
-def _milliseconds(sim: Simulator, start: State, trial: Trial) -> float:
+def _milliseconds(sim: Stepper, start: State, trial: Trial) -> float:
     """Of `sim(state)`: the lowest median of three series, so that a disturbance of one does not count."""
     timed = copy.copy(sim)
     timed.solver, timed.iterations, timed.tolerance = trial.solver, trial.iterations, 0.0
@@ -401,7 +401,7 @@ def _milliseconds(sim: Simulator, start: State, trial: Trial) -> float:
     return 1e3 * min(medians)
 
 
-def _wait_for(sim: Simulator) -> None:
+def _wait_for(sim: Stepper) -> None:
     if sim.device.type == "cuda":
         torch.cuda.synchronize(sim.device)
 
@@ -456,7 +456,7 @@ def _residual_limit(study: _Study, trials: list[Trial], promised: float) -> tupl
 
 
 def _promise(
-    sim: Simulator,
+    sim: Stepper,
     study: _Study,
     start: State,
     trials: list[Trial],

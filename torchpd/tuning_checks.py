@@ -15,7 +15,7 @@ from .material import MATERIAL_ROWS, environments_of_material, named_arrays
 from .state import State
 
 if TYPE_CHECKING:
-    from .simulator import Simulator
+    from .stepper import Stepper
 
 __all__ = ["check_known", "check_request", "check_start"]
 
@@ -33,7 +33,7 @@ def check_request(error: float | None, milliseconds: float | None) -> None:
         raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
 
 
-def check_start(sim: Simulator, state: State, forces: Tensor | None) -> None:
+def check_start(sim: Stepper, state: State, forces: Tensor | None) -> None:
     """States, forces and material that can be studied."""
     sim.check_state(state, forces=forces)
     if forces is not None:
