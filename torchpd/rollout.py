@@ -151,7 +151,6 @@ def _material_after(sim: Steps, before: list[Tensor], targets: Targets | None, b
 
 def _moved_on(material: list[Tensor], steps: int) -> list[Tensor]:
     """The material with moving spheres where they are some steps later."""
-    return [
-        Anchors.moved_on(array, steps) if name == "spheres" else array
-        for name, array in zip(MATERIAL_ROWS, material, strict=True)
-    ]
+    moved = list(material)
+    moved[_SPHERES] = Anchors.moved_on(material[_SPHERES], steps)
+    return moved
