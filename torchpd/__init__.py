@@ -22,12 +22,13 @@ if load_extension()[0] is not None:
     from .forecast import UnsolvedWarning
     from .ops import nearest_rotation
     from .patch_body import PatchBody
-    from .patch_fit import FitReport, PatchFit, fit_patches
+    from .patch_fit import FitReport
     from .patch_image import PatchImage
     from .patch_loss import PatchLoss
-    from .patch_rays import PatchHits, PatchRays
+    from .patch_rays import PatchHits
+    from .patch_surface import PatchPose, PatchSamples
     from .patch_transport import PatchTransport
-    from .patches import FreeFormPatches, PatchPose, PatchSamples
+    from .patches import FreeFormPatches, PatchFit, PatchRays, fit_patches
     from .plan import Plan, compile_plan
     from .quadric_transport import QuadricTransport
     from .quadrics import Quadrics

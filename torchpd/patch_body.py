@@ -14,8 +14,8 @@ from .effects import ArrayLike, Solid
 from .mesh import trusted
 from .mesh_checks import store
 from .patch_constraints import Constraints, prisms, skeleton
+from .patch_surface import PatchPose, PatchSurface
 from .patch_transport import FrameMode, PatchTransport
-from .patches import FreeFormPatches, PatchPose
 
 __all__ = ["PatchBody"]
 
@@ -57,7 +57,7 @@ class PatchBody(Solid):
             (less than 1e-3 of the mean volume, or of their longest edge high).
     """
 
-    patches: FreeFormPatches
+    patches: PatchSurface
     apex: ApexKind
     apexes: int  # K
     patch_of: Index  # [E] patch of each constraint, -1 between apexes
@@ -66,7 +66,7 @@ class PatchBody(Solid):
 
     def __init__(
         self,
-        patches: FreeFormPatches,
+        patches: PatchSurface,
         stiffness: ArrayLike,
         density: float = 1000.0,
         *,
@@ -75,7 +75,7 @@ class PatchBody(Solid):
         mode: FrameMode = "transport",
         stretch: tuple[float, float] = (0.3, 3.0),
     ) -> None:
-        if not isinstance(patches, FreeFormPatches):
+        if not isinstance(patches, PatchSurface):
             raise TypeError(
                 f"PatchBody: patches must be FreeFormPatches, got {type(patches).__name__}; "
                 "make them with torchpd.FreeFormPatches.from_mesh(surface, quadrics)"
@@ -189,7 +189,7 @@ def _per_patch(stiffness: ArrayLike, count: int) -> NDArray[np.float64]:
     return array
 
 
-def _constraints(patches: FreeFormPatches, apex: Any, thickness: float | None) -> Constraints:
+def _constraints(patches: PatchSurface, apex: Any, thickness: float | None) -> Constraints:
     vertices, directors = (t.detach().cpu().double().numpy() for t in (patches.vertices, patches.directors))
     triangles = patches.triangles.cpu().numpy().astype(np.int64)
     if not isinstance(apex, str) or apex not in ("skeleton", "prism"):

@@ -18,6 +18,7 @@ from .demo import TIME_STEP, DemoOptions, check_packages
 from .effects import Damping, Gravity, Ground, Pin
 from .mesh import TriMesh
 from .patch_body import PatchBody
+from .patch_mesh import tessellate
 from .patches import FreeFormPatches
 from .placing import find_device
 from .quadrics import Quadrics
@@ -210,7 +211,7 @@ def _simulate(scene: PatchScene, options: DemoOptions, device: torch.device, lev
     positions = torch.cat([start.positions[None], track.positions])
     if not bool(positions.isfinite().all()):
         raise ValueError("the motion left the range of numbers; a larger Young's modulus may help (--youngs)")
-    grid = body.patches.tessellate(level)
+    grid = tessellate(body.patches, level)
     with torch.no_grad():
         heights = body.patches.heights(grid.samples)  # they belong to the material
         body.patches.surface(grid.samples, body.pose(positions[0]), heights=heights)

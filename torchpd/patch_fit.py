@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Literal, TypeAlias, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from .checks import check_scalar, check_whole
 from .fit_problem import HeightProblem, QuadricNumbers, levenberg_marquardt, ridge_amplitudes
-from .fit_targets import FitTarget, base_triangles, target_of
-from .mesh import TriMesh
+from .fit_targets import FitTarget
 from .patch_loss import PatchLoss, descend
 from .patch_samples import FitSamples, inner_points, mean_edges, sample_target
-from .patches import FreeFormPatches
+from .patch_surface import PatchSurface
 
-__all__ = ["FitReport", "PatchFit", "fit_patches", "measure_fit"]
+__all__ = ["FitReport", "fit_quadrics", "measure_fit"]
+
+Surface = TypeVar("Surface", bound=PatchSurface)
 
 Array = NDArray[np.float64]
 Bar: TypeAlias = Callable[[], object]
@@ -55,90 +55,32 @@ class FitReport:
         )
 
 
-class PatchFit(NamedTuple):
-    """What `FreeFormPatches.fit` gives."""
-
-    patches: FreeFormPatches
-    report: FitReport
-
-
-def fit_patches(
-    target: Any,
-    quadrics: int = 60,
+def fit_quadrics(
+    empty: Surface,
+    target: FitTarget,
+    count: int,
     *,
-    patches: int | TriMesh = 80,
-    base: Literal["flat", "phong"] = "phong",
-    optimizer: Literal["lm", "adam"] = "lm",
-    iterations: int | None = None,
-    radius_cap: float = 1.1,
-    normals: Any = None,
-    bounds: Any = None,
-    dtype: torch.dtype = torch.float32,
-    progress: bool = False,
-) -> PatchFit:
-    """Patches fitted to a surface, and how far they are from it. The same bits on every run.
-
-    The base lies with its vertices on the target and has the target's normals for directors; it does not move. Quadrics
-    then make up the difference, measured along the directors at samples inside of patches and on their edges.
-
-    "lm": half of the quadrics begin as balls where the difference is large, and Levenberg-Marquardt moves all their
-    numbers; the other half begins on what is left; those that contribute nothing begin again elsewhere or are left out.
-    "adam": all begin at once, and normals and creases between patches count beside distances (`PatchLoss`); its errors
-    in distance are larger.
-
-    Args:
-        target: a TriMesh or trimesh.Trimesh, oriented; points [N, 3] of a closed surface [m]; or a function that turns
-            points [N, 3] (float64) into values [N], differentiable by torch, negative inside: a signed distance.
-        quadrics: at most so many.
-        patches: at most so many triangles for the base, found by simplifying the target, or the base itself.
-        base: "flat" or "phong", as for `FreeFormPatches`.
-        optimizer: "lm" or "adam".
-        iterations: of each stage, at most 60 when left out; of Adam in all, 500 when left out.
-        radius_cap: the largest half axis of a quadric, in mean edges of the patch where it begins. Small ones touch
-            fewer patches.
-        normals: of the points [N, 3], outwards; estimated from neighbours when left out.
-        bounds: for a function, a box [2, 3] around its surface [m]; not needed with a base of your own.
-        dtype: of the patches. The fit itself is in float64 on the CPU.
-        progress: show a progress bar.
-
-    Raises:
-        ValueError: a target that is not an oriented surface, that encloses nothing, or that folds over the base.
-        ImportError: distances from a mesh need the package rtree.
-    """
-    count = check_whole("FreeFormPatches.fit: quadrics", quadrics, minimum=1)
-    cap = check_scalar("FreeFormPatches.fit: radius_cap", radius_cap, minimum=0.1)
-    if optimizer not in ("lm", "adam"):
-        raise ValueError(f"FreeFormPatches.fit: optimizer must be lm or adam, got {optimizer!r}")
-    rounds = check_whole(
-        "FreeFormPatches.fit: iterations", (60 if optimizer == "lm" else 500) if iterations is None else iterations,
-        minimum=1,
-    )  # fmt: skip
-    if not isinstance(patches, TriMesh):
-        patches = check_whole("FreeFormPatches.fit: patches", patches, minimum=4)
-    surface = target_of(target, normals, bounds, patches if isinstance(patches, TriMesh) else None)
-    empty = empty_patches(surface, patches, base)
+    optimizer: Literal["lm", "adam"],
+    iterations: int,
+    radius_cap: float,
+    dtype: torch.dtype,
+    progress: bool,
+) -> tuple[Surface, FitReport]:
+    """Patches without quadrics, in float64 on the CPU, with `count` quadrics that bring them to a target."""
     level = sampling_level(len(empty.triangles), count)
-    samples = sample_target(empty, surface, level)
-    stages = _Stages(empty, samples, cap, level)
+    samples = sample_target(empty, target, level)
+    stages = _Stages(empty, samples, radius_cap, level)
     if optimizer == "lm":
-        total = (2 + _RESEEDS) * rounds
+        total = (2 + _RESEEDS) * iterations
         with tqdm(total=total, desc="fitting patches", disable=not progress, leave=False) as bar:
-            numbers = stages.solve(count, rounds, bar.update)
+            numbers = stages.solve(count, iterations, bar.update)
     else:
         seeds = ridge_amplitudes(stages.problem, stages.seed(count, stages.problem.residuals(np.empty((0, 10)))))
         loss = PatchLoss.from_samples(empty, samples, level)
-        numbers = descend(loss, empty, seeds, iterations=rounds, least=stages.least, progress=progress)
+        numbers = descend(loss, empty, seeds, iterations=iterations, least=stages.least, progress=progress)
     fitted = empty.with_quadrics(numbers.quadrics()).to(dtype)
     fitted = fitted.with_quadrics(fitted.quadrics)  # lists of the rounded numbers
-    return PatchFit(fitted, measure_fit(fitted, surface, samples.missed))
-
-
-def empty_patches(surface: FitTarget, patches: int | TriMesh, base: Literal["flat", "phong"]) -> FreeFormPatches:
-    """Patches without quadrics, their vertices on the target and its normals for directors, in float64."""
-    mesh, directors = base_triangles(surface, patches)
-    return FreeFormPatches(
-        torch.tensor(mesh.vertices), torch.tensor(mesh.triangles), directors=torch.tensor(directors), base=base
-    )
+    return fitted, measure_fit(fitted, target, samples.missed)
 
 
 def sampling_level(patches: int, quadrics: int) -> int:
@@ -149,7 +91,7 @@ def sampling_level(patches: int, quadrics: int) -> int:
 class _Stages:
     """Quadrics placed where the residual is large, half of them first, the others on what is left."""
 
-    def __init__(self, empty: FreeFormPatches, samples: FitSamples, cap: float, level: int) -> None:
+    def __init__(self, empty: PatchSurface, samples: FitSamples, cap: float, level: int) -> None:
         self.problem = HeightProblem(samples.points, samples.heights, samples.areas * samples.cosines**2)
         self.samples = samples
         edges = mean_edges(empty)
@@ -201,7 +143,7 @@ class _Stages:
         return np.asarray(share > _DEAD**2 * whole)
 
 
-def measure_fit(patches: FreeFormPatches, target: FitTarget, missed: float = 0.0, most: int = 20000) -> FitReport:
+def measure_fit(patches: PatchSurface, target: FitTarget, missed: float = 0.0, most: int = 20000) -> FitReport:
     """How far patches are from a target, on a grid of places that no fit uses."""
     level = int(np.clip(np.sqrt(most / len(patches.triangles)), 3, 13))
     inner = inner_points(level)

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .patch_rays import PatchRays
-from .patches import FreeFormPatches, PatchPose
+from .patch_rays import SurfaceRays
+from .patch_surface import PatchPose, PatchSurface
 from .render import Camera
 
 __all__ = ["PatchImage", "render_patches"]
@@ -36,12 +36,12 @@ class PatchImage:
 
 
 def render_patches(
-    rays: PatchRays,
+    rays: SurfaceRays,
     camera: Camera,
     size: tuple[int, int],
     pose: PatchPose | None = None,
     *,
-    patches: FreeFormPatches | None = None,
+    patches: PatchSurface | None = None,
     color: Color = (0.75, 0.75, 0.75),
     background: Color = (1.0, 1.0, 1.0),
     light: Color | None = None,

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from .checks import check_target_file
-from .patches import FreeFormPatches
+from .patch_surface import PatchSurface
 from .quadrics import Quadrics
 from .version import __version__
 
 __all__ = ["PATCHES_FORMAT_VERSION", "load_patches", "save_patches"]
 
+Surface = TypeVar("Surface", bound=PatchSurface)
+
 PATCHES_FORMAT_VERSION = 1
 _KEY = "torchpd.patches"  # of the metadata, beside which others may write theirs
 
 
-def save_patches(patches: FreeFormPatches, path: str | Path) -> None:
+def save_patches(patches: PatchSurface, path: str | Path) -> None:
     """Write base, quadrics and options; the lists are found again when the file is read."""
     target = check_target_file(path)
     quadrics = patches.quadrics
@@ -44,8 +47,8 @@ def save_patches(patches: FreeFormPatches, path: str | Path) -> None:
     save_file(values, target, metadata={_KEY: json.dumps(record)})
 
 
-def load_patches(path: str | Path) -> FreeFormPatches:
-    """Read what `save_patches` wrote, on the CPU."""
+def load_patches(path: str | Path, kind: type[Surface]) -> Surface:
+    """Read what `save_patches` wrote, on the CPU, as surfaces of a kind."""
     file = Path(path)
     if not file.is_file():
         raise FileNotFoundError(f"no such file of patches: {file}")
@@ -66,7 +69,7 @@ def load_patches(path: str | Path) -> FreeFormPatches:
                 f"reads formats up to {PATCHES_FORMAT_VERSION}: install a newer torchpd"
             )
         quadrics = Quadrics(*(tensors[f"quadrics.{name}"] for name in ("amplitudes", "centres", "factors")))
-        return FreeFormPatches(
+        return kind(
             tensors["vertices"],
             tensors["triangles"].to(torch.int64),
             quadrics,

@@ -13,7 +13,7 @@ from .checks import check_scalar, check_whole
 from .fit_problem import QuadricNumbers, within_radii
 from .fit_targets import target_of
 from .patch_samples import FitSamples, edge_pairs, mean_edges, sample_target
-from .patches import FreeFormPatches, PatchSamples
+from .patch_surface import PatchSamples, PatchSurface
 from .quadrics import Quadrics
 
 __all__ = ["PatchLoss", "descend"]
@@ -46,7 +46,7 @@ class PatchLoss:
 
     def __init__(
         self,
-        patches: FreeFormPatches,
+        patches: PatchSurface,
         target: Any,
         *,
         level: int = 8,
@@ -62,14 +62,14 @@ class PatchLoss:
         self._take(patches, samples, level, normal_weight, edge_weight)
 
     @classmethod
-    def from_samples(cls, patches: FreeFormPatches, samples: FitSamples, level: int) -> PatchLoss:
+    def from_samples(cls, patches: PatchSurface, samples: FitSamples, level: int) -> PatchLoss:
         """Of a target that has been sampled, with the usual weights."""
         loss = cls.__new__(cls)
         loss._take(patches, samples, level, 1e-3, 1e-3)
         return loss
 
     def _take(
-        self, patches: FreeFormPatches, samples: FitSamples, level: int, normal_weight: float, edge_weight: float
+        self, patches: PatchSurface, samples: FitSamples, level: int, normal_weight: float, edge_weight: float
     ) -> None:
         self.normal_weight = check_scalar("PatchLoss: normal_weight", normal_weight, minimum=0.0)
         self.edge_weight = check_scalar("PatchLoss: edge_weight", edge_weight, minimum=0.0)
@@ -84,7 +84,7 @@ class PatchLoss:
         self.places = _moved(patches, samples.places.patch, samples.places.barycentrics)
         self.sides = _moved(patches, torch.tensor(patch.reshape(-1)), torch.tensor(coordinates.reshape(-1, 3)))
 
-    def terms(self, patches: FreeFormPatches) -> tuple[Tensor, Tensor, Tensor]:
+    def terms(self, patches: PatchSurface) -> tuple[Tensor, Tensor, Tensor]:
         """The means of the three terms: of distance over L, normal and crease, each squared."""
         _check_patches(patches)
         mine, theirs = self._triangles, patches.triangles
@@ -105,24 +105,24 @@ class PatchLoss:
         crease = creases.mean() if len(creases) else creases.sum()
         return (self.areas * distance.square()).sum(), (self.areas * turned).sum(), crease
 
-    def __call__(self, patches: FreeFormPatches) -> Tensor:
+    def __call__(self, patches: PatchSurface) -> Tensor:
         """The loss of patches over the same triangles: other quadrics, or another shape (`with_shape`)."""
         distance, normal, crease = self.terms(patches)
         return distance + self.normal_weight * normal + self.edge_weight * crease
 
 
 def _check_patches(patches: Any) -> None:
-    if not isinstance(patches, FreeFormPatches):
+    if not isinstance(patches, PatchSurface):
         raise TypeError(f"PatchLoss: patches must be FreeFormPatches, got {type(patches).__name__}")
 
 
-def _moved(patches: FreeFormPatches, patch: Tensor, barycentrics: Tensor) -> PatchSamples:
+def _moved(patches: PatchSurface, patch: Tensor, barycentrics: Tensor) -> PatchSamples:
     return patches.samples(patch.to(patches.vertices.device), barycentrics.to(patches.vertices))
 
 
 def descend(
     loss: PatchLoss,
-    patches: FreeFormPatches,
+    patches: PatchSurface,
     numbers: QuadricNumbers,
     *,
     iterations: int,

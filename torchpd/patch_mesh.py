@@ -8,7 +8,7 @@ gaps.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .mesh import TriMesh
-
-if TYPE_CHECKING:
-    from .patches import FreeFormPatches, PatchPose, PatchSamples
+from .patch_surface import PatchPose, PatchSamples, PatchSurface
 
 __all__ = ["Tessellation", "tessellate"]
 
@@ -29,7 +27,7 @@ Index = NDArray[np.int64]
 class Tessellation:
     """A triangle mesh over patches. `patches.surface(samples, pose).points` are its vertices in a pose."""
 
-    patches: FreeFormPatches
+    patches: PatchSurface
     samples: PatchSamples  # one for each vertex
     triangles: Tensor  # int64 [T, 3]
 
@@ -74,7 +72,7 @@ def weld(elements: Index, vertices: int, steps: Index, level: int) -> Index:
     return number
 
 
-def tessellate(patches: FreeFormPatches, level: Any) -> Tessellation:
+def tessellate(patches: PatchSurface, level: Any) -> Tessellation:
     """The grid of `level` segments along every edge, over all patches, welded."""
     if isinstance(level, bool) or not isinstance(level, int) or level < 1:
         raise ValueError(f"tessellate: level must be a whole number of segments >= 1, got {level!r}")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,15 +16,11 @@ from torch import Tensor
 
 from . import patch_ops  # noqa: F401  (registers the ops)
 from .patch_mesh import grid, tessellate, weld
-from .patches import FreeFormPatches, PatchPose, PatchSamples, SurfacePoints, check_pose
+from .patch_surface import PatchPose, PatchSamples, PatchSurface, SurfacePoints, check_pose
 from .quadrics import dimensions, matrix_sets
 from .small_matrices import product
 
-if TYPE_CHECKING:
-    from .patch_image import PatchImage
-    from .render import Camera
-
-__all__ = ["PatchHits", "PatchRays"]
+__all__ = ["PatchHits", "SurfaceRays"]
 
 _ops = torch.ops.torchpd
 _CHECKS = 4  # segments of the grid on which a cell is compared with its triangle
@@ -43,26 +39,11 @@ class PatchHits:
     normals: Tensor  # [B, R, 3] unit, outwards
 
 
-class PatchRays:
-    """Finds where rays hit free-form patches.
+class SurfaceRays:
+    """The search of `PatchRays`, which documents it."""
 
-    Every patch is cut into `level` x `level` cells, which a tree of boxes holds; the boxes follow each pose. A cell
-    that a ray may meet is searched by Newton's method, from several places where the cell is seen edge-on. Both sides
-    of the surface are hit, and patches leave no gap along their edges. A ray within the plane of a flat patch may pass.
-
-    How far the surface bulges over a cell is measured at 12 points in it. That is an estimate, good where a cell is
-    smaller than the quadrics on it, which the default level sees to up to 32. With cells as long as the radii, one of
-    100,000 rays over a bumpy plane, half of them grazing, missed two crossings close to each other; of rays aimed at
-    bumps that are narrower than that and many times as high, one in two hundred passes.
-
-    Args:
-        patches: the surface. Others of the same triangles may be passed to each call, for instance in an optimisation.
-        level: cells along every edge; when left out, at least 4, and so many that no edge of a cell is longer than
-            half the radii of the quadrics.
-    """
-
-    def __init__(self, patches: FreeFormPatches, level: int | None = None) -> None:
-        if not isinstance(patches, FreeFormPatches):
+    def __init__(self, patches: PatchSurface, level: int | None = None) -> None:
+        if not isinstance(patches, PatchSurface):
             raise TypeError(f"PatchRays: patches must be FreeFormPatches, got {type(patches).__name__}")
         if level is None:
             level = _fine_enough(patches)
@@ -82,7 +63,7 @@ class PatchRays:
         directions: Tensor,
         pose: PatchPose | None = None,
         *,
-        patches: FreeFormPatches | None = None,
+        patches: PatchSurface | None = None,
         near: float = 0.0,
         far: float = math.inf,
     ) -> PatchHits:
@@ -116,7 +97,7 @@ class PatchRays:
         directions: Tensor,
         pose: PatchPose | None = None,
         *,
-        patches: FreeFormPatches | None = None,
+        patches: PatchSurface | None = None,
         near: float = 0.0,
         far: float = math.inf,
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -137,7 +118,7 @@ class PatchRays:
         origins: Tensor,
         directions: Tensor,
         pose: PatchPose,
-        surface: FreeFormPatches,
+        surface: PatchSurface,
         near: float,
         far: float,
         *,
@@ -153,20 +134,6 @@ class PatchRays:
             shape=shape, near=near, far=far,
         )  # fmt: skip
         return found
-
-    def render(
-        self,
-        camera: Camera,
-        size: tuple[int, int],
-        pose: PatchPose | None = None,
-        *,
-        patches: FreeFormPatches | None = None,
-        **options: Any,
-    ) -> PatchImage:
-        """Pictures of the surface: see `torchpd.patch_image.render_patches`, which takes the options."""
-        from .patch_image import render_patches
-
-        return render_patches(self, camera, size, pose, patches=patches, **options)
 
     def cast_field(
         self,
@@ -212,10 +179,10 @@ class PatchRays:
         )  # fmt: skip
         return depth, patch
 
-    def _surface(self, patches: FreeFormPatches | None) -> FreeFormPatches:
+    def _surface(self, patches: PatchSurface | None) -> PatchSurface:
         if patches is None:
             return self.patches
-        if not isinstance(patches, FreeFormPatches):
+        if not isinstance(patches, PatchSurface):
             raise TypeError(f"PatchRays: patches must be FreeFormPatches, got {type(patches).__name__}")
         mine, theirs = self.patches, patches
         same = theirs.triangles is mine.triangles or (
@@ -234,7 +201,7 @@ def _check_level(level: Any) -> None:
         raise ValueError(f"PatchRays: level must be a whole number in 1..{_FINEST}, got {level!r}")
 
 
-def _batched(name: str, rays: Tensor, surface: FreeFormPatches) -> Tensor:
+def _batched(name: str, rays: Tensor, surface: PatchSurface) -> Tensor:
     wanted = f"cast: {name} must be a tensor [R, 3], or [B, R, 3] in B poses"
     if dimensions(rays) < 0:
         raise TypeError(f"{wanted}, got {type(rays).__name__}")
@@ -248,7 +215,7 @@ def _batched(name: str, rays: Tensor, surface: FreeFormPatches) -> Tensor:
     return rays if rays.dim() == 3 else rays[None]
 
 
-def _rays(origins: Tensor, directions: Tensor, surface: FreeFormPatches) -> tuple[Tensor, Tensor]:
+def _rays(origins: Tensor, directions: Tensor, surface: PatchSurface) -> tuple[Tensor, Tensor]:
     """With a batch, and of unit length."""
     o, d = _batched("origins", origins, surface), _batched("directions", directions, surface)
     # first by the largest component, whose square alone might be beyond all numbers
@@ -256,7 +223,7 @@ def _rays(origins: Tensor, directions: Tensor, surface: FreeFormPatches) -> tupl
     return o, torch.nn.functional.normalize(d, dim=-1, eps=0.0)
 
 
-def _posed(surface: FreeFormPatches, pose: PatchPose | None) -> PatchPose:
+def _posed(surface: PatchSurface, pose: PatchPose | None) -> PatchPose:
     if pose is not None:
         check_pose(pose)
         return pose
@@ -264,7 +231,7 @@ def _posed(surface: FreeFormPatches, pose: PatchPose | None) -> PatchPose:
     return PatchPose(surface.vertices[None], eye.expand(1, len(surface.vertices), 3, 3))
 
 
-def _fine_enough(patches: FreeFormPatches) -> int:
+def _fine_enough(patches: PatchSurface) -> int:
     """Cells no longer than half the radii of quadrics: twice the greatest |M_i e|, e the edges of its patches."""
     quadric, patch = patches.lists[2].long(), patches.lists[3].long()
     if len(quadric) == 0:
@@ -275,7 +242,7 @@ def _fine_enough(patches: FreeFormPatches) -> int:
     return min(_FINEST, max(4, math.ceil(2.0 * float(product(edges, M.mT).norm(dim=2).max()))))
 
 
-def _cells(patches: FreeFormPatches, level: int) -> tuple[Any, Any, Any]:
+def _cells(patches: PatchSurface, level: int) -> tuple[Any, Any, Any]:
     """Cells [C, 17], weights [12, 3] and places [m^2, 9] as csrc/patches/rays.h has them."""
     elements = patches.triangles.cpu().numpy().astype(np.int64)
     steps, triangles = grid(level)
@@ -318,7 +285,7 @@ def _tree_order(middles: Any, per_leaf: int) -> Any:
     return order
 
 
-def _in_poses(surface: FreeFormPatches, pose: PatchPose, number: Tensor, where: PatchSamples) -> SurfacePoints:
+def _in_poses(surface: PatchSurface, pose: PatchPose, number: Tensor, where: PatchSamples) -> SurfacePoints:
     """The surface at samples of which each has its own pose, without a batch: all poses side by side as one surface."""
     batch, V, P = len(pose.positions), len(surface.vertices), len(surface.triangles)
     if batch * 3 * P >= 2**31:
@@ -344,7 +311,7 @@ def _in_poses(surface: FreeFormPatches, pose: PatchPose, number: Tensor, where: 
     return SurfacePoints(points[0], torch.nn.functional.normalize(normal, dim=-1, eps=0.0), tangents[0])
 
 
-def _with_gradients(surface: FreeFormPatches, pose: PatchPose, hits: PatchHits, o: Tensor, d: Tensor) -> PatchHits:
+def _with_gradients(surface: PatchSurface, pose: PatchPose, hits: PatchHits, o: Tensor, d: Tensor) -> PatchHits:
     """The same numbers, with gradients by the implicit function theorem."""
     number, ray = hits.hit.nonzero(as_tuple=True)
     where = surface.samples(hits.patch[hits.hit], hits.barycentrics[hits.hit])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 if TYPE_CHECKING:
-    from .patches import FreeFormPatches
+    from .patch_surface import PatchSurface
 
 __all__ = ["PatchReference", "clamped_gradient", "literal_field", "vertex_frames"]
 
@@ -28,7 +28,7 @@ class PatchReference:
     with X = sum_k b_k V_k and w_k = sum_j b_j (V_k - V_j) . N_k.
     """
 
-    def __init__(self, patches: FreeFormPatches) -> None:
+    def __init__(self, patches: PatchSurface) -> None:
         self.vertices = _numbers(patches.vertices)
         self.directors = _numbers(patches.directors)
         self.triangles = patches.triangles.cpu().numpy().astype(np.int64)

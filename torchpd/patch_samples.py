@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .fit_targets import FitTarget, along
-from .patch_mesh import grid
-from .patches import FreeFormPatches, PatchSamples
+from .patch_mesh import grid, tessellate
+from .patch_surface import PatchSamples, PatchSurface
 
 __all__ = ["FitSamples", "edge_pairs", "inner_points", "mean_edges", "sample_target"]
 
@@ -34,19 +34,19 @@ class FitSamples:
     missed: float  # share of samples that found no target
 
 
-def mean_edges(patches: FreeFormPatches) -> Array:
+def mean_edges(patches: PatchSurface) -> Array:
     """Mean length of the edges of each patch [P] [m]."""
     corners = patches.vertices.detach().double().numpy()[patches.triangles.numpy()]
     return np.asarray(np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).mean(axis=1))
 
 
-def sample_target(empty: FreeFormPatches, target: FitTarget, level: int) -> FitSamples:
+def sample_target(empty: PatchSurface, target: FitTarget, level: int) -> FitSamples:
     """Samples with `level` segments along every edge of patches without quadrics, in float64 on the CPU.
 
     Raises:
         ValueError: on more than one sample in twenty the target does not lie along the director, or is turned away.
     """
-    grid_on = empty.tessellate(level)
+    grid_on = tessellate(empty, level)
     places = grid_on.samples
     surface = empty.surface(places)
     points = surface.points.numpy()

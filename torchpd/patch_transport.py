@@ -13,7 +13,7 @@ from . import patch_ops  # noqa: F401  (registers the ops)
 from .checks import as_array
 from .ops import nearest_rotation
 from .patch_lists import corner_lists
-from .patches import FreeFormPatches, PatchPose
+from .patch_surface import PatchPose, PatchSurface
 from .quadrics import check_real_tensor
 
 __all__ = ["PatchTransport"]
@@ -53,7 +53,7 @@ class PatchTransport(nn.Module):
 
     def __init__(
         self,
-        patches: FreeFormPatches,
+        patches: PatchSurface,
         apexes: Tensor,
         apex: Tensor | None = None,
         *,
@@ -63,7 +63,7 @@ class PatchTransport(nn.Module):
         super().__init__()
         if mode not in ("transport", "rotation"):
             raise ValueError(f"PatchTransport.mode must be transport or rotation, got {mode!r}")
-        if not isinstance(patches, FreeFormPatches):
+        if not isinstance(patches, PatchSurface):
             raise TypeError(f"PatchTransport: patches must be FreeFormPatches, got {type(patches).__name__}")
         bounds = as_array("PatchTransport.stretch", stretch, np.float64)
         if bounds.shape != (2,) or not 0.0 < bounds[0] <= 1.0 <= bounds[1]:
@@ -117,7 +117,7 @@ class PatchTransport(nn.Module):
         return PatchPose(positions[:, : self.vertices], frames)
 
 
-def _tets(patches: FreeFormPatches, apex: Tensor | None, apexes: int) -> Index:
+def _tets(patches: PatchSurface, apex: Tensor | None, apexes: int) -> Index:
     triangles = patches.triangles.cpu().numpy().astype(np.int64)
     number = np.arange(len(triangles)) if apex is None else as_array("PatchTransport.apex", apex)
     if number.shape != (len(triangles),) or number.dtype.kind not in "iu":

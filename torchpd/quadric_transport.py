@@ -9,8 +9,8 @@ from torch import Tensor
 from . import patch_ops  # noqa: F401  (registers the ops)
 from .ops import nearest_rotation
 from .patch_lists import corner_lists
+from .patch_surface import PatchSurface
 from .patch_transport import PatchTransport
-from .patches import FreeFormPatches
 from .small_matrices import inverse, product
 
 __all__ = ["QuadricTransport"]
@@ -37,8 +37,8 @@ class QuadricTransport:
         ValueError: patches with other vertices or triangles than those of the transport.
     """
 
-    def __init__(self, transport: PatchTransport, patches: FreeFormPatches) -> None:
-        for name, given, want in (("transport", transport, PatchTransport), ("patches", patches, FreeFormPatches)):
+    def __init__(self, transport: PatchTransport, patches: PatchSurface) -> None:
+        for name, given, want in (("transport", transport, PatchTransport), ("patches", patches, PatchSurface)):
             if not isinstance(given, want):
                 raise TypeError(f"QuadricTransport: {name} must be a {want.__name__}, got {type(given).__name__}")
         self.transport, self.patches = transport, patches
@@ -111,7 +111,7 @@ class QuadricTransport:
 
 
 @torch.no_grad()
-def _shares(patches: FreeFormPatches) -> tuple[Tensor, Tensor, Tensor]:
+def _shares(patches: PatchSurface) -> tuple[Tensor, Tensor, Tensor]:
     """Patch, quadric and weight of every pair [N], quadric by quadric; the weights of each sum to 1."""
     q = patches.quadrics
     corners = patches.vertices[patches.triangles.long()]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .patches import FreeFormPatches, PatchPose
+from .patch_surface import PatchPose, PatchSurface
 
 __all__ = ["Seams", "measure_seams"]
 
@@ -25,7 +25,7 @@ class Seams(NamedTuple):
     most: float  # largest such angle [degrees]
 
 
-def measure_seams(patches: FreeFormPatches, pose: PatchPose | None = None) -> Seams:
+def measure_seams(patches: PatchSurface, pose: PatchPose | None = None) -> Seams:
     """Compare both patches of every edge at three places along it, at rest or in a pose."""
     triangles = patches.triangles.cpu().numpy().astype(np.int64)
     ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
@@ -43,7 +43,7 @@ def measure_seams(patches: FreeFormPatches, pose: PatchPose | None = None) -> Se
 
 
 def _at(
-    patches: FreeFormPatches, sides: Index, backwards: bool, pose: PatchPose | None
+    patches: PatchSurface, sides: Index, backwards: bool, pose: PatchPose | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Points and normals on sides 3 p + k of patches, which run from corner k to corner k + 1."""
     patch, corner = np.divmod(sides, 3)
