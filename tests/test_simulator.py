@@ -246,6 +246,10 @@ def test_a_checkpoint_of_torch_holds_states(tmp_path: Path) -> None:
     assert [type(loaded[name]) for name in ("state", "info", "track")] == [pd.State, pd.Info, pd.Track]
     assert same_bits(loaded["state"], after)
     assert same_bits(loaded["track"].state(), track.state())
+    # wherever in the package their classes are
+    assert {kind.__module__ for kind in (pd.State, pd.Info, pd.Track)} == {"torchpd"}
+    assert b"torchpd.state" not in pickle.dumps((after, info, track))
+    assert same_bits(pickle.loads(pickle.dumps(track)).state(), track.state())
 
 
 @pytest.mark.skipif(torch.version.cuda is not None, reason="for a CPU build of torch")

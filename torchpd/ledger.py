@@ -1,4 +1,4 @@
-"""Rows of a study that survive an interruption: one line of JSON for every finished task."""
+"""Records of a study: motions, and rows that survive an interruption, one line of JSON for every finished task."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Ledger", "Row", "write_csv"]
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Ledger", "Row", "Trajectory", "write_csv"]
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,19 @@ def _without_infinity(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _without_infinity(entry) for name, entry in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A motion, sampled at every time step, the start first."""
+
+    time_step: float  # s
+    probes: Array  # [T + 1, n, 3] m
+    energies: Array  # [T + 1] mechanical, J
+    brought: float  # kinetic energy at the start, J
+    milliseconds: float  # a step, mean
+    solved: bool = True  # every step of it, where that was asked for
+    iterations: float = math.nan  # of a step, mean, where it was not
 
 
 class Ledger:

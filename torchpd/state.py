@@ -130,7 +130,9 @@ class Track(NamedTuple):
             raise IndexError(f"Track.state: {there}, got {record}") from None
 
 
-# torch.load refuses other classes, and torch.export.save wants names of them; these hold tensors and run nothing
-torch.serialization.add_safe_globals([Info, State, Track])
 for _kind in (Info, State, Track):
+    # files name a class by its module: the package, and in files of before torchpd.state
+    _kind.__module__ = "torchpd"
+    # torch.load refuses other classes, and torch.export.save wants names of them; these hold tensors and run nothing
+    torch.serialization.add_safe_globals([_kind, (_kind, f"torchpd.state.{_kind.__name__}")])
     pytree._register_namedtuple(_kind, serialized_type_name=f"torchpd.{_kind.__name__}")

@@ -7,14 +7,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from .accuracy import ExactStep, exact_steps
 from .contenders import CONTENDERS
-from .ledger import Row
+from .ledger import Row, Trajectory
 from .mesh import TetMesh
 from .simulator import Simulator
 from .solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver
@@ -22,9 +22,6 @@ from .state import State
 from .subjects import Subject
 from .summary import workspace_bytes
 from .warn import warn_user
-
-if TYPE_CHECKING:
-    from .trajectory import Trajectory
 
 __all__ = [
     "Bench",

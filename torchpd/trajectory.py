@@ -3,34 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from .contenders import DEFAULT, DEFAULT_ITERATIONS
-from .ledger import Row
+from .ledger import Array, Row, Trajectory
 from .simulator import Simulator
 from .state import State
 from .study_bench import Bench, Setting, clock_of, precision_name, solved_step
 
-__all__ = ["Trajectory", "compare_trajectories", "first_turn", "record_trajectory", "tolerance_rows", "trajectory_rows"]
-
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """A motion, sampled at every time step, the start first."""
-
-    time_step: float  # s
-    probes: Array  # [T + 1, n, 3] m
-    energies: Array  # [T + 1] mechanical, J
-    brought: float  # kinetic energy at the start, J
-    milliseconds: float  # a step, mean
-    solved: bool = True  # every step of it, where that was asked for
-    iterations: float = math.nan  # of a step, mean, where it was not
+__all__ = ["compare_trajectories", "first_turn", "record_trajectory", "tolerance_rows", "trajectory_rows"]
 
 
 @torch.no_grad()
