@@ -264,3 +264,18 @@ def test_every_state_is_kept_once() -> None:
         torch.autograd.grad(loss, state.velocities)
     known = {t.untyped_storage().data_ptr() for t in (track.positions, track.velocities)}
     assert len(allocations.found - known) == 1
+
+
+def test_gradients_of_single_steps_are_those_of_one_call(dtype: torch.dtype, device: torch.device) -> None:
+    sim = simulate(dtype, device)
+    state = moving(sim)
+    forces = 0.1 * state.velocities
+    found = []
+    for given in (forces, lambda _: forces):
+        speeds = state.velocities.clone().requires_grad_()
+        track = sim.rollout(pd.State(state.positions, speeds), 5, 2, forces=given)
+        (track.positions[0].square().sum() + track.velocities.sum()).backward()
+        found.append(speeds.grad)
+    assert found[0] is not None
+    assert bool((found[0] != 0.0).any())
+    assert torch.equal(*found)
