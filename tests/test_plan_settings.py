@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 import torchpd as pd
-from torchpd import automatic, placing, settings
+from torchpd import automatic, model, placing, settings
 from torchpd.compiled import CompiledScene
 from torchpd.forecast import Spectrum
 from torchpd.gpu import H100
@@ -61,6 +63,25 @@ def test_another_kernel_makes_the_choice_of_auto_anew(monkeypatch: pytest.Monkey
     sim.plan = precondition_plan(choose_plan(values, torch.float32, H100, levels=True), values, *reference)
     sim.kernel = "grid"
     assert (sim.plan.kernel, type(sim.solver), asked) == ("grid", pd.Chebyshev, [("grid", pd.Chebyshev)])
+
+
+def test_a_move_that_is_refused_leaves_the_choice_of_auto(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the plan that goes with it, though another device begins with one for Chebyshev."""
+
+    def refuse(*_: object) -> None:
+        raise RuntimeError("no room")
+
+    body = pd.Solid(pd.shapes.box((1, 1, 1), (3, 3, 3)), 1e8)
+    sim = pd.Simulator(pd.Scene(body, pd.Gravity(), pd.Ground(-1.0)), 1 / 60, solver="auto", progress=False)
+    before = sim.plan, sim.choice, sim.solver, sim.iterations
+    wanted = SimpleNamespace(device=torch.device("cuda", 0), dtype=torch.float32)
+    monkeypatch.setattr(model, "check_wanted_device", lambda *_: wanted)
+    monkeypatch.setattr(settings, "check_solver", lambda solver, _: solver)
+    monkeypatch.setattr(settings, "plan_on", refuse)
+    with pytest.raises(RuntimeError, match="no room"):
+        sim.to("cuda")
+    assert isinstance(sim.solver, pd.Multilevel)
+    assert (sim.plan, sim.choice, sim.solver, sim.iterations) == before
 
 
 @pytest.mark.parametrize("setting", ["kernel", "batch"])

@@ -61,6 +61,15 @@ def test_weight_decay_and_averages_leave_hard_pins_hard(learn: Callable[[pd.Simu
     assert float((after[0, 3:] - sim.rest_positions[3:])[:, 1].mean()) < -1e-4
 
 
+def test_every_copy_follows_the_mask_that_it_shares() -> None:
+    """What a mask lets go moves rigidly in one as in the other, whichever steps first."""
+    body = pd.Solid(pd.shapes.box((0.3, 0.1, 0.1), (3, 1, 1)), youngs=2e4)
+    sim = pd.Simulator(pd.Scene(body, pd.Pin(body, [0, 1, 2, 3]), pd.Gravity()), 1 / 60, 8, progress=False)
+    other, state = copy.copy(sim), sim.rest_state()
+    sim.pin_hard.fill_(False)
+    assert torch.equal(sim(state).positions, other(state).positions)
+
+
 def test_an_average_is_of_what_was_learned() -> None:
     """Without an avg_fn of one's own. Masks are copied; torch refuses to average them, use_buffers=True."""
     sim = simulator()

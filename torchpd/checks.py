@@ -25,8 +25,10 @@ __all__ = [
     "check_target_file",
     "check_vector",
     "check_whole",
+    "has_numbers",
     "in_full",
     "of_each",
+    "plain_tensor",
     "tensor_of",
 ]
 
@@ -173,3 +175,20 @@ def check_target_file(path: str | os.PathLike[str], name: str = "save") -> Path:
     if target.is_dir():
         raise IsADirectoryError(f"{name}: path must name a file, got the folder {target}")
     return target
+
+
+def plain_tensor(tensor: torch.Tensor) -> torch.Tensor:
+    """The tensor itself or, where torch maps it, the whole one, mapped dimensions first."""
+    functorch = torch._C._functorch
+    mapped = []
+    while functorch.is_functorch_wrapped_tensor(tensor):
+        mapped.append(functorch.maybe_get_bdim(tensor))
+        tensor = functorch.get_unwrapped(tensor)
+    for moved, place in enumerate(place for place in reversed(mapped) if place >= 0):
+        tensor = tensor.movedim(moved + place, 0)
+    return tensor
+
+
+def has_numbers(tensor: torch.Tensor) -> bool:
+    """Whether the numbers of a tensor can be read: not of a subclass, nor on "meta"."""
+    return type(tensor) in (torch.Tensor, torch.nn.Parameter) and not tensor.is_meta

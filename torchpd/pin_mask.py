@@ -7,12 +7,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from .checks import has_numbers, plain_tensor
 from .compiled import CompiledScene, ordinary
 from .multilevel import has_levels
 from .pins import hold_exactly
 from .placing import is_recording, loosened_plan, plan_that_holds
 from .plan import Plan
-from .written import Seen, has_numbers, plain_tensor
+from .written import Seen
 
 __all__ = ["PinMask", "held_springs", "look_at_pins", "serves_any_mask"]
 

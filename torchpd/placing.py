@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import _C
+from .checks import plain_tensor
 from .compiled import CompiledScene
 from .diagonal import pinned_vertices
 from .gpu import free_memory, properties_of, refuse_full_memory, seen_devices, why_not
@@ -19,7 +20,6 @@ from .multilevel import Reference, has_levels, precondition_plan, reference_of, 
 from .plan import Plan, compile_plan, with_loose_pieces
 from .regimes import choose_plan
 from .solvers import Multilevel
-from .written import plain_tensor
 
 __all__ = [
     "check_wanted_device",

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from .checks import has_numbers, plain_tensor
 from .scene import Scene
 
-__all__ = ["Seen", "check_rest", "has_numbers", "plain_tensor"]
+__all__ = ["Seen", "check_rest"]
 
 _ANOTHER_SHAPE = "and for another shape make a Simulator of another mesh"
 
@@ -57,20 +58,3 @@ def check_rest(seen: Seen, positions: Tensor, scene: Scene) -> Seen:
             f"write back what was there, {_ANOTHER_SHAPE}"
         )
     return Seen(positions)
-
-
-def plain_tensor(tensor: Tensor) -> Tensor:
-    """The tensor itself or, where torch maps it, the whole one, mapped dimensions first."""
-    functorch = torch._C._functorch
-    mapped = []
-    while functorch.is_functorch_wrapped_tensor(tensor):
-        mapped.append(functorch.maybe_get_bdim(tensor))
-        tensor = functorch.get_unwrapped(tensor)
-    for moved, place in enumerate(place for place in reversed(mapped) if place >= 0):
-        tensor = tensor.movedim(moved + place, 0)
-    return tensor
-
-
-def has_numbers(tensor: Tensor) -> bool:
-    """Whether the numbers of a tensor can be read: not of a subclass, nor on "meta"."""
-    return type(tensor) in (Tensor, nn.Parameter) and not tensor.is_meta
