@@ -14,7 +14,11 @@ import torch
 from devices import missing_gpu
 
 ROOT = Path(__file__).resolve().parents[1]
-FILES = ["README.md", "benchmarks/README.md", *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/*.md"))]
+FILES = [
+    "README.md",
+    "benchmarks/README.md",
+    *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/*.md")),
+]
 FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # what a block may need beside a CPU; where it is missing the block is only compiled
 NEEDS = {"python": "", "python gpu": missing_gpu(), "python ranks": "several processes"}
