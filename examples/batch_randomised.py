@@ -7,7 +7,7 @@ import time
 
 import torch
 
-import torchpd as pd
+import torchpd as tpd
 
 
 def main() -> None:
@@ -16,11 +16,11 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=60, help="of 1/60 s")
     options = parser.parse_args()
 
-    mesh = pd.shapes.box((1.0, 0.2, 0.2), (13, 3, 3))
-    bar = pd.Solid(mesh, youngs=1e5, density=1000.0)
-    wall = pd.Pin(bar, mesh.vertices[:, 0] == 0.0)
-    scene = pd.Scene(bar, wall, pd.Gravity(), pd.Damping(1.0))
-    sim = pd.Simulator(scene, time_step=1 / 60, iterations=64, batch=options.batch)
+    mesh = tpd.shapes.box((1.0, 0.2, 0.2), (13, 3, 3))
+    bar = tpd.Solid(mesh, youngs=1e5, density=1000.0)
+    wall = tpd.Pin(bar, mesh.vertices[:, 0] == 0.0)
+    scene = tpd.Scene(bar, wall, tpd.Gravity(), tpd.Damping(1.0))
+    sim = tpd.Simulator(scene, time_step=1 / 60, iterations=64, batch=options.batch)
 
     # any material array may have a leading batch: one value, or one array, for each environment
     generator = torch.Generator().manual_seed(0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import torchpd as pd
+import torchpd as tpd
 from torchpd.animation import write_surface
 
 TIME_STEP = 1 / 60  # s
@@ -20,15 +20,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("dropped.glb"), help=".glb or .usdc: the motion; else the end")
     options = parser.parse_args()
 
-    surface = pd.TriMesh.from_file(options.surface) if options.surface else pd.shapes.octopus()
+    surface = tpd.TriMesh.from_file(options.surface) if options.surface else tpd.shapes.octopus()
     low, high = surface.bounds
     surface = surface.scaled(1.0 / float((high - low).max()))
-    mesh = pd.tetrahedralize(surface, cells=options.cells)
+    mesh = tpd.tetrahedralize(surface, cells=options.cells)
     mesh = mesh.translated((0.0, 0.3 - mesh.bounds[0, 1], 0.0))
     print(mesh)
 
-    scene = pd.Scene(pd.Solid(mesh, youngs=options.youngs, density=1000.0), pd.Gravity(), pd.Ground(friction=0.5))
-    sim = pd.Simulator(scene, TIME_STEP, iterations=64)
+    scene = tpd.Scene(tpd.Solid(mesh, youngs=options.youngs, density=1000.0), tpd.Gravity(), tpd.Ground(friction=0.5))
+    sim = tpd.Simulator(scene, TIME_STEP, iterations=64)
     track = sim.rollout(sim.rest_state(), options.steps, return_info=True, progress=True)
 
     # the simulator moves the tetrahedra; every vertex of the surface is a fixed combination of four of their corners
@@ -37,7 +37,7 @@ def main() -> None:
     if options.out.suffix in (".glb", ".usdc"):
         write_surface(options.out, frames, triangles, frames_per_second=1.0 / TIME_STEP)
     else:
-        pd.TriMesh(frames[-1], triangles, uvs=surface.uvs).to_file(options.out)
+        tpd.TriMesh(frames[-1], triangles, uvs=surface.uvs).to_file(options.out)
     print(f"lowest point {float(frames[-1, :, 1].min()):.3f} m, residual {float(track.info.residual[-1]):.1e}")
     print(f"written: {options.out}")
 

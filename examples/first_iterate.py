@@ -6,17 +6,17 @@ import argparse
 
 import torch
 
-import torchpd as pd
+import torchpd as tpd
 
 TIME_STEP = 1 / 30  # s
 
 
-def build(youngs: float, iterations: int, tolerance: float = 0.0) -> pd.Simulator:
+def build(youngs: float, iterations: int, tolerance: float = 0.0) -> tpd.Simulator:
     """A bar that a wall holds, in float64."""
-    mesh = pd.shapes.box((1.0, 0.2, 0.2), (15, 3, 3))
-    bar = pd.Solid(mesh, youngs=youngs, density=1000.0)
-    scene = pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] == 0.0), pd.Gravity())
-    return pd.Simulator(scene, TIME_STEP, iterations, dtype=torch.float64, tolerance=tolerance)
+    mesh = tpd.shapes.box((1.0, 0.2, 0.2), (15, 3, 3))
+    bar = tpd.Solid(mesh, youngs=youngs, density=1000.0)
+    scene = tpd.Scene(bar, tpd.Pin(bar, mesh.vertices[:, 0] == 0.0), tpd.Gravity())
+    return tpd.Simulator(scene, TIME_STEP, iterations, dtype=torch.float64, tolerance=tolerance)
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
     accurate = build(options.youngs, iterations=4000, tolerance=1e-12)
     positions, velocities = accurate.rest_state()
     velocities[..., 1] = -3.0 * positions[..., 0] ** 2
-    state = pd.State(positions, velocities)
+    state = tpd.State(positions, velocities)
     for _ in range(options.steps):
         state = accurate(state)
     exact, info = accurate(state, return_info=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import torchpd as pd
+import torchpd as tpd
 
 
 def main() -> None:
@@ -18,13 +18,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("patches.glb"), help="file for the mesh")
     options = parser.parse_args()
 
-    target = pd.TriMesh.from_file(options.mesh) if options.mesh else pd.shapes.octopus()
+    target = tpd.TriMesh.from_file(options.mesh) if options.mesh else tpd.shapes.octopus()
     index = 2 if len(target.vertices) <= 65536 else 4
     size = 12 * len(target.vertices) + 3 * index * len(target.triangles)
     print(f"{target}, {size:,} bytes")
 
     for base in ("flat", "phong"):
-        fit = pd.FreeFormPatches.fit(
+        fit = tpd.FreeFormPatches.fit(
             target, options.quadrics, patches=options.patches, base=base, iterations=options.iterations, progress=True
         )
         print(f"{base:>6}: {fit.report}")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parametrize
 
-import torchpd as pd
+import torchpd as tpd
 
 TRUTH = (3e5, 6e4)  # Pa: beside the wall, and far from it
 GUESS = 1.5e5  # Pa
@@ -37,11 +37,11 @@ def main() -> None:
     parser.add_argument("--fits", type=int, default=8, help="steps of the optimiser")
     options = parser.parse_args()
 
-    mesh = pd.shapes.box((1.0, 0.2, 0.2), (10, 2, 2))
-    bar = pd.Solid(mesh, youngs=GUESS, density=1000.0)
-    scene = pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+    mesh = tpd.shapes.box((1.0, 0.2, 0.2), (10, 2, 2))
+    bar = tpd.Solid(mesh, youngs=GUESS, density=1000.0)
+    scene = tpd.Scene(bar, tpd.Pin(bar, mesh.vertices[:, 0] == 0.0), tpd.Gravity())
     # gradients are those of converged steps, and as accurate as the steps are: iterate until little changes
-    sim = pd.Simulator(scene, time_step=1 / 30, iterations=1000, dtype=torch.float64, tolerance=1e-7)
+    sim = tpd.Simulator(scene, time_step=1 / 30, iterations=1000, dtype=torch.float64, tolerance=1e-7)
     half = torch.from_numpy((mesh.vertices[mesh.tets].mean(axis=1)[:, 0] > 0.5).astype(int))
 
     parametrize.register_parametrization(sim, "stiffness", Halves(half))

@@ -7,7 +7,7 @@ import math
 
 import torch
 
-import torchpd as pd
+import torchpd as tpd
 
 TIME_STEP = 1 / 60  # s
 
@@ -20,14 +20,14 @@ def main() -> None:
     parser.add_argument("--soft", type=float, help="stiffness of the grip [N/m]; it holds exactly without")
     options = parser.parse_args()
 
-    mesh = pd.shapes.box((1.0, 0.2, 0.2), (20, 4, 4)).translated((0.0, -0.1, -0.1))
-    bar = pd.Solid(mesh, youngs=1e5, density=1000.0)
-    wall = pd.Pin(bar, mesh.vertices[:, 0] == 0.0)
-    grip = pd.Pin(bar, mesh.vertices[:, 0] == 1.0, stiffness=options.soft)
-    sim = pd.Simulator(pd.Scene(bar, wall, grip, pd.Damping(2.0)), TIME_STEP, iterations=128)
+    mesh = tpd.shapes.box((1.0, 0.2, 0.2), (20, 4, 4)).translated((0.0, -0.1, -0.1))
+    bar = tpd.Solid(mesh, youngs=1e5, density=1000.0)
+    wall = tpd.Pin(bar, mesh.vertices[:, 0] == 0.0)
+    grip = tpd.Pin(bar, mesh.vertices[:, 0] == 1.0, stiffness=options.soft)
+    sim = tpd.Simulator(tpd.Scene(bar, wall, grip, tpd.Damping(2.0)), TIME_STEP, iterations=128)
     held = torch.from_numpy(mesh.vertices[grip.vertices]).float()
 
-    def targets(step: int) -> dict[pd.Pin, torch.Tensor]:
+    def targets(step: int) -> dict[tpd.Pin, torch.Tensor]:
         """Where the grip is at the end of a step; the wall stays where it is because it is not named."""
         share = (step + 1) / options.steps
         angle = math.radians(options.turn) * share

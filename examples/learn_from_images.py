@@ -9,28 +9,28 @@ import imageio.v3 as imageio
 import torch
 import trimesh
 
-import torchpd as pd
+import torchpd as tpd
 from torchpd.render import Camera
 
 VIEWS = 4
 CAMERA = Camera((0.0, 0.6, 4.2), (0.0, 0.0, 0.0), 36.0)
 
 
-def body() -> tuple[pd.FreeFormPatches, pd.Quadrics]:
+def body() -> tuple[tpd.FreeFormPatches, tpd.Quadrics]:
     """A ball of 80 patches, and the bumps and dents that the pictures know of."""
-    ball = pd.TriMesh.from_trimesh(trimesh.creation.icosphere(subdivisions=1))
+    ball = tpd.TriMesh.from_trimesh(trimesh.creation.icosphere(subdivisions=1))
     n = torch.arange(14, dtype=torch.float64)  # evenly over the ball, on a spiral
     y, turn = 1 - (2 * n + 1) / 14, math.pi * (3 - math.sqrt(5)) * n
     ring = (1 - y * y).sqrt()
     centres = torch.stack([ring * turn.cos(), y, ring * turn.sin()], dim=1)
     amplitudes = 0.12 * torch.tensor([1.0, -0.8, 0.6, 1.0, -0.5, 0.9, 0.7], dtype=torch.float64).repeat(2)
-    quadrics = pd.Quadrics.from_radii(amplitudes, centres, torch.full((14,), 0.55, dtype=torch.float64))
-    return pd.FreeFormPatches.from_mesh(ball, quadrics, dtype=torch.float64, base="phong"), quadrics
+    quadrics = tpd.Quadrics.from_radii(amplitudes, centres, torch.full((14,), 0.55, dtype=torch.float64))
+    return tpd.FreeFormPatches.from_mesh(ball, quadrics, dtype=torch.float64, base="phong"), quadrics
 
 
-def turned(patches: pd.FreeFormPatches) -> pd.PatchPose:
+def turned(patches: tpd.FreeFormPatches) -> tpd.PatchPose:
     """The body before the camera: stretched, and turned another way in every view."""
-    transport = pd.PatchTransport(patches, patches.vertices.mean(0, keepdim=True), torch.zeros(80, dtype=torch.int64))
+    transport = tpd.PatchTransport(patches, patches.vertices.mean(0, keepdim=True), torch.zeros(80, dtype=torch.int64))
     angles = torch.arange(VIEWS, dtype=torch.float64) * 2 * math.pi / VIEWS
     c, s, zero = angles.cos(), angles.sin(), torch.zeros(VIEWS, dtype=torch.float64)
     rows = [torch.stack(row, 1) for row in ((1.1 * c, zero, s), (zero, 0 * zero + 0.9, zero), (-1.1 * s, zero, c))]
@@ -44,9 +44,9 @@ def main() -> None:
     parser.add_argument("--out", help="a picture (PNG): truth, start and end, above one another")
     options = parser.parse_args()
     patches, truth = body()
-    pose, rays, size = turned(patches), pd.PatchRays(patches), (options.pixels, options.pixels)
+    pose, rays, size = turned(patches), tpd.PatchRays(patches), (options.pixels, options.pixels)
 
-    def look(quadrics: pd.Quadrics) -> pd.PatchImage:
+    def look(quadrics: tpd.Quadrics) -> tpd.PatchImage:
         # bumps move and patches under them change: the lists have to follow
         return rays.render(CAMERA, size, pose, patches=patches.with_quadrics(quadrics), light=(0.6, 1.0, 0.8))
 
@@ -62,7 +62,7 @@ def main() -> None:
     print("step    color   depth [mm]  height [mm]  centre [mm]")
     pictures = [seen.color]
     for step in range(options.steps + 1):
-        image = look(pd.Quadrics(amplitudes, centres, truth.factors))
+        image = look(tpd.Quadrics(amplitudes, centres, truth.factors))
         both = seen.hit & image.hit  # outlines have no gradient
         color = (image.color - seen.color)[both].square().mean()
         depth = (image.depth - seen.depth)[both].square().mean()

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 import trimesh
 
-import torchpd as pd
+import torchpd as tpd
 from torchpd.animation import write_surface
 from torchpd.seams import measure_seams
 
@@ -24,17 +24,17 @@ def main() -> None:
     options = parser.parse_args()
 
     # a bump or a dent on every vertex of a coarse torus, the highest a quarter of its radius
-    base = pd.TriMesh.from_trimesh(trimesh.creation.torus(0.4, 0.15, major_sections=20, minor_sections=10))
+    base = tpd.TriMesh.from_trimesh(trimesh.creation.torus(0.4, 0.15, major_sections=20, minor_sections=10))
     base = base.transformed(trimesh.transformations.rotation_matrix(1.0, [1, 0, 0])).translated((0.0, 0.8, 0.0))
     torch.manual_seed(0)
     radii = 0.1 * (0.8 + 0.4 * torch.rand(len(base.vertices)))
     heights = 0.25 * radii * (2.0 * torch.rand(len(radii)) - 1.0)
-    quadrics = pd.Quadrics.from_radii(heights, torch.tensor(base.vertices).float(), radii)
-    patches = pd.FreeFormPatches.from_mesh(base, quadrics, base="phong")
+    quadrics = tpd.Quadrics.from_radii(heights, torch.tensor(base.vertices).float(), radii)
+    patches = tpd.FreeFormPatches.from_mesh(base, quadrics, base="phong")
 
-    body = pd.PatchBody(patches, stiffness=options.stiffness, density=1000.0)
+    body = tpd.PatchBody(patches, stiffness=options.stiffness, density=1000.0)
     print(body)
-    sim = pd.Simulator(pd.Scene(body, pd.Gravity(), pd.Ground(friction=0.5)), TIME_STEP, iterations=64)
+    sim = tpd.Simulator(tpd.Scene(body, tpd.Gravity(), tpd.Ground(friction=0.5)), TIME_STEP, iterations=64)
     track = sim.rollout(sim.rest_state(), options.steps, return_info=True, progress=True)
 
     # every frame is a pose of the same patches: heights are of the material, evaluated once

@@ -7,7 +7,7 @@ import argparse
 import torch
 from torch import Tensor
 
-import torchpd as pd
+import torchpd as tpd
 
 GOAL = (0.09, 0.05, 0.06)  # m, of the middle of the block, which starts at (0.05, 0.05, 0.05)
 RADIUS = 0.2  # m, of the hand
@@ -19,11 +19,11 @@ def main() -> None:
     parser.add_argument("--tries", type=int, default=20, help="steps of the optimiser")
     options = parser.parse_args()
 
-    mesh = pd.shapes.box((0.1, 0.1, 0.1), (4, 4, 4))
-    hand = pd.Sphere((-RADIUS, 0.05, 0.05), RADIUS, friction=0.8)
-    scene = pd.Scene(pd.Solid(mesh, youngs=1e5), pd.Gravity(), pd.Ground(friction=0.4), hand)
+    mesh = tpd.shapes.box((0.1, 0.1, 0.1), (4, 4, 4))
+    hand = tpd.Sphere((-RADIUS, 0.05, 0.05), RADIUS, friction=0.8)
+    scene = tpd.Scene(tpd.Solid(mesh, youngs=1e5), tpd.Gravity(), tpd.Ground(friction=0.4), hand)
     # gradients are those of converged steps, and as accurate as the steps are
-    sim = pd.Simulator(scene, time_step=1 / 60, iterations=1000, dtype=torch.float64, tolerance=1e-6)
+    sim = tpd.Simulator(scene, time_step=1 / 60, iterations=1000, dtype=torch.float64, tolerance=1e-6)
     goal, share = torch.tensor(GOAL, dtype=torch.float64), sim.masses / sim.masses.sum()
 
     # how fast the hand goes in each step [m/s]: at first straight on, too slowly

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-import torchpd as pd
+import torchpd as tpd
 
 TIME_STEP = 1 / 60  # s
 LENGTH = 0.5  # m
@@ -20,13 +20,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("beam.pvd"), help="beside it goes a .vtu of every tenth step")
     options = parser.parse_args()
 
-    mesh = pd.shapes.box((LENGTH, 0.1, 0.1), (20, 4, 4))
+    mesh = tpd.shapes.box((LENGTH, 0.1, 0.1), (20, 4, 4))
     left, low = mesh.bounds[0, :2]
-    beam = pd.Solid(mesh, youngs=options.youngs, density=1000.0)
-    clamp = pd.Pin(beam, mesh.vertices[:, 0] == left)
-    ball = pd.Sphere((left + 0.8 * LENGTH, low - 0.22, 0.0), radius=0.2, friction=0.4)
-    scene = pd.Scene(beam, clamp, ball, pd.Gravity(), pd.Damping(5.0))
-    sim = pd.Simulator(scene, TIME_STEP, iterations=256, dtype=torch.float64)
+    beam = tpd.Solid(mesh, youngs=options.youngs, density=1000.0)
+    clamp = tpd.Pin(beam, mesh.vertices[:, 0] == left)
+    ball = tpd.Sphere((left + 0.8 * LENGTH, low - 0.22, 0.0), radius=0.2, friction=0.4)
+    scene = tpd.Scene(beam, clamp, ball, tpd.Gravity(), tpd.Damping(5.0))
+    sim = tpd.Simulator(scene, TIME_STEP, iterations=256, dtype=torch.float64)
 
     state, frames, contact, reaction = sim.rest_state(), [], [], []
     for step in range(options.steps):
