@@ -128,4 +128,6 @@ def test_what_is_refused_of_a_motion(tmp_path: Path) -> None:
         sim.write_vtu(tmp_path / "a.vtu", track)
     with pytest.raises(TypeError, match="states must be a State, a Track or a list"):
         sim.write_vtu(tmp_path / "a.vtu", track.positions)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"state must be a State, .* got Tensor"):
+        sim.write_vtu(tmp_path / "a.pvd", [track.state(), track.positions[1]])  # type: ignore[list-item]
     assert list(tmp_path.iterdir()) == []

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from .adjoint import AdjointCall
-from .checks import check_has_values, check_like
+from .checks import check_like
 from .diagonal import named_material
 from .material import check_environments
 from .model import Model
@@ -17,7 +17,7 @@ from .readouts import ContactForces, Reactions, contact_forces, reactions
 from .state import State
 from .stress import Stress, stress, vertex_average
 from .targets import Targets
-from .vtu import RestBody, States, write_vtu
+from .vtu import States, write_vtu
 
 __all__ = ["Readable"]
 
@@ -148,6 +148,9 @@ class Readable(Model):
         Returns:
             The path.
         """
-        check_has_values("write_vtu", self.device)
-        body = RestBody(self.scene, self.rest_positions, self.stiffness, self.time_step)
-        return write_vtu(body, self.positions_of, path, states, environment, times, point_data, cell_data)
+
+        def check(state: State) -> None:
+            self.check_state(state)
+            self.positions_of(state)
+
+        return write_vtu(self.compiled, check, path, states, environment, times, point_data, cell_data)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -23,29 +23,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .checks import as_array, check_finite, check_shape, check_target_file, check_whole
+from .checks import as_array, check_finite, check_has_values, check_shape, check_target_file, check_whole
+from .compiled import CompiledScene
 from .material import check_environments
 from .scene import Scene
 from .state import State, Track
 from .stress import stress
 
-__all__ = ["RestBody", "States", "write_vtu"]
+__all__ = ["States", "write_vtu"]
 
 States = State | Track | Sequence[State]
 Fields = dict[str, NDArray[Any]]
 
 
-class RestBody(NamedTuple):
-    """What files tell beside the states."""
-
-    scene: Scene
-    positions: Tensor  # [V, 3] m, at rest
-    stiffness: Tensor  # [E] or [B, E] Pa
-    time_step: float  # s, between states without times of their own
-
-
 def write_vtu(
-    body: RestBody,
+    compiled: CompiledScene,
     check: Callable[[State], object],
     path: str | Path,
     states: States,
@@ -55,21 +47,22 @@ def write_vtu(
     cell_data: Mapping[str, Any] | None,
 ) -> Path:
     """What `Simulator.write_vtu` does; `check` refuses what is no state."""
+    check_has_values("write_vtu", compiled.device)
     target = check_target_file(path, "write_vtu")
-    records, alone = _records(body, check, states)
+    records, alone = _records(compiled, check, states)
     ending, what = (".vtu", "one state") if alone else (".pvd", "several states, each of which gets a .vtu beside it")
     if target.suffix.lower() != ending:
         raise ValueError(f"write_vtu: path must end in {ending} for {what}, got {target.name}")
     batch = len(records[0].positions)
     chosen = _chosen(environment, batch)
-    tets, labels = _cells(body.scene)
+    tets, labels = _cells(compiled.scene)
     front = (batch,) if alone else (len(records), batch)
-    points = _given("point_data", point_data, (*front, len(body.positions)), chosen)
+    points = _given("point_data", point_data, (*front, compiled.vertices), chosen)
     cells = _given("cell_data", cell_data, (*front, len(tets)), chosen)
     files = [target] if alone else _numbered(target, len(records))
-    instants = _instants(body.time_step, times, len(records))
+    instants = _instants(compiled.time_step, times, len(records))
     for number, (file, state) in enumerate(zip(files, records, strict=True)):
-        own_points, own_cells = _own_fields(body, state, chosen)
+        own_points, own_cells = _own_fields(compiled, state, chosen)
         point_fields = _joined("point_data", own_points, points, number)
         cell_fields = _joined("cell_data", {**own_cells, **labels}, cells, number)
         _write(file, state.positions[chosen], tets, point_fields, cell_fields)
@@ -81,7 +74,7 @@ def write_vtu(
 # ---- what is written
 
 
-def _records(body: RestBody, check: Callable[[State], object], states: States) -> tuple[list[State], bool]:
+def _records(compiled: CompiledScene, check: Callable[[State], object], states: States) -> tuple[list[State], bool]:
     """The states one by one, and whether it is a single one."""
     alone = False
     if isinstance(states, Track):
@@ -100,7 +93,7 @@ def _records(body: RestBody, check: Callable[[State], object], states: States) -
         raise ValueError(f"write_vtu: states must have one number of environments, got {sorted(batches)}")
     if 0 in batches:
         raise ValueError("write_vtu: states must have at least one environment, got none")
-    check_environments("write_vtu: states", len(found[0][0]), {"stiffness": body.stiffness})
+    check_environments("write_vtu: states", len(found[0][0]), {"stiffness": compiled.named["stiffness"]})
     return [State(*state) for state in found], alone
 
 
@@ -135,12 +128,13 @@ def _cells(scene: Scene) -> tuple[NDArray[np.int64], Fields]:
 
 
 @torch.no_grad()
-def _own_fields(body: RestBody, state: State, chosen: int) -> tuple[Fields, Fields]:
+def _own_fields(compiled: CompiledScene, state: State, chosen: int) -> tuple[Fields, Fields]:
     """Fields of points and cells that every file has."""
     positions = state.positions[chosen]
-    stiffness = body.stiffness.expand(len(state.positions), -1)[chosen]
-    found = stress(body.scene, positions[None], stiffness)
-    points = {"displacement": positions - body.positions, "velocity": state.velocities[chosen]}
+    rest = positions.new_tensor(np.concatenate([solid.mesh.vertices for solid in compiled.scene.solids]))
+    stiffness = compiled.named["stiffness"].expand(len(state.positions), -1)[chosen]
+    found = stress(compiled.scene, positions[None], stiffness)
+    points = {"displacement": positions - rest, "velocity": state.velocities[chosen]}
     cells = {"stress": found.cauchy[0].flatten(1), "von_mises": found.von_mises[0]}
     return {k: v.cpu().numpy() for k, v in points.items()}, {k: v.cpu().numpy() for k, v in cells.items()}
 
