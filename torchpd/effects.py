@@ -17,6 +17,7 @@ from .checks import as_array, check_finite, check_positive, check_scalar, check_
 from .mesh import TetMesh
 from .mesh_checks import warn
 from .mesh_faces import pieces_of
+from .reprs import by_fields
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -41,6 +42,9 @@ class _Part:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self
+
+    def __repr__(self) -> str:
+        return by_fields(self)
 
 
 class _Key(_Part):
@@ -91,7 +95,7 @@ def _report_size(mesh: TetMesh) -> None:
         )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Solid(_Key):
     """An elastic body: tetrahedra that resist every departure from their rest shape.
 
@@ -128,7 +132,7 @@ class Solid(_Key):
         )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Pin(_Key):
     """Holds vertices of a solid at targets: at their rest positions, or where `targets` of a step puts them.
 
@@ -177,7 +181,7 @@ class Pin(_Key):
         _set(self, solid=solid, vertices=chosen.astype(np.int64), stiffness=springs)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Gravity(_Part):
     """A uniform acceleration [m/s^2] of everything."""
 
@@ -187,7 +191,7 @@ class Gravity(_Part):
         _set(self, vector=check_vector("Gravity.vector", vector))
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Ground(_Key):
     """A plane that vertices cannot pass: normal . x >= height, with Coulomb friction.
 
@@ -220,7 +224,7 @@ class Ground(_Key):
         )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Sphere(_Key):
     """A ball that vertices cannot enter, with Coulomb friction. `targets` of a step may move its centre.
 
@@ -249,7 +253,7 @@ class Sphere(_Key):
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Damping(_Part):
     """Drag proportional to mass: every velocity decays as dv/dt = -rate v.
 

@@ -66,6 +66,11 @@ class Plan:
         names = ", ".join(row.name for row in self.table)
         raise AttributeError(f"Plan has no array {name!r}; it has {names}")
 
+    def __repr__(self) -> str:
+        kernel = "" if self.kernel is None else f", kernel {self.kernel}"
+        sizes = f"{self.vertices} vertices, {self.patches} patches{kernel}, {self.bytes:,} B"
+        return f"Plan({sizes}, {str(self.dtype).removeprefix('torch.')}, {self.device})"
+
     @property
     def kernel(self) -> str | None:
         """Which kernel of a GPU the plan is for: "block", "cluster", "grid" or "stream"; None for the CPU."""

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from .reprs import by_sizes
+
 __all__ = ["Info", "State", "Track"]
 
 
@@ -65,6 +67,9 @@ class State(NamedTuple):
         """The same numbers without their history, as `Tensor.detach`."""
         return State(self.positions.detach(), self.velocities.detach())
 
+    def __repr__(self) -> str:
+        return by_sizes(self, self.positions, "batch", "vertices")
+
 
 class Info(NamedTuple):
     """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it.
@@ -110,6 +115,13 @@ class Info(NamedTuple):
         inverted = counted[0] if counted else torch.full_like(rho, -1.0)
         return cls(residual, energy, iterations.long(), restarts.long(), converged.bool(), rho, inverted.long())
 
+    def __repr__(self) -> str:
+        try:
+            worst = f"residual<={float(self.residual.max()):.2g}, iterations<={int(self.iterations.max())}"
+        except RuntimeError:  # no values: an empty batch, a traced step, "meta"
+            worst = ""
+        return by_sizes(self, self.residual, "records", "batch", trailing=0, more=worst)
+
 
 class Track(NamedTuple):
     """States along a rollout; the start is not among them."""
@@ -128,6 +140,9 @@ class Track(NamedTuple):
                 f"record must lie in {-count}..{count - 1}" if count else "the track has no record, steps // every is 0"
             )
             raise IndexError(f"Track.state: {there}, got {record}") from None
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.positions, "records", "batch", "vertices")
 
 
 for _kind in (Info, State, Track):
