@@ -78,4 +78,6 @@ def test_free_form_patches() -> None:
     assert repr(rays.cast(-towards, towards)) == "PatchHits(batch=1, rays=1, float32, cpu)"
     picture = rays.render(Camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), fov=40.0), (4, 2))
     assert repr(picture) == "PatchImage(batch=1, height=2, width=4, float32, cpu)"
-    assert repr(patches.tessellate(2)).endswith("samples=PatchSamples(samples=6, float32, cpu), triangles=int64 [4, 3])")
+    assert repr(patches.tessellate(2)).endswith(
+        "samples=PatchSamples(samples=6, float32, cpu), triangles=int64 [4, 3])"
+    )

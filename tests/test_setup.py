@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 
 import pytest
@@ -91,3 +92,19 @@ def test_the_shared_runtime_comes_before_a_static_one(tmp_path: Path) -> None:
         libraries = libraries_in(built)
         assert libraries is not None
         assert (runtime_fault(libraries, "c++") == "") == named
+
+
+def tracked() -> set[str]:
+    """The files of this repository; none where it came without its history."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    return set(listed.stdout.split("\n")) - {""}
+
+
+@pytest.mark.skipif(not tracked(), reason="not a checkout of git")
+def test_source_distribution_has_every_file(tmp_path: Path) -> None:
+    words = ["--quiet", "egg_info", "--egg-base", str(tmp_path), "sdist", "--dist-dir", str(tmp_path)]
+    subprocess.run([sys.executable, "setup.py", *words], cwd=ROOT, check=True, capture_output=True)
+    (file,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(file) as archive:
+        packed = {name.partition("/")[2] for name in archive.getnames()}
+    assert tracked() - packed == {".gitignore"}
