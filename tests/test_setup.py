@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from torchpd.__main__ import main
 from torchpd.linking import libraries_in, library_names, runtime_fault, shared_runtime
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -108,3 +110,14 @@ def test_source_distribution_has_every_file(tmp_path: Path) -> None:
     with tarfile.open(file) as archive:
         packed = {name.partition("/")[2] for name in archive.getnames()}
     assert tracked() - packed == {".gitignore"}
+
+
+def test_editable_install_is_a_path_that_type_checkers_follow() -> None:
+    files = importlib.metadata.files("torchpd") or []
+    lines = [Path(str(file.locate())).read_text().strip() for file in files if file.suffix == ".pth"]
+    assert all(Path(line).is_dir() for line in lines), "installed with an import hook: run pip install -e . again"
+
+
+def test_console_script_is_the_command_line() -> None:
+    (script,) = importlib.metadata.entry_points(group="console_scripts", name="torchpd")
+    assert script.load() is main

@@ -120,7 +120,7 @@ class Solid(_Key):
     youngs: Array
     density: Array
 
-    @check_arguments
+    @check_arguments("Solid")
     def __init__(self, mesh: TetMesh, youngs: ArrayLike, density: ArrayLike = 1000.0) -> None:
         if not isinstance(mesh, TetMesh):
             raise TypeError(
@@ -153,7 +153,7 @@ class Pin(_Key):
     vertices: NDArray[np.int64]
     stiffness: Array | None
 
-    @check_arguments
+    @check_arguments("Pin")
     def __init__(
         self, solid: Solid, vertices: Sequence[int] | NDArray[Any] | torch.Tensor, stiffness: ArrayLike | None = None
     ) -> None:
@@ -193,7 +193,7 @@ class Gravity(_Part):
 
     vector: Array
 
-    @check_arguments
+    @check_arguments("Gravity")
     def __init__(self, vector: ArrayLike = (0.0, -9.81, 0.0)) -> None:
         _set(self, vector=check_vector("Gravity.vector", vector))
 
@@ -215,7 +215,7 @@ class Ground(_Key):
     normal: Array
     friction: float
 
-    @check_arguments
+    @check_arguments("Ground")
     def __init__(self, height: float = 0.0, normal: ArrayLike = (0.0, 1.0, 0.0), friction: float = 0.0) -> None:
         direction = check_vector("Ground.normal", normal)
         largest = float(np.abs(direction).max())
@@ -249,7 +249,7 @@ class Sphere(_Key):
     radius: float
     friction: float
 
-    @check_arguments
+    @check_arguments("Sphere")
     def __init__(self, center: ArrayLike, radius: float, friction: float = 0.0) -> None:
         size = check_scalar("Sphere.radius", radius)
         if size <= 0.0:
@@ -274,6 +274,6 @@ class Damping(_Part):
 
     rate: float
 
-    @check_arguments
+    @check_arguments("Damping")
     def __init__(self, rate: float) -> None:
         _set(self, rate=check_scalar("Damping.rate", rate, minimum=0.0))

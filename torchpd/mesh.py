@@ -64,7 +64,7 @@ class TriMesh:
     triangles: Index
     uvs: Array | None
 
-    @check_arguments
+    @check_arguments("TriMesh")
     def __init__(
         self,
         vertices: Numbers,
@@ -224,7 +224,7 @@ class TetMesh:
     embedding: Embedding | None
     flipped: int
 
-    @check_arguments
+    @check_arguments("TetMesh")
     def __init__(
         self,
         vertices: Numbers,

@@ -13,7 +13,7 @@ __all__ = ["by_fields", "by_sizes"]
 _FEW = 6  # numbers of an array that are printed
 
 
-def by_sizes(value: object, tensor: Tensor, *names: str, trailing: int = 1, more: str = "") -> str:
+def by_sizes(value: object, tensor: Any, *names: str, trailing: int = 1, more: str = "") -> str:
     """`State(batch=32, vertices=4096, float32, cpu)`: a value by the shape of one of its tensors.
 
     Args:

@@ -75,7 +75,7 @@ class Scene:
             and one `Damping`; a `Pin` holds a `Solid` of this scene, and no vertex is pinned twice.
     """
 
-    @check_arguments
+    @check_arguments("Scene")
     def __init__(self, *parts: Part) -> None:
         for part in parts:
             if not isinstance(part, Part):

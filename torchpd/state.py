@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, overload
 
 import torch
 from torch import Tensor
@@ -10,7 +10,10 @@ from torch.utils import _pytree as pytree
 
 from .reprs import by_sizes
 
-__all__ = ["Info", "State", "Track"]
+if TYPE_CHECKING:
+    from .targets import Targets
+
+__all__ = ["Info", "State", "StepCall", "Track"]
 
 
 class State(NamedTuple):
@@ -121,6 +124,41 @@ class Info(NamedTuple):
         except RuntimeError:  # no values: an empty batch, a traced step, "meta"
             worst = ""
         return by_sizes(self, self.residual, "records", "batch", trailing=0, more=worst)
+
+
+class StepCall(Protocol):
+    """The types of a call of a simulator, which `torch.nn.Module` does not know; `Simulator.forward` documents it."""
+
+    @overload
+    def __call__(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        return_info: Literal[False] = False,
+    ) -> State: ...
+
+    @overload
+    def __call__(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        *,
+        return_info: Literal[True],
+    ) -> tuple[State, Info]: ...
+
+    @overload
+    def __call__(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        return_info: bool = False,
+    ) -> State | tuple[State, Info]: ...
 
 
 class Track(NamedTuple):

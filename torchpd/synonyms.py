@@ -57,7 +57,7 @@ SYNONYMS: dict[str, dict[str, str]] = {
     "Gravity": {"acceleration g value": "the acceleration is `vector` [3] in m/s^2"},
     "Damping": {"coefficient damping": "the drag is `rate` [1/s]"},
     "Scene": {
-        "bodies gravity ground objects parts pins solids": "parts come one by one: Scene(Solid(...), Ground(), Gravity())",
+        "bodies gravity ground objects parts pins": "parts come one by one: Scene(Solid(...), Ground(), Gravity())",
         "dt time_step": "the time step belongs to `Simulator(scene, time_step=...)`",
     },
     "TetMesh": {"points verts": _VERTICES, "cells elements tetrahedra tetras": "elements are `tets` [E, 4]"},
@@ -99,17 +99,22 @@ def no_attribute(owner: str, name: str, value: object = None) -> AttributeError:
     return AttributeError(words, name=name, obj=value)
 
 
-def check_arguments(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function so that the error of an unknown argument says which ones there are."""
-    known = [name for name, one in signature(function).parameters.items() if one.kind != one.VAR_POSITIONAL]
+def check_arguments(owner: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate what users know as `owner` so that errors of arguments name it and what it takes."""
 
-    @wraps(function)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-        for name in kwargs:
-            if name not in known:
-                owner = checked.__qualname__.removesuffix(".__init__")  # type: ignore[attr-defined]
-                ours = ", ".join(name for name in known if name != "self")
-                raise TypeError(f"{owner} has no argument {name!r}; {_answer(owner, name) or f'it takes {ours}'}")
-        return function(*args, **kwargs)
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        known = [name for name, one in signature(function).parameters.items() if one.kind != one.VAR_POSITIONAL]
+        # python's own errors, of missing arguments and of too many, name the function by it
+        function.__qualname__ = owner + ".__init__" * (function.__name__ == "__init__")
 
-    return checked
+        @wraps(function)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+            for name in kwargs:
+                if name not in known:
+                    ours = ", ".join(name for name in known if name != "self")
+                    raise TypeError(f"{owner} has no argument {name!r}; {_answer(owner, name) or f'it takes {ours}'}")
+            return function(*args, **kwargs)
+
+        return checked
+
+    return decorate

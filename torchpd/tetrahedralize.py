@@ -35,7 +35,7 @@ _SEAM = 0.25
 _HOLLOW = 1e-4
 
 
-@check_arguments
+@check_arguments("tetrahedralize")
 def tetrahedralize(
     surface: Any,
     cells: int = 20,
@@ -72,8 +72,8 @@ def tetrahedralize(
         progress: show a progress bar.
         fill_holes: "lattice" counts what lies behind a hole as inside, up to a cone of triangles over the open edges.
             False leaves whatever can be reached from outside empty: an open surface becomes a shell.
-        unit: "m", "cm", "mm", "in" or "ft", of the numbers of a file or a trimesh, see `TriMesh.from_file`. A TriMesh is
-            in metres.
+        unit: "m", "cm", "mm", "in" or "ft", of the numbers of a file or a trimesh, see `TriMesh.from_file`. A TriMesh
+            is in metres.
     """
     triangles = _as_surface(surface, unit)
     if check_scalar("tetrahedralize: cells", cells, minimum=1) != int(cells):
