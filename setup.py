@@ -145,4 +145,7 @@ class BuildExtension(cpp_extension.BuildExtension):
                 fail(fault)
 
 
-setup(ext_modules=[make_extension()], cmdclass={"build_ext": BuildExtension})
+# An editable install is then a path, which type checkers follow; they do not see through the usual import hook.
+EDITABLE = {"editable_wheel": {"mode": "compat"}}
+
+setup(ext_modules=[make_extension()], cmdclass={"build_ext": BuildExtension}, options=EDITABLE)

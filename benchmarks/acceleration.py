@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from beam import STIFFNESSES, beam, iterations_to, solution
 from machine import describe_run
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from torchpd.contenders import CONTENDERS
 

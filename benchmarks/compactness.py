@@ -22,7 +22,7 @@ import torch
 import trimesh
 from machine import describe_run
 from numpy.typing import NDArray
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 import torchpd as pd
 from torchpd.fit_targets import FitTarget, base_triangles, target_of

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import torch
 from machine import describe_run, measure, write_result
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 import torchpd as pd
 from torchpd.solvers import Solver

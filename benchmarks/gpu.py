@@ -18,7 +18,7 @@ from gpu_scenes import GPU_SCENES, PAPER, GpuScene, PaperTest
 from gpu_timing import Device, describe_device, event_times, graph_times, host_seconds, kernel_seconds
 from machine import PROVENANCE, milliseconds, run_of
 from scenes import TIME_STEP
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 import torchpd as pd
 from torchpd.gpu import properties_of

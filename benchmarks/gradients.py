@@ -25,7 +25,7 @@ import torch
 from gpu_scenes import GpuScene
 from gpu_timing import graph_times
 from machine import describe_run, measure
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 import torchpd as pd
 

@@ -21,7 +21,7 @@ from gpu_scenes import GpuScene
 from gpu_timing import event_times, recorded
 from machine import describe_run, run_of, write_result
 from scenes import TIME_STEP
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 import torchpd as pd
 from torchpd.gpu import properties_of

@@ -17,7 +17,7 @@ from gpu import run_on_gpu, with_earlier
 from gpu_scenes import GPU_SCENES, QUICK_GPU_SCENES
 from machine import describe_run, measure, milliseconds, multiply_adds_per_second, write_result
 from scenes import GOAL_MULTIPLY_ADDS_PER_SECOND, GOAL_THREADS, QUICK_SCENES, SCENES, TIME_STEP, BenchScene
-from tqdm import tqdm
+from tqdm.auto import tqdm
 from vectorised import VectorisedStep
 
 import torchpd as pd

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 from machine import describe_run, earlier_rows, run_of
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 import torchpd as pd
 from torchpd.accuracy import problem_of

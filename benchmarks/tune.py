@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from machine import describe_run, earlier_rows, measure, run_of
 from scipy.spatial import Delaunay
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 import torchpd as pd
 from torchpd.accuracy import exact_steps, settled_steps

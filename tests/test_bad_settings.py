@@ -55,12 +55,13 @@ def test_settings_of_a_simulator_are_checked() -> None:
         ({"tolerance": math.nan}, ValueError, r"tolerance must lie in \[0, 1\), got nan"),
         ({"tolerance": None}, ValueError, r"tolerance must lie in \[0, 1\), got None"),
         ({"tolerance": "low"}, ValueError, r"tolerance must lie in \[0, 1\), got 'low'"),
-        ({"dt": 0.01}, TypeError, r"^Simulator\.__init__\(\) got an unexpected keyword argument 'dt'"),
+        ({"dt": 0.01}, TypeError, r"^Simulator has no argument 'dt'; .*`time_step`"),
         (
-            {"solver": "jacobi"},
+            {"solver": "newton"},
             TypeError,
-            r"solver must be Jacobi, Chebyshev, Multilevel or \"auto\", got 'jacobi'",
+            r"solver must be Jacobi, Chebyshev, Multilevel or .*'jacobi'.*, got 'newton'",
         ),
+        ({"device": "gpu"}, RuntimeError, "gpu"),
         ({"dtype": "float32"}, ValueError, r"dtype must be torch\.float32 or torch\.float64, got 'float32'"),
         ({"dtype": torch.float16}, ValueError, r"dtype must be torch\.float32 or torch\.float64, got torch\.float16"),
     ):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 
 import pytest
 
+from torchpd.__main__ import main
 from torchpd.linking import libraries_in, library_names, runtime_fault, shared_runtime
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -91,3 +94,30 @@ def test_the_shared_runtime_comes_before_a_static_one(tmp_path: Path) -> None:
         libraries = libraries_in(built)
         assert libraries is not None
         assert (runtime_fault(libraries, "c++") == "") == named
+
+
+def tracked() -> set[str]:
+    """The files of this repository; none where it came without its history."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    return set(listed.stdout.split("\n")) - {""}
+
+
+@pytest.mark.skipif(not tracked(), reason="not a checkout of git")
+def test_source_distribution_has_every_file(tmp_path: Path) -> None:
+    words = ["--quiet", "egg_info", "--egg-base", str(tmp_path), "sdist", "--dist-dir", str(tmp_path)]
+    subprocess.run([sys.executable, "setup.py", *words], cwd=ROOT, check=True, capture_output=True)
+    (file,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(file) as archive:
+        packed = {name.partition("/")[2] for name in archive.getnames()}
+    assert tracked() - packed == {".gitignore"}
+
+
+def test_editable_install_is_a_path_that_type_checkers_follow() -> None:
+    files = importlib.metadata.files("torchpd") or []
+    lines = [Path(str(file.locate())).read_text().strip() for file in files if file.suffix == ".pth"]
+    assert all(Path(line).is_dir() for line in lines), "installed with an import hook: run pip install -e . again"
+
+
+def test_console_script_is_the_command_line() -> None:
+    (script,) = importlib.metadata.entry_points(group="console_scripts", name="torchpd")
+    assert script.load() is main

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from . import shapes
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
@@ -12,6 +12,7 @@ from .mesh import MeshWarning, TetMesh, TriMesh
 from .scene import Scene
 from .solvers import Chebyshev, Jacobi, Multilevel
 from .state import Info, State, Track
+from .synonyms import no_attribute
 from .tetrahedralize import tetrahedralize
 from .version import __version__
 from .warn import SceneWarning, TuningWarning
@@ -37,14 +38,6 @@ if load_extension()[0] is not None:
     from .simulator import Simulator
     from .spectrum import estimate_rho
     from .stress import Stress
-else:  # meshes, scenes and the doctor work without it
-
-    def __getattr__(name: str) -> Any:
-        if name in __all__:
-            raise extension_error(name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
 __all__ = [
     "CapturedStep",
     "Chebyshev",
@@ -96,3 +89,13 @@ __all__ = [
     "shapes",
     "tetrahedralize",
 ]
+
+if not TYPE_CHECKING:  # type checkers would take any name for one of ours
+
+    def __getattr__(name: str) -> Any:
+        if name in __all__:  # meshes, scenes and the doctor work without the extension
+            raise extension_error(name)
+        raise no_attribute("", name)
+
+    def __dir__() -> list[str]:
+        return [*__all__, *(name for name in globals() if name.startswith("__"))]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -262,7 +262,7 @@ def settled_steps(
 
         def run(solver: Solver, iterations: int, start: str | Tensor = "velocity") -> State:
             twin.solver, twin.iterations = solver, iterations
-            return cast(State, twin(wide, pushed, start=start))
+            return twin(wide, pushed, start=start)
 
         problems = [problem_of(sim, state, item, forces=forces) for item in range(len(wide.positions))]
         first = torch.from_numpy(np.stack([problem.course() for problem in problems]))

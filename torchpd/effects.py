@@ -17,6 +17,8 @@ from .checks import as_array, check_finite, check_positive, check_scalar, check_
 from .mesh import TetMesh
 from .mesh_checks import warn
 from .mesh_faces import pieces_of
+from .reprs import by_fields
+from .synonyms import check_arguments
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -41,6 +43,9 @@ class _Part:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self
+
+    def __repr__(self) -> str:
+        return by_fields(self)
 
 
 class _Key(_Part):
@@ -84,14 +89,16 @@ def _report_size(mesh: TetMesh) -> None:
     """Warn of a body whose longest side hardly is in metres."""
     length = _longest_side(mesh)
     if not _SHORTEST <= length <= _LONGEST:
-        fix = "(0.001) if these are millimetres" if length > _LONGEST else "(1000) if these were divided by 1000"
+        fix = "scaled(1000) if these were divided by 1000"
+        if length > _LONGEST:
+            fix = 'scaled(0.001) if these are millimetres, or read its file with unit="mm"'
         warn(
             f"Solid: the mesh is {length:.4g} m long, where bodies of {_SHORTEST:g} to {_LONGEST:g} m are expected. "
-            f"Coordinates are in metres: pass mesh.scaled{fix}"
+            f"Coordinates are in metres: pass mesh.{fix}"
         )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Solid(_Key):
     """An elastic body: tetrahedra that resist every departure from their rest shape.
 
@@ -104,6 +111,7 @@ class Solid(_Key):
 
     Args:
         mesh: the rest shape, in metres; a `MeshWarning` tells of one that is longer than 50 m or shorter than 1 mm.
+            `from_file(..., unit="mm")` turns the numbers of a file into metres.
         youngs: Young's modulus [Pa], a scalar or one value per tetrahedron, positive.
         density: [kg/m^3], a scalar or one value per tetrahedron, positive.
     """
@@ -112,6 +120,7 @@ class Solid(_Key):
     youngs: Array
     density: Array
 
+    @check_arguments("Solid")
     def __init__(self, mesh: TetMesh, youngs: ArrayLike, density: ArrayLike = 1000.0) -> None:
         if not isinstance(mesh, TetMesh):
             raise TypeError(
@@ -128,7 +137,7 @@ class Solid(_Key):
         )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Pin(_Key):
     """Holds vertices of a solid at targets: at their rest positions, or where `targets` of a step puts them.
 
@@ -144,6 +153,7 @@ class Pin(_Key):
     vertices: NDArray[np.int64]
     stiffness: Array | None
 
+    @check_arguments("Pin")
     def __init__(
         self, solid: Solid, vertices: Sequence[int] | NDArray[Any] | torch.Tensor, stiffness: ArrayLike | None = None
     ) -> None:
@@ -177,17 +187,18 @@ class Pin(_Key):
         _set(self, solid=solid, vertices=chosen.astype(np.int64), stiffness=springs)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Gravity(_Part):
     """A uniform acceleration [m/s^2] of everything."""
 
     vector: Array
 
+    @check_arguments("Gravity")
     def __init__(self, vector: ArrayLike = (0.0, -9.81, 0.0)) -> None:
         _set(self, vector=check_vector("Gravity.vector", vector))
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Ground(_Key):
     """A plane that vertices cannot pass: normal . x >= height, with Coulomb friction.
 
@@ -204,6 +215,7 @@ class Ground(_Key):
     normal: Array
     friction: float
 
+    @check_arguments("Ground")
     def __init__(self, height: float = 0.0, normal: ArrayLike = (0.0, 1.0, 0.0), friction: float = 0.0) -> None:
         direction = check_vector("Ground.normal", normal)
         largest = float(np.abs(direction).max())
@@ -220,7 +232,7 @@ class Ground(_Key):
         )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Sphere(_Key):
     """A ball that vertices cannot enter, with Coulomb friction. `targets` of a step may move its centre.
 
@@ -237,6 +249,7 @@ class Sphere(_Key):
     radius: float
     friction: float
 
+    @check_arguments("Sphere")
     def __init__(self, center: ArrayLike, radius: float, friction: float = 0.0) -> None:
         size = check_scalar("Sphere.radius", radius)
         if size <= 0.0:
@@ -249,7 +262,7 @@ class Sphere(_Key):
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Damping(_Part):
     """Drag proportional to mass: every velocity decays as dv/dt = -rate v.
 
@@ -261,5 +274,6 @@ class Damping(_Part):
 
     rate: float
 
+    @check_arguments("Damping")
     def __init__(self, rate: float) -> None:
         _set(self, rate=check_scalar("Damping.rate", rate, minimum=0.0))

@@ -35,6 +35,8 @@ from .mesh_checks import (
 from .mesh_faces import ROUNDING, TET_FACES, match_faces, merge_near, report_faces
 from .mesh_files import write_tets
 from .quality import MeshQuality, measure_quality
+from .synonyms import check_arguments
+from .units import Unit, metres
 
 if TYPE_CHECKING:
     from .embedding import Embedding
@@ -62,6 +64,7 @@ class TriMesh:
     triangles: Index
     uvs: Array | None
 
+    @check_arguments("TriMesh")
     def __init__(
         self,
         vertices: Numbers,
@@ -94,8 +97,11 @@ class TriMesh:
         )
 
     @classmethod
-    def from_trimesh(cls, surface: Any) -> TriMesh:
-        """From a trimesh.Trimesh, or from a trimesh.Scene with all its geometry in place."""
+    def from_trimesh(cls, surface: Any, *, unit: Unit | None = None) -> TriMesh:
+        """From a trimesh.Trimesh, or from a trimesh.Scene with all its geometry in place.
+
+        `unit`, as in `from_file`, is that of its numbers; what `surface.units` says is not looked at.
+        """
         import trimesh
 
         if isinstance(surface, trimesh.Scene):
@@ -108,7 +114,7 @@ class TriMesh:
         if not isinstance(surface, trimesh.Trimesh):
             raise TypeError(f"TriMesh.from_trimesh: surface must be a Trimesh or a Scene, got {type(surface).__name__}")
         return cls(
-            surface.vertices,
+            metres("TriMesh.from_trimesh", unit) * surface.vertices,
             surface.faces,
             uvs=getattr(surface.visual, "uv", None),
             drop_unreferenced=True,
@@ -116,7 +122,7 @@ class TriMesh:
         )
 
     @classmethod
-    def from_file(cls, path: PathLike) -> TriMesh:
+    def from_file(cls, path: PathLike, *, unit: Unit | None = None) -> TriMesh:
         """Read the triangles of a mesh file; quads and polygons become triangles.
 
         Surfaces: .obj, .ply, .stl, .off, .gltf, .glb, .dae, .3mf, and through usd-core .usd, .usda, .usdc, .usdz. Of a
@@ -127,12 +133,17 @@ class TriMesh:
         unless it says otherwise). Vertices keep the order of the file; one with several texture coordinates is doubled,
         and equal corners of an .stl become one vertex.
 
+        Args:
+            path: the file; the suffix of its name says in which format it is.
+            unit: "m", "cm", "mm", "in" or "ft", of the numbers in the file; they become metres. None: what the file
+                declares, or metres.
+
         Raises:
             FileNotFoundError: there is no such file.
             ModuleNotFoundError: the format needs a package that is not installed, which is named.
             ValueError: the file cannot be read, or holds no triangles; with its name, its format and what was met.
         """
-        surface = read_surface("TriMesh.from_file", path)
+        surface = read_surface("TriMesh.from_file", path, unit)
         if surface.notes:
             warn(f"TriMesh.from_file: {Path(path).name}: {'; '.join(surface.notes)}")
         with naming("TriMesh.from_file", path):
@@ -213,6 +224,7 @@ class TetMesh:
     embedding: Embedding | None
     flipped: int
 
+    @check_arguments("TetMesh")
     def __init__(
         self,
         vertices: Numbers,
@@ -230,7 +242,7 @@ class TetMesh:
         report_faces(self.vertices, self.tets)
 
     @classmethod
-    def from_file(cls, path: PathLike, *, drop_degenerate: bool = False) -> TetMesh:
+    def from_file(cls, path: PathLike, *, unit: Unit | None = None, drop_degenerate: bool = False) -> TetMesh:
         """Read a volume mesh (.mesh, .msh, .vtk, .vtu, .inp, ...).
 
         Hexahedra, wedges and pyramids are split into tets that fill them and match across faces; of cells of higher
@@ -238,12 +250,18 @@ class TetMesh:
         `embedding`; quads and polygons are split. Physical groups, references, element sets and attributes become
         `regions`. What is left out, split or assumed a `MeshWarning` says.
 
+        Args:
+            path: the file; the suffix of its name says in which format it is.
+            unit: "m", "cm", "mm", "in" or "ft", of the numbers in the file; they become metres. None: what the file
+                declares, or metres.
+            drop_degenerate: as for a new mesh.
+
         Raises:
             ValueError: the file cannot be read, or holds no such cells; with its name, its format and what was met.
         """
         from .embedding import embed, embed_triangles
 
-        body = read_body("TetMesh.from_file", path)
+        body = read_body("TetMesh.from_file", path, unit)
         if body.notes:
             warn(f"TetMesh.from_file: {Path(path).name}: {'; '.join(body.notes)}")
         with naming("TetMesh.from_file", path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -50,8 +50,9 @@ from .settings import (
     prepare,
     reconfigure,
 )
-from .solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Solver, check_solver
+from .solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Solver, SolverName, check_solver
 from .state import State
+from .synonyms import check_arguments
 from .targets import Anchors, Targets
 from .written import Seen, check_rest
 
@@ -84,23 +85,27 @@ class Model(nn.Module):
     spheres: Tensor
     progress: bool = True  # whether bars show while a large scene compiles, for another device too
 
+    @check_arguments("Simulator")
     def __init__(
         self,
         scene: Scene,
         time_step: float = 1 / 60,
         iterations: int | None = None,
-        solver: Solver | Literal["auto"] | None = None,
+        solver: Solver | SolverName | None = None,
         dtype: torch.dtype = torch.float32,
         *,
         tolerance: float = 0.0,
         kernel: str = "auto",
         batch: int | None = None,
         adjoint: str = "solver",
+        device: torch.device | str | None = None,
         progress: bool = True,
     ) -> None:
         super().__init__()
         if not isinstance(scene, Scene):
             raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
+        if device is not None:  # before a large scene is compiled
+            check_wanted_device(lambda probe: probe.to(device), torch.empty(0, dtype=dtype))
         self.scene = scene
         self._time_step = check_time_step(time_step, dtype)
         self.iterations = DEFAULT_ITERATIONS if iterations is None else iterations
@@ -127,15 +132,14 @@ class Model(nn.Module):
             self.register_buffer(PIN_HARD, arrays[PIN_HARD])
         self._read_pins()
         warn_of_overlaps(scene)
+        if device is not None:  # first, since "auto" chooses for it
+            self.to(device)
         if is_auto(solver):
             self._take(choose(self.compiled, None if iterations is None else self.iterations))
         else:
             self.solver = given
             self.named_iterations = iterations is not None
             self.judge_iterations(None)
-
-    # python's errors of arguments name the class that users know
-    __init__.__qualname__ = "Simulator.__init__"
 
     @property
     def vertices(self) -> int:
@@ -223,7 +227,7 @@ class Model(nn.Module):
         return self._solver
 
     @solver.setter
-    def solver(self, solver: Solver | Literal["auto"]) -> None:
+    def solver(self, solver: Solver | SolverName) -> None:
         self._reconfigure(solver=solver)
 
     @property

@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from .fit_problem import HeightProblem, QuadricNumbers, levenberg_marquardt, ridge_amplitudes
 from .fit_targets import FitTarget

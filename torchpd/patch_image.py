@@ -16,6 +16,7 @@ from torch import Tensor
 from .patch_rays import SurfaceRays
 from .patch_surface import PatchPose, PatchSurface
 from .render import Camera
+from .reprs import by_sizes
 
 __all__ = ["PatchImage", "render_patches"]
 
@@ -33,6 +34,9 @@ class PatchImage:
     barycentrics: Tensor  # [B, H, W, 3]
     points: Tensor  # [B, H, W, 3] m
     color: Tensor  # [B, H, W, 3] linear RGB
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.color, "batch", "height", "width")
 
 
 def render_patches(

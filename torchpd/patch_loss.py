@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from .checks import check_scalar, check_whole
 from .fit_problem import QuadricNumbers, within_radii

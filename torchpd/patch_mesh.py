@@ -17,6 +17,7 @@ from torch import Tensor
 
 from .mesh import TriMesh
 from .patch_surface import PatchPose, PatchSamples, PatchSurface
+from .reprs import by_fields
 
 __all__ = ["Tessellation", "tessellate"]
 
@@ -41,6 +42,9 @@ class Tessellation:
         with torch.no_grad():
             points = self.patches.surface(self.samples, pose).points
         return TriMesh(points.reshape(-1, 3).cpu().numpy(), self.triangles.cpu().numpy())
+
+    def __repr__(self) -> str:
+        return by_fields(self)
 
 
 def grid(level: int) -> tuple[Index, Index]:

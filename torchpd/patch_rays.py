@@ -18,6 +18,7 @@ from . import patch_ops  # noqa: F401  (registers the ops)
 from .patch_mesh import grid, tessellate, weld
 from .patch_surface import PatchPose, PatchSamples, PatchSurface, SurfacePoints, check_pose
 from .quadrics import dimensions, matrix_sets
+from .reprs import by_sizes
 from .small_matrices import product
 
 __all__ = ["PatchHits", "SurfaceRays"]
@@ -37,6 +38,9 @@ class PatchHits:
     barycentrics: Tensor  # [B, R, 3]
     points: Tensor  # [B, R, 3] m
     normals: Tensor  # [B, R, 3] unit, outwards
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.depth, "batch", "rays", trailing=0)
 
 
 class SurfaceRays:

@@ -20,6 +20,7 @@ from .mesh_checks import store
 from .patch_checks import angle_weighted_normals, check_surface
 from .patch_lists import Touching, gather_lists, touching
 from .quadrics import Quadrics, check_real_tensor, dimensions, matrix_sets
+from .reprs import by_sizes
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -39,6 +40,9 @@ class PatchPose(NamedTuple):
     positions: Tensor  # [B, V, 3] m
     frames: Tensor  # [B, V, 3, 3]
 
+    def __repr__(self) -> str:
+        return by_sizes(self, self.positions, "batch", "vertices")
+
 
 class SurfacePoints(NamedTuple):
     """The surface at samples; without the batch dimension at rest."""
@@ -46,6 +50,9 @@ class SurfacePoints(NamedTuple):
     points: Tensor  # [B, S, 3] m
     normals: Tensor  # [B, S, 3] unit, outwards
     tangents: Tensor  # [B, S, 2, 3] m, derivatives along the first two barycentric coordinates (the third gives way)
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.points, "batch", "samples")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +69,9 @@ class PatchSamples:
     def at(self, barycentrics: Tensor) -> PatchSamples:
         """The same patches at other barycentric coordinates [S, 3]."""
         return PatchSamples(self.patch, barycentrics, self.lists)
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.barycentrics, "samples")
 
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from . import _C
 from .checks import tensor_of
@@ -65,6 +65,11 @@ class Plan:
                 return self.arrays[number]
         names = ", ".join(row.name for row in self.table)
         raise AttributeError(f"Plan has no array {name!r}; it has {names}")
+
+    def __repr__(self) -> str:
+        kernel = "" if self.kernel is None else f", kernel {self.kernel}"
+        sizes = f"{self.vertices} vertices, {self.patches} patches{kernel}, {self.bytes:,} B"
+        return f"Plan({sizes}, {str(self.dtype).removeprefix('torch.')}, {self.device})"
 
     @property
     def kernel(self) -> str | None:

@@ -33,6 +33,7 @@ from .checks import in_full
 from .diagonal import named_material, pinned_vertices, step_diagonal
 from .effects import Ground, Pin, Solid, Sphere
 from .material import MATERIAL_ROWS
+from .reprs import by_sizes
 from .scene import Scene
 from .small_matrices import dot, inverse, length, product
 
@@ -58,6 +59,9 @@ class Wrench(NamedTuple):
     torque: Tensor  # [B, 3] N m, sum of (x' - about) x force
     about: Tensor  # [B, 3] m, the point that the torque is about
 
+    def __repr__(self) -> str:
+        return by_sizes(self, self.force, "batch")
+
 
 class ContactForce(NamedTuple):
     """What one collider does to the vertices in a step; zero where it does not push."""
@@ -68,6 +72,9 @@ class ContactForce(NamedTuple):
     touches: Tensor  # [B, V] bool, whether it pushes
     bodies: dict[Solid, Wrench]  # sum and torque on each body
 
+    def __repr__(self) -> str:
+        return by_sizes(self, self.force, "batch", "vertices")
+
 
 class ContactForces(NamedTuple):
     """What contacts do to the vertices in a step, see `Simulator.contact_forces`."""
@@ -77,12 +84,18 @@ class ContactForces(NamedTuple):
     bodies: dict[Solid, Wrench]  # sum and torque of all colliders on each body
     colliders: dict[Ground | Sphere, ContactForce]  # empty without colliders
 
+    def __repr__(self) -> str:
+        return by_sizes(self, self.force, "batch", "vertices")
+
 
 class PinForce(NamedTuple):
     """What one pin does to its vertices."""
 
     force: Tensor  # [B, p, 3] N, on the vertices, in the order of `Pin.vertices`
     wrench: Wrench  # sum and torque
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.force, "batch", "pinned")
 
 
 class Reactions(NamedTuple):
@@ -91,6 +104,9 @@ class Reactions(NamedTuple):
     force: Tensor  # [B, P, 3] N, on the pinned vertices, in the order of `pin_targets`
     on_vertices: Tensor  # [B, V, 3] N, the same on all vertices, zero on those without a pin
     pins: dict[Pin, PinForce]  # by pin; empty without pins
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.force, "batch", "pinned")
 
 
 # ---- sums

@@ -9,7 +9,7 @@ from typing import Any, NoReturn, Protocol
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from .checks import STEPS_DIFFER
 from .material import MATERIAL_ROWS

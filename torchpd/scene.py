@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .mesh_faces import pieces_of
 from .pins import PinnedPieces
+from .synonyms import check_arguments
 
 __all__ = ["Part", "Scene", "SceneValues"]
 
@@ -74,6 +75,7 @@ class Scene:
             and one `Damping`; a `Pin` holds a `Solid` of this scene, and no vertex is pinned twice.
     """
 
+    @check_arguments("Scene")
     def __init__(self, *parts: Part) -> None:
         for part in parts:
             if not isinstance(part, Part):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,6 +19,7 @@ from .solvers import Solver
 from .state import State
 from .stepper import Stepper
 from .summary import describe
+from .synonyms import no_attribute
 from .targets import Targets
 from .tuning import tune
 
@@ -38,7 +40,7 @@ class Simulator(Stepper):
     NaN, or stiffness, masses or springs are negative, `Info.residual` is NaN, with exceptions named there. Let an
     optimiser learn the logarithm of those. The rest shape is compiled and not learned.
 
-    It is made on the CPU, whatever torch's default device; `.to(...)` moves it.
+    It is made on the CPU, whatever torch's default device, unless `device` says otherwise; `.to(...)` moves it.
 
     Args:
         scene: what there is.
@@ -46,7 +48,8 @@ class Simulator(Stepper):
         iterations: local and global steps of one time step, at most. None: 64, or what "auto" chooses. Where 64 are
             expected to leave a tenth of the error or more an `UnsolvedWarning` says so, once, also when `set_material`,
             `load_state_dict` or another `time_step` has brought that about; `print(sim)` tells for any.
-        solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`; `sim.solver` may be replaced later. None is Chebyshev.
+        solver: `Chebyshev()`, `Jacobi()` or `Multilevel()`, or "chebyshev", "jacobi" or "multilevel" for these without
+            options; `sim.solver` may be replaced later. None is Chebyshev.
             "auto" takes Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner on the device,
             Chebyshev where there is friction, and as many iterations as that takes unless they are given, four times as
             many where a `tolerance` ends easy steps, but no more than 10,000, and 1000 of Multilevel, times four with a
@@ -70,6 +73,7 @@ class Simulator(Stepper):
         adjoint: what preconditions the linear system of a gradient. "solver": what the solver has, a diagonal or the
             matrix of `Multilevel`. "multilevel": that matrix beside any solver, made when it is set; docs/accuracy.md
             says when it pays. A GPU needs kernel="stream" for it. `sim.adjoint` may be set later.
+        device: what `.to(device)` would take, "cuda" for example. None: the CPU.
         progress: show a bar while a large scene compiles, for another device too.
     """
 
@@ -77,6 +81,15 @@ class Simulator(Stepper):
 
     def extra_repr(self) -> str:
         return describe(self, self.promise)
+
+    def __getattr__(self, name: str) -> Any:
+        parameters = self.__dict__.get("_parameters", ())
+        if name in parameters:
+            return parameters[name]
+        try:
+            return super().__getattr__(name)
+        except AttributeError as error:
+            raise no_attribute("Simulator", name, self) from error
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(\n  {self.extra_repr()}\n)"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, TypedDict
+from typing import Literal, TypedDict, get_args
 
 import torch
 
@@ -16,6 +16,7 @@ __all__ = [
     "Jacobi",
     "Multilevel",
     "Solver",
+    "SolverName",
     "SolverNumbers",
     "check_solver",
 ]
@@ -196,16 +197,21 @@ class Multilevel:
 
 
 Solver = Jacobi | Chebyshev | Multilevel
+SolverName = Literal["auto", "chebyshev", "jacobi", "multilevel"]
+_NAMED: dict[object, Solver] = {"chebyshev": Chebyshev(), "jacobi": Jacobi(), "multilevel": Multilevel()}
 DEFAULT_ITERATIONS = 64  # of a simulator that is given none
 
 
 def check_solver(solver: object, device: torch.device) -> Solver:
-    """The solver, if a simulator on this device can have it."""
+    """The solver, also by its name, if a simulator on this device can have it."""
+    solver = _NAMED.get(solver, solver) if isinstance(solver, str) else solver
     if not isinstance(solver, Jacobi | Chebyshev | Multilevel):
         given = repr(solver) if isinstance(solver, str) else type(solver).__name__
         if isinstance(solver, type):
             given = f"the class {solver.__name__}: write {solver.__name__}()"
-        raise TypeError(f'Simulator: solver must be Jacobi, Chebyshev, Multilevel or "auto", got {given}')
+        raise TypeError(
+            f"Simulator: solver must be Jacobi, Chebyshev, Multilevel or one of {get_args(SolverName)}, got {given}"
+        )
     if isinstance(solver, Multilevel) and device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"Simulator: Multilevel is prepared on the CPU or on a GPU, not on {device}")
     return solver

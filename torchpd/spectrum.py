@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -62,7 +62,7 @@ def _trial(sim: Stepper, solver: Jacobi | Chebyshev, iterations: int) -> Stepper
 
 def _residual(sim: Stepper, state: State, solver: Jacobi | Chebyshev, iterations: int) -> float:
     _, info = _trial(sim, solver, iterations)(state, return_info=True)
-    worst = float(cast(Tensor, info.residual).max())
+    worst = float(info.residual.max())
     return worst if math.isfinite(worst) else math.inf
 
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, overload
 
 import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-__all__ = ["Info", "State", "Track"]
+from .reprs import by_sizes
+
+if TYPE_CHECKING:
+    from .targets import Targets
+
+__all__ = ["Info", "State", "StepCall", "Track"]
 
 
 class State(NamedTuple):
@@ -65,6 +70,9 @@ class State(NamedTuple):
         """The same numbers without their history, as `Tensor.detach`."""
         return State(self.positions.detach(), self.velocities.detach())
 
+    def __repr__(self) -> str:
+        return by_sizes(self, self.positions, "batch", "vertices")
+
 
 class Info(NamedTuple):
     """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it.
@@ -110,6 +118,48 @@ class Info(NamedTuple):
         inverted = counted[0] if counted else torch.full_like(rho, -1.0)
         return cls(residual, energy, iterations.long(), restarts.long(), converged.bool(), rho, inverted.long())
 
+    def __repr__(self) -> str:
+        try:
+            worst = f"residual<={float(self.residual.max()):.2g}, iterations<={int(self.iterations.max())}"
+        except RuntimeError:  # no values: an empty batch, a traced step, "meta"
+            worst = ""
+        return by_sizes(self, self.residual, "records", "batch", trailing=0, more=worst)
+
+
+class StepCall(Protocol):
+    """The types of a call of a simulator, which `torch.nn.Module` does not know; `Simulator.forward` documents it."""
+
+    @overload
+    def __call__(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        return_info: Literal[False] = False,
+    ) -> State: ...
+
+    @overload
+    def __call__(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        *,
+        return_info: Literal[True],
+    ) -> tuple[State, Info]: ...
+
+    @overload
+    def __call__(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        return_info: bool = False,
+    ) -> State | tuple[State, Info]: ...
+
 
 class Track(NamedTuple):
     """States along a rollout; the start is not among them."""
@@ -128,6 +178,9 @@ class Track(NamedTuple):
                 f"record must lie in {-count}..{count - 1}" if count else "the track has no record, steps // every is 0"
             )
             raise IndexError(f"Track.state: {there}, got {record}") from None
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.positions, "records", "batch", "vertices")
 
 
 for _kind in (Info, State, Track):

@@ -13,7 +13,8 @@ from .material import MATERIAL_ROWS, environments_of_material, named_arrays
 from .ops import INFO_WIDTH, refuse_tangents
 from .readable import Readable
 from .rollout import PerStep, Rollout, roll
-from .state import Info, State, Track
+from .state import Info, State, StepCall, Track
+from .synonyms import check_arguments
 from .targets import Targets
 
 __all__ = ["Stepper"]
@@ -24,8 +25,11 @@ _ops = torch.ops.torchpd
 class Stepper(Readable):
     """What a `Simulator` does to states: steps, rollouts, energies and their gradients."""
 
+    __call__: StepCall
+
     # ---- states
 
+    @check_arguments("Simulator.rest_state")
     def rest_state(self, batch: int | None = None) -> State:
         """Everything at rest [batch, V, 3], by default once for each environment of the material."""
         count = (
@@ -128,6 +132,7 @@ class Stepper(Readable):
         if info is not None:
             self._notices.after(self, state[0], info)
 
+    @check_arguments("Simulator.rollout")
     def rollout(
         self,
         state: State,

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from .ops import nearest_rotation
+from .reprs import by_sizes
 from .scene import Scene
 from .small_matrices import dot, product, root
 
@@ -32,6 +33,9 @@ class Stress(NamedTuple):
     von_mises: Tensor  # [B, E] Pa, sqrt(3 / 2 s : s), s the deviator of `cauchy`
     strain: Tensor  # [B, E, 3, 3], Green's, (F^T F - 1) / 2
     inverted: Tensor  # [B, E] bool, whether det F > 0 fails
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.cauchy, "batch", "tets", trailing=2)
 
 
 class _Rest(NamedTuple):

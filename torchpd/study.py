@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from .baselines import BASELINES
 from .contenders import CONTENDERS, DEFAULT

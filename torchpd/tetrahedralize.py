@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from .checks import check_scalar
 from .embedding import Embedding, embed
@@ -21,6 +21,8 @@ from .lattice import Lattice
 from .mesh import TetMesh, TriMesh
 from .mesh_checks import warn
 from .mesh_faces import TET_FACES, match_faces
+from .synonyms import check_arguments
+from .units import Unit
 
 __all__ = ["tetrahedralize"]
 
@@ -33,6 +35,7 @@ _SEAM = 0.25
 _HOLLOW = 1e-4
 
 
+@check_arguments("tetrahedralize")
 def tetrahedralize(
     surface: Any,
     cells: int = 20,
@@ -40,6 +43,7 @@ def tetrahedralize(
     progress: bool = False,
     *,
     fill_holes: bool = True,
+    unit: Unit | None = None,
 ) -> TetMesh:
     """A tetrahedral mesh around a surface, which carries the surface along as `mesh.embedding`.
 
@@ -68,8 +72,10 @@ def tetrahedralize(
         progress: show a progress bar.
         fill_holes: "lattice" counts what lies behind a hole as inside, up to a cone of triangles over the open edges.
             False leaves whatever can be reached from outside empty: an open surface becomes a shell.
+        unit: "m", "cm", "mm", "in" or "ft", of the numbers of a file or a trimesh, see `TriMesh.from_file`. A TriMesh
+            is in metres.
     """
-    triangles = _as_surface(surface)
+    triangles = _as_surface(surface, unit)
     if check_scalar("tetrahedralize: cells", cells, minimum=1) != int(cells):
         raise ValueError(f"tetrahedralize: cells must be a whole number, got {cells}")
     low, high = triangles.bounds
@@ -82,17 +88,19 @@ def tetrahedralize(
     raise ValueError(f'tetrahedralize: method must be "lattice" or "tetwild", got {method!r}')
 
 
-def _as_surface(surface: Any) -> TriMesh:
+def _as_surface(surface: Any, unit: Unit | None) -> TriMesh:
     if isinstance(surface, TriMesh):
+        if unit is not None:
+            raise ValueError(f"tetrahedralize: unit must be None for a TriMesh, which is in metres, got {unit!r}")
         return surface
     if isinstance(surface, (str, os.PathLike)):
-        return TriMesh.from_file(Path(surface))
+        return TriMesh.from_file(Path(surface), unit=unit)
     if isinstance(surface, TetMesh):
         raise TypeError("tetrahedralize: surface must be a surface, got a TetMesh, which is filled already")
     import trimesh
 
     if isinstance(surface, (trimesh.Trimesh, trimesh.Scene)):
-        return TriMesh.from_trimesh(surface)
+        return TriMesh.from_trimesh(surface, unit=unit)
     raise TypeError(
         "tetrahedralize: surface must be a TriMesh, a trimesh.Trimesh or Scene, or a path, "
         f"got {type(surface).__name__}"

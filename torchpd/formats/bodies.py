@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..units import Unit
 from . import split
 from .content import CELLS, Array, Index, MeshContent
 from .guard import PathLike, read
@@ -49,9 +50,9 @@ def holds_body(owner: str, path: PathLike) -> bool:
     return any(len(block) and CELLS.get(block.kind, (0, 0))[1] == 3 for block in read(owner, path).cells)
 
 
-def read_body(owner: str, path: PathLike) -> Body:
-    """Read a body of tets; a `ValueError` where the file holds none."""
-    content = read(owner, path)
+def read_body(owner: str, path: PathLike, unit: Unit | None = None) -> Body:
+    """Read a body of tets; a `ValueError` where the file holds none. `unit`: see `torchpd.units`."""
+    content = read(owner, path, unit)
     solid = split.tets_of(content)
     name = Path(path).name
     if not len(solid.elements):
@@ -72,9 +73,9 @@ def read_body(owner: str, path: PathLike) -> Body:
     )
 
 
-def read_surface(owner: str, path: PathLike) -> Surface:
-    """Read a surface; a `ValueError` where the file holds no triangle, quad or polygon."""
-    content = read(owner, path)
+def read_surface(owner: str, path: PathLike, unit: Unit | None = None) -> Surface:
+    """Read a surface; a `ValueError` where the file holds no triangle, quad or polygon. `unit`: see `torchpd.units`."""
+    content = read(owner, path, unit)
     flat = split.triangles_of(content)
     if not len(flat.elements):
         raise ValueError(f"{owner}: {Path(path).name} holds no triangles, but {_kinds(content)}{_noted(content)}")

@@ -57,16 +57,18 @@ class MeshContent:
     """Points and cells of a file, and sentences about what of the file is not among them.
 
     Args:
-        points: [N, 3] in the units of the file.
+        points: [N, 3] in the unit of the file, or in metres.
         cells: blocks of cells, in the order of the file.
         uvs: texture coordinates of the points [N, 2], or None.
         notes: what was left out, repaired or assumed, a sentence each: the caller says them in one `MeshWarning`.
+        in_metres: whether the file declares its unit, which its reader has turned into metres.
     """
 
     points: Array
     cells: list[Cells]
     uvs: Array | None = None
     notes: list[str] = field(default_factory=list)
+    in_metres: bool = False
 
     def in_cells(self) -> NDArray[np.bool_]:
         """Which points a cell uses [N], as a corner or beyond."""

@@ -8,10 +8,12 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from ..units import Unit, metres
 from .content import CELLS, MeshContent
 from .registry import FORMATS, Format
 
@@ -30,18 +32,20 @@ def existing(path: PathLike) -> Path:
     return file
 
 
-def read(owner: str, path: PathLike) -> MeshContent:
+def read(owner: str, path: PathLike, unit: Unit | None = None) -> MeshContent:
     """Read points and cells of a mesh file.
 
     Args:
         owner: who asks, with which the errors begin.
         path: the file; the suffix of its name says in which format it is.
+        unit: of its numbers, see `torchpd.units`.
 
     Raises:
         FileNotFoundError: there is no such file, or one that belongs to it is missing.
         ModuleNotFoundError: the format needs a package that is not installed.
         ValueError: anything else, with the name of the file, its format and what was met.
     """
+    factor = metres(owner, unit)
     file = existing(path)
     kind = FORMATS.get(file.suffix.lower())
     if kind is None:
@@ -58,7 +62,6 @@ def read(owner: str, path: PathLike) -> MeshContent:
             warnings.simplefilter("ignore")
             content = kind.read(file)
             _check(content)
-            return content
     except ModuleNotFoundError as error:
         needed = f"its format needs the package {error.name}; pip install {error.name}"
         raise ModuleNotFoundError(f"{failure}: {needed}", name=error.name) from error
@@ -71,6 +74,11 @@ def read(owner: str, path: PathLike) -> MeshContent:
         if isinstance(error, (KeyboardInterrupt, GeneratorExit)):
             raise
         raise ValueError(f"{failure}: {_words(error, said.getvalue(), kind)}") from error
+    if unit is None:
+        return content
+    if content.in_metres:
+        raise ValueError(f"{owner}: unit must be None for {file.name}, which declares its unit, got {unit!r}")
+    return replace(content, points=factor * content.points)
 
 
 @contextmanager

@@ -158,7 +158,8 @@ class _Reading:
         self.others["geometries in no node of the scene"] = sum(g.get("id") not in self.used for g in geometries)
         notes = left_out(+self.others)
         points = np.concatenate([np.empty((0, 3)), *self.points]) @ self._axes(notes).T
-        return MeshContent(points, self.cells, join_uvs(self.uvs, notes), notes)
+        declared = self.root.find("{*}asset/{*}unit") is not None
+        return MeshContent(points, self.cells, join_uvs(self.uvs, notes), notes, declared)
 
     def _axes(self, notes: list[str]) -> Array:
         """The matrix from the numbers of the file to metres with y up [3, 3]."""

@@ -173,4 +173,4 @@ class _Reading:
         notes = left_out(+self.others)
         if self.package.scale != 1.0:
             notes.append(f"its unit is the {self.package.unit}, and its numbers were turned into metres")
-        return MeshContent(np.concatenate([np.empty((0, 3)), *self.points]), cells, None, notes)
+        return MeshContent(np.concatenate([np.empty((0, 3)), *self.points]), cells, None, notes, in_metres=True)

@@ -41,7 +41,7 @@ def read_usd(path: Path) -> MeshContent:
             prims.PruneChildren()
         elif prim.IsA(UsdGeom.Gprim):
             reading.take(prim)
-    content = reading.content()
+    content = reading.content(in_metres=UsdGeom.StageHasAuthoredMetersPerUnit(stage))
     content.notes.extend(warnings_of(delegate))
     return content
 
@@ -170,14 +170,14 @@ class _Reading:
         self.uvs.append(uvs)
         self.count += len(points)
 
-    def content(self) -> MeshContent:
+    def content(self, *, in_metres: bool) -> MeshContent:
         notes = self.notes + left_out(self.others)
         for scheme, count in self.smooth.items():
             notes.append(f"{count} of its meshes are to be subdivided ({scheme}); the control meshes were read")
         if self.moving:
             notes.append(f"{self.moving} of its meshes move, and were read at their earliest time")
         uvs = join_uvs(self.uvs, notes)
-        return MeshContent(np.concatenate([np.empty((0, 3)), *self.points]), self.cells, uvs, notes)
+        return MeshContent(np.concatenate([np.empty((0, 3)), *self.points]), self.cells, uvs, notes, in_metres)
 
 
 def _coordinates(prim: Any, time: Any, corners: Index, count: int) -> tuple[Index, Array] | None:

@@ -63,7 +63,7 @@ def axes_of(stage: Any) -> tuple[Array, list[str]]:
 
     matrix, notes = np.eye(3), []
     if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
-        notes.append("the stage declares no metersPerUnit, and its numbers were taken as metres")
+        notes.append("the stage declares no metersPerUnit: its numbers count as metres, or in the unit of the call")
     elif (scale := UsdGeom.GetStageMetersPerUnit(stage)) != 1.0:
         if not 0.0 < scale < np.inf:
             raise ValueError(f"metersPerUnit must be positive, got {scale}")

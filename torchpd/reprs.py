@@ -1,0 +1,50 @@
+"""How values that hold arrays print: in one line, with sizes in place of numbers."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+__all__ = ["by_fields", "by_sizes"]
+
+_FEW = 6  # numbers of an array that are printed
+
+
+def by_sizes(value: object, tensor: Any, *names: str, trailing: int = 1, more: str = "") -> str:
+    """`State(batch=32, vertices=4096, float32, cpu)`: a value by the shape of one of its tensors.
+
+    Args:
+        value: what is printed.
+        tensor: one of its tensors; anything else prints as it is.
+        names: of the dimensions, the last of them always there.
+        trailing: dimensions behind these, the components of a vector.
+        more: what to add behind the sizes.
+    """
+    kind = type(value).__name__
+    if not isinstance(tensor, Tensor):
+        return f"{kind}({tensor!r}, ...)"
+    shape = tensor.shape[: tensor.dim() - trailing]
+    sizes = [f"{name}={length}" for name, length in zip(names[len(names) - len(shape) :], shape, strict=False)]
+    return f"{kind}({', '.join([*sizes, *([more] if more else []), _precision(tensor), str(tensor.device)])})"
+
+
+def by_fields(value: Any) -> str:
+    """`Ground(height=0.0, normal=[0.0, 1.0, 0.0], friction=0.5)`: a dataclass, long arrays by precision and shape."""
+    words = (f"{field.name}={_in_short(getattr(value, field.name))}" for field in fields(value))
+    return f"{type(value).__name__}({', '.join(words)})"
+
+
+def _in_short(value: object) -> str:
+    if isinstance(value, np.ndarray) and value.size:
+        if value.size <= _FEW:
+            return str(value.tolist())
+        if value.ndim == 1 and value.dtype.kind == "f" and value.min() == value.max():
+            return f"{value[0]:g}"  # one number for all elements
+    return f"{_precision(value)} {list(value.shape)}" if isinstance(value, np.ndarray | Tensor) else repr(value)
+
+
+def _precision(array: Any) -> str:
+    return str(array.dtype).removeprefix("torch.")

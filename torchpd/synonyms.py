@@ -1,0 +1,120 @@
+"""Names of other libraries, answered with ours by the error that they raise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from inspect import signature
+from typing import ParamSpec, TypeVar
+
+__all__ = ["SYNONYMS", "check_arguments", "no_attribute"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_BATCH = "environments are the leading dimension of a state, sim.rest_state(n), and `batch` prepares for so many"
+_FRICTION = "Coulomb's coefficient is `friction`"
+_TIME_STEP = "the time step is `time_step` [s]"
+_VERTICES = "positions are `vertices` [V, 3] in m"
+
+# By what is asked, "" for the module: names that are not there, separated by blanks, and what to use instead.
+SYNONYMS: dict[str, dict[str, str]] = {
+    "": {
+        "Body DeformableBody FEM FEMEntity SoftBody": "an elastic body is `Solid(mesh, youngs=..., density=...)`",
+        "Cloth Membrane Sheet Shell": 'an open sheet is `PatchBody(patches, apex="prism", ...)`',
+        "Collider": "bodies collide with `Ground` and `Sphere`",
+        "Engine Env Environment Model Sim World": "`Simulator(scene)` steps a `Scene`",
+        "Anchor Attachment Constraint Fixed FixedConstraint": "`Pin(solid, vertices)` holds vertices",
+        "Floor GroundPlane HalfSpace Plane": "a plane is `Ground(height, normal, friction=...)`",
+        "Ball": "a ball is `Sphere(center, radius)`",
+        "Mesh": "`TetMesh` is what bodies are made of, `TriMesh` a surface",
+        "step": "`Simulator(scene)` is called: after = sim(state)",
+        "reset": "`Simulator(scene).rest_state()` is where everything starts",
+        "load": "`Simulator.load(path)` reads a simulation, `TetMesh.from_file(path)` a mesh",
+    },
+    "Solid": {
+        "E modulus young young_modulus youngs_modulus": "Young's modulus is `youngs` [Pa]",
+        "nu poisson poisson_ratio poissons_ratio": "Poisson's ratio is 0 in this energy, and cannot be set",
+        "lam lame la mu stiffness": "the material is Young's modulus `youngs` [Pa], at a Poisson's ratio of 0",
+        "rho": "`density` is in kg/m^3",
+        "mass masses": "mass follows from `density` [kg/m^3]; sim.set_material(masses=...) sets that of vertices",
+        "damping": "damping is a part of the scene: Scene(solid, Damping(rate))",
+        "friction": "friction belongs to colliders: Ground(friction=...)",
+        "tets vertices": "the rest shape is `mesh`, a TetMesh(vertices, tets)",
+    },
+    "Pin": {
+        "idx ids indices indexes nodes points verts": "`vertices` are numbers of vertices, or a mask",
+        "k ke kp": "`stiffness` is in N/m, and None holds exactly",
+        "position positions target targets": "a step takes targets: sim(state, targets={pin: positions})",
+        "body mesh": "the body is `solid`",
+    },
+    "Ground": {
+        "mu friction_coefficient": _FRICTION,
+        "level offset y z": "the plane is where normal . x is `height` [m]",
+        "up": "`normal` points to the free side",
+    },
+    "Sphere": {"centre pos position": "the middle is `center` [3] in m", "r": "`radius` is in m", "mu": _FRICTION},
+    "Gravity": {"acceleration g value": "the acceleration is `vector` [3] in m/s^2"},
+    "Damping": {"coefficient damping": "the drag is `rate` [1/s]"},
+    "Scene": {
+        "bodies gravity ground objects parts pins": "parts come one by one: Scene(Solid(...), Ground(), Gravity())",
+        "dt time_step": "the time step belongs to `Simulator(scene, time_step=...)`",
+    },
+    "TetMesh": {"points verts": _VERTICES, "cells elements tetrahedra tetras": "elements are `tets` [E, 4]"},
+    "TriMesh": {"points verts": _VERTICES, "faces": "faces are `triangles` [T, 3]"},
+    "tetrahedralize": {
+        "res resolution": "`cells` is how many cells the longest side has",
+        "edge_length size spacing": "`cells` is the longest side divided by that length",
+        "mesh": "what is filled is `surface`",
+    },
+    "Simulator": {
+        "dt h step_size timestep": _TIME_STEP,
+        "batch_size n_envs num_envs num_worlds nworld": _BATCH,
+        "iters max_iter max_iterations n_iterations num_iterations": "`iterations` are those of a time step",
+        "tol": "`tolerance` ends a step by its estimated error",
+        "n_substeps num_substeps substeps": "there are no substeps: divide `time_step` by their number",
+        "gravity ground": "gravity and grounds are parts of the scene: Scene(solid, Ground(), Gravity())",
+        "step": "the simulator is called: after = sim(state); sim.step_(state) overwrites the state",
+        "reset": "sim.rest_state() gives the start, and state.where(kept, start) resets some environments",
+        "run simulate": "sim.rollout(state, steps) takes many steps",
+        "initial_state": "sim.rest_state() gives the start",
+        "state": "the simulator keeps no state: after = sim(state), from sim.rest_state() on",
+    },
+    "Simulator.rest_state": {"batch_size n n_envs num_envs": "`batch` is the number of environments"},
+    "Simulator.rollout": {
+        "T horizon n_steps num_steps": "`steps` is their number",
+        "action actions control controls": "what acts from outside is `forces` and `targets`",
+    },
+}
+
+
+def _answer(owner: str, name: str) -> str:
+    return next((answer for names, answer in SYNONYMS.get(owner, {}).items() if name in names.split()), "")
+
+
+def no_attribute(owner: str, name: str, value: object = None) -> AttributeError:
+    """The error of an attribute that is not there, of a class or ("") of the module."""
+    answer = _answer(owner, name)
+    words = f"{owner or 'torchpd'} has no attribute {name!r}{'; ' if answer else ''}{answer}"
+    return AttributeError(words, name=name, obj=value)
+
+
+def check_arguments(owner: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate what users know as `owner` so that errors of arguments name it and what it takes."""
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        known = [name for name, one in signature(function).parameters.items() if one.kind != one.VAR_POSITIONAL]
+        # python's own errors, of missing arguments and of too many, name the function by it
+        function.__qualname__ = owner + ".__init__" * (function.__name__ == "__init__")
+
+        @wraps(function)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+            for name in kwargs:
+                if name not in known:
+                    ours = ", ".join(name for name in known if name != "self")
+                    raise TypeError(f"{owner} has no argument {name!r}; {_answer(owner, name) or f'it takes {ours}'}")
+            return function(*args, **kwargs)
+
+        return checked
+
+    return decorate
