@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from programs import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
 TABLE = ROOT / "benchmarks" / "results" / "cuda-registers.csv"
 
 REPORT = """nvcc -c x.cu

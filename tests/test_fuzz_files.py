@@ -10,8 +10,8 @@ from pathlib import Path
 from fuzz_files import Silence, damage, try_file
 from fuzz_seeds import Seed, make_seeds
 
+from torchpd import TriMesh
 from torchpd.formats.registry import FORMATS
-from torchpd.mesh import TriMesh
 
 # Their packages are optional, and their sound files cannot be made without.
 OPTIONAL = {".cgns", ".e", ".ex2", ".exo", ".h5m", ".hmf", ".med", ".usd", ".usda", ".usdc", ".usdz"}

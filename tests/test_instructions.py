@@ -5,12 +5,12 @@ from __future__ import annotations
 import runpy
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
+from programs import ROOT
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
+TOOLS = ROOT / "tools"
 # a loop from 2 to 9 that holds one from 5 to 6, which a branch jumps over, and has rare parts behind the end
 CODE = (
     "MOV R1, c[0x0][0x28]",

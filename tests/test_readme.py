@@ -12,6 +12,7 @@ import pytest
 import torch
 import trimesh
 from devices import missing_gpu
+from programs import ROOT
 
 import torchpd as pd
 
@@ -22,7 +23,6 @@ SMALLER = {
 }  # fmt: skip
 
 
-ROOT = Path(__file__).parents[1]
 # blocks of each
 FILES = {
     "README.md": 4,

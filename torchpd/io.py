@@ -30,6 +30,7 @@ from .mesh_checks import store
 from .pins import PIN_HARD
 from .scene import Part, Scene
 from .solvers import Chebyshev, Jacobi, Multilevel, Solver
+from .tri_mesh import TriMesh
 from .version import __version__
 
 __all__ = ["FORMAT_VERSION", "SavedSimulation", "load_simulation", "reading", "save_simulation"]

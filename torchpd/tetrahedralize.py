@@ -15,12 +15,13 @@ from scipy.sparse.csgraph import connected_components
 from tqdm import tqdm
 
 from .checks import check_scalar
-from .embedding import Embedding, embed
+from .embedding import Embedding
 from .fill import LEAST_FILL, Parts, inside_share, parts_of
 from .lattice import Lattice
-from .mesh import TetMesh, TriMesh
+from .mesh import TetMesh, embed
 from .mesh_checks import warn
 from .mesh_faces import TET_FACES, match_faces
+from .tri_mesh import TriMesh
 
 __all__ = ["tetrahedralize"]
 
