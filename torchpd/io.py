@@ -25,7 +25,7 @@ from .automatic import Choice
 from .checks import check_target_file
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .embedding import Embedding
-from .mesh import TetMesh, TriMesh, trusted
+from .mesh import TetMesh, trusted
 from .mesh_checks import store
 from .pins import PIN_HARD
 from .scene import Part, Scene

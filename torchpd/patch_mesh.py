@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .mesh import TriMesh
 from .patch_surface import PatchPose, PatchSamples, PatchSurface
+from .tri_mesh import TriMesh
 
 __all__ = ["Tessellation", "tessellate"]
 
