@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay
 
+from torchpd import TetMesh
 from torchpd.effects import Gravity, Ground, Pin, Solid, Sphere
-from torchpd.mesh import TetMesh
 from torchpd.reference import StepProblem, elements, step_problem
 from torchpd.scene import Part, Scene
 
@@ -198,3 +198,10 @@ def on_sphere(friction: float = 0.3) -> Case:
 def longest_spread(mesh: TetMesh) -> float:
     """Largest l_e of a mesh."""
     return float(elements(mesh.vertices, mesh.tets).spread.max())
+
+
+class Still(StepProblem):
+    """Without rigid motions."""
+
+    def align(self, displacement: Array) -> Array:
+        return displacement

@@ -220,3 +220,18 @@ def fixture_plan(case: tuple[str, int]) -> Arrays:
 @pytest.fixture(name="lanes", scope="module")
 def fixture_lanes(plan: Arrays) -> Lanes:
     return Lanes.of(plan)
+
+
+def box_values(cells: tuple[int, int, int], *parts: pd.Ground | pd.Sphere) -> SceneValues:
+    return pd.Scene(pd.Solid(pd.TetMesh(*box((1.0, 1.0, 1.0), cells)), 1e5), *parts).values()
+
+
+def cut_by_centres(centres: NDArray[np.float64], tets: NDArray[np.int64], patches: int) -> list[NDArray[np.int64]]:
+    """Recursive bisection by one coordinate of the centres."""
+    if patches == 1:
+        return [tets]
+    axis = int(np.ptp(centres[tets], axis=0).argmax())
+    tets = tets[np.lexsort((tets, centres[tets, axis]))]
+    left = patches // 2
+    middle = len(tets) * left // patches
+    return [*cut_by_centres(centres, tets[:middle], left), *cut_by_centres(centres, tets[middle:], patches - left)]

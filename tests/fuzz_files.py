@@ -23,7 +23,7 @@ from pathlib import Path
 
 from fuzz_seeds import Seed, make_seeds
 
-from torchpd.mesh import MeshWarning
+from torchpd import MeshWarning
 
 __all__ = ["main"]
 

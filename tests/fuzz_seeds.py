@@ -11,9 +11,8 @@ import meshio
 import numpy as np
 import trimesh
 
-from torchpd import shapes
+from torchpd import TetMesh, TriMesh, shapes
 from torchpd.formats.registry import FORMATS
-from torchpd.mesh import TetMesh, TriMesh
 
 __all__ = ["Seed", "make_seeds"]
 

@@ -10,6 +10,7 @@ from cases import Array, Case, Index, box, oriented
 from runs import arguments_of, displacement, simulator, state_of
 from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.spatial import Delaunay
 
 import torchpd as pd
 from torchpd import _C
@@ -193,3 +194,19 @@ def spectrum_of(sim: pd.Simulator, case: Case) -> tuple[float, float]:
         for end in ("SA", "LA")
     )
     return low, high
+
+
+def plate(youngs: float) -> tuple[pd.Simulator, pd.State]:
+    """Delaunay tetrahedra of random points, slivers among them, a third of which lie on the smooth ground below."""
+    points = np.random.default_rng(0).uniform(size=(700, 3)) * (1.0, 0.06, 0.5)
+    points[:250, 1] = 0.0
+    tets = Delaunay(points).simplices.astype(np.int64)
+    volumes = np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) / 6.0
+    tets = np.where((volumes < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)[np.abs(volumes) > 1e-9]
+    scene = pd.Scene(pd.Solid(pd.TetMesh(points, tets), youngs, 1000.0), pd.Gravity(), pd.Ground(-0.02))
+    sim = pd.Simulator(scene, 1 / 60, 600, dtype=torch.float64, progress=False)
+    state = sim.rest_state()
+    state.velocities[..., 1] = -2.0
+    for _ in range(3):
+        state = sim(state)
+    return sim, state

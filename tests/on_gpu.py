@@ -161,3 +161,11 @@ def device_work(call: Callable[[], object]) -> list[str]:
     if len(names(lambda: ones.add(1.0))) != 1:
         pytest.skip("the profiler does not see the kernels of this machine")
     return names(call)
+
+
+def still_works() -> None:
+    """No error has stayed behind in the context, and no kernel is broken."""
+    torch.cuda.synchronize()
+    sim, state = small_on_gpu(torch.float32, "block")
+    expected = small(torch.float32)[0](moved(state, "cpu"))
+    assert relative(sim(state).velocities, expected.velocities) <= 1e-4

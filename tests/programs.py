@@ -1,4 +1,4 @@
-"""Programs that run headers of csrc on the host."""
+"""Where files of the repository are, and programs that run headers of csrc on the host."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-CSRC = Path(__file__).resolve().parent.parent / "csrc"
+HELPERS = Path(__file__).resolve().parent
+ROOT = HELPERS.parent
+CSRC = ROOT / "csrc"
 
 
 def compiled(source: str, folder: Path) -> Path:

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-
-ROOT = Path(__file__).parents[1]
+from programs import ROOT
 
 
 def run(script: str, *words: str) -> str:

@@ -13,6 +13,7 @@ import torch
 from cases import sliver_mesh
 from devices import missing_gpu
 from multilevel_cases import landing
+from programs import ROOT
 from runs import same_bits, state_of
 
 import torchpd as pd
@@ -227,7 +228,7 @@ def test_time_of_a_batch() -> None:
 @pytest.mark.parametrize("size", ["1k", "3k", "10k"])
 def test_few_environments_get_the_solver_that_was_faster(size: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the measured steps of 16 beams on a GPU, with the costs of one: the choice itself is the same on the CPU."""
-    file = Path(__file__).parent.parent / "benchmarks" / "results" / "time-to-error-cuda-batch-16.json"
+    file = ROOT / "benchmarks" / "results" / "time-to-error-cuda-batch-16.json"
     rows = [row for row in json.loads(file.read_text())["rows"] if row["size"] == size]
     subject = SUBJECTS["beam"]()
     mesh = subject.mesh({"1k": 5, "3k": 8, "10k": 12}[size])

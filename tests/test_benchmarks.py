@@ -17,10 +17,9 @@ import numpy as np
 import pytest
 import torch
 from devices import missing_gpu
+from programs import ROOT
 
 from torchpd.gpu import properties_of
-
-ROOT = Path(__file__).parents[1]
 
 SCHEMA: dict[str, Any] = {
     "schema": int,

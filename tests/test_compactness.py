@@ -12,11 +12,10 @@ import pytest
 import torch
 import trimesh
 from patch_cases import ball
+from programs import ROOT
 
 import torchpd as pd
 from torchpd.fit_targets import target_of
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture

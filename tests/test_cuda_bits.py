@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 from devices import require_gpu
+from environments import assert_same_bits, count_sliding, different_environments, gradients, run
+from environments import scene as scene_of_all_effects
 from on_gpu import (
     DTYPES,
     GPU,
@@ -24,8 +26,6 @@ from on_gpu import (
     threads_of,
 )
 from runs import moving, noise, same_bits, state_of
-from test_determinism import assert_same_bits, count_sliding, different_environments, gradients, run
-from test_determinism import scene as scene_of_all_effects
 from torch import Tensor
 
 import torchpd as pd

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from programs import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
 TABLE = ROOT / "benchmarks" / "results" / "cuda-registers.csv"
 
 REPORT = """nvcc -c x.cu
@@ -74,10 +74,10 @@ def test_the_table_is_of_these_sources(tool: dict[str, Any]) -> None:
     stamp, rows = tool["read_table"](TABLE)
     command = f"python tools/cuda_check.py --table {TABLE.relative_to(ROOT)}"
     assert stamp == tool["fingerprint"](), f"CUDA sources or flags have changed since; run `{command}`"
-    targets = {path.stem: set(tool["targets_of"](path)) for path in (ROOT / "csrc" / "cuda").glob("*.cu")}
+    targets = {path.stem: set(tool["targets_of"](path)) for path in (ROOT / "csrc").rglob("*.cu")}
     found: dict[str, set[str]] = {}
     for row in rows:
-        found.setdefault(row["source"].removeprefix("cuda-").removesuffix(".cu"), set()).add(row["architecture"])
+        found.setdefault(row["source"].split("-")[-1].removesuffix(".cu"), set()).add(row["architecture"])
     assert found == {name: wanted for name, wanted in targets.items() if name != "runtime"}  # which has no kernels
 
 

@@ -14,6 +14,10 @@ import torch
 from cases import Array, Case, box, cone_mesh, slivers
 from device_plans import delaunay_mesh
 from devices import require_gpu
+from environments import different_environments
+from environments import scene as scene_of_all_effects
+from iterate_cases import CASES as SAME_CASES
+from iterate_cases import RESTARTS, SOLVERS, in_a_corner, restarting, stirred
 from numpy.typing import NDArray
 from on_gpu import DTYPES, GPU, KERNELS, bar, crowd, full_on_gpu, moved, on_gpu, relative
 from runs import (
@@ -30,10 +34,6 @@ from runs import (
     state_of,
     taken_off,
 )
-from test_determinism import different_environments
-from test_determinism import scene as scene_of_all_effects
-from test_same_iterates import CASES as SAME_CASES
-from test_same_iterates import RESTARTS, SOLVERS, in_a_corner, restarting, stirred
 
 import torchpd as pd
 from torchpd import regimes

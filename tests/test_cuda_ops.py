@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from devices import require_gpu
+from matrix_classes import CLASSES
 from on_gpu import (
     DTYPES,
     GPU,
@@ -24,10 +25,10 @@ from on_gpu import (
     on_gpu,
     relative,
     small_on_gpu,
+    still_works,
 )
+from op_samples import OPS, samples
 from runs import ULP, moving, noise, numbers_of, plan_of, same_bits, simulate, simulator, small, small_case, state_of
-from test_ops import OPS, samples
-from test_rotation import CLASSES
 from torch import Tensor
 
 import torchpd as pd
@@ -266,14 +267,6 @@ def test_what_a_scene_does_not_have_is_not_launched() -> None:
 
 
 # ---- refusals
-
-
-def still_works() -> None:
-    """No error has stayed behind in the context, and no kernel is broken."""
-    torch.cuda.synchronize()
-    sim, state = small_on_gpu(torch.float32, "block")
-    expected = small(torch.float32)[0](moved(state, "cpu"))
-    assert relative(sim(state).velocities, expected.velocities) <= 1e-4
 
 
 def test_plan_and_state_must_be_together() -> None:

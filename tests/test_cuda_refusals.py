@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 import torch
 from devices import require_gpu
-from on_gpu import DTYPES, GPU, KERNELS, bar, has_clusters, moved, small_on_gpu
+from on_gpu import DTYPES, GPU, KERNELS, bar, has_clusters, moved, small_on_gpu, still_works
 from runs import moving, same_bits, simulate, simulator, small, state_of
-from test_cuda_ops import still_works
 
 import torchpd as pd
 from torchpd import placing, regimes

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from devices import require_gpu
+from held_bar import BAR, LEFT, H, fallen, way
 from on_gpu import DTYPES, GPU, KERNELS, compiled_for, host_waits
 from runs import same_bits
-from test_release import BAR, LEFT, H, fallen, way
 
 import torchpd as pd
 from torchpd.solvers import Solver

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import runpy
 import subprocess
-from pathlib import Path
 
 import pytest
+from programs import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
 # An A100 without code, whose blocks may have 166912 bytes; it counts how often an error was cleared.
 PROGRAM = """
 #include "cuda/runtime.h"

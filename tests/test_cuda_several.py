@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import torch
 from devices import require_gpu
+from environments import assert_same_bits, run
 from on_gpu import GPU, bar, crowd, device_work, moved, on_gpu, relative, threads_of
 from runs import noise, simulator
-from test_determinism import assert_same_bits, run
 from torch import Tensor
 
 import torchpd as pd

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 import torch
+from conjugate_cases import MANY, environment, given_of, sliding_on, system
 from conjugate_reference import conjugate_gradients
 from devices import require_gpu
 from on_gpu import DTYPES, GPU, KERNELS, device_work, relative, small_on_gpu
 from runs import noise
-from test_conjugate import MANY, environment, given_of, sliding_on, system
 from torch import Tensor
 
 import torchpd as pd

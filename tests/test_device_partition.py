@@ -7,10 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 from cases import oriented
-from device_plans import Arrays
+from device_plans import Arrays, cut_by_centres
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
-from test_device_patches import cut_by_centres
 
 import torchpd as pd
 

@@ -18,6 +18,7 @@ from device_plans import (  # noqa: F401  (fixtures)
     Arrays,
     Lanes,
     arrays_of,
+    cut_by_centres,
     fixture_case,
     fixture_lanes,
     fixture_plan,
@@ -168,17 +169,6 @@ def test_a_cut_shares_one_layer_of_vertices(
     for number, part in enumerate(cut_by_centres(vertices[tets].mean(axis=1), np.arange(len(tets)), patches)):
         touched[tets[part], number] = True
     assert (touched.sum(axis=1) > 1).sum() > most
-
-
-def cut_by_centres(centres: NDArray[np.float64], tets: NDArray[np.int64], patches: int) -> list[NDArray[np.int64]]:
-    """Recursive bisection by one coordinate of the centres."""
-    if patches == 1:
-        return [tets]
-    axis = int(np.ptp(centres[tets], axis=0).argmax())
-    tets = tets[np.lexsort((tets, centres[tets, axis]))]
-    left = patches // 2
-    middle = len(tets) * left // patches
-    return [*cut_by_centres(centres, tets[:middle], left), *cut_by_centres(centres, tets[middle:], patches - left)]
 
 
 def test_parts_hold_each_free_vertex_once(plan: Arrays, values: SceneValues) -> None:

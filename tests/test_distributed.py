@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from programs import HELPERS
 from two_ranks import Falling, gradients, youngs
 
 import torchpd as pd
@@ -18,7 +18,7 @@ import torchpd as pd
 def ranks(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     """What two processes found."""
     folder = tmp_path_factory.mktemp("ranks")
-    program = Path(__file__).with_name("two_ranks.py")
+    program = HELPERS / "two_ranks.py"
     command = [sys.executable, str(program)]
     runs = [subprocess.Popen([*command, str(rank), str(folder)], stderr=subprocess.PIPE, text=True) for rank in (0, 1)]
     errors = [run.communicate(timeout=120)[1] for run in runs]

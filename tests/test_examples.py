@@ -12,10 +12,11 @@ from pathlib import Path
 import imageio.v3 as imageio
 import pytest
 import trimesh
+from programs import ROOT
 
 import torchpd
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = ROOT / "examples"
 
 
 @pytest.fixture

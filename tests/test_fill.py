@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from mesh_cases import block, surface_of
 from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 from small_strains import elastic_matrix
@@ -20,16 +21,8 @@ from torchpd.fill import LEAST_FILL, parts_of
 Array = NDArray[np.float64]
 
 
-def surface_of(made: trimesh.Trimesh) -> pd.TriMesh:
-    return pd.TriMesh.from_trimesh(made)
-
-
 def ball(subdivisions: int = 3) -> pd.TriMesh:
     return surface_of(trimesh.creation.icosphere(subdivisions))
-
-
-def block(*size: float) -> pd.TriMesh:
-    return surface_of(trimesh.creation.box(size))
 
 
 def joined(*surfaces: pd.TriMesh) -> pd.TriMesh:

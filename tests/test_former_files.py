@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from programs import ROOT
 from safetensors import safe_open
 from safetensors.torch import save_file
 from torch.nn.utils.parametrize import register_parametrization
 
 import torchpd as pd
 
-FILES = Path(__file__).parent / "fixtures"
+FILES = ROOT / "tests" / "fixtures"
 ROUNDING = 1e-6  # m: some units in the last place of a float32 near 0.3 m, times the steps
 
 

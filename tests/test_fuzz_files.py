@@ -9,18 +9,18 @@ from pathlib import Path
 
 from fuzz_files import Silence, damage, try_file
 from fuzz_seeds import Seed, make_seeds
+from programs import HELPERS, ROOT
 
+from torchpd import TriMesh
 from torchpd.formats.registry import FORMATS
-from torchpd.mesh import TriMesh
 
 # Their packages are optional, and their sound files cannot be made without.
 OPTIONAL = {".cgns", ".e", ".ex2", ".exo", ".h5m", ".hmf", ".med", ".usd", ".usda", ".usdc", ".usdz"}
-HERE = Path(__file__).resolve().parent
 
 
 def test_500_damaged_files_are_read_or_refused_in_words(tmp_path: Path) -> None:
-    program = [sys.executable, str(HERE / "fuzz_files.py"), "500"]
-    paths = os.environ | {"PYTHONPATH": str(HERE.parent)}
+    program = [sys.executable, str(HELPERS / "fuzz_files.py"), "500"]
+    paths = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(program, cwd=tmp_path, env=paths, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.startswith("500 damaged files in")

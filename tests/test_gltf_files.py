@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchpd.mesh import MeshWarning, TriMesh
+from torchpd import MeshWarning, TriMesh
 
 BOX = np.array([[x, y, z] for z in (0.0, 3.0) for y in (0.0, 2.0) for x in (0.0, 1.0)])
 QUADS = [[2, 3, 1, 0], [4, 5, 7, 6], [0, 1, 5, 4], [3, 2, 6, 7], [1, 3, 7, 5], [2, 0, 4, 6]]

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from programs import ROOT
 
-TOOLS = Path(__file__).parent.parent / "tools"
+TOOLS = ROOT / "tools"
 
 
 @pytest.fixture(name="tool", scope="module")

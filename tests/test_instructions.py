@@ -5,12 +5,12 @@ from __future__ import annotations
 import runpy
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
+from programs import ROOT
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
+TOOLS = ROOT / "tools"
 # a loop from 2 to 9 that holds one from 5 to 6, which a branch jumps over, and has rare parts behind the end
 CODE = (
     "MOV R1, c[0x0][0x28]",
@@ -64,7 +64,7 @@ def test_a_conditional_way_out_does_not_end_a_loop(tool: dict[str, Any]) -> None
 
 def test_what_is_missing_is_said() -> None:
     for source, words in (
-        ("nothing", "there is no csrc/cuda/nothing.cu"),
+        ("nothing", "there is no nothing.cu in csrc/"),
         ("fused_float", "there is no nvcc: set CUDA_HOME"),
     ):
         command = [sys.executable, TOOLS / "instructions.py", source]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from cases import box
-from test_regimes import values_of
+from device_plans import box_values
+from programs import ROOT
 
 import torchpd as pd
 from torchpd import kernel_costs
@@ -23,7 +23,7 @@ MESHES = [(3, 3, 3), (15, 3, 3), (8, 5, 5), (15, 4, 4), (25, 5, 5), (19, 8, 8), 
 
 @pytest.fixture(scope="module")
 def measured() -> list[dict[str, Any]]:
-    file = Path(__file__).parent.parent / "benchmarks" / "results" / "kernels-by-batch-h100.json"
+    file = ROOT / "benchmarks" / "results" / "kernels-by-batch-h100.json"
     rows: list[dict[str, Any]] = json.loads(file.read_text())["rows"]
     return rows
 
@@ -61,7 +61,7 @@ def test_time_of_an_iteration_by_hand(dtype: torch.dtype, monkeypatch: pytest.Mo
     """Waves, turns and tetrahedra counted: 40 multiprocessors, 81 environments of 750 tetrahedra."""
     fit = kernel_costs._Fit((0.5, 0.005), (1.0, 0.01), (2.0, 0.02), (3.0, 0.04), (4.0, 0.08), 20.0, (5.0, 0.01))
     monkeypatch.setitem(kernel_costs._FITS, dtype, fit)
-    values, gpu = values_of((5, 5, 5)), Properties(40, 232_448, 16)
+    values, gpu = box_values((5, 5, 5)), Properties(40, 232_448, 16)
     tets = len(values.tets)
     assert tets == 750
 
@@ -90,7 +90,7 @@ def test_time_of_an_iteration_by_hand(dtype: torch.dtype, monkeypatch: pytest.Mo
 
 def test_a_grid_has_as_few_patches_as_let_enough_environments_run(dtype: torch.dtype) -> None:
     """Alone many small ones; of a batch as many as share the device, as long as the patches fit."""
-    values = values_of((20, 8, 8))  # 7680 tetrahedra
+    values = box_values((20, 8, 8))  # 7680 tetrahedra
     counts = [choose_plan(values, dtype, H100, "grid", batch=batch).patches for batch in (1, 4, 16, 1_000_000)]
     assert counts[:3] == [51, 33, 8]
     least = counts[3]
@@ -102,18 +102,18 @@ def test_a_grid_has_as_few_patches_as_let_enough_environments_run(dtype: torch.d
 
 
 def test_what_is_asked_for_counts_and_what_fits(dtype: torch.dtype) -> None:
-    values = values_of((5, 5, 5))
+    values = box_values((5, 5, 5))
     kernels = [choose_plan(values, dtype, H100, batch=batch).kernel for batch in (None, 1, 1024)]
     assert kernels == ["block", "cluster", "block"]
     assert choose_plan(values, dtype, H100, "block", batch=1).kernel == "block"
     assert choose_plan(values, dtype, H100._replace(cluster=1), batch=1).kernel == "grid"
     assert choose_plan(values, dtype, H100._replace(shared=1000), batch=1).kernel == "stream"
-    assert choose_plan(values_of((14, 14, 14)), dtype, H100, batch=1, progress=False).kernel == "grid"
+    assert choose_plan(box_values((14, 14, 14)), dtype, H100, batch=1, progress=False).kernel == "grid"
 
 
 def test_blocks_are_shaped_for_the_environments_of_a_multiprocessor() -> None:
     """Rounded up; without a batch nobody knows them."""
-    values = values_of((3, 3, 3))
+    values = box_values((3, 3, 3))
 
     def environments(kernel: str, batch: int | None) -> int:
         return choose_plan(values, torch.float32, H100, kernel, batch=batch).size("environments")

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from mesh_cases import jittered_box, signed_volumes
 
-from torchpd import shapes
+from torchpd import MeshWarning, TetMesh, TriMesh, shapes
 from torchpd.embedding import embed_triangles
-from torchpd.mesh import MeshWarning, TetMesh, TriMesh
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 TET = np.array([[0, 1, 2, 3]])
@@ -198,7 +197,7 @@ def test_the_boundary_is_closed_and_faces_outwards(mesh: TetMesh) -> None:
     assert {(int(a), int(b)) for a, b in edges} == {(int(b), int(a)) for a, b in edges}
     assert len(np.unique(edges, axis=0)) == len(edges)
     # Divergence theorem: outward faces enclose the volume of the tets. Rounding: some n u of the volume.
-    enclosed = embed_triangles(mesh, boundary).surface.volume()
+    enclosed = embed_triangles(mesh.vertices, mesh.tets, boundary).surface.volume()
     assert enclosed == pytest.approx(signed_volumes(mesh).sum(), rel=len(boundary) * 1e-15 + 1e-14)
 
 
@@ -285,7 +284,7 @@ TURN = trimesh.transformations.rotation_matrix(0.7, [1.0, 2.0, -0.5])
 @pytest.mark.parametrize("matrix", [TURN, np.diag([1.0, -1.0, 1.0]), np.diag([2.0, 3.0, -0.5, 1.0])])
 def test_transformed_meshes_keep_their_surface_and_orientation(matrix: np.ndarray) -> None:
     mesh = jittered_box()
-    mesh = mesh.with_embedding(embed_triangles(mesh, mesh.boundary()))
+    mesh = mesh.with_embedding(embed_triangles(mesh.vertices, mesh.tets, mesh.boundary()))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         moved = mesh.transformed(matrix)
@@ -338,7 +337,7 @@ def test_a_tet_that_comes_twice_is_refused_or_left_out() -> None:
 def test_an_embedding_must_belong_to_its_mesh() -> None:
     mesh, other = jittered_box(), shapes.single_tet()
     with pytest.raises(ValueError, match="the embedding must belong to this mesh"):
-        mesh.with_embedding(embed_triangles(other, other.boundary()))
+        mesh.with_embedding(embed_triangles(other.vertices, other.tets, other.boundary()))
     assert mesh.with_embedding(None).embedding is None
 
 
@@ -353,6 +352,6 @@ def test_validation_is_linear_and_fast() -> None:
 def test_meshes_describe_themselves() -> None:
     mesh = shapes.single_tet()
     assert repr(mesh) == "TetMesh(4 vertices, 1 tets)"
-    mesh = mesh.with_embedding(embed_triangles(mesh, mesh.boundary()))
+    mesh = mesh.with_embedding(embed_triangles(mesh.vertices, mesh.tets, mesh.boundary()))
     assert repr(mesh) == "TetMesh(4 vertices, 1 tets, carrying TriMesh(4 vertices, 4 triangles))"
     assert repr(mesh.embedding) == "Embedding(TriMesh(4 vertices, 4 triangles) in 4 mesh vertices)"

@@ -224,7 +224,7 @@ def test_a_mesh_that_is_there_twice() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         twice = TetMesh(*beside(BOX, BOX))
-    twice = twice.with_embedding(embed_triangles(twice, twice.boundary()[:48]))
+    twice = twice.with_embedding(embed_triangles(twice.vertices, twice.tets, twice.boundary()[:48]))
     with pytest.raises(ValueError, match=r"every tet must come once.* \(48 in all\); pass drop_degenerate=True"):
         twice.merged()
     with pytest.warns(MeshWarning, match="48 of 96 tets come twice"):

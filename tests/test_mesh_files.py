@@ -12,10 +12,9 @@ import pytest
 import trimesh
 from mesh_cases import jittered_box, signed_volumes
 
-from torchpd import shapes
+from torchpd import MeshWarning, TetMesh, TriMesh, shapes
 from torchpd.effects import Solid
 from torchpd.embedding import embed_triangles
-from torchpd.mesh import MeshWarning, TetMesh, TriMesh
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 TET = np.array([[0, 1, 2, 3]])
@@ -51,7 +50,7 @@ def test_unreferenced_vertices_of_a_file_are_dropped_and_reported(tmp_path: Path
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl", ".glb"])
 def test_surfaces_survive_a_file(tmp_path: Path, suffix: str) -> None:
     mesh = shapes.box((1.0, 2.0, 3.0), (2, 2, 2))
-    surface = embed_triangles(mesh, mesh.boundary()).surface
+    surface = embed_triangles(mesh.vertices, mesh.tets, mesh.boundary()).surface
     surface.to_file(tmp_path / f"box{suffix}")
     again = TriMesh.from_file(tmp_path / f"box{suffix}")
     assert len(again.triangles) == len(surface.triangles)
@@ -117,7 +116,7 @@ def test_a_file_says_what_it_leaves_out(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mesh.to_file(tmp_path / "bare.vtu")
-    carrying = mesh.with_embedding(embed_triangles(mesh, mesh.boundary()))
+    carrying = mesh.with_embedding(embed_triangles(mesh.vertices, mesh.tets, mesh.boundary()))
     with pytest.warns(MeshWarning, match=r"a\.vtu is without the embedded surface, for which .*Simulator\.save"):
         carrying.to_file(tmp_path / "a.vtu")
     partly = TetMesh(mesh.vertices, mesh.tets, fill=[0.5])

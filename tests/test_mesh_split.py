@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from torchpd import TetMesh
 from torchpd.formats.content import Cells, MeshContent
 from torchpd.formats.split import tets_of, triangles_of
-from torchpd.mesh import TetMesh
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 from cases import Case, box, contact_block, on_sphere
-from multilevel_cases import IDS, SOLVERS
+from multilevel_cases import IDS, SOLVERS, plate
 from runs import arguments_of, displacement, simulator, state_of
-from scipy.spatial import Delaunay
 
 import torchpd as pd
 from torchpd.reference_solvers import relative_error, solve_with_contact
@@ -135,22 +134,6 @@ def test_a_stiff_body_rests_on_a_slope_with_few_iterations(youngs: float) -> Non
     way, speed = rest(pd.Multilevel(), 8)
     assert way <= 1.2 * rest(pd.Chebyshev(), 80)[0]
     assert speed <= 1e-6
-
-
-def plate(youngs: float) -> tuple[pd.Simulator, pd.State]:
-    """Delaunay tetrahedra of random points, slivers among them, a third of which lie on the smooth ground below."""
-    points = np.random.default_rng(0).uniform(size=(700, 3)) * (1.0, 0.06, 0.5)
-    points[:250, 1] = 0.0
-    tets = Delaunay(points).simplices.astype(np.int64)
-    volumes = np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) / 6.0
-    tets = np.where((volumes < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)[np.abs(volumes) > 1e-9]
-    scene = pd.Scene(pd.Solid(pd.TetMesh(points, tets), youngs, 1000.0), pd.Gravity(), pd.Ground(-0.02))
-    sim = pd.Simulator(scene, 1 / 60, 600, dtype=torch.float64, progress=False)
-    state = sim.rest_state()
-    state.velocities[..., 1] = -2.0
-    for _ in range(3):
-        state = sim(state)
-    return sim, state
 
 
 @pytest.mark.parametrize("solver", [pd.Multilevel("lbfgs"), pd.Multilevel()], ids=["lbfgs", "corotated"])

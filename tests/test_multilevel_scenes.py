@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from cases import Case, beam, box, contact_block, on_sphere, slivers
+from environments import assert_same_bits, different_environments
+from environments import run as outputs
+from environments import scene as everything
 from multilevel_cases import IDS, SOLVERS, swing
 from runs import displacement, moving, same_bits, simulate, simulator, state_of
-from test_determinism import assert_same_bits, different_environments
-from test_determinism import run as outputs
-from test_determinism import scene as everything
 
 import torchpd as pd
 from torchpd import placing

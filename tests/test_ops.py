@@ -8,99 +8,13 @@ import numpy as np
 import pytest
 import torch
 from cases import Case
-from runs import ULP, noise, numbers_of, plan_of, rounded_problem, simulator, small, small_case, tensor_of
+from op_samples import BATCH, OPS, samples
+from runs import ULP, noise, plan_of, rounded_problem, simulator, small, small_case, tensor_of
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.state import Info
 
 ops = torch.ops.torchpd
-BATCH = 3
-
-
-def samples(
-    name: str, dtype: torch.dtype, device: torch.device, **options: Any
-) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Arguments of an op; those for which it has derivatives ask for gradients."""
-    sim, state = small(dtype, device, **options)
-    material, plan = sim.material(), plan_of(sim)
-    x, v = state
-    f, direction = noise(x), noise(x, 1)
-    still, zero = sim.rest_state(BATCH)
-    info = torch.full((BATCH, len(Info._fields)), float("nan"), dtype=torch.float64, device=device)
-    numbers = numbers_of(sim)
-    matrices = noise(torch.empty(5, 3, 3, dtype=dtype, device=device)) + 2.0 * torch.eye(3, dtype=dtype, device=device)
-
-    def wanted(tensor: Tensor) -> Tensor:
-        return tensor.detach().clone().requires_grad_()
-
-    w = wanted(sim.stiffness)
-    found: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = {
-        # near an equilibrium, where the adjoint of a step has a solution
-        "step": (
-            (wanted(still), wanted(zero), wanted(0.01 * f), None, material, plan),
-            {**numbers, "iterations": 400},
-        ),
-        "step_": ((x.clone(), v.clone(), info, f, x + 0.01 * direction, material, plan), numbers),
-        "rollout": (
-            (wanted(still), wanted(zero), wanted(0.01 * f), material, plan),
-            {**numbers, "iterations": 400, "steps": 3, "every": 1},
-        ),
-        "step_vjp": (
-            (f, direction, still, still, zero, 0.01 * f, material, plan),
-            {"time_step": sim.time_step, "wanted": [number % 3 != 1 for number in range(len(material))]},
-        ),
-        "rollout_vjp": (
-            (noise(still[None]), noise(still[None], 1), still[None], zero[None], still, zero, 0.01 * f, material, plan),
-            {"time_step": sim.time_step, "wanted": [number % 3 != 1 for number in range(len(material))]},
-        ),
-        "gradient": ((wanted(x), w, plan), {}),
-        "element_energy": ((wanted(x), w, plan), {}),
-        "element_energy_product": ((wanted(x), wanted(direction), w, plan), {}),
-        "hessian_product": ((x, wanted(direction), w.detach(), plan), {}),
-        "elastic_diagonal": ((w.detach(), plan), {"weighted": True}),
-        "nearest_rotation": ((wanted(matrices),), {}),
-        "rotation_differential": ((wanted(matrices), wanted(matrices.flip(0))), {}),
-    }
-    return found[name] if name in found else samples_of_the_adjoint(sim, x)[name]
-
-
-def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
-    """Arguments of the ops that it is made of, which have no derivatives."""
-    material, plan = [array.detach() for array in sim.material()], plan_of(sim)
-    f, direction = noise(x), noise(x, 1)
-    still, zero = sim.rest_state(BATCH)
-    stiffness, h, double = (
-        sim.stiffness.detach(),
-        {"time_step": sim.time_step},
-        {"dtype": torch.float64, "device": x.device},
-    )
-    progress, errors = torch.full((BATCH, 4), -1.0, **double), torch.tensor([0.0, 2.0, 1.0], **double)
-    inertia = sim.masses / sim.time_step**2
-    projector = torch.eye(3, dtype=x.dtype, device=x.device).repeat(*x.shape[:2], 1, 1)
-    sliding = noise(projector.new_empty(*x.shape[:2], 5, 3), 3)
-    return {
-        "conjugate_gradients_": (
-            (0 * x, f.clone(), f.clone(), progress, x, sim.masses, 1 / sim.masses, None, stiffness, plan),
-            {"tolerance": 1e-3, "iterations": 2},
-        ),
-        "conjugate_gradients": (
-            (x, f, inertia, 1 / inertia, projector, stiffness, plan, 0.1 * sliding), {"tolerance": 1e-3},
-        ),
-        "adjoint_system": ((f, direction, x, still, zero, 0.01 * f, material, plan), h),
-        "contact_gradients": ((direction, f, f, direction, x, still, zero, 0.01 * f, material, plan), h),
-        "adjoint_result": (
-            (f, errors, direction, sim.masses, sim.damping, f, direction, projector, x[..., 0] > 0.1, sliding), h,
-        ),
-        "mend_adjoint": ((direction, errors, 0 * errors, still, f, 1 / inertia, None, material, plan), h),
-    }  # fmt: skip
-
-
-OPS = (
-    "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
-    "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "rollout_vjp", "conjugate_gradients_",
-    "adjoint_system", "contact_gradients", "adjoint_result", "mend_adjoint", "conjugate_gradients",
-)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", OPS)

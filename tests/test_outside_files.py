@@ -10,7 +10,7 @@ import meshio
 import numpy as np
 import pytest
 
-from torchpd.mesh import MeshWarning, TetMesh, TriMesh
+from torchpd import MeshWarning, TetMesh, TriMesh
 
 # Two tets, which fill 1/6 and 1/3 m^3, and the faces around the first.
 POINTS = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 from patch_cases import F64, ball, patches_on
+from programs import ROOT
 
 import torchpd as pd
 from torchpd.fit_targets import target_of
@@ -22,7 +22,7 @@ BOX = [[-1.5] * 3, [1.5] * 3]
 @pytest.fixture
 def blob(monkeypatch: pytest.MonkeyPatch):
     """The bumpy ball of the compactness study."""
-    monkeypatch.setattr(sys, "path", [str(Path(__file__).parents[1] / "benchmarks"), *sys.path])
+    monkeypatch.setattr(sys, "path", [str(ROOT / "benchmarks"), *sys.path])
     from compactness import blob
 
     return blob

@@ -10,10 +10,9 @@ import meshio
 import numpy as np
 import pytest
 import torch
+from programs import ROOT
 
 import torchpd as pd
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture

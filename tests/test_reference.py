@@ -26,8 +26,8 @@ from cases import (
 )
 from scipy.spatial.transform import Rotation
 
+from torchpd import TetMesh
 from torchpd.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
-from torchpd.mesh import TetMesh
 from torchpd.reference import (
     Array,
     StepProblem,

@@ -6,12 +6,12 @@ import copy
 import pickle
 import re
 import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from cases import box
+from device_plans import box_values
+from programs import ROOT
 
 import torchpd as pd
 from torchpd import _C, kernel_costs, placing, regimes
@@ -27,13 +27,9 @@ SMALL = Properties(20, 101_376)
 REAL = {torch.float32: 4, torch.float64: 8}
 
 
-def values_of(cells: tuple[int, int, int], *parts: pd.Ground | pd.Sphere) -> SceneValues:
-    return pd.Scene(pd.Solid(pd.TetMesh(*box((1.0, 1.0, 1.0), cells)), 1e5), *parts).values()
-
-
 def test_auto_takes_the_first_that_fits() -> None:
     """Just enough memory for a kernel chooses it, one byte less the next one."""
-    values = values_of((6, 6, 6))
+    values = box_values((6, 6, 6))
     for dtype in REAL:
         needs = {name: most_shared_bytes(choose_plan(values, dtype, H100, name), 0, 0) for name in KERNELS[:-1]}
         assert needs["grid"] < needs["cluster"] < needs["block"]
@@ -52,7 +48,7 @@ def test_auto_takes_the_first_that_fits() -> None:
 
 
 def test_auto_looks_at_clusters_of_small_meshes_where_there_are_any(monkeypatch: pytest.MonkeyPatch) -> None:
-    values = values_of((6, 6, 6))
+    values = box_values((6, 6, 6))
     shared = shared_bytes(choose_plan(values, torch.float32, H100, "block"), 0, 0) - 1
     for most, blocks, kernel in ((1296, 16, "cluster"), (1295, 16, "grid"), (1296, 1, "grid")):
         monkeypatch.setattr(regimes, "_CLUSTER_TETS", most)
@@ -66,10 +62,10 @@ def test_auto_looks_at_clusters_of_small_meshes_where_there_are_any(monkeypatch:
 
 def test_patches_too_large_for_a_cluster_go_to_a_grid() -> None:
     """Every vertex of a patch wants threads, and in float32 every tetrahedron one of its own."""
-    large = values_of((14, 7, 7))  # 4116 tetrahedra, 960 vertices
+    large = box_values((14, 7, 7))  # 4116 tetrahedra, 960 vertices
     needs = r"cluster needs patches smaller than \d+ pairs of tetrahedra and \d+ vertices"
     for gpu, dtype in ((H100, torch.float64), (Properties(170, 101_376, 8), torch.float32)):
-        plan = choose_plan(values_of((6, 4, 4)), dtype, gpu, "cluster")
+        plan = choose_plan(box_values((6, 4, 4)), dtype, gpu, "cluster")
         assert _C.fits_cluster(REAL[dtype], plan.size("most_pairs"), plan.size("most_interior"))
         with pytest.raises(
             ValueError, match=rf"'cluster' does not fit this GPU: .*{needs}, .*; take \"grid\" or \"stream"
@@ -82,7 +78,7 @@ def test_patches_too_large_for_a_cluster_go_to_a_grid() -> None:
 
 def test_a_mesh_that_no_cluster_could_have_is_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the patches, one has a sixteenth of the tetrahedra at least."""
-    values = values_of((12, 12, 12))
+    values = box_values((12, 12, 12))
 
     def fail(*_: object, **__: object) -> None:
         raise AssertionError("a plan was built")
@@ -94,14 +90,14 @@ def test_a_mesh_that_no_cluster_could_have_is_not_cut(monkeypatch: pytest.Monkey
 
 
 def test_a_gpu_without_clusters_is_told() -> None:
-    values = values_of((3, 3, 3))
+    values = box_values((3, 3, 3))
     refusal = r'kernel="cluster" needs .*\(NVIDIA compute capability 9\.0\).*has none; take "block", "grid" or "stream"'
     with pytest.raises(ValueError, match=refusal):
         choose_plan(values, torch.float32, A100, "cluster")
 
 
 def test_who_is_refused_hears_of_kernels_that_may_fit() -> None:
-    small, large = values_of((3, 3, 3)), values_of((12, 12, 12))
+    small, large = box_values((3, 3, 3)), box_values((12, 12, 12))
     tight = H100._replace(shared=100)
     for values, gpu, others in (
         (small, tight, '"cluster", "grid" or "stream"'),
@@ -116,7 +112,7 @@ def test_who_is_refused_hears_of_kernels_that_may_fit() -> None:
 
 def test_shared_memory_of_a_cluster() -> None:
     """One byte less than a patch needs is too little."""
-    values = values_of((6, 6, 6), pd.Ground(), pd.Sphere((0, -3, 0), 1.0))
+    values = box_values((6, 6, 6), pd.Ground(), pd.Sphere((0, -3, 0), 1.0))
     for dtype, real in REAL.items():
         plan = choose_plan(values, dtype, H100, "cluster")
         needed = shared_bytes(plan, 1, 1)
@@ -129,14 +125,14 @@ def test_shared_memory_of_a_cluster() -> None:
 
 def test_number_of_patches() -> None:
     """As many for a grid as leave each its least number of tetrahedra, as few for a stream as leave none too many."""
-    small, large = values_of((6, 6, 6)), values_of((13, 11, 10))
+    small, large = box_values((6, 6, 6)), box_values((13, 11, 10))
     for dtype in REAL:
         assert choose_plan(small, dtype, H100, "block").patches == 1
         grid, tets = choose_plan(small, dtype, H100, "grid").patches, len(small.tets)
         assert grid > 2
         assert tets / grid >= regimes._GRID_TETS > tets / (grid + 1)
         assert choose_plan(small, dtype, Properties(5, 232_448), "grid").patches == 5
-        middle = values_of((9, 3, 3))
+        middle = box_values((9, 3, 3))
         cluster, tets = choose_plan(middle, torch.float32, H100, "cluster").patches, len(middle.tets)
         assert 2 < cluster < 16
         assert tets / cluster >= regimes._CLUSTER_EACH > tets / (cluster + 1)
@@ -162,7 +158,7 @@ def test_number_of_patches() -> None:
 
 def test_patches_of_a_pipeline_are_larger() -> None:
     """Of float32, without contacts, where a block has room for two of them and every multiprocessor has one."""
-    free, touching = values_of((13, 12, 11)), values_of((13, 12, 11), pd.Ground(-1.0))
+    free, touching = box_values((13, 12, 11)), box_values((13, 12, 11), pd.Ground(-1.0))
     few = H100._replace(multiprocessors=1)
     small = few._replace(shared=166_912)  # compute capability 8.0
 
@@ -177,14 +173,14 @@ def test_patches_of_a_pipeline_are_larger() -> None:
     # as many as there are multiprocessors rather than fewer larger ones
     assert patches(free, few._replace(multiprocessors=more - 1)) == more - 1
     # their slots are what bringers hold at once (csrc/cuda/pipeline.h), and two fit
-    plan = choose_plan(values_of((40, 12, 12)), torch.float32, few, "stream")
+    plan = choose_plan(box_values((40, 12, 12)), torch.float32, few, "stream")
     assert plan.size("most_slots") <= 640
     half = 24 * plan.size("most_slots") + 12 * plan.size("most_entries")
     assert 2 * half <= regimes._PIPED_BYTES
 
 
 def test_a_kernel_that_does_not_fit_is_refused_with_numbers() -> None:
-    values = values_of((12, 12, 12))
+    values = box_values((12, 12, 12))
     with pytest.raises(
         ValueError, match=r"'block' does not fit this GPU: .*block needs at least [\d,]+ B, 101,376 B are there; .*grid"
     ):
@@ -200,7 +196,7 @@ def test_a_kernel_that_does_not_fit_is_refused_with_numbers() -> None:
 
 def test_shared_memory_by_hand(dtype: torch.dtype) -> None:
     """Many patches keep four numbers a slot (position) in place of eight (and u), and both 1 KB for control."""
-    values, real = values_of((4, 4, 4)), torch.finfo(dtype).bits // 8
+    values, real = box_values((4, 4, 4)), torch.finfo(dtype).bits // 8
     for kernel, numbers in (("block", 8), ("grid", 4)):
         plan = choose_plan(values, dtype, H100, kernel)
         slots, entries = plan.size("most_slots"), plan.size("most_entries")
@@ -215,7 +211,7 @@ def test_the_way_back_fits_where_the_step_does(
     kernel: str, batch: int | None, cells: tuple[int, int, int], dtype: torch.dtype
 ) -> None:
     """Its passes keep a position and a direction of every slot, beside static memory, where a grid has a position."""
-    values, real = values_of(cells), torch.finfo(dtype).bits // 8
+    values, real = box_values(cells), torch.finfo(dtype).bits // 8
     plan = choose_plan(values, dtype, H100, kernel, batch=batch)
     step, most = shared_bytes(plan, 0, 0), most_shared_bytes(plan, 0, 0)
     passes = -(-6 * real * plan.size("most_slots") // 16) * 16 + 4 * real * plan.size("most_entries")
@@ -229,7 +225,7 @@ def test_the_way_back_fits_where_the_step_does(
 def test_what_is_refused_unbuilt_does_not_fit_when_built() -> None:
     """The bound from the numbers of vertices and tetrahedra never exceeds what the plan then needs."""
     for cells in ((1, 1, 1), (5, 4, 3), (9, 9, 2)):
-        values = values_of(cells, pd.Ground(), pd.Sphere((0, -3, 0), 1.0))
+        values = box_values(cells, pd.Ground(), pd.Sphere((0, -3, 0), 1.0))
         for dtype, real in REAL.items():
             plan = choose_plan(values, dtype, Properties(2, 10**9), "block")
             least = _C.fused_shared_bytes(real, False, len(values.rest_positions), 5 * len(values.tets) // 2, 1, 1)
@@ -263,7 +259,7 @@ def test_a_patch_with_more_slots_than_can_be_counted_is_split(monkeypatch: pytes
 @pytest.mark.parametrize("gpu", [Properties(1, 232_448), Properties(20, 101_376)])
 def test_patches_of_a_multilevel_solver_fit(gpu: Properties, dtype: torch.dtype) -> None:
     """As many for every multiprocessor as fit, also where 16 bits would not count the entries of fewer."""
-    values = values_of((54, 11, 11))  # 39 204 tetrahedra
+    values = box_values((54, 11, 11))  # 39 204 tetrahedra
     plan = choose_plan(values, dtype, gpu, levels=True, progress=False)
     assert plan.for_levels
     assert plan.kernel == "stream"
@@ -271,14 +267,14 @@ def test_patches_of_a_multilevel_solver_fit(gpu: Properties, dtype: torch.dtype)
     assert shared_bytes(plan, 0, 0) <= gpu.shared
     # not many more than it takes
     assert shared_bytes(plan, 0, 0) >= 0.3 * gpu.shared
-    assert choose_plan(values_of((3, 3, 3)), dtype, gpu, levels=True).patches == 1
+    assert choose_plan(box_values((3, 3, 3)), dtype, gpu, levels=True).patches == 1
     with pytest.raises(ValueError, match='Multilevel runs with kernel="stream" on a GPU'):
         choose_plan(values, dtype, gpu, "block", levels=True)
 
 
 @pytest.mark.parametrize("gpu", [Properties(8, 232_448), Properties(20, 101_376), H100])
 def test_many_environments_of_a_multilevel_solver_get_larger_patches(gpu: Properties, dtype: torch.dtype) -> None:
-    values = values_of((9, 9, 9))  # 3 645 or more tetrahedra
+    values = box_values((9, 9, 9))  # 3 645 or more tetrahedra
     least = -(-gpu.multiprocessors // 4)
     few, many = (choose_plan(values, dtype, gpu, levels=True, batch=batch) for batch in (least - 1, least))
     assert (few.many, many.many) == (False, True)
@@ -290,16 +286,16 @@ def test_many_environments_of_a_multilevel_solver_get_larger_patches(gpu: Proper
 
 def test_blocks_of_a_multilevel_solver_share_a_small_mesh_where_environments_are_few(dtype: torch.dtype) -> None:
     """Which is done sooner; in large batches, and where nobody knows, one block does it."""
-    values = values_of((5, 5, 5))  # 625 or more tetrahedra
+    values = box_values((5, 5, 5))  # 625 or more tetrahedra
     assert [choose_plan(values, dtype, H100, levels=True, batch=b).patches for b in (None, 1, 32, 33)] == [1, 2, 2, 1]
-    assert choose_plan(values_of((3, 3, 3)), dtype, H100, levels=True, batch=1).patches == 1
+    assert choose_plan(box_values((3, 3, 3)), dtype, H100, levels=True, batch=1).patches == 1
 
 
 def test_many_environments_of_several_patches_get_levels() -> None:
     """A direct solve reads more, but has fewer phases: it serves all others of up to 1024 vertices."""
 
     def is_direct(cells: int, batch: int | None) -> bool:
-        values = values_of((cells, cells, cells))
+        values = box_values((cells, cells, cells))
         plan = choose_plan(values, torch.float32, H100, levels=True, batch=batch)
         inertia = torch.ones(plan.vertices, dtype=torch.float64)
         made = precondition_plan(plan, values, torch.full((len(values.tets),), 1e5, dtype=torch.float64), inertia)
@@ -312,8 +308,8 @@ def test_many_environments_of_several_patches_get_levels() -> None:
 @pytest.mark.parametrize(("source", "dtype"), [("float", torch.float32), ("double", torch.float64)])
 def test_registers_of_clusters_are_those_of_the_table(source: str, dtype: torch.dtype) -> None:
     """Of sm_90, the first that has clusters; a multiprocessor hands them out in eights."""
-    tool = runpy.run_path(str(Path(__file__).parent.parent / "tools" / "cuda_check.py"))
-    _, rows = tool["read_table"](Path(__file__).parent.parent / "benchmarks" / "results" / "cuda-registers.csv")
+    tool = runpy.run_path(str(ROOT / "tools" / "cuda_check.py"))
+    _, rows = tool["read_table"](ROOT / "benchmarks" / "results" / "cuda-registers.csv")
     used = [
         int(row["registers"])
         for row in rows
@@ -325,8 +321,8 @@ def test_registers_of_clusters_are_those_of_the_table(source: str, dtype: torch.
 @pytest.mark.parametrize("architecture", ["90", "100"])
 def test_shared_vertices_have_room_beside_the_pipeline(architecture: str) -> None:
     """Of the registers of a multiprocessor: else their kernel would come after it, and nothing but time would tell."""
-    tool = runpy.run_path(str(Path(__file__).parent.parent / "tools" / "cuda_check.py"))
-    _, rows = tool["read_table"](Path(__file__).parent.parent / "benchmarks" / "results" / "cuda-registers.csv")
+    tool = runpy.run_path(str(ROOT / "tools" / "cuda_check.py"))
+    _, rows = tool["read_table"](ROOT / "benchmarks" / "results" / "cuda-registers.csv")
     used = {
         row["kernel"]: -(-int(row["registers"]) // 8) * 8
         for row in rows
@@ -340,14 +336,14 @@ def test_shared_vertices_have_room_beside_the_pipeline(architecture: str) -> Non
 
 
 def test_contacts_take_shared_memory() -> None:
-    values = values_of((3, 3, 3))
+    values = box_values((3, 3, 3))
     plan = choose_plan(values, torch.float32, H100, "block")
     assert shared_bytes(plan, 2, 3) - shared_bytes(plan, 0, 0) == 4 * (2 * 5 + 3 * 8)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_one_class_for_both_plans(kernel: str, dtype: torch.dtype) -> None:
-    values = values_of((4, 3, 3))
+    values = box_values((4, 3, 3))
     plan, cpu = choose_plan(values, dtype, H100, kernel), compile_plan(values, dtype=dtype)
     assert (plan.kernel, cpu.kernel) == (kernel, None)
     assert plan.vertices == cpu.vertices == len(values.rest_positions)

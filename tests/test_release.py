@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from held_bar import BAR, LEFT, RIGHT, H, fallen, way
 from torch import Tensor
 from torch.func import functional_call
 
@@ -18,15 +19,6 @@ from torchpd.gpu import Properties
 from torchpd.plan import Plan
 from torchpd.regimes import choose_plan
 from torchpd.solvers import Solver
-
-H = 1 / 60
-BAR = pd.shapes.box((0.3, 0.1, 0.1), (6, 2, 2))
-LEFT, RIGHT = (np.flatnonzero(np.abs(BAR.vertices[:, 0] - x) < 1e-6) for x in np.sort(BAR.vertices[:, 0])[[0, -1]])
-
-
-def fallen(steps: int) -> float:
-    """Of a free body from rest by implicit Euler: -g h^2 n (n + 1) / 2 [m]."""
-    return -9.81 * H**2 * steps * (steps + 1) / 2
 
 
 def simulator(
@@ -40,11 +32,6 @@ def simulator(
     bar = pd.Solid(BAR, youngs=youngs)
     scene = pd.Scene(bar, pd.Pin(bar, held), pd.Gravity(), *parts)
     return pd.Simulator(scene, H, iterations, solver, dtype, progress=False)
-
-
-def way(sim: pd.Simulator, positions: Tensor) -> Tensor:
-    """Mean height above that at rest, of each environment."""
-    return (positions - sim.rest_positions)[..., 1].mean(-1)
 
 
 def by_tiny_springs(sim: pd.Simulator) -> Any:

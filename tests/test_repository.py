@@ -10,11 +10,11 @@ import re
 from pathlib import Path
 
 import pytest
+from programs import ROOT
 from setuptools import find_packages
 
 import torchpd
 
-ROOT = Path(__file__).resolve().parent.parent
 PACKAGE_FILES = sorted((ROOT / "torchpd").rglob("*.py"))
 PLACEHOLDERS = re.compile(r"\b(" + "|".join(["TO" + "DO", "FIX" + "ME", "raise NotImplemented" + "Error"]) + r")\b")
 TEXT_SUFFIXES = {".py", ".pyi", ".h", ".cuh", ".cpp", ".cu", ".inl", ".def", ".md", ".toml"}

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cases import Case, box, contact_block, slope
+from cases import Case, Still, box, contact_block, slope
 from numpy.typing import NDArray
 from runs import arguments_of, simulator, state_of
 
 import torchpd as pd
-from torchpd.reference import StepProblem, step_problem
+from torchpd.reference import step_problem
 from torchpd.reference_solvers import guarded_chebyshev
 
 pytestmark = pytest.mark.usefixtures("poisoned")
@@ -186,13 +186,6 @@ def test_energy_falls_along_rigid_motions() -> None:
     scale = np.abs(gradient).sum()
     assert np.abs(gradient.sum(axis=0)).max() <= 1e-12 * scale
     assert np.abs(np.cross(arms, gradient).sum(axis=0)).max() <= 1e-12 * scale
-
-
-class Still(StepProblem):
-    """Without rigid motions."""
-
-    def align(self, displacement: Array) -> Array:
-        return displacement
 
 
 def pressed_corner() -> Case:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import itertools
 import runpy
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from programs import ROOT
 
 from torchpd import _C, regimes
 from torchpd.gpu import Properties
 from torchpd.plan import Plan
 
-TOOLS = Path(__file__).parent.parent / "tools"
+TOOLS = ROOT / "tools"
 H100 = Properties(132, 232448, 16)
 FAR_THREADS = {torch.float32: 384, torch.float64: 192}  # far_threads of csrc/cuda/fused_kernels.cuh
 PIPELINE_SLOTS = 1024  # csrc/cuda/pipeline.h

@@ -10,11 +10,10 @@ import tarfile
 from pathlib import Path
 
 import pytest
+from programs import ROOT
 
 from torchpd.__main__ import main
 from torchpd.linking import libraries_in, library_names, runtime_fault, shared_runtime
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 def failure(*command: str, modules: Path | None = None, **environment: str) -> str:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchpd import shapes
+from torchpd import TriMesh, shapes
 from torchpd.contour import contour
-from torchpd.mesh import TriMesh
 from torchpd.tetrahedralize import tetrahedralize
 
 

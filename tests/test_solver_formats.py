@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchpd.mesh import MeshWarning, TetMesh
+from torchpd import MeshWarning, TetMesh
 
 POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
 NODES = "".join(f"{n + 1}, {x}, {y}, {z}\n" for n, (x, y, z) in enumerate(POINTS.tolist()))

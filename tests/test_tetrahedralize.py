@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from mesh_cases import jittered_box
 from scipy.optimize import linprog
 
-from torchpd import shapes
-from torchpd.embedding import Embedding, _outside, embed
+from torchpd import Embedding, MeshWarning, TetMesh, TriMesh, embed, shapes
+from torchpd.embedding import _outside
 from torchpd.lattice import Lattice, _overlaps
-from torchpd.mesh import MeshWarning, TetMesh, TriMesh
 from torchpd.tetrahedralize import _split_hinges, tetrahedralize
 
 

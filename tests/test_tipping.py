@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from cases import Case, box, leaning, oriented, rotation
+from cases import Case, Still, box, leaning, oriented, rotation
 from numpy.typing import NDArray
 from runs import simulator, state_of
-from test_rigid_motion import Still
 
 import torchpd as pd
 from torchpd.reference import step_problem

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from cases import Array, beam, contact_block
+from multilevel_cases import plate
 from runs import displacement, simulator, state_of
-from test_multilevel_contacts import plate
 
 import torchpd as pd
 from torchpd.reference import StepProblem, step_problem

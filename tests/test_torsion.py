@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from mesh_cases import block
 from scipy.sparse.linalg import spsolve
 from small_strains import elastic_matrix
-from test_fill import block
 
 import torchpd as pd
 

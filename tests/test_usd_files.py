@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchpd.mesh import MeshWarning, TetMesh, TriMesh
+from torchpd import MeshWarning, TetMesh, TriMesh
 
 pytest.importorskip("pxr", reason="USD files need usd-core")
 from pxr import Gf, Sdf, Usd, UsdGeom

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 import torch
+from programs import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
 CHANGE = """diff --git a/{file} b/{file}
 --- a/{file}
 +++ b/{file}

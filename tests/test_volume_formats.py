@@ -10,9 +10,9 @@ import meshio
 import numpy as np
 import pytest
 
+from torchpd import MeshWarning, TetMesh, TriMesh
 from torchpd.formats.content import MeshContent
 from torchpd.formats.guard import read
-from torchpd.mesh import MeshWarning, TetMesh, TriMesh
 
 POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
 TETS = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])

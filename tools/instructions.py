@@ -2,7 +2,7 @@
 
 python tools/instructions.py fused_float "fused_step<float, false, false, .*Blocks.0, true"
 
-compiles csrc/cuda/fused_float.cu as a build does and prints, of each kernel whose name the pattern is found in, the
+compiles fused_float.cu as a build does and prints, of each kernel whose name the pattern is found in, the
 loops: where they begin, how many instructions they have, and how many the shortest pass runs. Left out are functions
 that a loop calls, what stands behind its end, and what a warp does whose lanes have parted. This one is the kernel
 "block" in float32 of held bodies without contacts: its loop over pairs of tetrahedra that adds up no energy has 487,
@@ -113,14 +113,14 @@ def demangled(name: str) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Count the instructions of the loops of kernels, for sm_90.")
-    parser.add_argument("source", help="of csrc/cuda, such as fused_float")
+    parser.add_argument("source", help="a source of csrc without its .cu, such as fused_float")
     parser.add_argument("pattern", nargs="?", default="", help="a regular expression for names of kernels")
     parser.add_argument("--cuobjdump", default=find_tool("cuobjdump"), help="the program; needs nvdisasm beside it")
     parser.add_argument("--least", type=int, default=100, help="instructions of a loop to be printed")
     options = parser.parse_args()
-    source, nvcc = CSRC / "cuda" / f"{options.source}.cu", find_tool("nvcc")
-    if not source.exists():
-        parser.error(f"there is no {source.relative_to(CSRC.parent)}")
+    source, nvcc = next(CSRC.rglob(f"{options.source}.cu"), None), find_tool("nvcc")
+    if source is None:
+        parser.error(f"there is no {options.source}.cu in csrc/")
     if nvcc is None or options.cuobjdump is None:
         missing = "nvcc" if nvcc is None else "cuobjdump"
         parser.error(f"there is no {missing}: set CUDA_HOME to the folder of a CUDA toolkit, or name it (--cuobjdump)")

@@ -87,7 +87,7 @@ def make_variant(folder: Path, source: str, patch: Path | None, linked: list[Pat
     target = f"-gencode=arch=compute_{major}{minor},code=sm_{major}{minor}"
     made = folder / f"{source}.o"
     nvcc = Path(str(cpp_extension.CUDA_HOME)) / "bin" / "nvcc"
-    kernels = folder / "csrc" / "cuda" / f"{source}.cu"
+    kernels = next((folder / "csrc").rglob(f"{source}.cu"))
     run(nvcc, "-c", kernels, "-o", made, *flags, target, "-Xcompiler=-fPIC", "-I", folder / "csrc")
     others = [path for path in linked if path.name != made.name]
     paths = [word for path in cpp_extension.library_paths("cuda") for word in ("-L", path)]
@@ -130,7 +130,7 @@ def measure(name: str, scene_name: str, tets: int | None, plans: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("source", help="a source of csrc/cuda without its .cu")
+    parser.add_argument("source", help="a source of csrc without its .cu")
     parser.add_argument("scene")
     parser.add_argument("--patch", type=Path, nargs="*", default=[])
     parser.add_argument("--tets", type=int, nargs="*", default=[None])

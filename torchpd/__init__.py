@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 from . import shapes
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
-from .embedding import Embedding, embed
+from .embedding import Embedding
 from .extension import extension_error, load_extension
-from .mesh import MeshWarning, TetMesh, TriMesh
+from .mesh import MeshWarning, TetMesh, embed
 from .scene import Scene
 from .solvers import Chebyshev, Jacobi, Multilevel
 from .state import Info, State, Track
 from .synonyms import no_attribute
 from .tetrahedralize import tetrahedralize
+from .tri_mesh import TriMesh
 from .version import __version__
 from .warn import SceneWarning, TuningWarning
 

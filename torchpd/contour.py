@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from .lattice import Lattice
-from .mesh import TriMesh
 from .mesh_faces import TET_FACES
+from .tri_mesh import TriMesh
 
 __all__ = ["contour"]
 

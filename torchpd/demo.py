@@ -15,16 +15,17 @@ from tqdm.auto import tqdm
 from . import shapes
 from .animation import write_film, write_surface
 from .convergence import SolvedAlreadyError, compare_solvers, plot_convergence
-from .doctor import OPTIONAL, missing_packages
 from .effects import Gravity, Ground, Solid
 from .formats.bodies import holds_body
-from .mesh import TetMesh, TriMesh
+from .mesh import TetMesh
+from .packages import OPTIONAL, missing_packages
 from .placing import find_device
 from .render import Studio, contact_sheet
 from .scene import Scene
 from .simulator import Simulator
 from .state import State, Track
 from .tetrahedralize import tetrahedralize
+from .tri_mesh import TriMesh
 
 __all__ = ["DemoOptions", "check_packages", "run_demo"]
 

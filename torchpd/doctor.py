@@ -6,7 +6,6 @@ Works without the compiled extension, because its absence is the first thing to 
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
 import os
 import platform
 import signal
@@ -14,47 +13,19 @@ import subprocess
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
 from .extension import BUILD_COMMAND, load_extension
 from .gpu import DOCTOR, LEAST_CAPABILITY, why_not
+from .packages import OPTIONAL, REQUIRED, Package, is_installed, missing_packages
 from .toolkit import Toolkit, find_toolkit
 from .version import __version__
 
-__all__ = ["Package", "missing_packages", "notes", "problems", "report"]
+__all__ = ["notes", "problems", "report"]
 
 
-class Package(NamedTuple):
-    """A package that torchpd can use."""
-
-    module: str
-    pip_name: str
-    purpose: str
-
-
-REQUIRED = (
-    Package("torch", "torch", ""),
-    Package("numpy", "numpy", ""),
-    Package("scipy", "scipy", ""),
-    Package("trimesh", "trimesh", ""),
-    Package("meshio", "meshio", ""),
-    Package("safetensors", "safetensors", ""),
-    Package("tqdm", "tqdm", ""),
-)
-OPTIONAL = (
-    Package("mitsuba", "mitsuba", "pictures"),
-    Package("matplotlib", "matplotlib", "plots"),
-    Package("plotly", "plotly", "reports of studies"),
-    Package("threadpoolctl", "threadpoolctl", "times of studies"),
-    Package("PIL", "pillow", "pictures"),
-    Package("imageio", "imageio", "GIF"),
-    Package("imageio_ffmpeg", "imageio-ffmpeg", "MP4"),
-    Package("pygltflib", "pygltflib", "glTF files"),
-    Package("pxr", "usd-core", "USD files"),
-    Package("pytetwild", "pytetwild", 'tetrahedralize(method="tetwild")'),
-)
 # a wrong argument of an op, which has to raise ValueError and say what came
 _WRONG_CALL = """
 import torch, torchpd
@@ -72,15 +43,6 @@ def _load_build() -> tuple[Mapping[str, Any] | None, str]:
     return (None, reason) if extension is None else (extension.build_info(), "")
 
 
-def _installed(package: Package) -> bool:
-    return importlib.util.find_spec(package.module) is not None
-
-
-def missing_packages(packages: Iterable[Package]) -> list[Package]:
-    """Those of the packages that cannot be imported."""
-    return [package for package in packages if not _installed(package)]
-
-
 def _version(package: Package) -> str:
     # of what this process runs: the metadata of torch leave out which CUDA it was built for
     loaded = getattr(sys.modules.get(package.module), "__version__", None)
@@ -89,7 +51,7 @@ def _version(package: Package) -> str:
     try:
         return importlib.metadata.version(package.pip_name)
     except importlib.metadata.PackageNotFoundError:
-        return "present, version unknown" if _installed(package) else "missing"
+        return "present, version unknown" if is_installed(package) else "missing"
 
 
 def _devices() -> list[tuple[str, str]]:
@@ -195,7 +157,7 @@ def _build_rows() -> list[tuple[str, str]]:
 
 
 def _optional_row(package: Package) -> tuple[str, str]:
-    if _installed(package):
+    if is_installed(package):
         return package.pip_name, f"{_version(package)} ({package.purpose})"
     return package.pip_name, f"missing; for {package.purpose}: pip install {package.pip_name}"
 

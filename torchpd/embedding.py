@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from .mesh import TetMesh, TriMesh
 from .mesh_checks import warn
 from .mesh_faces import TET_FACES
 from .quality import shape_gradients
+from .tri_mesh import TriMesh
 
-__all__ = ["Embedding", "embed", "embed_triangles"]
+__all__ = ["Embedding", "embed_surface", "embed_triangles"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -110,38 +110,31 @@ def _weights(points: Array, origins: Array, gradients: Array) -> Array:
     return np.asarray(weights)
 
 
-def embed(surface: TriMesh, mesh: TetMesh) -> Embedding:
-    """Embed a surface in any tetrahedral mesh: each vertex in the tet that contains it, or else the least distant one.
-
-    A vertex outside of the mesh is extrapolated, with negative weights. Where one is farther outside than its tet is
-    long, a `MeshWarning` says how far: a small strain of that tet moves it by more than the strain.
-    """
-    for name, value, kind in (("surface", surface, TriMesh), ("mesh", mesh, TetMesh)):
-        if not isinstance(value, kind):
-            raise TypeError(f"embed: {name} must be a {kind.__name__}, got {type(value).__name__}")
-    points, corners = surface.vertices, mesh.vertices[mesh.tets]
-    gradients, _ = shape_gradients(mesh.vertices, mesh.tets)
+def embed_surface(surface: TriMesh, vertices: Array, tets: Index) -> Embedding:
+    """`embed` for a mesh of vertices [V, 3] and tets [E, 4]."""
+    points, corners = surface.vertices, vertices[tets]
+    gradients, _ = shape_gradients(vertices, tets)
     centres = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
     # A tet contains only points of the ball around its centre through its farthest corner (widened for rounding).
     found = cKDTree(points).query_ball_point(centres, radii * (1.0 + 1e-9))
     sizes = np.fromiter(map(len, found), dtype=np.int64, count=len(found))
     which = np.fromiter(chain.from_iterable(found), dtype=np.int64, count=int(sizes.sum()))
-    tets = np.repeat(np.arange(len(centres)), sizes)
+    carriers = np.repeat(np.arange(len(centres)), sizes)
     # Points outside of every tet compete among their nearest tets.
     near = cKDTree(centres).query(points, k=min(_NEAREST, len(centres)))[1].reshape(len(points), -1)
     which = np.concatenate([which, np.repeat(np.arange(len(points)), near.shape[1])])
-    tets = np.concatenate([tets, near.reshape(-1)])
+    carriers = np.concatenate([carriers, near.reshape(-1)])
     # The signed distance to the plane of face a is w_a / |grad N_a|. A tet contains the point where the least over a is
     # not negative, and else is at least as far away as that.
-    weights = _weights(points[which], corners[tets, 0], gradients[tets])
-    depth = (weights / np.linalg.norm(gradients[tets], axis=2)).min(axis=1)
-    distance = _distances(points, which, corners, tets, weights, depth)
-    order = np.lexsort((tets, -depth, distance, which))
+    weights = _weights(points[which], corners[carriers, 0], gradients[carriers])
+    depth = (weights / np.linalg.norm(gradients[carriers], axis=2)).min(axis=1)
+    distance = _distances(points, which, corners, carriers, weights, depth)
+    order = np.lexsort((carriers, -depth, distance, which))
     best = order[np.unique(which[order], return_index=True)[1]]
-    chosen = tets[best]
+    chosen = carriers[best]
     _report_far(corners[chosen], distance[best])
-    return Embedding(surface, chosen, weights[best], mesh.tets[chosen], len(mesh.vertices))
+    return Embedding(surface, chosen, weights[best], tets[chosen], len(vertices))
 
 
 def _distances(points: Array, which: Index, corners: Array, tets: Index, weights: Array, depth: Array) -> Array:
@@ -195,9 +188,9 @@ def _report_far(corners: Array, distance: Array) -> None:
         )
 
 
-def embed_triangles(mesh: TetMesh, triangles: Index) -> Embedding:
-    """A surface whose corners are vertices of the mesh itself: each has weight 1 at that vertex, in its first tet."""
+def embed_triangles(vertices: Array, tets: Index, triangles: Index) -> Embedding:
+    """A surface of mesh vertices, given by their numbers [T, 3]: each has weight 1 at that vertex, in its first tet."""
     used, numbers = np.unique(triangles, return_inverse=True)
-    surface = TriMesh(mesh.vertices[used], numbers.reshape(-1, 3))
-    tets, corner = np.divmod(np.unique(mesh.tets.reshape(-1), return_index=True)[1][used], 4)
-    return Embedding(surface, tets, np.eye(4)[corner], mesh.tets[tets], len(mesh.vertices))
+    surface = TriMesh(vertices[used], numbers.reshape(-1, 3))
+    carriers, corner = np.divmod(np.unique(tets.reshape(-1), return_index=True)[1][used], 4)
+    return Embedding(surface, carriers, np.eye(4)[corner], tets[carriers], len(vertices))

@@ -17,9 +17,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .lattice import Lattice, candidates, split_long
-from .mesh import TriMesh
 from .mesh_checks import find_repeated
 from .mesh_faces import numbered
+from .tri_mesh import TriMesh
 
 __all__ = ["LEAST_FILL", "Parts", "inside_share", "parts_of"]
 

@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 
 from .checks import as_array, check_finite, check_shape
 from .contour import contour
-from .mesh import TriMesh
 from .mesh_checks import compact
 from .patch_checks import angle_weighted_normals, check_surface
 from .simplify import simplify
+from .tri_mesh import TriMesh
 
 __all__ = ["CloudTarget", "FieldTarget", "FitTarget", "MeshTarget", "along", "base_triangles", "project", "target_of"]
 

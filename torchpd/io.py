@@ -25,11 +25,12 @@ from .automatic import Choice
 from .checks import check_target_file
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .embedding import Embedding
-from .mesh import TetMesh, TriMesh, trusted
+from .mesh import TetMesh, trusted
 from .mesh_checks import store
 from .pins import PIN_HARD
 from .scene import Part, Scene
 from .solvers import Chebyshev, Jacobi, Multilevel, Solver
+from .tri_mesh import TriMesh
 from .version import __version__
 
 __all__ = ["FORMAT_VERSION", "SavedSimulation", "load_simulation", "reading", "save_simulation"]

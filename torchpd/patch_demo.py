@@ -16,7 +16,6 @@ from tqdm.auto import tqdm
 from .animation import write_surface
 from .demo import TIME_STEP, DemoOptions, check_packages
 from .effects import Damping, Gravity, Ground, Pin
-from .mesh import TriMesh
 from .patch_body import PatchBody
 from .patch_mesh import tessellate
 from .patches import FreeFormPatches
@@ -26,6 +25,7 @@ from .render import Picture, Studio, contact_sheet
 from .scene import Scene
 from .seams import Seams, measure_seams
 from .simulator import Simulator
+from .tri_mesh import TriMesh
 
 __all__ = ["PAPER_SCENES", "PatchScene", "PatchSubject", "run_patch_demo"]
 

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .mesh import TriMesh
 from .patch_surface import PatchPose, PatchSamples, PatchSurface
 from .reprs import by_fields
+from .tri_mesh import TriMesh
 
 __all__ = ["Tessellation", "tessellate"]
 

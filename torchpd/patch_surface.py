@@ -15,12 +15,12 @@ from torch import Tensor
 
 from . import patch_ops  # noqa: F401  (registers the ops)
 from .checks import check_scalar
-from .mesh import TriMesh
 from .mesh_checks import store
 from .patch_checks import angle_weighted_normals, check_surface
 from .patch_lists import Touching, gather_lists, touching
 from .quadrics import Quadrics, check_real_tensor, dimensions, matrix_sets
 from .reprs import by_sizes
+from .tri_mesh import TriMesh
 
 if TYPE_CHECKING:
     from typing_extensions import Self

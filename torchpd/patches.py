@@ -10,7 +10,6 @@ import torch
 
 from .checks import check_scalar, check_whole
 from .fit_targets import base_triangles, target_of
-from .mesh import TriMesh
 from .patch_fit import FitReport, fit_quadrics
 from .patch_image import PatchImage, render_patches
 from .patch_io import load_patches, save_patches
@@ -18,6 +17,7 @@ from .patch_mesh import Tessellation, tessellate
 from .patch_rays import SurfaceRays
 from .patch_surface import PatchPose, PatchSurface
 from .render import Camera
+from .tri_mesh import TriMesh
 
 __all__ = ["FreeFormPatches", "PatchFit", "PatchRays", "fit_patches"]
 

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array, diags_array, kron
 
-from .reference_rigid import align, begin, gaps_of
+from .reference_piece import gaps_of
+from .reference_rigid import align, begin
 from .scene import SceneValues
 
 __all__ = [
@@ -243,18 +244,18 @@ class StepProblem:
             guesses = {"velocity": self.time_step * self.velocities, "inertial": self.target}
             if start not in guesses:
                 raise ValueError(f'start must be "velocity", "inertial" or positions [V, 3], got "{start}"')
-            guess = self._hold(guesses[start])
+            guess = self.hold(guesses[start])
             begun = begin(self, guess, self.weighted_diagonal if weighted else self.plain_diagonal)
             return self.align(begun, first=True)
-        guess = self._hold(np.asarray(start, dtype=np.float64) - self.positions)
+        guess = self.hold(np.asarray(start, dtype=np.float64) - self.positions)
         return self.project(guess, guess)
 
     def course(self) -> Array:
         """h v, on the pins and out of the contacts."""
-        guess = self._hold(self.time_step * self.velocities)
+        guess = self.hold(self.time_step * self.velocities)
         return self.project(guess, guess)
 
-    def _hold(self, displacement: Array) -> Array:
+    def hold(self, displacement: Array) -> Array:
         return np.where(self.free[:, None], displacement, self.target)
 
     def align(self, displacement: Array, *, first: bool = False) -> Array:

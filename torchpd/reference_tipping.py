@@ -7,19 +7,15 @@ they have converged.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from .reference_rigid import Piece
+from .reference_piece import LYING, Piece, axis_of, part_of, rotation_about, turn_about
 
-__all__ = ["LYING", "Tipping", "part_of", "turn_about"]
+__all__ = ["Tipping"]
 
 Array = NDArray[np.float64]
 
-LYING = 0.01  # of the way that a plane stops: a vertex lies on it that is no further off
 TOUCHING = 1e-3  # of that: vertices may go so deep, and are lifted out again
 ROUNDED = 0.1  # the same of those that it turns about
 RESTING = 0.5  # square of how far off pressure is, by the spread of what lies on the plane
@@ -31,7 +27,6 @@ DOUBT = 2.0  # of friction whose direction differs between two vertices, by that
 NEWTON = 8  # steps to a balance of torques
 ONWARD = 0.9  # least cosine between a slip before and after
 UPHILL = 1e-9  # what rounding may add to the energy, of that of the way that it goes
-HALF_TURN = 1e-6  # 4 cos^2(angle / 2), at most, of what counts as half a turn
 
 
 class Tipping:
@@ -291,17 +286,17 @@ class Tipping:
             at = turn @ arm
             product = piece.covariance @ turn.T
             lift = weight * (float(n @ (arm - at - piece.lag)) - drop)
-            torque = _axis(product) + lift * np.cross(at, force)
+            torque = axis_of(product) + lift * np.cross(at, force)
             slope = np.trace(product) * np.eye(3) - product.T
             slope += weight * np.outer(np.cross(at, force), np.cross(at, n))
             slope += lift * ((at @ force) * np.eye(3) - np.outer(at, force))
             if not rolls:
                 yaw = float(force @ torque / (force @ slope @ n))
-                turn = _rotation(yaw * n) @ turn
+                turn = rotation_about(yaw * n) @ turn
                 size = abs(yaw)
             elif axis is None:
                 step = np.linalg.solve(slope, torque)
-                turn = _rotation(step) @ turn
+                turn = rotation_about(step) @ turn
                 size = float(np.linalg.norm(step))
             else:
                 # friction acts where the push has its centre: across n x line and force nothing is known of it
@@ -310,39 +305,8 @@ class Tipping:
                 slopes = tests @ slope @ basis
                 slopes[0, 1] -= np.cross(n, line) @ torque
                 roll, yaw = np.linalg.solve(slopes, tests @ torque)
-                turn = _rotation(yaw * n) @ _rotation(roll * line) @ turn
+                turn = rotation_about(yaw * n) @ rotation_about(roll * line) @ turn
                 size = float(np.hypot(roll, yaw))
             if size < 1e-14:
                 break
         return turn if size < 1e-9 else None
-
-
-def _axis(matrix: Array) -> Array:
-    """Twice the axis of the skew part."""
-    return np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
-
-
-def _rotation(half: Array) -> Array:
-    """By Cayley's formula, about an axis by 2 atan(|v| / 2)."""
-    v = 0.5 * half
-    skew = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    return np.asarray(np.eye(3) + 2.0 / (1.0 + v @ v) * (skew + skew @ skew))
-
-
-def part_of(turn: Array, share: float) -> Array:
-    """About that share of a turn: Cayley's vector of it times `share`; none of half a turn, which has no axis."""
-    if share == 1.0:
-        return turn
-    left = 1.0 + float(np.trace(turn))
-    return _rotation(share * 2.0 / left * _axis(turn)) if left > HALF_TURN else np.eye(3)
-
-
-def turn_about(normal: Array, covariance: Array) -> Array:
-    """The rotation R about a normal that maximises tr(R^T covariance), by its angle."""
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    first /= np.linalg.norm(first)
-    frame = np.stack([first, np.cross(normal, first)])
-    flat = frame @ covariance @ frame.T
-    angle = np.arctan2(flat[1, 0] - flat[0, 1], flat[0, 0] + flat[1, 1])
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return np.asarray(np.outer(normal, normal) + frame.T @ turn @ frame)

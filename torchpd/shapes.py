@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from .checks import as_array, check_scalar, check_vector
 from .contour import contour
-from .mesh import TetMesh, TriMesh
+from .mesh import TetMesh
+from .tri_mesh import TriMesh
 
 __all__ = ["box", "octopus", "single_tet"]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .checks import check_scalar
-from .mesh import TriMesh
+from .tri_mesh import TriMesh
 
 __all__ = ["simplify"]
 

@@ -21,8 +21,8 @@ from tqdm.auto import tqdm
 from .baselines import BASELINES
 from .contenders import CONTENDERS, DEFAULT
 from .dense_direct import DENSE
-from .doctor import OPTIONAL, missing_packages
 from .ledger import Ledger, Row, write_csv
+from .packages import OPTIONAL, missing_packages
 from .placing import find_device
 from .provenance import describe_run
 from .study_axes import (

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from . import shapes
 from .effects import Gravity, Ground, Pin, Solid
 from .formats.bodies import holds_body
-from .mesh import TetMesh, TriMesh
+from .mesh import TetMesh
 from .scene import Scene
 from .simulator import Simulator
 from .state import State
 from .tetrahedralize import tetrahedralize
+from .tri_mesh import TriMesh
 
 __all__ = ["SCENES", "SUBJECTS", "Subject", "subject_of"]
 

@@ -15,13 +15,14 @@ from scipy.sparse.csgraph import connected_components
 from tqdm.auto import tqdm
 
 from .checks import check_scalar
-from .embedding import Embedding, embed
+from .embedding import Embedding
 from .fill import LEAST_FILL, Parts, inside_share, parts_of
 from .lattice import Lattice
-from .mesh import TetMesh, TriMesh
+from .mesh import TetMesh, embed
 from .mesh_checks import warn
 from .mesh_faces import TET_FACES, match_faces
 from .synonyms import check_arguments
+from .tri_mesh import TriMesh
 from .units import Unit
 
 __all__ = ["tetrahedralize"]
