@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +13,10 @@ import pytest
 import torch
 from test_regimes import values_of
 
-from torchpd import kernel_costs
+from torchpd import kernel_benchmark, kernel_costs
 from torchpd.gpu import H100, Properties
 from torchpd.kernel_costs import clusters_together, iteration_microseconds, kernel_microseconds
+from torchpd.plan import Plan
 from torchpd.regimes import choose_plan, shared_bytes
 
 # of those that benchmarks/kernels_by_batch.py measures, what is quickly made
@@ -108,3 +111,30 @@ def test_blocks_are_shaped_for_the_environments_of_a_multiprocessor() -> None:
 
     assert [environments("block", batch) for batch in (None, 1, 132, 133, 8192, 1 << 40)] == [0, 1, 1, 2, 63, 1 << 20]
     assert environments("grid", 8192) == 0
+
+
+def test_benchmark_takes_the_quickest_of_the_kernels_that_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each is timed once, and not again for the same sizes; one that wants too much memory is not taken."""
+    monkeypatch.setattr(kernel_benchmark, "_TIMES", {})
+    milliseconds = {"block": 3.0, "cluster": math.inf, "grid": 2.0, "stream": 9.0}
+    timed = []
+
+    def time(step: object, plan: Plan) -> float:
+        timed.append(plan.kernel)
+        return milliseconds[str(plan.kernel)]
+
+    monkeypatch.setattr(kernel_benchmark, "_milliseconds", time)
+    values = values_of((5, 5, 5))
+
+    def chosen(batch: int) -> Plan:
+        pick = partial(kernel_benchmark.quickest_plan, key=batch, step=lambda plan: lambda: None)
+        return choose_plan(values, torch.float32, H100, "benchmark", batch=batch, quickest=pick)
+
+    plan = chosen(16)
+    assert plan.kernel == "grid"
+    assert plan.why.endswith("grid 2 ms, block 3 ms, stream 9 ms, cluster inf ms")
+    assert sorted(timed) == ["block", "cluster", "grid", "stream"]
+    assert chosen(16).kernel == "grid"
+    assert len(timed) == 4
+    milliseconds["grid"] = 4.0
+    assert chosen(17).kernel == "block"
