@@ -12,12 +12,41 @@ from dataclasses import replace
 
 import torch
 
+from .compiled import CompiledScene
 from .plan import Plan
 
-__all__ = ["quickest_plan"]
+__all__ = ["quickest_plan", "steps_of"]
 
 _REPETITIONS = 5
 _TIMES: dict[Hashable, dict[str, float]] = {}  # milliseconds of a step by kernel
+
+
+def steps_of(
+    scene: CompiledScene, dtype: torch.dtype, device: torch.device
+) -> tuple[Hashable, Callable[[Plan], Callable[[], object]]]:
+    """`key` and `step` of `quickest_plan` for a scene on a GPU: what times depend on, and steps from rest."""
+    values, batch = scene.scene.values(), scene.environments
+    numbers = {
+        **scene.solver.numbers(),
+        "iterations": scene.iterations,
+        "time_step": scene.time_step,
+        "tolerance": 0.0,
+        "inertial": False,
+        "report": False,
+    }
+    key = (
+        torch.cuda.get_device_name(device), dtype, len(values.tets), len(values.rest_positions), len(values.planes),
+        len(values.spheres), len(values.pin_vertices), batch, scene.iterations, scene.solver,
+    )  # fmt: skip
+
+    def step(plan: Plan) -> Callable[[], object]:
+        rest = torch.as_tensor(values.rest_positions).to(device, dtype).expand(batch, -1, -1).contiguous()
+        material = [array.detach().to(device, dtype) for array in scene.material]
+        arrays = list(plan.to(device).arrays)
+        still = torch.zeros_like(rest)
+        return lambda: torch.ops.torchpd.step(rest, still, None, None, material, arrays, **numbers)
+
+    return key, step
 
 
 def quickest_plan(plans: Iterator[Plan], key: Hashable, step: Callable[[Plan], Callable[[], object]]) -> Plan:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from . import _C
 from .compiled import CompiledScene
 from .diagonal import pinned_vertices
 from .gpu import free_memory, properties_of, refuse_full_memory, seen_devices, why_not
+from .kernel_benchmark import quickest_plan, steps_of
 from .material import in_order, material_of
 from .multilevel import Reference, has_levels, precondition_plan, reference_of, reference_of_levels, without_levels
 from .plan import Plan, compile_plan, with_loose_pieces
@@ -92,9 +94,12 @@ def _compile(scene: CompiledScene, dtype: torch.dtype, device: torch.device, loo
     values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
         return compile_plan(values, dtype=dtype, progress=scene.progress)
-    levels = isinstance(scene.solver, Multilevel)
-    gpu = properties_of(device)
-    return choose_plan(values, dtype, gpu, scene.kernel, levels=levels, batch=scene.batch, progress=scene.progress)
+    key, step = steps_of(scene, dtype, device)
+    return choose_plan(
+        values, dtype, properties_of(device), scene.kernel,
+        levels=isinstance(scene.solver, Multilevel), batch=scene.batch, progress=scene.progress,
+        quickest=partial(quickest_plan, key=key, step=step),
+    )  # fmt: skip
 
 
 def _wants_levels(scene: CompiledScene) -> bool:
