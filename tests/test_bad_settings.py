@@ -79,7 +79,7 @@ def test_settings_that_are_replaced_are_checked() -> None:
     for value in ("a", None, -1, math.nan):
         with pytest.raises(ValueError, match=rf"time_step must be positive and finite \[s\], got {value!r}"):
             sim.time_step = value  # type: ignore[assignment]
-    with pytest.raises(ValueError, match=r'kernel must be "auto", "block", .*, got \'foo\''):
+    with pytest.raises(ValueError, match=r'kernel must be "auto", "benchmark", .*, got \'foo\''):
         sim.kernel = "foo"
     with pytest.raises(ValueError, match=r"iterations must be a whole number >= 0, got None"):
         sim.iterations = None  # type: ignore[assignment]

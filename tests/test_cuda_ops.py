@@ -32,6 +32,7 @@ from runs import ULP, moving, noise, numbers_of, plan_of, same_bits, simulate, s
 from torch import Tensor
 
 import torchpd as pd
+from torchpd import kernel_benchmark
 from torchpd.gpu import properties_of
 
 require_gpu()
@@ -398,3 +399,18 @@ def test_more_numbers_than_32_bits_count(kernel: str) -> None:
     worst = max(float((part - expected.positions[0]).abs().max()) for part in state.positions.split(1 << 16))
     assert worst == 0.0
     assert np.isfinite(worst)
+
+
+def test_benchmark_times_every_kernel_once_and_steps_with_the_quickest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_benchmark, "_TIMES", {})
+    case = bar((6, 2, 2))
+    sim = simulator(case, torch.float32, GPU, kernel="benchmark", batch=4)
+    (times,) = kernel_benchmark._TIMES.values()
+    assert times.keys() >= {"block", "grid", "stream"}
+    assert sim.plan.kernel == min(times, key=lambda kernel: times[kernel])
+    assert "the quickest of those timed" in repr(sim)
+    asked = simulator(case, torch.float32, GPU, kernel=str(sim.plan.kernel), batch=4)
+    state = sim.rest_state(batch=4)
+    assert torch.equal(sim(state).positions, asked(state).positions)
+    simulator(case, torch.float32, GPU, kernel="benchmark", batch=4)
+    assert len(kernel_benchmark._TIMES) == 1

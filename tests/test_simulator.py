@@ -166,7 +166,7 @@ def test_kernel_changes_nothing_on_the_cpu(dtype: torch.dtype) -> None:
     state = moving(sim)
     for kernel in KERNELS:
         assert same_bits(simulate(dtype, kernel=kernel)(state), sim(state))
-    refusal = 'kernel must be "auto", "block", "cluster", "grid" or "stream", got \'warp\''
+    refusal = 'kernel must be "auto", "benchmark", "block", "cluster", "grid" or "stream", got \'warp\''
     with pytest.raises(ValueError, match=refusal):
         simulate(dtype, kernel="warp")
 

@@ -1,13 +1,15 @@
-"""About how long an iteration of a step takes with each kernel of a GPU, whatever the number of environments.
+"""About how long an iteration takes with each kernel of a GPU, from seven numbers: the rule behind `kernel="auto"`.
 
-Fitted to steps of 64 iterations on an H100, a share of what a step costs beside them included: Chebyshev with the
-guard, regular bars of 64 to 38,125 vertices in batches of 1 to 8192, by `benchmarks/kernels_by_batch.py`, which shows
-what it measures beside these. What matters is which kernel takes least, so other GPUs need only be alike in proportion.
+    time = turns (latency + rate tets),   tets: those of one environment on its busiest multiprocessor
+
+A multiprocessor takes `rate` microseconds for a tetrahedron, whatever the kernel; a kernel adds its latency, and what
+does not run at once takes turns. The numbers are rounded from Chebyshev steps on an H100, 64 to 38,125 vertices
+(`benchmarks/kernels_by_batch.py`): in 218 batches the kernel with the least time here takes at most 1.02 times as long
+as the quickest. The times themselves are within a third of the measured ones in float32, within 1.8 times in float64.
+Only the order of the kernels matters, so that other GPUs need only be alike in proportion.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import torch
 
@@ -15,41 +17,15 @@ from . import _C
 from .gpu import Properties
 from .plan import Plan
 
-__all__ = [
-    "block_microseconds",
-    "clusters_together",
-    "grid_microseconds",
-    "iteration_microseconds",
-    "stream_microseconds",
-]
+__all__ = ["clusters_together", "iteration_microseconds", "kernel_microseconds"]
 
-
-class _Fit(NamedTuple):
-    """Microseconds of an iteration, and microseconds that each tetrahedron adds."""
-
-    small_block: tuple[float, float]  # alone, a block waits: of a mesh so small that many may share one
-    block: tuple[float, float]  # of others
-    full_block: tuple[float, float]  # many are issued by one multiprocessor
-    cluster: tuple[float, float]  # of one that runs with others, whatever the patches
-    grid: tuple[float, float]  # of a patch
-    least_grid: float  # an exchange takes so long
-    stream: tuple[float, float]  # of all environments
-
-
-_FITS = {
-    torch.float32: _Fit((1.2, 1.0e-3), (1.5, 1.5e-3), (0.5, 2.0e-3), (1.1, 1.3e-4), (1.7, 2.0e-3), 1.9, (7.0, 1.75e-5)),
-    torch.float64: _Fit((2.0, 4.7e-3), (2.0, 4.7e-3), (0.5, 6.4e-3), (1.5, 6.0e-4), (1.5, 7.2e-3), 2.8, (8.0, 7.4e-5)),
-}
-_MEASURED_ON = 132  # multiprocessors
-_SMALL_TETS = 2 * _C.most_sharing_pairs  # where all have partners
+_LATENCY = {"block": 1.0, "cluster": 1.0, "grid": 1.6, "stream": 8.0}
+_RATE = {torch.float32: 2.0e-3, torch.float64: 7.0e-3}
+_STREAM = 1.2  # times the rate: positions and forces pass through the GPU's memory
 # registers of a multiprocessor, and of a thread of a cluster (benchmarks/results/cuda-registers.csv)
 _REGISTERS, _CLUSTER_REGISTERS = 65536, {torch.float32: 168, torch.float64: 256}
 # multiprocessors that blocks of a cluster are neighbours in, and the share of a GPU that has as many together
 _NEIGHBOURS, _SHARE = 16, 7 / 8
-
-
-def _line(fit: tuple[float, float], tets: float) -> float:
-    return fit[0] + fit[1] * tets
 
 
 def clusters_together(plan: Plan, gpu: Properties) -> int:
@@ -63,26 +39,28 @@ def clusters_together(plan: Plan, gpu: Properties) -> int:
     return max(1, groups * (each * _NEIGHBOURS // plan.patches))
 
 
-def block_microseconds(tets: int, batch: int, dtype: torch.dtype, gpu: Properties) -> float:
-    """With a block an environment, or several small ones."""
-    each = -(-batch // gpu.multiprocessors)
-    fit = _FITS[dtype]
-    alone = fit.small_block if tets <= _SMALL_TETS else fit.block
-    return max(_line(alone, tets), _line(fit.full_block, each * tets))
+def kernel_microseconds(
+    kernel: str, patches: int, tets: int, batch: int, dtype: torch.dtype, gpu: Properties, together: int = 1
+) -> float:
+    """Of an iteration of a whole batch.
 
-
-def grid_microseconds(tets: int, patches: int, batch: int, dtype: torch.dtype, gpu: Properties) -> float:
-    """With a block a patch; as many environments at a time as leave every block a multiprocessor.
-
-    Very small patches share one, and take less than this where there are many; then another kernel takes less still.
+    Args:
+        kernel: "block", "cluster", "grid" or "stream".
+        patches: blocks of one environment, for "cluster" and "grid".
+        tets: tetrahedra of one environment.
+        batch: environments.
+        dtype: precision.
+        gpu: what the device has.
+        together: environments that run at a time, for "cluster"; see `clusters_together`.
     """
-    turns = -(-batch // max(1, gpu.multiprocessors // patches))
-    return turns * max(_FITS[dtype].least_grid, _line(_FITS[dtype].grid, tets / patches))
-
-
-def stream_microseconds(tets: int, batch: int, dtype: torch.dtype, gpu: Properties) -> float:
-    """With launches for every iteration."""
-    return _line(_FITS[dtype].stream, _MEASURED_ON / gpu.multiprocessors * tets * batch)
+    latency, rate = _LATENCY[kernel], _RATE[dtype]
+    if kernel == "stream":
+        return latency + _STREAM * rate * tets * batch / gpu.multiprocessors
+    if kernel == "block":
+        return latency + rate * tets * -(-batch // gpu.multiprocessors)
+    if kernel == "grid":
+        together = max(1, gpu.multiprocessors // patches)
+    return -(-batch // together) * (latency + rate * tets / patches)
 
 
 def iteration_microseconds(
@@ -97,11 +75,6 @@ def iteration_microseconds(
         gpu: what the device has.
         dtype: precision to take instead of the plan's.
     """
-    dtype = plan.dtype if dtype is None else dtype
-    if plan.kernel == "block":
-        return block_microseconds(tets, batch, dtype, gpu)
-    if plan.kernel == "cluster":
-        return -(-batch // clusters_together(plan, gpu)) * _line(_FITS[dtype].cluster, tets)
-    if plan.kernel == "grid":
-        return grid_microseconds(tets, plan.patches, batch, dtype, gpu)
-    return stream_microseconds(tets, batch, dtype, gpu)
+    kernel = str(plan.kernel)
+    together = clusters_together(plan, gpu) if kernel == "cluster" else 1
+    return kernel_microseconds(kernel, plan.patches, tets, batch, dtype or plan.dtype, gpu, together)

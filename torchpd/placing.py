@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from .checks import plain_tensor
 from .compiled import CompiledScene
 from .diagonal import pinned_vertices
 from .gpu import free_memory, properties_of, refuse_full_memory, seen_devices, why_not
+from .kernel_benchmark import quickest_plan, steps_of
 from .material import in_order, material_of
 from .multilevel import Reference, has_levels, precondition_plan, reference_of, reference_of_levels, without_levels
 from .plan import Plan, compile_plan, with_loose_pieces
@@ -92,11 +94,12 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
     values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
         return compile_plan(values, dtype=dtype, progress=compiled.progress)
-    levels = isinstance(compiled.solver, Multilevel)
-    gpu = properties_of(device)
+    key, step = steps_of(compiled, dtype, device)
     return choose_plan(
-        values, dtype, gpu, compiled.kernel, levels=levels, batch=compiled.batch, progress=compiled.progress
-    )
+        values, dtype, properties_of(device), compiled.kernel,
+        levels=isinstance(compiled.solver, Multilevel), batch=compiled.batch, progress=compiled.progress,
+        quickest=partial(quickest_plan, key=key, step=step),
+    )  # fmt: skip
 
 
 def _wants_levels(compiled: CompiledScene) -> bool:

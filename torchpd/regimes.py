@@ -9,7 +9,7 @@
 
 Where the number of environments is known (`Simulator(batch=...)`), the kernel that fits and should take least is taken,
 by `kernel_costs`: a cluster for a few environments of a small mesh, launches for many of a large one, and between them
-a grid, of fewer and larger patches the more environments are to run at a time.
+a grid, of fewer and larger patches the more environments are to run at a time. "benchmark" times each that fits.
 Every vertex belongs to one patch of a cluster, and a patch has every tetrahedron that touches one of its own vertices:
 those at the borders are worked out by several. So no forces are exchanged, and once an iteration the new position of a
 vertex is sent into the shared memory of the patches that have a copy of it. Patches of the others share no tetrahedra,
@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ import torch
 from . import _C
 from .device_plan import compile_device_plan
 from .gpu import Properties
-from .kernel_costs import block_microseconds, grid_microseconds, iteration_microseconds, stream_microseconds
+from .kernel_costs import iteration_microseconds, kernel_microseconds
 from .plan import KERNELS, Plan, any_of
 from .scene import SceneValues
 from .tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
@@ -60,8 +60,8 @@ _MOST_FIELDS = 2  # of a pass: the products with a second derivative
 
 
 def check_kernel(kernel: str) -> str:
-    """The name of a kernel, or "auto"."""
-    names = ("auto", *KERNELS)
+    """The name of a kernel, "auto" or "benchmark"."""
+    names = ("auto", "benchmark", *KERNELS)
     if kernel not in names:
         raise ValueError(f"Simulator: kernel must be {any_of(names)}, got {kernel!r}")
     return kernel
@@ -160,8 +160,11 @@ class _Scene(NamedTuple):
         """
         most = self.most_grid_patches(gpu)
         counts = {min(most, gpu.multiprocessors // together) for together in range(1, gpu.multiprocessors // 2 + 1)}
-        timed = [(grid_microseconds(self.tets, count, batch, self.dtype, gpu), count) for count in counts or {most}]
+        timed = [(self.microseconds("grid", count, batch, gpu), count) for count in counts or {most}]
         return sorted(timed, key=lambda offer: (offer[0], -offer[1]))
+
+    def microseconds(self, kernel: str, patches: int, batch: int, gpu: Properties) -> float:
+        return kernel_microseconds(kernel, patches, self.tets, batch, self.dtype, gpu)
 
     def most_own(self) -> int:
         """Vertices that a block of a cluster has threads for."""
@@ -227,33 +230,30 @@ def _grid_plan(scene: _Scene, gpu: Properties, batch: int | None) -> tuple[Plan 
     return plan, needed
 
 
-def _quickest_plan(scene: _Scene, gpu: Properties, batch: int) -> Plan:
-    """Of the kernels that fit the one that should take least for so many environments."""
+def _plans_that_fit(scene: _Scene, gpu: Properties, batch: int) -> Iterator[Plan]:
+    """A plan for every kernel that fits, first the one that should take least for so many environments."""
     cluster = _fused_plan(scene, "cluster", gpu)[0] if scene.considers("cluster", gpu) else None
     offers = [
-        (block_microseconds(scene.tets, batch, scene.dtype, gpu), "block", 1),
+        (scene.microseconds("block", 1, batch, gpu), "block", 1),
         *((time, "grid", patches) for time, patches in scene.grids(batch, gpu)),
-        (stream_microseconds(scene.tets, batch, scene.dtype, gpu), "stream", 0),
+        (scene.microseconds("stream", 0, batch, gpu), "stream", 0),
     ]
     if cluster is not None:
         offers.append((iteration_microseconds(cluster, scene.tets, batch, gpu), "cluster", cluster.patches))
-    too_few = 0  # patches of a grid
-    for time, kernel, patches in sorted(offers, key=lambda offer: offer[0]):
+    done, too_few = set(), 0  # kernels; patches of a grid
+    for _, kernel, patches in sorted(offers, key=lambda offer: offer[0]):
+        if kernel in done or (kernel == "grid" and patches <= too_few):
+            continue
         if kernel == "stream":
             plan: Plan | None = _stream_plan(scene, gpu)
-        elif kernel == "grid" and patches <= too_few:
-            continue
         else:
             plan = cluster if kernel == "cluster" else _fused_plan(scene, kernel, gpu, batch, patches)[0]
         if plan is not None:
-            return replace(plan, why=f"should be the quickest that fits, {_microseconds(time)} an iteration on an H100")
-        if kernel == "grid":
+            done.add(kernel)
+            count = f"{batch} environment" + "s" * (batch != 1)
+            yield replace(plan, why=f"of the kernels that fit, expected to be the quickest for {count}")
+        elif kernel == "grid":
             too_few = patches
-    raise AssertionError("a stream fits always")
-
-
-def _microseconds(time: float) -> str:
-    return f"about {time:.1f} us" if time < 10.0 else f"about {time:,.0f} us"
 
 
 def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
@@ -298,6 +298,7 @@ def choose_plan(
     levels: bool = False,
     batch: int | None = None,
     progress: bool = True,
+    quickest: Callable[[Iterator[Plan]], Plan] = next,
 ) -> Plan:
     """The plan of a scene for a GPU, on the CPU; move it with `Plan.to`.
 
@@ -306,16 +307,18 @@ def choose_plan(
         dtype: torch.float32 or torch.float64.
         gpu: what the device has.
         kernel: "auto" takes the first of "block", "cluster", "grid" and "stream" that fits, and where the batch is
-            known the quickest for it; a "cluster" where the GPU has them, and for a small mesh alone.
+            known the one that `kernel_costs` expects to be the quickest; a "cluster" where the GPU has them, and for
+            a small mesh alone. "benchmark" takes the one that `quickest` returns.
         levels: for a multilevel solver, which runs as "stream" does but for its iterations.
         batch: environments that a step will have; None: not known, which is between few and many.
         progress: show a bar when the mesh is large.
+        quickest: for "benchmark": takes a plan for every kernel that fits, see `kernel_benchmark`.
     """
     check_kernel(kernel)
     scene = _Scene(values, dtype, progress)
     size = "any" if batch is None else "many" if _MANY_SHARE * batch >= gpu.multiprocessors else "few"
     if levels:
-        if kernel not in ("auto", "stream"):
+        if kernel not in ("auto", "benchmark", "stream"):
             raise ValueError(
                 f'Simulator: Multilevel runs with kernel="stream" on a GPU, got kernel={kernel!r}; leave it at "auto"'
             )
@@ -326,8 +329,10 @@ def choose_plan(
             'capability 9.0), and this GPU has none; take "block", "grid" or "stream", or "auto", which takes one '
             "that fits"
         )
+    if kernel == "benchmark":
+        return quickest(_plans_that_fit(scene, gpu, 1 if batch is None else batch))
     if kernel == "auto" and batch is not None:
-        return _quickest_plan(scene, gpu, batch)
+        return next(_plans_that_fit(scene, gpu, batch))
     needs = []
     for name in ("block", "cluster", "grid"):
         if kernel != name and not (kernel == "auto" and scene.considers(name, gpu)):

@@ -63,8 +63,9 @@ class Simulator(Stepper):
             do, or what gravity does if that is more; 0 never. The error is judged by the changes of iterations and by
             how slow the slowest mode can be, from the weights of the step: see docs/limits.md.
         kernel: how a GPU is to step the scene after `.to("cuda")`: "block", "cluster", "grid" or "stream", see
-            `torchpd.regimes`; "auto" takes the first that fits, and with `batch` the quickest. `sim.kernel` may be
-            set later. Changes nothing on the CPU.
+            `torchpd.regimes`; "auto" takes the first that fits, and with `batch` the one expected to be the quickest.
+            "benchmark" times a few steps of each that fits, once a process, GPU and size. `sim.kernel` may be set
+            later. Changes nothing on the CPU.
         batch: environments that a step will have, where you know it: a GPU's kernel, its patches and thread blocks, the
             patches and preconditioner of `Multilevel` and the choice of "auto" are for so many. States of any batch may
             come, and an environment has the same bits in all of them, but takes longer in some; thread blocks of the
