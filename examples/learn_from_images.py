@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 
-import imageio.v3 as imageio
 import torch
 import trimesh
+from PIL import Image
 
 import torchpd as tpd
 from torchpd.render import Camera
@@ -79,7 +79,7 @@ def main() -> None:
         schedule.step()
     if options.out:
         rows = torch.cat([picture.transpose(0, 1).flatten(1, 2) for picture in pictures])
-        imageio.imwrite(options.out, (255 * rows.clamp(0, 1) ** (1 / 2.2)).byte().numpy())
+        Image.fromarray((255 * rows.clamp(0, 1) ** (1 / 2.2)).byte().numpy()).save(options.out)
 
 
 if __name__ == "__main__":

@@ -134,10 +134,10 @@ def test_gif_keeps_time_and_colours(tmp_path: Path) -> None:
     for number, image in enumerate(images):
         film.seek(number)
         milliseconds += film.info["duration"]
-        # half the dither and half a step of a palette of 256 colours
+        # half a step of a palette of 256 colours, and a dither about as high
         assert np.abs(np.asarray(film.convert("RGB")).astype(int) - image).mean() < 5.0
     assert film.n_frames == 8
-    assert milliseconds == 270  # 8/30 s in units of 1/100 s
+    assert abs(milliseconds - 8000 / 30) <= 10  # the unit of a delay: those of the frames are not rounded one by one
 
 
 def test_mp4_holds_every_picture(tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_mp4_holds_every_picture(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "module", "package"),
-    [("a.usdc", "pxr", "usd-core"), ("a.gif", "PIL", "Pillow"), ("a.mp4", "imageio_ffmpeg", "imageio-ffmpeg")],
+    [("a.usdc", "pxr", "usd-core"), ("a.glb", "pygltflib", "pygltflib"), ("a.mp4", "imageio_ffmpeg", "imageio-ffmpeg")],
 )
 def test_missing_packages_say_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str, package: str
@@ -163,7 +163,7 @@ def test_missing_packages_say_what_to_install(
     monkeypatch.setitem(sys.modules, module, None)
     frames, triangles = _motion(2)
     with pytest.raises(ModuleNotFoundError, match=rf"{package}: pip install torchpd\[demo\]"):  # noqa: PT012
-        if name == "a.usdc":
+        if name in ("a.usdc", "a.glb"):
             write_surface(tmp_path / name, frames, triangles, frames_per_second=1.0)
         else:
             write_film(tmp_path / name, _film(2, 16, 32), frames_per_second=1.0)

@@ -5,8 +5,7 @@ Lengths in m, y up, times in s, colours linear RGB in 0..1, images uint8 [H, W, 
 
 from __future__ import annotations
 
-import json
-import struct
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import as_array, check_finite, check_scalar, check_shape
+from .checks import as_array, check_finite, check_scalar, check_shape, optional_module
 from .shading import SmoothSurface
 
 __all__ = ["write_film", "write_surface"]
@@ -24,9 +23,14 @@ Picture = NDArray[np.uint8]
 Color = tuple[float, float, float]
 
 _ROUGHNESS = 0.4
-_DITHER = 6.0  # of 255: about what separates neighbouring colours of a palette made for a smooth background
-_GLTF_FLOAT, _GLTF_UINT = 5126, 5125
-_GLTF_VERTICES, _GLTF_INDICES = 34962, 34963
+# One palette for all frames, as separate ones flicker; its steps are hidden by a pattern that stays where it is, as
+# diffused errors shimmer.
+_PALETTE = "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=bayer:bayer_scale=4"
+# of an ending: what the sides of a picture are multiples of, most frames in a second, and what ffmpeg is told
+_FILMS: dict[str, tuple[int, float, dict[str, Any]]] = {
+    ".gif": (1, 50.0, {"codec": "gif", "pix_fmt_out": "pal8", "output_params": ["-filter_complex", _PALETTE]}),
+    ".mp4": (2, math.inf, {"codec": "libx264", "pix_fmt_out": "yuv420p", "quality": 8}),  # every browser plays it
+}
 
 
 def write_surface(
@@ -41,8 +45,8 @@ def write_surface(
     """Write a moving surface; the ending of `path` decides the format.
 
     `.usdc`, `.usda`, `.usd`: points with one time sample per frame (Blender, Houdini, usdview, Omniverse); needs
-    usd-core. `.glb`: glTF morph targets, one per key frame and linear in between (browsers, Blender); every key
-    frame takes 24 bytes per vertex, so a long motion is thinned out to `keyframes` of its frames.
+    usd-core. `.glb`: glTF morph targets, one per key frame and linear in between (browsers, Blender); needs pygltflib.
+    Every key frame takes 24 bytes per vertex, so a long motion is thinned out to `keyframes` of its frames.
 
     Args:
         path: of the file; an existing one is replaced, a folder that is missing is made.
@@ -71,31 +75,37 @@ def write_surface(
     target.parent.mkdir(parents=True, exist_ok=True)
     if target.suffix.lower() == ".glb":
         chosen = np.unique(np.linspace(0, len(motion) - 1, min(keyframes, len(motion))).round().astype(int))
-        target.write_bytes(_glb(surface, motion[chosen], chosen / rate, color))
+        _write_glb(target, surface, motion[chosen], chosen / rate, color)
     else:
         _write_usd(target, surface, motion, rate, color)
     return target
 
 
 def write_film(path: str | Path, images: Sequence[Picture], *, frames_per_second: float) -> Path:
-    """Write pictures as a film: `.gif` (needs Pillow; plays for ever) or `.mp4` (H.264; needs imageio-ffmpeg).
+    """Write pictures as a film (needs imageio-ffmpeg): `.gif`, which plays for ever, or `.mp4` (H.264).
 
     Args:
         path: of the file; an existing one is replaced, a folder that is missing is made.
-        images: of one size.
-        frames_per_second: of the film.
+        images: of one size; an .mp4 leaves out an odd last row or column.
+        frames_per_second: of the film; a .gif plays at most 50, as browsers slow down what is faster.
     """
-    target = _output(path, (".gif", ".mp4"))
+    target = _output(path, tuple(_FILMS))
     rate = check_scalar("frames_per_second", frames_per_second)
     if len(images) == 0 or any(image.shape != images[0].shape for image in images):
         raise ValueError("images must be at least one, all of one size")
     if rate <= 0.0:
         raise ValueError(f"frames_per_second must be positive, got {rate}")
+    ffmpeg = optional_module("imageio_ffmpeg", "imageio-ffmpeg", "films")
     target.parent.mkdir(parents=True, exist_ok=True)
-    if target.suffix.lower() == ".gif":
-        _write_gif(target, images, rate)
-    else:
-        _write_mp4(target, images, rate)
+    unit, most, options = _FILMS[target.suffix.lower()]
+    height, width = (length - length % unit for length in images[0].shape[:2])
+    writer = ffmpeg.write_frames(
+        str(target), (width, height), fps=min(rate, most), macro_block_size=1, ffmpeg_log_level="error", **options
+    )
+    writer.send(None)
+    for image in images:
+        writer.send(np.ascontiguousarray(image[:height, :width]))
+    writer.close()
     return target
 
 
@@ -108,10 +118,9 @@ def _output(path: str | Path, endings: tuple[str, ...]) -> Path:
 
 def _write_usd(path: Path, surface: SmoothSurface, motion: Array, rate: float, color: Color) -> None:
     """One mesh with time-sampled points, normals and extent; one time code per frame."""
-    try:
-        from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
-    except ImportError:
-        raise ModuleNotFoundError("USD files need usd-core: pip install torchpd[demo]") from None
+    optional_module("pxr", "usd-core", "USD files")
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
+
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -146,133 +155,52 @@ def _write_usd(path: Path, surface: SmoothSurface, motion: Array, rate: float, c
         raise OSError(f"usd-core cannot write {path}")
 
 
-class _GlbBuffer:
-    """The binary chunk of a .glb, with the views and accessors that describe it."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-
-    def add(self, array: NDArray[Any], *, target: int | None = None, bounds: bool = False) -> int:
-        """Append numbers, [n] or [n, 3]; the number of their accessor."""
-        kind, code = (np.uint32, _GLTF_UINT) if array.dtype.kind in "iu" else (np.float32, _GLTF_FLOAT)
-        values = np.ascontiguousarray(array, dtype=kind)
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes}
-        accessor: dict[str, Any] = {
-            "bufferView": len(self.views),
-            "componentType": code,
-            "count": len(values),
-            "type": "VEC3" if values.ndim == 2 else "SCALAR",
-        }
-        if target is not None:
-            view["target"] = target
-        if bounds:
-            accessor["min"] = np.atleast_1d(values.min(axis=0)).tolist()
-            accessor["max"] = np.atleast_1d(values.max(axis=0)).tolist()
-        self.data += values.tobytes()
-        self.views.append(view)
-        self.accessors.append(accessor)
-        return len(self.accessors) - 1
-
-    def add_shape(self, positions: Array, normals: Array) -> dict[str, int]:
-        return {
-            "POSITION": self.add(positions, target=_GLTF_VERTICES, bounds=True),
-            "NORMAL": self.add(normals, target=_GLTF_VERTICES),
-        }
-
-
-def _glb(surface: SmoothSurface, motion: Array, times: Array, color: Color) -> bytes:
+def _write_glb(path: Path, surface: SmoothSurface, motion: Array, times: Array, color: Color) -> None:
     """A binary glTF 2.0: the first key frame is the shape, each later one a morph target of differences to it."""
-    buffer = _GlbBuffer()
+    gltf = optional_module("pygltflib", "pygltflib", "glTF files")
+    data = bytearray()
+    views: list[Any] = []
+    accessors: list[Any] = []
+
+    def add(array: NDArray[Any], target: int | None = None) -> int:
+        """Append numbers, [n] or [n, 3]; the number of their accessor."""
+        kind, code = (np.uint32, gltf.UNSIGNED_INT) if array.dtype.kind in "iu" else (np.float32, gltf.FLOAT)
+        values = np.ascontiguousarray(array, dtype=kind)
+        bounds = {name: np.atleast_1d(end).tolist() for name, end in (("min", values.min(0)), ("max", values.max(0)))}
+        shape = gltf.VEC3 if values.ndim == 2 else gltf.SCALAR
+        accessors.append(
+            gltf.Accessor(bufferView=len(views), componentType=code, count=len(values), type=shape, **bounds)
+        )
+        views.append(gltf.BufferView(buffer=0, byteOffset=len(data), byteLength=values.nbytes, target=target))
+        data.extend(values.tobytes())
+        return len(views) - 1
+
+    def add_shape(positions: Array, normals: Array) -> Any:
+        return gltf.Attributes(POSITION=add(positions, gltf.ARRAY_BUFFER), NORMAL=add(normals, gltf.ARRAY_BUFFER))
+
     shapes = surface.split(motion)
-    first, first_normals = shapes[0], surface.normals(shapes[0])
-    primitive: dict[str, Any] = {
-        "indices": buffer.add(surface.triangles.reshape(-1), target=_GLTF_INDICES),
-        "attributes": buffer.add_shape(first, first_normals),
-        "material": 0,
-    }
-    mesh: dict[str, Any] = {"name": "body", "primitives": [primitive]}
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "torchpd"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "body", "mesh": 0}],
-        "meshes": [mesh],
-        "materials": [
-            {
-                "name": "plastic",
-                "doubleSided": True,
-                "pbrMetallicRoughness": {
-                    "baseColorFactor": [*color, 1.0],
-                    "metallicFactor": 0.0,
-                    "roughnessFactor": _ROUGHNESS,
-                },
-            }
-        ],
-    }
-    if len(shapes) > 1:
-        primitive["targets"] = [
-            buffer.add_shape(shape - first, surface.normals(shape) - first_normals) for shape in shapes[1:]
-        ]
-        mesh["weights"] = [0.0] * (len(shapes) - 1)
-        # at key frame k target k - 1 alone counts; linear weights in between are linear positions
-        weights = np.eye(len(shapes))[:, 1:]
-        sampler = {
-            "input": buffer.add(times, bounds=True),
-            "output": buffer.add(weights.reshape(-1)),
-            "interpolation": "LINEAR",
-        }
-        channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
-        document["animations"] = [{"name": "motion", "samplers": [sampler], "channels": [channel]}]
-    document["bufferViews"], document["accessors"] = buffer.views, buffer.accessors
-    document["buffers"] = [{"byteLength": len(buffer.data)}]
-
-    # container: magic, version, length, then the chunks JSON (padded by spaces) and BIN, both of whole words
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    length = 12 + 8 + len(text) + 8 + len(buffer.data)
-    header = struct.pack("<4sII", b"glTF", 2, length)
-    return b"".join(
-        [header, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(buffer.data), b"BIN\0"),
-         bytes(buffer.data)]
-    )  # fmt: skip
-
-
-def _write_gif(path: Path, images: Sequence[Picture], rate: float) -> None:
-    """One palette for all frames, from a dozen of them: separate palettes flicker."""
-    try:
-        from PIL import Image
-    except ImportError:
-        raise ModuleNotFoundError("GIF files need Pillow: pip install torchpd[demo]") from None
-    sample = np.concatenate(images[:: max(1, len(images) // 12)])
-    palette = Image.fromarray(sample).quantize(256, method=Image.Quantize.MEDIANCUT)
-    pictures = [Image.fromarray(_dither(image)).quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    # GIF counts time in 1/100 s: rounding the instants instead of the delays keeps the whole film in time
-    instants = np.round(np.arange(len(images) + 1) * 100.0 / rate)
-    delays = (10 * np.maximum(np.diff(instants), 2)).astype(int).tolist()  # browsers slow down a delay below 2
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=delays, loop=0, optimize=False)
-
-
-def _dither(image: Picture) -> Picture:
-    """Adds one fine pattern to every frame, which hides the steps of the palette; error diffusion would shimmer."""
-    bayer = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]]) / 16.0 - 15.0 / 32.0
-    height, width = image.shape[:2]
-    pattern = np.tile(bayer, (-(-height // 4), -(-width // 4)))[:height, :width, None]
-    return np.clip(np.round(image + _DITHER * pattern), 0, 255).astype(np.uint8)
-
-
-def _write_mp4(path: Path, images: Sequence[Picture], rate: float) -> None:
-    """H.264 with halved chroma, which every browser plays; an odd last row or column is left out for it."""
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise ModuleNotFoundError("MP4 files need imageio-ffmpeg: pip install torchpd[demo]") from None
-    height, width = (length - length % 2 for length in images[0].shape[:2])
-    writer = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=rate, codec="libx264", quality=8, macro_block_size=1, pix_fmt_out="yuv420p"
+    normals = [surface.normals(shape) for shape in shapes]
+    body = gltf.Primitive(
+        indices=add(surface.triangles.reshape(-1), gltf.ELEMENT_ARRAY_BUFFER),
+        attributes=add_shape(shapes[0], normals[0]),
+        targets=[add_shape(x - shapes[0], n - normals[0]) for x, n in zip(shapes[1:], normals[1:], strict=True)],
+        material=0,
     )
-    writer.send(None)
-    for image in images:
-        writer.send(np.ascontiguousarray(image[:height, :width]))
-    writer.close()
+    plastic = gltf.PbrMetallicRoughness(baseColorFactor=[*color, 1.0], metallicFactor=0.0, roughnessFactor=_ROUGHNESS)
+    document = gltf.GLTF2(
+        scene=0,
+        scenes=[gltf.Scene(nodes=[0])],
+        nodes=[gltf.Node(mesh=0)],
+        meshes=[gltf.Mesh(primitives=[body], weights=[0.0] * (len(shapes) - 1))],
+        materials=[gltf.Material(pbrMetallicRoughness=plastic, doubleSided=True, alphaCutoff=None)],
+    )
+    if len(shapes) > 1:
+        # at key frame k target k - 1 alone counts; linear weights in between are linear positions
+        sampler = gltf.AnimationSampler(input=add(times), output=add(np.eye(len(shapes))[:, 1:].reshape(-1)))
+        target = gltf.AnimationChannelTarget(node=0, path="weights")
+        channel = gltf.AnimationChannel(sampler=0, target=target)
+        document.animations = [gltf.Animation(samplers=[sampler], channels=[channel])]
+    document.bufferViews, document.accessors = views, accessors
+    document.buffers = [gltf.Buffer(byteLength=len(data))]
+    document.set_binary_blob(bytes(data))
+    document.save_binary(path)

@@ -25,6 +25,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import cg, splu
 
+from .checks import optional_module
 from .compiled_step import CompiledStep, CountedStep
 from .contact_newton import ContactNewton
 from .newton_krylov import NewtonKrylov
@@ -151,11 +152,8 @@ def run_baseline(
 
 def _blas_threads() -> AbstractContextManager[object]:
     """As many for BLAS as torch has: processor time counts those that wait too."""
-    try:
-        from threadpoolctl import threadpool_limits
-    except ImportError:
-        raise ModuleNotFoundError("the study needs threadpoolctl: pip install torchpd[study]") from None
-    limits: AbstractContextManager[object] = threadpool_limits(torch.get_num_threads(), user_api="blas")
+    threads = optional_module("threadpoolctl", "threadpoolctl", "studies", "study")
+    limits: AbstractContextManager[object] = threads.threadpool_limits(torch.get_num_threads(), user_api="blas")
     return limits
 
 

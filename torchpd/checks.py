@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ __all__ = [
     "has_numbers",
     "in_full",
     "of_each",
+    "optional_module",
     "plain_tensor",
     "tensor_of",
 ]
@@ -44,6 +46,14 @@ def check_has_values(name: str, device: torch.device) -> None:
     """Refuse what needs the values of a simulator on "meta"."""
     if device.type == "meta":
         raise RuntimeError(f"{name}: {NO_VALUES}")
+
+
+def optional_module(module: str, package: str, users: str, extra: str = "demo") -> Any:
+    """The module of a package that not everybody has, or an error that says what needs it and how it is installed."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise ModuleNotFoundError(f"{users} need {package}: pip install torchpd[{extra}]") from None
 
 
 def as_array(name: str, value: Any, dtype: Any = None, *, for_picture: bool = False) -> NDArray[Any]:

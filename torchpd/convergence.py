@@ -11,6 +11,7 @@ import torch
 from tqdm.auto import tqdm
 
 from .accuracy import exact_steps, scene_without_friction
+from .checks import optional_module
 from .simulator import Simulator
 from .solvers import Chebyshev, Jacobi, Solver
 from .spectrum import estimate_rho
@@ -123,11 +124,9 @@ def plot_convergence(
         title: one line above the plot.
         mark: number of iterations to mark by a vertical line, for example those of a run.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ModuleNotFoundError("plots need matplotlib: pip install torchpd[demo]") from None
-    figure = Figure(figsize=(8.0, 5.0), dpi=150, layout="constrained")
+    figure = optional_module("matplotlib.figure", "matplotlib", "plots").Figure(
+        figsize=(8.0, 5.0), dpi=150, layout="constrained"
+    )
     axes = figure.add_subplot()
     lowest = min(min(curve.errors) for curve in curves.values())
     for number, (name, curve) in enumerate(curves.items()):

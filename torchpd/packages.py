@@ -28,12 +28,12 @@ REQUIRED = (
 )
 OPTIONAL = (
     Package("mitsuba", "mitsuba", "pictures"),
+    Package("pyoidn", "pyoidn", "pictures without grain"),
     Package("matplotlib", "matplotlib", "plots"),
     Package("plotly", "plotly", "reports of studies"),
     Package("threadpoolctl", "threadpoolctl", "times of studies"),
     Package("PIL", "pillow", "pictures"),
-    Package("imageio", "imageio", "GIF"),
-    Package("imageio_ffmpeg", "imageio-ffmpeg", "MP4"),
+    Package("imageio_ffmpeg", "imageio-ffmpeg", "films"),
     Package("pygltflib", "pygltflib", "glTF files"),
     Package("pxr", "usd-core", "USD files"),
     Package("pytetwild", "pytetwild", 'tetrahedralize(method="tetwild")'),

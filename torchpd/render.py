@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import as_array, check_finite, check_scalar, check_shape, check_vector
-from .denoise import denoise
+from .checks import as_array, check_finite, check_scalar, check_shape, check_vector, optional_module
 from .shading import SmoothSurface
+from .warn import warn_user
 
 __all__ = ["CORAL", "Camera", "Studio", "contact_sheet", "frame_camera", "render"]
 
 Array = NDArray[np.float64]
-Image = NDArray[np.float32]
+Radiance = NDArray[np.float32]
 Index = NDArray[np.int64]
 Picture = NDArray[np.uint8]
 Color = tuple[float, float, float]
@@ -176,8 +176,7 @@ class Studio:
         with _mitsuba() as mi:
             scene = mi.load_dict(self._scene(mi, positions, normals))
             radiance = np.array(mi.render(scene, spp=self.samples))
-            seen_normals, seen_positions = self._guides(mi, positions, normals)
-        return _develop(denoise(radiance, seen_normals, seen_positions, size=self._radius()))
+        return _develop(_denoise(radiance))
 
     def _radius(self) -> float:
         return max(float(np.linalg.norm(self.high - self.low)) / 2.0, 1e-6)
@@ -214,22 +213,6 @@ class Studio:
             },
             "sky": {"type": "constant", "radiance": _rgb(_SKY)},
         }
-
-    def _guides(self, mi: Any, positions: Array, normals: Array) -> tuple[Image, Image]:
-        """Normals and positions [H, W, 3] that the camera sees, averaged over each pixel.
-
-        Normals are painted on as light, (n + 1) / 2: several times faster than Mitsuba's own integrator for them.
-        """
-        light = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_normal_color"}}
-        body = _mesh(mi, positions, self.surface.triangles, normals, emitter=light)
-        up = {"emitter": {"type": "area", "radiance": _rgb((0.5, 1.0, 0.5))}}
-        scene = mi.load_dict(
-            {"type": "scene", "camera": self._sensor(mi), "body": body, "floor": {**self._floor(mi), **up}}
-        )
-        light_only, depth_only = mi.load_dict({"type": "path", "max_depth": 1}), mi.load_dict({"type": "depth"})
-        seen = np.asarray(2.0 * np.array(mi.render(scene, integrator=light_only, spp=4)) - 1.0, dtype=np.float32)
-        depth = np.array(mi.render(scene, integrator=depth_only, spp=4))[..., :1]
-        return seen, np.asarray(depth * self.camera.rays(self.size), dtype=np.float32)
 
     def _floor(self, mi: Any) -> dict[str, Any]:
         """Wide enough to fill every picture that looks down on it."""
@@ -283,15 +266,17 @@ def contact_sheet(
         raise ValueError("images must be at least one, all of one size")
     if captions is not None and len(captions) != len(images):
         raise ValueError(f"captions must be one per image ({len(images)}), got {len(captions)}")
-    image_class, draw_class, font_class = _pillow()
+    optional_module("PIL", "Pillow", "contact sheets")
+    from PIL import Image, ImageDraw, ImageFont
+
     height, width = images[0].shape[:2]
     columns = min(columns, len(images))
     rows = -(-len(images) // columns)
-    sheet = image_class.new("RGB", (columns * (width + gap) + gap, rows * (height + gap) + gap), _PAPER)
-    draw, font = draw_class.Draw(sheet), font_class.load_default(size=max(11, height // 20))
+    sheet = Image.new("RGB", (columns * (width + gap) + gap, rows * (height + gap) + gap), _PAPER)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=max(11, height // 20))
     for number, image in enumerate(images):
         left, top = gap + (number % columns) * (width + gap), gap + (number // columns) * (height + gap)
-        sheet.paste(image_class.fromarray(image), (left, top))
+        sheet.paste(Image.fromarray(image), (left, top))
         if captions is not None:
             inset = height // 28
             draw.text((left + inset, top + height - inset), captions[number], fill=_INK, font=font, anchor="ls")
@@ -300,7 +285,17 @@ def contact_sheet(
     return np.asarray(sheet)
 
 
-def _develop(radiance: Image) -> Picture:
+def _denoise(radiance: Radiance) -> Radiance:
+    """Without the grain of few light paths, by Intel's Open Image Denoise where there is a build of it."""
+    try:
+        from pyoidn import denoise
+    except ImportError:
+        warn_user("pictures keep their grain, as pyoidn is missing: pip install pyoidn, or take more samples")
+        return radiance
+    return np.asarray(denoise(radiance, hdr=True))
+
+
+def _develop(radiance: Radiance) -> Picture:
     """Linear radiance to sRGB; what is brighter than 0.7 bends towards white instead of being cut off."""
     linear = np.maximum(radiance, 0.0)
     linear = np.where(linear > 0.7, 1.0 - 0.3 * np.exp(-(linear - 0.7) / 0.3), linear)
@@ -308,13 +303,11 @@ def _develop(radiance: Image) -> Picture:
     return (255.0 * encoded + 0.5).astype(np.uint8)
 
 
-def _mesh(mi: Any, positions: Array, triangles: Index, normals: Array, **parts: dict[str, Any]) -> Any:
-    """A Mitsuba mesh with smooth normals, also as an attribute that an emitter can show; `parts`: bsdf, emitter."""
+def _mesh(mi: Any, positions: Array, triangles: Index, normals: Array, bsdf: dict[str, Any]) -> Any:
+    """A Mitsuba mesh with smooth normals."""
     properties = mi.Properties()
-    for name, part in parts.items():
-        properties[name] = mi.load_dict(part)
+    properties["bsdf"] = mi.load_dict(bsdf)
     mesh = mi.Mesh("body", len(positions), len(triangles), has_vertex_normals=True, props=properties)
-    mesh.add_attribute("vertex_normal_color", 3, (0.5 + 0.5 * normals).astype(np.float32).ravel())
     buffers = mi.traverse(mesh)
     buffers["vertex_positions"] = positions.astype(np.float32).ravel()
     buffers["vertex_normals"] = normals.astype(np.float32).ravel()
@@ -334,10 +327,7 @@ def _triple(vector: Array) -> tuple[float, float, float]:
 @contextmanager
 def _mitsuba() -> Iterator[Any]:
     """Mitsuba in its scalar variant (needs neither LLVM nor a GPU); the caller's variant comes back afterwards."""
-    try:
-        import mitsuba
-    except ImportError:
-        raise ModuleNotFoundError("pictures need Mitsuba: pip install torchpd[demo]") from None
+    mitsuba = optional_module("mitsuba", "Mitsuba", "pictures")
     before = mitsuba.variant()
     mitsuba.set_variant("scalar_rgb")
     try:
@@ -345,11 +335,3 @@ def _mitsuba() -> Iterator[Any]:
     finally:
         if before is not None:
             mitsuba.set_variant(before)
-
-
-def _pillow() -> tuple[Any, Any, Any]:
-    try:
-        from PIL import Image, ImageDraw, ImageFont
-    except ImportError:
-        raise ModuleNotFoundError("contact sheets need Pillow: pip install torchpd[demo]") from None
-    return Image, ImageDraw, ImageFont

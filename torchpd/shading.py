@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from trimesh.geometry import mean_vertex_normals
+from trimesh.graph import face_adjacency
 
 from .checks import as_array, check_finite, check_shape
 
@@ -54,11 +56,8 @@ class SmoothSurface:
     def normals(self, split_vertices: Array) -> Array:
         """Unit normals [S, 3], weighted by area; +y where the triangles around a vertex cancel out."""
         face_normals = _face_normals(split_vertices, self.triangles)
-        normals = np.zeros_like(split_vertices)
-        for corner in range(3):
-            np.add.at(normals, self.triangles[:, corner], face_normals)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return np.where(length > 0.0, normals / np.where(length > 0.0, length, 1.0), [0.0, 1.0, 0.0])
+        normals = mean_vertex_normals(len(split_vertices), self.triangles, face_normals)
+        return np.where(normals.any(axis=1, keepdims=True), normals, [0.0, 1.0, 0.0])
 
     def normals_seen_from(self, eye: Array, split_vertices: Array) -> Array:
         """The normals [S, 3], where need be bent until they face the eye on every side of a triangle that does.
@@ -92,19 +91,11 @@ def _smoothing_groups(vertices: Array, triangles: Index, crease: float) -> Index
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(length > 0.0, length, 1.0)
 
-    # half-edges sorted by their two places: those of one edge stand in a row, neighbours in that row are paired
-    ends = np.stack([place, np.roll(place, -1, axis=1)], axis=2).reshape(-1, 2)
-    swapped = ends[:, 0] > ends[:, 1]
-    corner = np.arange(triangles.size)
-    other = (corner // 3) * 3 + (corner + 1) % 3
-    low, high = np.where(swapped, other, corner), np.where(swapped, corner, other)
-    order = np.lexsort((ends.max(axis=1), ends.min(axis=1)))
-    key = np.sort(ends, axis=1)[order]
-    paired = np.flatnonzero((key[1:] == key[:-1]).all(axis=1))
-    first, second = order[paired], order[paired + 1]
-    gentle = np.einsum("ij,ij->i", normals[first // 3], normals[second // 3]) > np.cos(np.radians(crease))
-    first, second = first[gentle], second[gentle]
-
-    rows, columns = np.concatenate([low[first], high[first]]), np.concatenate([low[second], high[second]])
+    pairs, edges = face_adjacency(place, return_edges=True)
+    gentle = np.einsum("ij,ij->i", *normals[pairs.T]) > np.cos(np.radians(crease))
+    pairs, edges = pairs[gentle], edges[gentle]
+    # for each pair and each end of its edge: the corners of both triangles there
+    corner = (place[pairs][:, :, None] == edges[:, None, :, None]).argmax(axis=3) + 3 * pairs[:, :, None]
+    rows, columns = corner[:, 0].reshape(-1), corner[:, 1].reshape(-1)
     graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(triangles.size, triangles.size))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)

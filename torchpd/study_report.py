@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from .checks import optional_module
 from .ledger import Row
 from .study_plots import SLOPES, STYLES, TOP, axis_label, curves_of, in_words, pareto_front
 
@@ -36,14 +37,11 @@ def write_report(rows: list[Row], record: dict[str, Any], path: Path) -> Path:
         record: command, machine, versions and subject, as in study.json.
         path: of the file.
     """
-    try:
-        from plotly.io import to_html
-    except ImportError:
-        raise ModuleNotFoundError("the report needs plotly: pip install torchpd[study]") from None
+    plotly = optional_module("plotly.io", "plotly", "reports", "study")
     figures = _figures(rows)
     parts = []
     for number, (title, words, figure) in enumerate(figures):
-        drawn = to_html(
+        drawn = plotly.to_html(
             figure,
             full_html=False,
             include_plotlyjs="inline" if number == 0 else False,
