@@ -26,48 +26,6 @@ def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("on_path")
-def test_acceleration_counts_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At 10 kPa, with 150 iterations at most, by which Jacobi comes to a hundredth and not to a thousandth."""
-    import acceleration
-
-    monkeypatch.setattr(acceleration, "STIFFNESSES", (1e4,))
-    jacobi, *others = acceleration.count_all(150)
-    assert jacobi["solver"] == "Jacobi"
-    assert jacobi["iterations"] == [41, 102, None, None]
-    assert len(others) == 2
-    for row in others:
-        assert row["iterations"] == sorted(row["iterations"])
-        assert row["iterations"][1] < 102 / 3
-
-
-@pytest.mark.usefixtures("on_path")
-def test_acceleration_is_a_ratio_of_iterations() -> None:
-    from acceleration import table, with_factors
-
-    rows = [
-        {"youngs": 1e5, "solver": "Jacobi", "iterations": [100, None, None, None]},
-        {"youngs": 1e5, "solver": "guarded Chebyshev", "iterations": [10, 50, None, None]},
-    ]
-    plain, fast = with_factors(rows, most=1000)
-    assert fast["factors"] == [10.0, 20.0, None, None]
-    assert fast["at_least"] == [False, True, True, True]
-    assert plain["factors"] == [1.0, None, None, None]
-    last = table([plain, fast], 1000).splitlines()[-1]
-    assert last.split() == [
-        "1e+05",
-        "guarded",
-        "Chebyshev",
-        "10",
-        "(10.0",
-        "x)",
-        "50",
-        "(>20.0",
-        "x)",
-        *[">", "1000"] * 2,
-    ]
-
-
-@pytest.mark.usefixtures("on_path")
 def test_promises_and_refusals_are_counted_apart() -> None:
     from tune import summary
 

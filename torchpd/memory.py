@@ -1,4 +1,4 @@
-"""How much memory a process may have: the machine's, or what its container is limited to."""
+"""How much memory a process may have: the machine's, or what its container is limited to, which psutil does not see."""
 
 from __future__ import annotations
 

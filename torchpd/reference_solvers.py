@@ -20,7 +20,6 @@ __all__ = [
     "guard_tolerance",
     "guarded_chebyshev",
     "jacobi",
-    "local_global",
     "newton",
     "newton_step",
     "preconditioned_lbfgs",
@@ -370,18 +369,6 @@ def _newton_direction(
         if direction[rows] @ flat <= -1e-6 * np.linalg.norm(direction) * np.linalg.norm(flat):
             break
     return direction.reshape(-1, 3), not positive
-
-
-def local_global(problem: StepProblem, first: Array, *, iterations: int, observe: Observer | None = None) -> Array:
-    """Classic projective dynamics: u <- u - A^-1 grad E(u), the global step solved directly (Bouaziz et al. 2014)."""
-    free = np.flatnonzero(problem.free)
-    factor = splu(csc_array(problem.matrix[free][:, free]))
-    u = np.array(first)
-    for k in range(iterations):
-        u[free] -= factor.solve(problem.gradient(u)[free])
-        if observe is not None:
-            observe(k + 1, u)
-    return u
 
 
 def solve_with_contact(

@@ -1,7 +1,8 @@
 """Fewer triangles for a surface, as few as patches need for a base.
 
 Edges are contracted in the order of their quadric error (Garland and Heckbert, 1997), as long as the surface keeps its
-topology and no triangle turns over: what results can carry patches whenever the original could.
+topology and no triangle turns over: what results can carry patches whenever the original could. fast-simplification
+is a hundred times faster, but of the octopus at 80 triangles it leaves an edge that more than two have in common.
 """
 
 from __future__ import annotations
