@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +17,20 @@ _OTHER = ("#56b4e9", 2.0, "solid")
 _COLORS = ("#d55e00", "#0072b2", "#56b4e9")  # the stiffness of the study first, then softer ones
 _SYMBOLS = {"diverged": "x", "uncertain": "circle-open"}  # circles for the others
 _LOWEST_POWER = -8  # of ten, of the errors that are shown at first
-_STYLE = """
+# columns of the table of all rows, and the fields of `Row` that they show
+_COLUMNS = {
+    "axis": "axis", "method": "method", "precision": "precision", "iterations": "iterations",
+    "Young's modulus [Pa]": "youngs", "time step [s]": "time_step", "tets": "tets", "error": "error",
+    "uncertainty": "uncertainty", "energy error": "error_energy", "residual": "residual", "ms": "milliseconds",
+    "p5": "milliseconds_p5", "p95": "milliseconds_p95", "bytes": "bytes",
+}  # fmt: skip
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<title>What accuracy costs: {{ record.subject }}</title>
+<link rel="icon" href="data:,">
+<style>
 body { font: 15px/1.5 system-ui, sans-serif; color: #2b2d31; max-width: 1180px; margin: 2em auto; padding: 0 1em; }
 h1 { font-size: 1.6em; margin-bottom: .2em } h2 { font-size: 1.15em; margin: 2.2em 0 .2em }
 p { margin: .4em 0 } code, pre { background: #f3f4f6; border-radius: 4px; padding: .15em .4em; font-size: .9em }
@@ -26,6 +38,45 @@ pre { padding: .7em 1em; overflow-x: auto } table { border-collapse: collapse; f
 th, td { text-align: right; padding: .18em .7em; border-bottom: 1px solid #e4e5e8 }
 th:first-child, td:first-child, th:nth-child(2), td:nth-child(2) { text-align: left } .bad { color: #b3261e }
 details summary { cursor: pointer; margin-top: 2em }
+</style>
+</head>
+<body>
+<h1>What accuracy costs: {{ record.subject }}</h1>
+<p>Errors are |x &minus; x*| / |x<sub>0</sub> &minus; x*| of one time step: 1 is the first iterate, 0 the
+converged step. Thick lines are the solvers of this library; thin ones are methods of the literature: on a
+GPU dense inverses in cuBLAS, on the CPU, in float64, methods on the compiled local step of this library
+(C++) but for those with NumPy in their names. What is around that step is in brackets. Full lines are
+compiled in nearly all that takes time; dashed ones spend much of it in Python: their iterations compare
+exactly, their milliseconds are upper bounds. Failures are crosses at the top; rings are uncertain, for want
+of a converged step to compare with; what is refused has not run. Click a name in a legend to hide it.</p>
+<pre>{{ record.command }}</pre>
+{% set machine = record.machine -%}
+<p>{{ machine.cpu }}, {{ machine.threads }} thread{{ "s" * (machine.threads > 1) }}, {{ machine.simd }}; device:
+{{ machine.device }}; milliseconds are {{ record.clock }}<br>
+{% for name, version in record.versions.items() %}{{ name }} {{ version }}{{ ", " * (not loop.last) }}{% endfor %}<br>
+commit {{ record.commit[:12] }}, {{ record.created }}</p>
+{% for row in tests %}{% if loop.first %}<h2>The tests of the source paper</h2>
+<table>
+<tr><th>test of the paper</th><th>here</th><th>iterations</th><th>paper, GTX 470 [ms]</th><th>this machine [ms]</th>
+<th>error of the step</th></tr>
+{% endif -%}
+<tr><td>{{ row.more.constraints | shown }} constraints</td><td>{{ row.tets | shown }} tetrahedra</td>
+<td>{{ row.iterations }}</td><td>{{ row.more.paper_milliseconds | shown }}</td><td>{{ row.milliseconds | shown }}</td>
+<td>{{ row.error | shown }}</td></tr>
+{% if loop.last %}</table>
+{% endif %}{% endfor %}
+{%- for title, words, drawn in figures %}<h2>{{ title }}</h2>
+<p>{{ words | safe }}</p>
+{{ drawn | safe }}
+{% endfor %}
+<details><summary>All {{ rows | length }} rows</summary>
+<table>
+<tr>{% for name in columns %}<th>{{ name }}</th>{% endfor %}<th>status</th></tr>
+{% for row in rows %}<tr>{% for field in columns.values() %}<td>{{ row[field] | shown }}</td>{% endfor %}
+<td{% if row.status != "ok" %} class="bad"{% endif %}>{{ row.status }}</td></tr>
+{% endfor %}</table></details>
+</body>
+</html>
 """
 
 
@@ -38,45 +89,28 @@ def write_report(rows: list[Row], record: dict[str, Any], path: Path) -> Path:
         path: of the file.
     """
     plotly = optional_module("plotly.io", "plotly", "reports", "study")
-    figures = _figures(rows)
-    parts = []
-    for number, (title, words, figure) in enumerate(figures):
-        drawn = plotly.to_html(
-            figure,
-            full_html=False,
-            include_plotlyjs="inline" if number == 0 else False,
-            config={"displaylogo": False, "responsive": True},
-            div_id=f"figure-{number}",
-        )
-        parts.append(f"<h2>{html.escape(title)}</h2>\n<p>{words}</p>\n{drawn}")
-    title = f"What accuracy costs: {record['subject']}"
+    jinja = optional_module("jinja2", "jinja2", "reports", "study").Environment(autoescape=True)
+    jinja.filters["shown"] = _shown
+    figures = [
+        (title, words, plotly.to_html(
+            figure, full_html=False, include_plotlyjs="inline" if number == 0 else False,
+            config={"displaylogo": False, "responsive": True}, div_id=f"figure-{number}",
+        ))
+        for number, (title, words, figure) in enumerate(_figures(rows))
+    ]  # fmt: skip
+    tests = [row for row in rows if row.axis == "paper"]
+    page = jinja.from_string(_PAGE)
     path.write_text(
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{html.escape(title)}</title>\n'
-        f'<link rel="icon" href="data:,">\n<style>{_STYLE}</style>\n</head>\n<body>\n<h1>{html.escape(title)}</h1>\n'
-        f"{_header(record)}\n{_paper_table(rows)}\n{''.join(parts)}\n{_all_rows(rows)}\n</body>\n</html>\n",
-        encoding="utf-8",
+        page.render(record=record, rows=rows, tests=tests, figures=figures, columns=_COLUMNS), encoding="utf-8"
     )
     return path
 
 
-def _header(record: dict[str, Any]) -> str:
-    machine, versions = record["machine"], record["versions"]
-    threads = f"{machine['threads']} thread{'s' * (machine['threads'] > 1)}"
-    where = f"{machine['cpu']}, {threads}, {machine['simd']}; device: {machine['device']}"
-    where = f"{where}; milliseconds are {record['clock']}"
-    what = ", ".join(f"{name} {version}" for name, version in versions.items())
-    return (
-        f"<p>Errors are |x &minus; x*| / |x<sub>0</sub> &minus; x*| of one time step: 1 is the first iterate, 0 the "
-        f"converged step. Thick lines are the solvers of this library; thin ones are methods of the literature: on a "
-        f"GPU dense inverses in cuBLAS, on the CPU, in float64, methods on the compiled local step of this library "
-        f"(C++) but for those with NumPy in their names. What is around that step is in brackets. Full lines are "
-        f"compiled in nearly all that takes time; dashed ones spend much of it in Python: their iterations compare "
-        f"exactly, their milliseconds are upper bounds. Failures are crosses at the top; rings are uncertain, for want "
-        f"of a converged step to compare with; what is refused has not run. Click a name in a legend to hide it.</p>\n"
-        f"<pre>{html.escape(record['command'])}</pre>\n"
-        f"<p>{html.escape(where)}<br>{html.escape(what)}<br>commit {html.escape(record['commit'][:12])}, "
-        f"{html.escape(record['created'])}</p>"
-    )
+def _shown(value: Any) -> str:
+    """Of a cell: numbers to three digits, whole ones in full."""
+    if isinstance(value, float):
+        return f"{value:.3g}" if math.isfinite(value) else ""
+    return f"{value:,}" if isinstance(value, int) else str(value or "")
 
 
 # ---- figures
@@ -219,44 +253,3 @@ def _plain_figure(rows: list[Row], place: Callable[[Row], float], label: str, sl
         if row not in measured:
             figure.add_annotation(text=row.status, showarrow=False, xref="paper", yref="paper", x=0.5, y=0.5)
     return _layout(figure, label, rows)
-
-
-# ---- tables
-
-
-def _table(head: list[str], lines: list[list[str]]) -> str:
-    cells = "".join(f"<th>{html.escape(name)}</th>" for name in head)
-    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in line) + "</tr>\n" for line in lines)
-    return f"<table>\n<tr>{cells}</tr>\n{body}</table>"
-
-
-def _paper_table(rows: list[Row]) -> str:
-    tests = [row for row in rows if row.axis == "paper"]
-    if not tests:
-        return ""
-    lines = [
-        [f"{row.more['constraints']:.0f} constraints", f"{row.tets:,} tetrahedra", f"{row.iterations}",
-         f"{row.more['paper_milliseconds']:.0f}", f"{row.milliseconds:.2f}", f"{row.error:.1e}"]
-        for row in tests
-    ]  # fmt: skip
-    head = ["test of the paper", "here", "iterations", "paper, GTX 470 [ms]", "this machine [ms]", "error of the step"]
-    return f"<h2>The tests of the source paper</h2>\n{_table(head, lines)}"
-
-
-def _all_rows(rows: list[Row]) -> str:
-    def number(value: float | None) -> str:
-        return "" if value is None else f"{value:.3g}"
-
-    lines = []
-    for row in rows:
-        status = row.status if row.status == "ok" else f'<span class="bad">{html.escape(row.status)}</span>'
-        lines.append(
-            [row.axis, html.escape(row.method), row.precision, f"{row.iterations}", f"{row.youngs:g}",
-             number(row.time_step), f"{row.tets}", number(row.error if math.isfinite(row.error) else None),
-             number(row.uncertainty), number(row.error_energy), number(row.residual), number(row.milliseconds),
-             number(row.milliseconds_p5), number(row.milliseconds_p95),
-             "" if row.bytes is None else f"{row.bytes:,}", status]
-        )  # fmt: skip
-    head = ["axis", "method", "precision", "iterations", "Young's modulus [Pa]", "time step [s]", "tets", "error",
-            "uncertainty", "energy error", "residual", "ms", "p5", "p95", "bytes", "status"]  # fmt: skip
-    return f"<details><summary>All {len(rows)} rows</summary>\n{_table(head, lines)}</details>"
