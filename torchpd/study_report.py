@@ -60,7 +60,7 @@ commit {{ record.commit[:12] }}, {{ record.created }}</p>
 <tr><th>test of the paper</th><th>here</th><th>iterations</th><th>paper, GTX 470 [ms]</th><th>this machine [ms]</th>
 <th>error of the step</th></tr>
 {% endif -%}
-<tr><td>{{ row.more.constraints | shown }} constraints</td><td>{{ row.tets | shown }} tetrahedra</td>
+<tr><td>{{ "%.0f" | format(row.more.constraints) }} constraints</td><td>{{ row.tets | shown }} tetrahedra</td>
 <td>{{ row.iterations }}</td><td>{{ row.more.paper_milliseconds | shown }}</td><td>{{ row.milliseconds | shown }}</td>
 <td>{{ row.error | shown }}</td></tr>
 {% if loop.last %}</table>
