@@ -11,7 +11,6 @@ PN triangles: Vlachos et al. (2001), with the shape's own normals at their verti
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from machine import describe_run
+from machine import describe_run, write_result
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
@@ -207,9 +206,8 @@ def main() -> None:
         rows += [{"shape": name, "size": size, **row} for row in found]
     print(table(rows))
     if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        record = {"schema": 1, **describe_run(torch.device("cpu"), torch.get_num_threads()), "rows": rows}
-        options.out.write_text(json.dumps(record, indent=1) + "\n")
+        run = describe_run(torch.device("cpu"), torch.get_num_threads())
+        write_result(options.out, {"schema": 1, **run, "rows": rows})
     if options.picture:
         draw(rows, options.picture)
 

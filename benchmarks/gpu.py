@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gpu_scenes import GPU_SCENES, PAPER, GpuScene, PaperTest
+from gpu_scenes import GPU_SCENES, GpuScene
 from gpu_timing import Device, describe_device, event_times, graph_times, host_seconds, kernel_seconds
-from machine import PROVENANCE, milliseconds, run_of
+from machine import PROVENANCE, aligned, cell, milliseconds, run_of
 from scenes import TIME_STEP
 from tqdm.auto import tqdm
 
 import torchpd as pd
 from torchpd.gpu import properties_of
 from torchpd.plan import KERNELS
+from torchpd.study_axes import PAPER_TESTS
 
 Row = dict[str, Any]
 
@@ -171,30 +172,27 @@ def measure_calls(options: argparse.Namespace) -> Row:
 
 def measure_paper(options: argparse.Namespace) -> list[Row]:
     """Scenes of as many tetrahedra as the paper's have constraints, with 64 iterations."""
-    return [measure_test(test, kernel, options) for test in PAPER for kernel in ("block", "cluster")]
+    return [measure_test(*test, kernel, options) for test in PAPER_TESTS for kernel in ("block", "cluster")]
 
 
-def measure_test(test: PaperTest, kernel: str, options: argparse.Namespace) -> Row:
-    scene = GpuScene(test.name, test.cells, kernel=kernel)
+def measure_test(
+    constraints: int, theirs: float, cells: tuple[int, int, int], kernel: str, options: argparse.Namespace
+) -> Row:
+    scene = GpuScene(f"paper-{constraints}", cells, kernel=kernel)
     sim, facts = compile_on(scene, torch.float32, torch.device(options.device))
     state = scene.start(sim)
     given = {"repetitions": options.repetitions, "seconds": 0.0}
     milliseconds_here = 1e3 * statistics.median(graph_times(lambda: sim(state), **given))
     return {
-        "scene": test.name,
+        "scene": scene.name,
         "kernel": facts["kernel"],
         "tets": facts["tets"],
         "milliseconds": milliseconds_here,
         "eager_milliseconds": 1e3 * statistics.median(event_times(lambda: sim(state), **given)),
-        "constraints_of_the_paper": test.constraints,
-        "milliseconds_of_the_paper": test.milliseconds,
-        "speedup": test.milliseconds / milliseconds_here,
+        "constraints_of_the_paper": constraints,
+        "milliseconds_of_the_paper": theirs,
+        "speedup": theirs / milliseconds_here,
     }
-
-
-def cell(value: float | None, places: int, scale: float = 1.0) -> str:
-    """For a table."""
-    return "-" if value is None else f"{value * scale:,.{places}f}"
 
 
 def table(rows: list[Row]) -> str:
@@ -228,8 +226,7 @@ def table(rows: list[Row]) -> str:
                 cell(row["bytes_per_vertex"], 0),
             ]
         )
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    return "\n".join("  ".join(c.rjust(width) for c, width in zip(line, widths, strict=True)) for line in lines)
+    return aligned(lines)
 
 
 def put(rows: list[Row], row: Row) -> None:

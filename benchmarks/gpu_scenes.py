@@ -217,20 +217,3 @@ QUICK_GPU_SCENES = tuple(
     for mesh in MESHES
     for kernel, batch in (("block", 9), ("cluster", 3), ("grid", 2), ("stream", 1))
 )
-
-
-@dataclass(frozen=True)
-class PaperTest:
-    """One of the source paper's three: its constraints and milliseconds on a GTX 470, and cells here."""
-
-    name: str
-    constraints: int
-    milliseconds: float
-    cells: tuple[int, int, int]
-
-
-PAPER = (
-    PaperTest("paper-1200", 1200, 27.0, (8, 5, 5)),
-    PaperTest("paper-1000", 1000, 26.0, (7, 6, 4)),  # 1008 tetrahedra
-    PaperTest("paper-200", 200, 20.0, (11, 3, 1)),  # 198
-)

@@ -14,7 +14,6 @@ of Multilevel, on a GPU with kernel "stream"; --cells and --youngs choose other 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 from collections.abc import Callable
@@ -24,7 +23,7 @@ from typing import Any
 import torch
 from gpu_scenes import GpuScene
 from gpu_timing import graph_times
-from machine import describe_run, measure
+from machine import describe_run, measure, write_result
 from tqdm.auto import tqdm
 
 import torchpd as pd
@@ -136,8 +135,7 @@ def main() -> None:
     for row in rows:
         print(line_of(row))
     if options.out:
-        result = {"schema": 1, **describe_run(device, options.threads), "rows": rows}
-        options.out.write_text(json.dumps(result, indent=1) + "\n")
+        write_result(options.out, {"schema": 1, **describe_run(device, options.threads), "rows": rows})
 
 
 if __name__ == "__main__":

@@ -34,15 +34,15 @@ def measure(work: Callable[[], object], device: torch.device, *, repetitions: in
     times: list[float] = []
     work()
     while len(times) < repetitions or sum(times) < seconds:
-        _wait_for(device)
+        wait_for(device)
         begin = time.perf_counter()
         work()
-        _wait_for(device)
+        wait_for(device)
         times.append(time.perf_counter() - begin)
     return times
 
 
-def _wait_for(device: torch.device) -> None:
+def wait_for(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -50,6 +50,17 @@ def _wait_for(device: torch.device) -> None:
 def milliseconds(times: list[float]) -> Record:
     """A summary of times."""
     return {"median": 1e3 * statistics.median(times), "min": 1e3 * min(times), "repetitions": len(times)}
+
+
+def cell(value: float | None, places: int, scale: float = 1.0) -> str:
+    """A number of a table."""
+    return "-" if value is None else f"{value * scale:,.{places}f}"
+
+
+def aligned(lines: list[list[str]]) -> str:
+    """A table: cells to the right of their columns."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join("  ".join(map(str.rjust, line, widths)) for line in lines)
 
 
 def write_result(path: Path, result: Record, merge: Callable[[Record, Record], Record] | None = None) -> None:

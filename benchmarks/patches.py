@@ -14,7 +14,6 @@ on any device; "fit, one step" is `PatchLoss` over the same patches and its grad
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 from collections.abc import Callable
@@ -25,7 +24,7 @@ import numpy as np
 import torch
 import trimesh
 from compactness import BLOB_BOX, balls, blob
-from machine import describe_run, measure, multiply_adds_per_second
+from machine import describe_run, measure, multiply_adds_per_second, write_result
 
 import torchpd as pd
 from torchpd import _C
@@ -169,8 +168,8 @@ def main() -> None:
     options = parser.parse_args()
     rows = [row for n in options.subdivisions for row in measure_patches(n, options)] + measure_fit(options)
     if options.out:
-        record = describe_run(torch.device(options.device), torch.get_num_threads()) | {"rows": rows}
-        options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        run = describe_run(torch.device(options.device), torch.get_num_threads())
+        write_result(options.out, {**run, "rows": rows})
 
 
 if __name__ == "__main__":

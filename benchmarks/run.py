@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from gpu import run_on_gpu, with_earlier
 from gpu_scenes import GPU_SCENES, QUICK_GPU_SCENES
-from machine import describe_run, measure, milliseconds, multiply_adds_per_second, write_result
+from machine import aligned, cell, describe_run, measure, milliseconds, multiply_adds_per_second, write_result
 from scenes import GOAL_MULTIPLY_ADDS_PER_SECOND, GOAL_THREADS, QUICK_SCENES, SCENES, TIME_STEP, BenchScene
 from tqdm.auto import tqdm
 from vectorised import VectorisedStep
@@ -141,11 +141,6 @@ def measure_calls(options: argparse.Namespace) -> Row:
     }
 
 
-def number(value: float | None, places: int, scale: float = 1.0) -> str:
-    """For a cell of the table."""
-    return "-" if value is None else f"{value * scale:,.{places}f}"
-
-
 def table(rows: list[Row]) -> str:
     """The rows for a reader."""
     head = ["scene", "dtype", "tets", "batch", "K", "ms median", "ms min", "M tet-it/s", "goal here", "of goal"]
@@ -156,22 +151,21 @@ def table(rows: list[Row]) -> str:
             [
                 row["scene"],
                 row["dtype"],
-                number(row["tets"], 0),
-                number(row["batch"], 0),
-                number(row["iterations"], 0),
-                number(row["milliseconds"]["median"], 3),
-                number(row["milliseconds"]["min"], 3),
-                number(row["tet_iterations_per_second"], 1, 1e-6),
-                number(goal["least"], 0, 1e-6),
-                number(goal["share_of_least"], 2),
-                number(row["multiply_adds_per_tet_iteration"], 0),
-                number(row["speedup"], 0),
-                number(row["plan_seconds"], 2),
-                number(row["bytes_per_vertex"], 0),
+                cell(row["tets"], 0),
+                cell(row["batch"], 0),
+                cell(row["iterations"], 0),
+                cell(row["milliseconds"]["median"], 3),
+                cell(row["milliseconds"]["min"], 3),
+                cell(row["tet_iterations_per_second"], 1, 1e-6),
+                cell(goal["least"], 0, 1e-6),
+                cell(goal["share_of_least"], 2),
+                cell(row["multiply_adds_per_tet_iteration"], 0),
+                cell(row["speedup"], 0),
+                cell(row["plan_seconds"], 2),
+                cell(row["bytes_per_vertex"], 0),
             ]
         )
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
+    return aligned(lines)
 
 
 def parse(words: list[str]) -> argparse.Namespace:

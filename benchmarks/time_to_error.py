@@ -17,7 +17,6 @@ that were measured are kept, with the run that measured them: a run that was sto
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import statistics
 import sys
@@ -27,7 +26,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from machine import describe_run, earlier_rows, run_of
+from machine import describe_run, earlier_rows, run_of, wait_for, write_result
 from tqdm.auto import tqdm
 
 import torchpd as pd
@@ -131,11 +130,6 @@ def milliseconds(case: Case, solvers: dict[str, tuple[Solver, int]], seconds: fl
         if len(min(times.values(), key=len)) >= 50:
             break
     return {name: {"min": 1e3 * min(t), "median": 1e3 * statistics.median(t)} for name, t in times.items()}
-
-
-def wait_for(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 @torch.no_grad()
@@ -342,7 +336,7 @@ def main(words: list[str]) -> None:
                 row.update(judged(row))
             else:
                 continue
-            write(out, {**now, "error": ERROR, "rows": in_order(rows)})
+            write_result(out, {"schema": 1, **now, "error": ERROR, "rows": in_order(rows)})
     found = [row for row in in_order(rows) if row.get("batch", 1) == options.batch]
     print(table(found))
     print(matrix(found))
@@ -352,12 +346,6 @@ def main(words: list[str]) -> None:
 def in_order(rows: Rows) -> list[Row]:
     """By batch, size and stiffness."""
     return [rows[key] for key in sorted(rows, key=lambda key: (key[2], SIZES[key[0]], key[1]))]
-
-
-def write(out: Path, result: Row) -> None:
-    """Everything so far."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps({"schema": 1, **result}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from machine import describe_run, earlier_rows, measure, run_of
+from machine import describe_run, earlier_rows, measure, run_of, write_result
 from scipy.spatial import Delaunay
 from tqdm.auto import tqdm
 
@@ -248,17 +248,11 @@ def main(words: list[str]) -> None:
             rows[number]["budget"] = {**judge_budget(sim, start, other), "commit": now["commit"]}
         else:
             continue
-        write(options.out, header, list(rows.values()))
+        if options.out:
+            every = list(rows.values())
+            write_result(options.out, {"schema": 1, **header, "summary": summary(every), "rows": every})
     chosen = [rows[number] for number in range(options.scenes)]
     print(json.dumps(summary(chosen), indent=1))
-
-
-def write(out: Path | None, header: Row, rows: list[Row]) -> None:
-    """Everything so far."""
-    if out is None:
-        return
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps({"schema": 1, **header, "summary": summary(rows), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -268,8 +268,8 @@ def _report(runs: list[_Run], options: DemoOptions, level: int, drawing: list[fl
              f"{1e3 * surfaced:.2f}", f"{1 / (simulated + surfaced):.0f}", f"{run.scene.milliseconds:.0f}",
              f"{run.scene.frames_per_second:.0f}", f"{run.residual:.1e}", f"{picture:.1f}"]
         )  # fmt: skip
-    widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
-    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.rjust, row, widths)) for row in rows]
     where = f"cpu with threads: {torch.get_num_threads()}" if options.device == "cpu" else options.device
     lines += [
         "",

@@ -31,6 +31,7 @@ _FLOOR: Color = (0.41, 0.53, 0.60)
 _KEY_LIGHT: Color = (12.0, 11.4, 10.6)  # radiance of the soft box, warm
 _SKY: Color = (0.61, 0.625, 0.66)  # radiance from everywhere, cool
 _ROWS = 16  # of a picture at a time, so that they stay in the cache
+_MARGIN = 16  # pixels
 _PAPER, _INK = (255, 255, 255), (62, 64, 70)
 
 
@@ -292,7 +293,10 @@ def _denoise(radiance: Radiance) -> Radiance:
     except ImportError:
         warn_user("pictures keep their grain, as pyoidn is missing: pip install pyoidn, or take more samples")
         return radiance
-    return np.asarray(denoise(radiance, hdr=True))
+    wide = np.pad(
+        radiance, (*2 * ((_MARGIN, _MARGIN),), (0, 0)), mode="symmetric"
+    )  # else it leaves a seam at the edges
+    return np.asarray(denoise(wide, hdr=True)[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN])
 
 
 def _develop(radiance: Radiance) -> Picture:
