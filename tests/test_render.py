@@ -118,6 +118,17 @@ def test_missing_mitsuba_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -
         render(vertices, triangles)
 
 
+def test_grain_is_filtered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error of four light paths per pixel is halved."""
+    vertices, triangles = _ball((0.0, 0.5, 0.0), 0.5)
+    many, few = (render(vertices, triangles, size=(96, 72), samples=samples) for samples in (144, 4))
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    with pytest.warns(UserWarning, match="pip install pyoidn"):
+        raw = render(vertices, triangles, size=(96, 72), samples=4)
+    filtered, unfiltered = (np.sqrt(np.mean((image.astype(float) - many) ** 2)) for image in (few, raw))
+    assert filtered < unfiltered / 2.0
+
+
 def test_bad_requests_are_named() -> None:
     vertices, triangles = _ball((0.0, 0.5, 0.0), 0.5)
     with pytest.raises(ValueError, match="elevation must lie between"):
