@@ -16,7 +16,6 @@ from torchpd.accuracy import (
     frictionless,
     problem_of,
     scene_without_friction,
-    select_state,
     settled_steps,
 )
 from torchpd.contact_newton import ContactNewton
@@ -91,7 +90,7 @@ def test_material_of_every_environment_is_that_of_now() -> None:
     after = converged(state).velocities * sim.time_step
     for step, u in zip(steps, after.numpy(), strict=True):
         assert step.judge(u).position < 1e-9
-    alone = exact_steps(sim_of_one(sim, 2), select_state(state, [2]))[0]
+    alone = exact_steps(sim_of_one(sim, 2), pd.State(*(part[2:3] for part in state)))[0]
     assert np.abs(alone.solution - steps[2].solution).max() < 1e-12
 
 

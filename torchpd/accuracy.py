@@ -42,7 +42,6 @@ __all__ = [
     "frictionless",
     "problem_of",
     "scene_without_friction",
-    "select_state",
     "settled_steps",
 ]
 
@@ -148,11 +147,6 @@ def frictionless(sim: Stepper, dtype: torch.dtype | None = None) -> Stepper:
             array[..., 4] = 0.0
         twin.set_material(**smooth)
     return twin
-
-
-def select_state(state: State, items: list[int]) -> State:
-    """Some environments of a state."""
-    return State(state[0][items], state[1][items])
 
 
 def problem_of(

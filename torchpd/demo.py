@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from tqdm.auto import tqdm
 
 from . import shapes
@@ -111,18 +112,11 @@ def _load(path: Path | None) -> TetMesh | TriMesh:
 def _place(shape: TetMesh | TriMesh, cells: int) -> TetMesh:
     """One metre long, tilted so that it lands on an edge and bends, its lowest vertex above the ground."""
     low, high = shape.bounds
-    placed = shape.translated(-(low + high) / 2.0).scaled(1.0 / float((high - low).max())).transformed(_tilt())
+    # about z, then x and, towards the camera, y
+    tilt = Rotation.from_euler("zxy", [25.0, 20.0, 25.0], degrees=True).as_matrix()
+    placed = shape.translated(-(low + high) / 2.0).scaled(1.0 / float((high - low).max())).transformed(tilt)
     mesh = placed if isinstance(placed, TetMesh) else tetrahedralize(placed, cells=cells, progress=True)
     return mesh.translated((0.0, DROP_HEIGHT - float(mesh.bounds[0, 1]), 0.0))
-
-
-def _tilt() -> Array:
-    """Turns of 25 degrees about z, 20 about x and, towards the camera, 25 about y, one after another."""
-    x, y, z = np.radians(20.0), np.radians(25.0), np.radians(25.0)
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(x), -np.sin(x)], [0.0, np.sin(x), np.cos(x)]])
-    about_y = np.array([[np.cos(y), 0.0, np.sin(y)], [0.0, 1.0, 0.0], [-np.sin(y), 0.0, np.cos(y)]])
-    about_z = np.array([[np.cos(z), -np.sin(z), 0.0], [np.sin(z), np.cos(z), 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(about_y @ about_x @ about_z)
 
 
 def _simulate(sim: Simulator, mesh: TetMesh, steps: int) -> _Motion:

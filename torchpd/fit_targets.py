@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
+from trimesh.triangles import points_to_barycentric
 
 from .checks import as_array, check_finite, check_shape
 from .contour import contour
@@ -89,7 +90,8 @@ class MeshTarget:
             return np.empty(0), np.empty((0, 3)), np.empty((0, 3))
         nearest, distance, face = self._closest(self.shape, points)
         corners = self.surface.triangles[face]
-        share = _barycentrics(self.surface.vertices[corners], nearest)
+        triangles = self.surface.vertices[corners]
+        share = np.clip(points_to_barycentric(triangles, nearest, method="cramer"), 0.0, 1.0)
         normals = _unit(np.einsum("nk,nkx->nx", share, self.vertex_normals.numpy()[corners]))
         apart = points - nearest
         flat = self.shape.face_normals[face]
@@ -332,13 +334,3 @@ def base_triangles(target: FitTarget, patches: int | TriMesh) -> tuple[TriMesh, 
 def _unit(vectors: Array) -> Array:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(length, np.finfo(np.float64).tiny))
-
-
-def _barycentrics(corners: Array, points: Array) -> Array:
-    """Coordinates [N, 3] of points in the planes of triangles [N, 3, 3]."""
-    a, b, p = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
-    aa, ab, bb = (a * a).sum(1), (a * b).sum(1), (b * b).sum(1)
-    pa, pb = (p * a).sum(1), (p * b).sum(1)
-    det = aa * bb - ab * ab
-    second, third = (bb * pa - ab * pb) / det, (aa * pb - ab * pa) / det
-    return np.asarray(np.clip(np.stack([1.0 - second - third, second, third], axis=1), 0.0, 1.0))

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -122,11 +123,7 @@ def _body(mesh: TriMesh, quadrics: Quadrics, device: torch.device, stiffness: fl
 
 def _turns(angle: float, axis: int) -> Array:
     """The rotation about an axis."""
-    c, s = np.cos(angle), np.sin(angle)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    turn = np.eye(3)
-    turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
-    return turn
+    return np.asarray(Rotation.from_rotvec(angle * np.eye(3)[axis]).as_matrix())
 
 
 def _share(step: int, steps: int) -> float:

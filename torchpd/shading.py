@@ -10,6 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from trimesh.geometry import mean_vertex_normals
 from trimesh.graph import face_adjacency
+from trimesh.triangles import cross
 
 from .checks import as_array, check_finite, check_shape
 
@@ -55,7 +56,7 @@ class SmoothSurface:
 
     def normals(self, split_vertices: Array) -> Array:
         """Unit normals [S, 3], weighted by area; +y where the triangles around a vertex cancel out."""
-        face_normals = _face_normals(split_vertices, self.triangles)
+        face_normals = cross(split_vertices[self.triangles])
         normals = mean_vertex_normals(len(split_vertices), self.triangles, face_normals)
         return np.where(normals.any(axis=1, keepdims=True), normals, [0.0, 1.0, 0.0])
 
@@ -68,7 +69,7 @@ class SmoothSurface:
         normals = self.normals(split_vertices)
         towards = eye - split_vertices
         towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
-        face_normals = _face_normals(split_vertices, self.triangles)
+        face_normals = cross(split_vertices[self.triangles])
         seen_faces = np.einsum("ij,ij->i", face_normals, eye - split_vertices[self.triangles[:, 0]]) > 0.0
         seen = np.zeros(len(normals), dtype=bool)
         seen[self.triangles[seen_faces]] = True
@@ -78,16 +79,10 @@ class SmoothSurface:
         return np.asarray(bent / np.linalg.norm(bent, axis=1, keepdims=True))
 
 
-def _face_normals(vertices: Array, triangles: Index) -> Array:
-    """Normals of twice the triangles' area."""
-    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
-    return np.cross(b - a, c - a)
-
-
 def _smoothing_groups(vertices: Array, triangles: Index, crease: float) -> Index:
     """The number [3T] of the split vertex that each corner of a triangle belongs to."""
     place = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[triangles]
-    normals = _face_normals(vertices, triangles)
+    normals = cross(vertices[triangles])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(length > 0.0, length, 1.0)
 
