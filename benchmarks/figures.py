@@ -10,6 +10,10 @@ import csv
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from torchpd.animation import write_film
+
 ROOT = Path(__file__).resolve().parents[1]
 STUDY = ROOT / "benchmarks" / "results" / "study-beam" / "study.csv"
 STIFFNESS = 1e6  # Pa
@@ -59,17 +63,19 @@ def draw(out: Path, study: Path = STUDY) -> None:
     figure.savefig(out)
 
 
-def film(source: Path, out: Path, *, width: int = 360, every: int = 3, colors: int = 128) -> None:
-    """A small film that repeats: every third picture of 30 a second, in one palette."""
-    import imageio.v3 as imageio
+def film(source: Path, out: Path, *, width: int = 360, every: int = 3) -> None:
+    """A small film that repeats: every third picture of 30 a second."""
+    import imageio_ffmpeg
     from PIL import Image
 
-    pictures = [Image.fromarray(array) for array in imageio.imread(source)[::every]]
-    height = width * pictures[0].height // pictures[0].width
-    small = [picture.resize((width, height), Image.Resampling.LANCZOS) for picture in pictures]
-    palette = small[len(small) // 2].quantize(colors)
-    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in small]
-    frames[0].save(out, save_all=True, append_images=frames[1:], duration=1000 * every // 30, loop=0, optimize=True)
+    reader = imageio_ffmpeg.read_frames(str(source))
+    size = next(reader)["size"]
+    pictures = [Image.frombytes("RGB", size, data) for data in reader][::every]
+    small = [
+        np.asarray(picture.resize((width, width * size[1] // size[0]), Image.Resampling.LANCZOS))
+        for picture in pictures
+    ]
+    write_film(out, small, frames_per_second=30 / every)
 
 
 def main() -> None:
