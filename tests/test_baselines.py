@@ -322,7 +322,7 @@ def test_newton_krylov_finds_contacts(ground: pd.Ground) -> None:
 def test_examination_is_not_imported_with_the_library() -> None:
     """Neither the methods to compare with nor what draws them: they are asked for by name."""
     ours = ("baselines", "compiled_step", "dense_direct", "study", "tuning", "accuracy")
-    modules = [*(f"torchpd.{name}" for name in ours), "plotly", "matplotlib", "threadpoolctl"]
+    modules = [*(f"torchpd.{name}" for name in ours), "plotly", "matplotlib", "threadpoolctl", "trimesh"]
     code = f"import sys, torchpd; print([name for name in {modules} if name in sys.modules])"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ended.stdout.strip() == "[]"

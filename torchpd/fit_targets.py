@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
-from trimesh.triangles import points_to_barycentric
 
 from .checks import as_array, check_finite, check_shape
 from .contour import contour
@@ -90,6 +89,8 @@ class MeshTarget:
             return np.empty(0), np.empty((0, 3)), np.empty((0, 3))
         nearest, distance, face = self._closest(self.shape, points)
         corners = self.surface.triangles[face]
+        from trimesh.triangles import points_to_barycentric
+
         triangles = self.surface.vertices[corners]
         share = np.clip(points_to_barycentric(triangles, nearest, method="cramer"), 0.0, 1.0)
         normals = _unit(np.einsum("nk,nkx->nx", share, self.vertex_normals.numpy()[corners]))

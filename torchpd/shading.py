@@ -8,9 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from trimesh.geometry import mean_vertex_normals
-from trimesh.graph import face_adjacency
-from trimesh.triangles import cross
 
 from .checks import as_array, check_finite, check_shape
 
@@ -56,8 +53,10 @@ class SmoothSurface:
 
     def normals(self, split_vertices: Array) -> Array:
         """Unit normals [S, 3], weighted by area; +y where the triangles around a vertex cancel out."""
-        face_normals = cross(split_vertices[self.triangles])
-        normals = mean_vertex_normals(len(split_vertices), self.triangles, face_normals)
+        import trimesh
+
+        face_normals = trimesh.triangles.cross(split_vertices[self.triangles])
+        normals = trimesh.geometry.mean_vertex_normals(len(split_vertices), self.triangles, face_normals)
         return np.where(normals.any(axis=1, keepdims=True), normals, [0.0, 1.0, 0.0])
 
     def normals_seen_from(self, eye: Array, split_vertices: Array) -> Array:
@@ -66,10 +65,12 @@ class SmoothSurface:
         Along the silhouette of a coarse surface an averaged normal may look away although its triangle is seen, and
         a path tracer paints such a place black.
         """
+        import trimesh
+
         normals = self.normals(split_vertices)
         towards = eye - split_vertices
         towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
-        face_normals = cross(split_vertices[self.triangles])
+        face_normals = trimesh.triangles.cross(split_vertices[self.triangles])
         seen_faces = np.einsum("ij,ij->i", face_normals, eye - split_vertices[self.triangles[:, 0]]) > 0.0
         seen = np.zeros(len(normals), dtype=bool)
         seen[self.triangles[seen_faces]] = True
@@ -81,12 +82,14 @@ class SmoothSurface:
 
 def _smoothing_groups(vertices: Array, triangles: Index, crease: float) -> Index:
     """The number [3T] of the split vertex that each corner of a triangle belongs to."""
+    import trimesh
+
     place = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[triangles]
-    normals = cross(vertices[triangles])
+    normals = trimesh.triangles.cross(vertices[triangles])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(length > 0.0, length, 1.0)
 
-    pairs, edges = face_adjacency(place, return_edges=True)
+    pairs, edges = trimesh.graph.face_adjacency(place, return_edges=True)
     gentle = np.einsum("ij,ij->i", *normals[pairs.T]) > np.cos(np.radians(crease))
     pairs, edges = pairs[gentle], edges[gentle]
     # for each pair and each end of its edge: the corners of both triangles there
