@@ -51,7 +51,7 @@ inline void check_step_taken(const AdjointTensors& t, double time_step) {
   if (t.forces) check_state(*t.forces, t.positions, "forces", "N");
   check_state(t.grad_positions, t.positions, "grad_positions", "of a loss, 1/m");
   check_state(t.grad_velocities, t.positions, "grad_velocities", "of a loss, 1/(m/s)");
-  check_time_step(time_step);
+  CheckSetting::time_step(time_step);
 }
 
 // The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1, vertices], and of
@@ -77,7 +77,8 @@ struct PassedOn {
 };
 
 struct ResultTensors {
-  Tensor multiplier, error, grad_velocities, masses, damping;
+  Tensor multiplier, error, grad_velocities;
+  at::TensorList material;
   PassedOn passed_on;
 };
 
@@ -87,9 +88,10 @@ Outputs adjoint_result_typed(const ResultTensors& t, double time_step) {
   const Place place{t.multiplier.device()};
   call.batch = t.multiplier.size(0);
   call.vertices = t.multiplier.size(1);
-  call.masses =
-      values_view<T>(t.masses, call.vertices, 1, false, call.batch, place, "masses", "kg");
-  call.damping = values_view<T>(t.damping, 1, 1, true, call.batch, place, "damping", "1/s");
+  call.masses = values_view<T>(array_of(t.material, "masses"), call.vertices, 1, false, call.batch,
+                               place, "masses", "kg");
+  call.damping = values_view<T>(array_of(t.material, "damping"), 1, 1, true, call.batch, place,
+                                "damping", "1/s");
   call.time_step = time_step;
   const Tensor l = t.multiplier.contiguous(), v = t.grad_velocities.contiguous();
   const Tensor x = at::empty_like(l), before = at::empty_like(l), out = at::empty_like(l);
@@ -118,17 +120,17 @@ Outputs adjoint_result_typed(const ResultTensors& t, double time_step) {
 // Gradients for positions and velocities before a step, and the multiplier, of which no number is left where the error is none.
 template <class Backend>
 Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tensor& grad_velocities,
-                       const Tensor& masses, const Tensor& damping,
-                       const OptionalTensor& grad_positions, const OptionalTensor& elastic,
-                       const OptionalTensor& projector, const OptionalTensor& stuck,
-                       const OptionalTensor& sliding, double time_step) {
+                       at::TensorList material, const OptionalTensor& grad_positions,
+                       const OptionalTensor& elastic, const OptionalTensor& projector,
+                       const OptionalTensor& stuck, const OptionalTensor& sliding,
+                       double time_step) {
   check_positions(multiplier, "multiplier");
   check_state(grad_velocities, multiplier, "grad_velocities", "of a loss, 1/(m/s)");
   TORCH_CHECK_VALUE(
       error.scalar_type() == at::kDouble && error.dim() == 1 &&
           error.size(0) == multiplier.size(0) && error.device() == multiplier.device(),
       "error must be float64 [", multiplier.size(0), "] beside multiplier, got ", describe(error));
-  check_time_step(time_step);
+  CheckSetting::time_step(time_step);
   const bool some = grad_positions || elastic || projector || stuck || sliding;
   if (some) {
     TORCH_CHECK_VALUE(
@@ -143,9 +145,11 @@ Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tens
         "stuck must be bool [batch, vertices] beside multiplier, got ", describe(*stuck));
     check_sliding(*sliding, multiplier);
   }
-  const ResultTensors tensors{
-      multiplier, error,   grad_velocities,
-      masses,     damping, {grad_positions, elastic, projector, stuck, sliding}};
+  const ResultTensors tensors{multiplier,
+                              error,
+                              grad_velocities,
+                              material,
+                              {grad_positions, elastic, projector, stuck, sliding}};
   return multiplier.scalar_type() == at::kFloat
              ? adjoint_result_typed<Backend, float>(tensors, time_step)
              : adjoint_result_typed<Backend, double>(tensors, time_step);
@@ -180,7 +184,7 @@ struct Solved {
 
 // By the iterations of conjugate_gradients_ and those of friction, as many as it takes.
 template <class Backend>
-Solved iterate(const Tensor& positions, const AdjointSystem& s, const Tensor& stiffness,
+Solved iterate(const Tensor& positions, const AdjointSystem& s, at::TensorList material,
                at::TensorList plan, double tolerance) {
   const Tensor right = s.right.contiguous(), x = positions.contiguous();
   const Tensor solution = at::empty_like(right), direction = at::empty_like(right);
@@ -190,7 +194,7 @@ Solved iterate(const Tensor& positions, const AdjointSystem& s, const Tensor& st
   OptionalTensor friction;
   if (s.sliding) friction = at::zeros({x.size(0), friction_count}, numbers);
   solve_conjugate<Backend>({solution, residual, direction, progress, x, s.inertia, s.inverse,
-                            s.projector, stiffness, plan, s.sliding, right, friction},
+                            s.projector, material, plan, s.sliding, right, friction},
                            tolerance, (s.sliding ? 2 : 1) * adjoint_iterations);
   return {solution, progress.select(1, progress_error),
           friction ? friction->select(1, friction_error) : Tensor()};
@@ -200,12 +204,12 @@ template <class Backend>
 std::tuple<Tensor, Tensor> conjugate_gradients(const Tensor& positions, const Tensor& right,
                                                const Tensor& inertia, const Tensor& inverse,
                                                const OptionalTensor& projector,
-                                               const Tensor& stiffness, at::TensorList plan,
+                                               at::TensorList material, at::TensorList plan,
                                                const OptionalTensor& sliding, double tolerance) {
   check_positions(positions, "positions");
   check_state(right, positions, "right", "N");
   const Solved found = iterate<Backend>(positions, {right, inertia, inverse, projector, sliding},
-                                        stiffness, plan, tolerance);
+                                        material, plan, tolerance);
   return {found.solution,
           sliding ? at::maximum(found.error, found.friction) : found.error.contiguous()};
 }
@@ -240,8 +244,7 @@ std::tuple<Tensor, Tensor> solve(const AdjointTensors& t, const AdjointSystem& s
                                  double time_step) {
   const double tolerance =
       t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
-  const Solved found =
-      iterate<Backend>(t.after, s, t.material[place_in_material("stiffness")], t.plan, tolerance);
+  const Solved found = iterate<Backend>(t.after, s, t.material, t.plan, tolerance);
   // a recording cannot ask, and does all of it
   const bool mends = Backend::recording(t.after) || some_failed(found, tolerance);
   return {mends ? mend(t, s, time_step, found) : found.solution, found.error};
@@ -285,8 +288,7 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
     passed_on = {grad_positions, elastic, projector, stuck, sliding};
   }
   auto [x, v, multiplier] = adjoint_result<Backend>(
-      solution, error, grad_velocities, material[place_in_material("masses")],
-      material[place_in_material("damping")], passed_on.grad_positions, passed_on.elastic,
+      solution, error, grad_velocities, material, passed_on.grad_positions, passed_on.elastic,
       passed_on.projector, passed_on.stuck, passed_on.sliding, time_step);
   const Asked asked(grad_positions, grad_velocities);
   std::vector<Tensor> found{asked.only(x), asked.only(v), asked.only(multiplier)};

@@ -1,9 +1,9 @@
 // What autograd does around a step and a rollout. Their adjoints are ops of their own, step_vjp and rollout_vjp.
 //
 // Not registered from Python, where the lists of a plan and of a material cost more than a small step itself.
-#include "checks.h"
 #include "find_op.h"
 #include "plan_views.h"
+#include "settings.h"
 
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
@@ -23,30 +23,23 @@ using Outputs = std::tuple<Tensor, Tensor, Tensor>;
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 
-Outputs plain_step(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
-                   const OptionalTensor& start, at::TensorList material, at::TensorList plan,
-                   const Numbers& n) {
-  static const auto op =
-      find_op<Outputs(const Tensor&, const Tensor&, const OptionalTensor&, const OptionalTensor&,
-                      at::TensorList, at::TensorList, std::int64_t, std::int64_t, double, double,
-                      double, std::int64_t, bool, double, bool, bool)>("torchpd::step");
+Outputs plain_step(const Numbers& n, const Tensor& positions, const Tensor& velocities,
+                   const OptionalTensor& forces, const OptionalTensor& start,
+                   at::TensorList material, at::TensorList plan) {
+  using Step = WithSettings<decltype(plain_step)>;
+  static const auto op = find_op<Step::Op>("torchpd::step");
   const at::AutoDispatchBelowADInplaceOrView below;
-  return op.call(positions, velocities, forces, start, material, plan, n.schedule, n.iterations,
-                 n.time_step, n.relaxation, n.rho, n.delay, n.weighted, n.tolerance, n.inertial,
-                 n.report);
+  return Step::call(op, n, positions, velocities, forces, start, material, plan);
 }
 
-Outputs plain_rollout(const Tensor& positions, const Tensor& velocities,
+Outputs plain_rollout(const Numbers& n, const Tensor& positions, const Tensor& velocities,
                       const OptionalTensor& forces, at::TensorList material, at::TensorList plan,
-                      const c10::SymInt& steps, const c10::SymInt& every, const Numbers& n) {
-  static const auto op =
-      find_op<Outputs(const Tensor&, const Tensor&, const OptionalTensor&, at::TensorList,
-                      at::TensorList, c10::SymInt, c10::SymInt, std::int64_t, std::int64_t, double,
-                      double, double, std::int64_t, bool, double, bool, bool)>("torchpd::rollout");
+                      c10::SymInt steps, c10::SymInt every) {
+  using Rollout = WithSettings<decltype(plain_rollout)>;
+  static const auto op = find_op<Rollout::Op>("torchpd::rollout");
   const at::AutoDispatchBelowADInplaceOrView below;
-  return op.call(positions, velocities, forces, material, plan, steps, every, n.schedule,
-                 n.iterations, n.time_step, n.relaxation, n.rho, n.delay, n.weighted, n.tolerance,
-                 n.inertial, n.report);
+  return Rollout::call(op, n, positions, velocities, forces, material, plan, std::move(steps),
+                       std::move(every));
 }
 
 // Which arrays of a material autograd wants to know about.
@@ -151,7 +144,7 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
                                const OptionalTensor& start, at::TensorList material,
                                const Unvaried& rest) {
     const Outputs outputs =
-        plain_step(positions, velocities, forces, start, material, rest.plan, rest.numbers);
+        plain_step(rest.numbers, positions, velocities, forces, start, material, rest.plan);
     context->saved_data["starts"] = start.has_value();
     return keep(context, positions, velocities, forces, outputs, Tensor(), material, rest);
   }
@@ -185,8 +178,8 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
   static variable_list forward(AutogradContext* context, const Tensor& positions,
                                const Tensor& velocities, const OptionalTensor& forces,
                                at::TensorList material, const Unvaried& rest) {
-    const Outputs outputs = plain_rollout(positions, velocities, forces, material, rest.plan,
-                                          rest.steps, rest.every, rest.numbers);
+    const Outputs outputs = plain_rollout(rest.numbers, positions, velocities, forces, material,
+                                          rest.plan, rest.steps, rest.every);
     context->set_materialize_grads(false);
     return keep(context, positions, velocities, forces, outputs, std::get<1>(outputs), material,
                 rest);
@@ -237,15 +230,11 @@ bool varies(const Tensor& positions, const Tensor& velocities, const OptionalTen
                                         (start && start->requires_grad()) || varies(material));
 }
 
-Outputs step(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
-             const OptionalTensor& start, at::TensorList material, at::TensorList plan,
-             std::int64_t schedule, std::int64_t iterations, double time_step, double relaxation,
-             double rho, std::int64_t delay, bool weighted, double tolerance, bool inertial,
-             bool report) {
-  const Numbers n{schedule, iterations, time_step, relaxation, rho,
-                  delay,    weighted,   tolerance, inertial,   report};
+Outputs step(const Numbers& n, const Tensor& positions, const Tensor& velocities,
+             const OptionalTensor& forces, const OptionalTensor& start, at::TensorList material,
+             at::TensorList plan) {
   if (!varies(positions, velocities, forces, start, material))
-    return plain_step(positions, velocities, forces, start, material, plan, n);
+    return plain_step(n, positions, velocities, forces, start, material, plan);
   refuse_transforms();
   Tensor info;
   const variable_list state = StepFunction::apply(positions, velocities, forces, start, material,
@@ -253,15 +242,12 @@ Outputs step(const Tensor& positions, const Tensor& velocities, const OptionalTe
   return {state[0], state[1], info};
 }
 
-Outputs rollout(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
-                at::TensorList material, at::TensorList plan, c10::SymInt steps, c10::SymInt every,
-                std::int64_t schedule, std::int64_t iterations, double time_step, double relaxation,
-                double rho, std::int64_t delay, bool weighted, double tolerance, bool inertial,
-                bool report) {
-  const Numbers n{schedule, iterations, time_step, relaxation, rho,
-                  delay,    weighted,   tolerance, inertial,   report};
+Outputs rollout(const Numbers& n, const Tensor& positions, const Tensor& velocities,
+                const OptionalTensor& forces, at::TensorList material, at::TensorList plan,
+                c10::SymInt steps, c10::SymInt every) {
   if (!varies(positions, velocities, forces, {}, material))
-    return plain_rollout(positions, velocities, forces, material, plan, steps, every, n);
+    return plain_rollout(n, positions, velocities, forces, material, plan, std::move(steps),
+                         std::move(every));
   refuse_transforms();
   Tensor info;
   const variable_list track =
@@ -326,8 +312,8 @@ variable_list rollout_vjp(const Tensor& grad_positions, const Tensor& grad_veloc
 }  // namespace
 
 TORCH_LIBRARY_IMPL(torchpd, Autograd, m) {
-  m.impl("step", &step);
-  m.impl("rollout", &rollout);
+  m.impl("step", unpacked<&step>);
+  m.impl("rollout", unpacked<&rollout>);
   m.impl("step_vjp", &step_vjp);
   m.impl("rollout_vjp", &rollout_vjp);
 }

@@ -6,10 +6,7 @@
 #include <ATen/MemoryOverlap.h>
 #include <c10/util/Exception.h>
 
-#include <algorithm>
-#include <cmath>
 #include <cstdint>
-#include <optional>
 #include <string>
 #include <vector>
 
@@ -128,52 +125,6 @@ inline void check_sliding(const Tensor& t, const Tensor& like) {
                         t.device() == like.device(),
                     "sliding must be [batch, vertices, ", int(slide_count),
                     ", 3] beside the vectors, got ", describe(t));
-}
-
-inline void check_time_step(double time_step) {
-  TORCH_CHECK_VALUE(time_step > 0 && std::isfinite(time_step),
-                    "time_step must be positive and finite [s], got ", time_step);
-}
-
-// What a step is told besides tensors, in the order of the schemas.
-struct Numbers {
-  std::int64_t schedule, iterations;
-  double time_step, relaxation, rho;
-  std::int64_t delay;
-  bool weighted;
-  double tolerance;
-  bool inertial, report;
-};
-
-inline Settings settings_of(const Numbers& n, bool given, std::int64_t steps, std::int64_t every) {
-  constexpr std::int64_t most = 1'000'000'000;
-  TORCH_CHECK_VALUE(n.schedule >= 0 && n.schedule <= 5,
-                    "schedule must be 0 (jacobi), 1 (classic), 2 (guarded), 3 (lbfgs), 4 "
-                    "(momentum) or 5 (corotated), got ",
-                    n.schedule);
-  TORCH_CHECK_VALUE(n.iterations >= 0 && n.iterations <= most, "iterations must be 0..1e9, got ",
-                    n.iterations);
-  check_time_step(n.time_step);
-  TORCH_CHECK_VALUE(n.relaxation > 0 && n.relaxation < 2, "relaxation must lie in (0, 2), got ",
-                    n.relaxation);
-  TORCH_CHECK_VALUE(n.rho >= 0 && n.rho < 1, "rho must lie in [0, 1), got ", n.rho);
-  TORCH_CHECK_VALUE(n.delay >= 0, "delay must be >= 0, got ", n.delay);
-  TORCH_CHECK_VALUE(n.tolerance >= 0, "tolerance must be >= 0, got ", n.tolerance);
-  TORCH_CHECK_VALUE(steps >= 0 && every >= 1 && steps <= most && every <= most,
-                    "steps must be 0..1e9 and every 1..1e9, got ", steps, " and ", every);
-  Settings s;
-  s.steps = int(steps);
-  s.every = int(every);
-  s.iterations = int(n.iterations);
-  s.schedule = ScheduleKind(n.schedule);
-  s.start = given ? StartKind::given : n.inertial ? StartKind::inertial : StartKind::velocity;
-  s.time_step = n.time_step;
-  s.relaxation = n.relaxation;
-  s.rho = n.rho;
-  s.tolerance = n.tolerance;
-  s.delay = int(std::min(n.delay, most));
-  s.weighted = n.weighted;
-  return s;
 }
 
 }  // namespace pd

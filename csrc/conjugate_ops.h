@@ -14,8 +14,7 @@ using OptionalTensor = std::optional<Tensor>;
 struct ConjugateTensors {
   Tensor solution, residual, direction, progress, positions, inertia, inverse;
   OptionalTensor projector;
-  Tensor stiffness;
-  at::TensorList plan;
+  at::TensorList material, plan;
   OptionalTensor sliding, right, friction;  // all or none
 };
 
@@ -26,8 +25,8 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
   call.plan = Backend::template plan_view<T>(t.plan, place);
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
-  check_tets(t.stiffness, call.plan.tets);
-  const Tensor x = t.positions.contiguous(), w = t.stiffness.contiguous();
+  const Tensor x = t.positions.contiguous();
+  const Tensor w = stiffness_of(t.material, call.plan.tets);
   const Tensor a = t.inertia.contiguous(), inverse = t.inverse.contiguous();
   const Tensor p = t.projector ? t.projector->contiguous() : Tensor();
   const Tensor slides = t.sliding ? t.sliding->contiguous() : Tensor();
@@ -79,7 +78,7 @@ void conjugate_gradients_inplace(const Tensor& solution, const Tensor& residual,
                                  const Tensor& direction, const Tensor& progress,
                                  const Tensor& positions, const Tensor& inertia,
                                  const Tensor& inverse, const OptionalTensor& projector,
-                                 const Tensor& stiffness, at::TensorList plan, double tolerance,
+                                 at::TensorList material, at::TensorList plan, double tolerance,
                                  std::int64_t iterations) {
   check_positions(positions, "positions");
   const Place place{positions.device()};
@@ -97,7 +96,7 @@ void conjugate_gradients_inplace(const Tensor& solution, const Tensor& residual,
                     "iterations must be in [0, 2^31), got ", iterations);
   const OptionalTensor none;
   solve_conjugate<Backend>({solution, residual, direction, progress, positions, inertia, inverse,
-                            projector, stiffness, plan, none, none, none},
+                            projector, material, plan, none, none, none},
                            tolerance, iterations);
   for (const Tensor& t : {solution, residual, direction, progress}) {
     if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();

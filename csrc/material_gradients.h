@@ -19,9 +19,9 @@ namespace pd {
 // K l, by the dispatcher, whose profiler then sees it.
 inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier) {
   static const auto op =
-      find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, at::TensorList)>(
+      find_op<Tensor(const Tensor&, const Tensor&, at::TensorList, at::TensorList)>(
           "torchpd::hessian_product");
-  return op.call(t.after, multiplier, t.material[place_in_material("stiffness")], t.plan);
+  return op.call(t.after, multiplier, t.material, t.plan);
 }
 
 // Environments of whose ends the loss knows anything. One of no number that it leaves out must not spoil what it shares.
@@ -85,8 +85,8 @@ std::tuple<Tensor, Tensor> gradients_for_contacts_typed(const AdjointTensors& t,
   const auto of_vertices = [&](std::int64_t count, std::int64_t numbers) {
     return at::empty({step.call.batch, step.call.plan.vertices, count, numbers}, t.after.options());
   };
-  const Tensor planes = of_vertices(wanted.planes ? m.planes_count : 0, plane_numbers);
-  const Tensor spheres = of_vertices(wanted.spheres ? m.spheres_count : 0, sphere_numbers);
+  const Tensor planes = of_vertices(wanted.planes ? m.planes_count : 0, planes_numbers);
+  const Tensor spheres = of_vertices(wanted.spheres ? m.spheres_count : 0, spheres_numbers);
   if (planes.numel() > 0) call.planes = planes.mutable_data_ptr<T>();
   if (spheres.numel() > 0) call.spheres = spheres.mutable_data_ptr<T>();
   if (call.planes || call.spheres) Backend::contact_gradients(call, multiplier);
@@ -158,9 +158,11 @@ class MaterialGradients {
 
   Tensor stiffness() const {
     static const auto op =
-        find_op<Tensor(const Tensor&, const Tensor&, const Tensor&, at::TensorList)>(
+        find_op<Tensor(const Tensor&, const Tensor&, at::TensorList, at::TensorList)>(
             "torchpd::element_energy_product");
-    return -op.call(t_.after, multiplier_, at::ones_like(material("stiffness")), t_.plan);
+    std::vector<Tensor> unit(t_.material.begin(), t_.material.end());
+    unit[place_in_material("stiffness")] = at::ones_like(material("stiffness"));
+    return -op.call(t_.after, multiplier_, unit, t_.plan);
   }
 
   Tensor masses() const {

@@ -6,6 +6,7 @@
 #include "plan/device_build.h"
 #include "plan/multilevel_build.h"
 #include "plan/shared_memory.h"
+#include "settings.h"
 #include "solver/adjoint.h"
 #include "solver/multilevel.h"
 
@@ -189,6 +190,26 @@ py::list material_table() {
   return rows;
 }
 
+py::list material_columns() {
+  py::list columns;
+#define X(name, width, rows, meaning)
+#define COLUMN(array, name, width, meaning) \
+  columns.append(py::make_tuple(#array, #name, int(pd::array##_##name), width, meaning));
+#include "plan/material.def"
+#undef X
+  return columns;
+}
+
+py::list settings_table() {
+  using namespace pd;
+  py::list rows;
+#define X(name, type, usual, holds, contract, meaning) \
+  rows.append(py::make_tuple(#name, schema_type<type>, Given<type>(usual), contract, meaning));
+#include "plan/settings.def"
+#undef X
+  return rows;
+}
+
 py::list device_sizes() {
   py::list names;
 #define X(name, meaning) names.append(#name);
@@ -297,6 +318,12 @@ PYBIND11_MODULE(_C, m) {
   m.def("device_sizes", &device_sizes, "Names of the numbers in a GPU plan's sizes.");
   m.def("material_table", &material_table,
         "Rows (name, width, rows, meaning) of the differentiable arrays, in op order.");
+  m.def("material_columns", &material_columns,
+        "Rows (array, name, first, width, meaning) of the columns that those arrays have.");
+  m.def("settings_table", &settings_table,
+        "Rows (name, type, usual, contract, meaning) of the settings of a step, in op order.");
+  m.attr("info_numbers") = int(pd::info_count);
+  m.attr("slide_vectors") = int(pd::slide_count);
   m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("many"),
         py::arg("slots"), py::arg("entries"), py::arg("planes"), py::arg("balls"),
         "Shared memory of a block of the kernels block and (many patches) grid.");

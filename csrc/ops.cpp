@@ -98,11 +98,6 @@ struct Cpu {
   static int threads() { return at::get_num_threads(); }
 };
 
-const std::string step_numbers =
-    "int schedule, int iterations, float time_step, float relaxation, float rho, int delay, bool "
-    "weighted, "
-    "float tolerance, bool inertial, bool report";
-
 }  // namespace
 
 TORCH_LIBRARY(torchpd, m) {
@@ -114,24 +109,25 @@ TORCH_LIBRARY(torchpd, m) {
   with_plan(
       "step(Tensor positions, Tensor velocities, Tensor? forces, Tensor? start, Tensor[] material, "
       "Tensor[] plan, *, " +
-      step_numbers + ") -> (Tensor, Tensor, Tensor)");
+      settings_schema() + ") -> (Tensor, Tensor, Tensor)");
   with_plan(
       "step_(Tensor(a!) positions, Tensor(b!) velocities, Tensor(c!) info, Tensor? forces, Tensor? "
       "start, Tensor[] material, Tensor[] plan, *, " +
-      step_numbers + ") -> ()");
+      settings_schema() + ") -> ()");
   with_plan(
       "rollout(Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, Tensor[] "
       "plan, *, SymInt steps, SymInt every, " +
-      step_numbers + ") -> (Tensor, Tensor, Tensor)");
-  with_plan("gradient(Tensor positions, Tensor stiffness, Tensor[] plan) -> Tensor");
+      settings_schema() + ") -> (Tensor, Tensor, Tensor)");
+  with_plan("gradient(Tensor positions, Tensor[] material, Tensor[] plan) -> Tensor");
   with_plan(
-      "hessian_product(Tensor positions, Tensor direction, Tensor stiffness, Tensor[] plan) -> "
+      "hessian_product(Tensor positions, Tensor direction, Tensor[] material, Tensor[] plan) -> "
       "Tensor");
-  with_plan("element_energy(Tensor positions, Tensor stiffness, Tensor[] plan) -> Tensor");
+  with_plan("element_energy(Tensor positions, Tensor[] material, Tensor[] plan) -> Tensor");
   with_plan(
-      "element_energy_product(Tensor positions, Tensor direction, Tensor stiffness, Tensor[] plan) "
+      "element_energy_product(Tensor positions, Tensor direction, Tensor[] material, Tensor[] "
+      "plan) "
       "-> Tensor");
-  with_plan("elastic_diagonal(Tensor stiffness, Tensor[] plan, *, bool weighted) -> Tensor");
+  with_plan("elastic_diagonal(Tensor[] material, Tensor[] plan, *, bool weighted) -> Tensor");
   with_plan("precondition(Tensor field, Tensor[] plan) -> Tensor");
   with_plan(
       "step_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor positions, "
@@ -158,19 +154,19 @@ TORCH_LIBRARY(torchpd, m) {
       "Tensor[] "
       "material, Tensor[] plan, *, float time_step) -> (Tensor, Tensor)");
   m.def(
-      "adjoint_result(Tensor multiplier, Tensor error, Tensor grad_velocities, Tensor masses, "
-      "Tensor "
-      "damping, Tensor? grad_positions=None, Tensor? elastic=None, Tensor? projector=None, Tensor? "
+      "adjoint_result(Tensor multiplier, Tensor error, Tensor grad_velocities, Tensor[] "
+      "material, Tensor? grad_positions=None, Tensor? elastic=None, Tensor? projector=None, "
+      "Tensor? "
       "stuck=None, Tensor? sliding=None, *, float time_step) -> (Tensor, Tensor, Tensor)");
   with_plan(
       "conjugate_gradients(Tensor positions, Tensor right, Tensor inertia, Tensor inverse, Tensor? "
-      "projector, Tensor stiffness, Tensor[] plan, Tensor? sliding=None, *, float tolerance) -> "
+      "projector, Tensor[] material, Tensor[] plan, Tensor? sliding=None, *, float tolerance) -> "
       "(Tensor, Tensor)");
   with_plan(
       "conjugate_gradients_(Tensor(a!) solution, Tensor(b!) residual, Tensor(c!) direction, "
       "Tensor(d!) "
-      "progress, Tensor positions, Tensor inertia, Tensor inverse, Tensor? projector, Tensor "
-      "stiffness, Tensor[] plan, *, float tolerance, int iterations) -> ()");
+      "progress, Tensor positions, Tensor inertia, Tensor inverse, Tensor? projector, Tensor[] "
+      "material, Tensor[] plan, *, float tolerance, int iterations) -> ()");
   m.def("nearest_rotation(Tensor matrices) -> Tensor");
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }

@@ -7,6 +7,7 @@
 #include "conjugate_ops.h"
 #include "plan/views.h"
 #include "plan_views.h"
+#include "settings.h"
 
 #include <ATen/ATen.h>
 #include <torch/library.h>
@@ -82,31 +83,23 @@ template <class Backend>
 void report_rollout(const StepTensors& t, const Numbers& n, const Settings& settings);
 
 template <class Backend>
-Outputs step(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
-             const OptionalTensor& start, at::TensorList material, at::TensorList plan,
-             std::int64_t schedule, std::int64_t iterations, double time_step, double relaxation,
-             double rho, std::int64_t delay, bool weighted, double tolerance, bool inertial,
-             bool report) {
+Outputs step(const Numbers& n, const Tensor& positions, const Tensor& velocities,
+             const OptionalTensor& forces, const OptionalTensor& start, at::TensorList material,
+             at::TensorList plan) {
   check_positions(positions, "positions");
-  const Numbers n{schedule, iterations, time_step, relaxation, rho,
-                  delay,    weighted,   tolerance, inertial,   report};
   const Tensor x = at::empty(positions.sizes(), positions.options()), v = at::empty_like(x);
   const Tensor info = info_for(positions, {});
   const StepTensors tensors{positions, velocities, forces, start, material, plan, x, v, info};
   run_step<Backend>(tensors, settings_of(n, start.has_value(), 1, 1));
-  if (report) report_step<Backend>(tensors, n);
+  if (n.report) report_step<Backend>(tensors, n);
   return {x, v, info};
 }
 
 template <class Backend>
-void step_inplace(const Tensor& positions, const Tensor& velocities, const Tensor& info,
-                  const OptionalTensor& forces, const OptionalTensor& start,
-                  at::TensorList material, at::TensorList plan, std::int64_t schedule,
-                  std::int64_t iterations, double time_step, double relaxation, double rho,
-                  std::int64_t delay, bool weighted, double tolerance, bool inertial, bool report) {
+void step_inplace(const Numbers& n, const Tensor& positions, const Tensor& velocities,
+                  const Tensor& info, const OptionalTensor& forces, const OptionalTensor& start,
+                  at::TensorList material, at::TensorList plan) {
   check_positions(positions, "positions");
-  const Numbers n{schedule, iterations, time_step, relaxation, rho,
-                  delay,    weighted,   tolerance, inertial,   report};
   check_inplace(positions, velocities, info);
   // The state is read before it is written: loads and stores of an environment do not overlap in time. Others in the very same place are
   // safe since blocks wait for each other in iterations: with none, and where they belong to other environments, they are copied.
@@ -116,16 +109,16 @@ void step_inplace(const Tensor& positions, const Tensor& velocities, const Tenso
       return given->const_data_ptr() == t.const_data_ptr();
     };
     const bool same = is_at(positions) || is_at(velocities);
-    return same && iterations > 0 ? given : OptionalTensor(given->clone());
+    return same && n.iterations > 0 ? given : OptionalTensor(given->clone());
   };
   // what a report looks back to
-  const auto kept = [&](const Tensor& t) { return report ? t.clone() : t; };
+  const auto kept = [&](const Tensor& t) { return n.report ? t.clone() : t; };
   StepTensors tensors{kept(positions), kept(velocities), copied(forces),
                       copied(start),   material,         plan,
                       positions,       velocities,       info};
-  if (report && tensors.forces) tensors.forces = tensors.forces->clone();
+  if (n.report && tensors.forces) tensors.forces = tensors.forces->clone();
   run_step<Backend>(tensors, settings_of(n, start.has_value(), 1, 1));
-  if (report) report_step<Backend>(tensors, n);
+  if (n.report) report_step<Backend>(tensors, n);
   // so that autograd notices when it needs what has been overwritten
   for (const Tensor& t : {positions, velocities, info}) {
     if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
@@ -133,27 +126,23 @@ void step_inplace(const Tensor& positions, const Tensor& velocities, const Tenso
 }
 
 template <class Backend>
-Outputs rollout(const Tensor& positions, const Tensor& velocities, const OptionalTensor& forces,
-                at::TensorList material, at::TensorList plan, std::int64_t steps,
-                std::int64_t every, std::int64_t schedule, std::int64_t iterations,
-                double time_step, double relaxation, double rho, std::int64_t delay, bool weighted,
-                double tolerance, bool inertial, bool report) {
+Outputs rollout(const Numbers& n, const Tensor& positions, const Tensor& velocities,
+                const OptionalTensor& forces, at::TensorList material, at::TensorList plan,
+                std::int64_t steps, std::int64_t every) {
   check_positions(positions, "positions");
-  const Numbers n{schedule, iterations, time_step, relaxation, rho,
-                  delay,    weighted,   tolerance, inertial,   report};
   const Settings settings = settings_of(n, false, steps, every);
   const std::int64_t records = steps / every;
   const Tensor x =
       at::empty({records, positions.size(0), positions.size(1), 3}, positions.options());
   const Tensor v = at::empty_like(x), info = info_for(positions, {records});
   const StepTensors tensors{positions, velocities, forces, {}, material, plan, x, v, info};
-  report ? report_rollout<Backend>(tensors, n, settings) : run_step<Backend>(tensors, settings);
+  n.report ? report_rollout<Backend>(tensors, n, settings) : run_step<Backend>(tensors, settings);
   return {x, v, info};
 }
 
 template <class Backend, class T>
 void field_typed(Field field, const Tensor& positions, const Tensor& direction,
-                 const Tensor& stiffness, at::TensorList plan, const Tensor& out,
+                 at::TensorList material, at::TensorList plan, const Tensor& out,
                  const Tensor& displacement = {}) {
   FieldCall<T, typename Backend::template Plan<T>> call;
   const Place place{positions.device()};
@@ -161,8 +150,7 @@ void field_typed(Field field, const Tensor& positions, const Tensor& direction,
   call.field = field;
   call.batch = positions.size(0);
   check_vertices(positions, call.plan.vertices);
-  check_tets(stiffness, call.plan.tets);
-  const Tensor w = stiffness.contiguous(), x = positions.contiguous();
+  const Tensor w = stiffness_of(material, call.plan.tets), x = positions.contiguous();
   const Tensor d = direction.defined() ? direction.contiguous() : Tensor();
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
@@ -175,58 +163,59 @@ void field_typed(Field field, const Tensor& positions, const Tensor& direction,
 
 template <class Backend>
 Tensor run_field(Field field, const Tensor& positions, const Tensor& direction,
-                 const Tensor& stiffness, at::TensorList plan) {
+                 at::TensorList material, at::TensorList plan) {
   check_positions(positions, "positions");
   if (direction.defined()) check_state(direction, positions, "direction", "m");
   const bool per_element = field == Field::element_energy || field == Field::element_energy_product;
+  const Tensor& stiffness = array_of(material, "stiffness");
   TORCH_CHECK_VALUE(stiffness.dim() >= 1, "stiffness must be [tet] or [batch, tet] (Pa), got ",
                     describe(stiffness));
   const Tensor out = per_element
                          ? at::empty({positions.size(0), stiffness.size(-1)}, positions.options())
                          : at::empty(positions.sizes(), positions.options());
   if (positions.scalar_type() == at::kFloat) {
-    field_typed<Backend, float>(field, positions, direction, stiffness, plan, out);
+    field_typed<Backend, float>(field, positions, direction, material, plan, out);
   } else {
-    field_typed<Backend, double>(field, positions, direction, stiffness, plan, out);
+    field_typed<Backend, double>(field, positions, direction, material, plan, out);
   }
   return out;
 }
 
 template <class Backend>
-Tensor gradient(const Tensor& positions, const Tensor& stiffness, at::TensorList plan) {
-  return run_field<Backend>(Field::gradient, positions, {}, stiffness, plan);
+Tensor gradient(const Tensor& positions, at::TensorList material, at::TensorList plan) {
+  return run_field<Backend>(Field::gradient, positions, {}, material, plan);
 }
 
 template <class Backend>
-Tensor hessian_product(const Tensor& positions, const Tensor& direction, const Tensor& stiffness,
+Tensor hessian_product(const Tensor& positions, const Tensor& direction, at::TensorList material,
                        at::TensorList plan) {
-  return run_field<Backend>(Field::hessian_product, positions, direction, stiffness, plan);
+  return run_field<Backend>(Field::hessian_product, positions, direction, material, plan);
 }
 
 template <class Backend>
-Tensor element_energy(const Tensor& positions, const Tensor& stiffness, at::TensorList plan) {
-  return run_field<Backend>(Field::element_energy, positions, {}, stiffness, plan);
+Tensor element_energy(const Tensor& positions, at::TensorList material, at::TensorList plan) {
+  return run_field<Backend>(Field::element_energy, positions, {}, material, plan);
 }
 
 template <class Backend>
 Tensor element_energy_product(const Tensor& positions, const Tensor& direction,
-                              const Tensor& stiffness, at::TensorList plan) {
-  return run_field<Backend>(Field::element_energy_product, positions, direction, stiffness, plan);
+                              at::TensorList material, at::TensorList plan) {
+  return run_field<Backend>(Field::element_energy_product, positions, direction, material, plan);
 }
 
 template <class Backend, class T>
-Tensor diagonal_typed(const Tensor& stiffness, at::TensorList plan, bool weighted) {
+Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighted) {
   FieldCall<T, typename Backend::template Plan<T>> call;
+  const Tensor& stiffness = array_of(material, "stiffness");
   const Place place{stiffness.device(), "stiffness"};
   call.plan = Backend::template plan_view<T>(plan, place);
   call.field = Field::diagonal;
   call.weighted = weighted;
-  check_tets(stiffness, call.plan.tets);
-  const bool batched = stiffness.dim() == 2;
-  call.batch = batched ? stiffness.size(0) : 1;
-  const Tensor w = stiffness.contiguous();
-  const Tensor out = batched ? at::empty({call.batch, call.plan.vertices}, stiffness.options())
-                             : at::empty({call.plan.vertices}, stiffness.options());
+  const Tensor w = stiffness_of(material, call.plan.tets);
+  const bool batched = w.dim() == 2;
+  call.batch = batched ? w.size(0) : 1;
+  const Tensor out = batched ? at::empty({call.batch, call.plan.vertices}, w.options())
+                             : at::empty({call.plan.vertices}, w.options());
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
   call.out = out.mutable_data_ptr<T>();
@@ -235,11 +224,12 @@ Tensor diagonal_typed(const Tensor& stiffness, at::TensorList plan, bool weighte
 }
 
 template <class Backend>
-Tensor elastic_diagonal(const Tensor& stiffness, at::TensorList plan, bool weighted) {
+Tensor elastic_diagonal(at::TensorList material, at::TensorList plan, bool weighted) {
+  const Tensor& stiffness = array_of(material, "stiffness");
   check_real(stiffness, "stiffness", "[tets] or [batch, tets] (Pa)");
   return stiffness.scalar_type() == at::kFloat
-             ? diagonal_typed<Backend, float>(stiffness, plan, weighted)
-             : diagonal_typed<Backend, double>(stiffness, plan, weighted);
+             ? diagonal_typed<Backend, float>(material, plan, weighted)
+             : diagonal_typed<Backend, double>(material, plan, weighted);
 }
 
 template <class Backend, class T>
@@ -305,9 +295,9 @@ Tensor rotation_differential(const Tensor& matrices, const Tensor& direction) {
 
 template <class Backend>
 void register_ops(torch::Library& m) {
-  m.impl("step", &step<Backend>);
-  m.impl("step_", &step_inplace<Backend>);
-  m.impl("rollout", &rollout<Backend>);
+  m.impl("step", unpacked<&step<Backend>>);
+  m.impl("step_", unpacked<&step_inplace<Backend>>);
+  m.impl("rollout", unpacked<&rollout<Backend>>);
   m.impl("gradient", &gradient<Backend>);
   m.impl("hessian_product", &hessian_product<Backend>);
   m.impl("element_energy", &element_energy<Backend>);

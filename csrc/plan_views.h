@@ -279,6 +279,34 @@ constexpr std::size_t place_in_material(std::string_view name) {
   return place;
 }
 
+// The array of a name.
+inline const Tensor& array_of(at::TensorList material, std::string_view name) {
+  TORCH_CHECK_VALUE(material.size() == material_arrays, "material must be ", material_arrays,
+                    " arrays, got ", material.size());
+  return material[place_in_material(name)];
+}
+
+// Young's moduli, one for each tetrahedron of a plan.
+inline Tensor stiffness_of(at::TensorList material, std::int64_t tets) {
+  const Tensor& stiffness = array_of(material, "stiffness");
+  check_tets(stiffness, tets);
+  return stiffness.contiguous();
+}
+
+// Columns, where an array has any, are all of its numbers.
+constexpr int columns_of(std::string_view name) {
+  int numbers = 0;
+#define X(name, width, rows, meaning)
+#define COLUMN(array, column, width, meaning) numbers += name == #array ? width : 0;
+#include "plan/material.def"
+#undef X
+  return numbers;
+}
+#define X(name, width, rows, meaning) \
+  static_assert(columns_of(#name) == 0 || columns_of(#name) == width);
+#include "plan/material.def"
+#undef X
+
 inline std::int64_t rows_of(const Tensor& t, int width, const char* name) {
   const int own = width > 1 ? 2 : 1;
   TORCH_CHECK_VALUE(t.dim() == own || t.dim() == own + 1, "material.", name, " must have ", own,

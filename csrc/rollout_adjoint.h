@@ -12,15 +12,17 @@ inline std::vector<Tensor> material_at(at::TensorList material, std::int64_t ste
   std::vector<Tensor> at_step(material.begin(), material.end());
   Tensor& spheres = at_step[place_in_material("spheres")];
   if (spheres.numel() == 0) return at_step;
-  const Tensor center = spheres.narrow(-1, 0, 3), rest = spheres.narrow(-1, 3, 5);
-  spheres = at::cat({center + double(step) * spheres.narrow(-1, 5, 3), rest}, -1);
+  const Tensor center = spheres.narrow(-1, spheres_center, 3);
+  const Tensor rest = spheres.narrow(-1, 3, spheres_numbers - 3);
+  spheres = at::cat({center + double(step) * spheres.narrow(-1, spheres_motion, 3), rest}, -1);
   return at_step;
 }
 
 // Of spheres at a step, seen from the start of the rollout.
 inline Tensor moved_back(const Tensor& gradient, std::int64_t step) {
-  const Tensor center = gradient.narrow(-1, 0, 3), rest = gradient.narrow(-1, 0, 5);
-  return at::cat({rest, gradient.narrow(-1, 5, 3) + double(step) * center}, -1);
+  const Tensor center = gradient.narrow(-1, spheres_center, 3);
+  const Tensor rest = gradient.narrow(-1, 0, spheres_motion);
+  return at::cat({rest, gradient.narrow(-1, spheres_motion, 3) + double(step) * center}, -1);
 }
 
 // Of every step: [step, batch, vertex, 3], for as many steps as `after` has.
@@ -55,7 +57,7 @@ std::vector<Tensor> rollout_vjp(const Tensor& grad_positions, const Tensor& grad
   check_track(after_velocities, positions, after, "after_velocities", "m/s");
   check_track(grad_positions, positions, after, "grad_positions", "of a loss, 1/m");
   check_track(grad_velocities, positions, after, "grad_velocities", "of a loss, 1/(m/s)");
-  check_time_step(time_step);
+  CheckSetting::time_step(time_step);
   TORCH_CHECK_VALUE(material.size() == material_arrays, "rollout_vjp: material must have ",
                     material_arrays, " arrays, got ", material.size());
   check_wanted(wanted, material.size(), "rollout_vjp");

@@ -15,18 +15,17 @@ void report_typed(const StepTensors& t, const Numbers& n) {
   call.material =
       material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch, place);
   call.time_step = n.time_step;
-  const Tensor& stiffness = t.material[place_in_material("stiffness")];
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
   const Tensor f = t.forces ? t.forces->contiguous() : Tensor();
   // u, which positions have lost digits of
   const Tensor u = t.out_velocities.mul(n.time_step);
   const auto field = [&](Field kind) {
     const Tensor out = at::empty_like(x);
-    field_typed<Backend, T>(kind, x, {}, stiffness, t.plan, out, u);
+    field_typed<Backend, T>(kind, x, {}, t.material, t.plan, out, u);
     return out;
   };
   const Tensor gradient = field(Field::gradient), elements = field(Field::report);
-  const Tensor elastic = diagonal_typed<Backend, T>(stiffness, t.plan, n.weighted);
+  const Tensor elastic = diagonal_typed<Backend, T>(t.material, t.plan, n.weighted);
   const Tensor sums = at::empty({call.batch, call.chunks(), report_sums}, t.info.options());
   call.elastic = {elastic.const_data_ptr<T>(),
                   elastic.dim() == 2 && elastic.size(0) == call.batch ? call.plan.vertices : 0};
@@ -61,8 +60,9 @@ void report_rollout(const StepTensors& t, const Numbers& n, const Settings& sett
     some.steps = some.every = steps;
     run_step<Backend>(tensors, some);
     for (int s = 0; moves && s < steps; ++s) {
-      const Tensor center = spheres.narrow(-1, 0, 3) + spheres.narrow(-1, 5, 3);
-      spheres = at::cat({center, spheres.narrow(-1, 3, 5)}, -1);
+      const Tensor center =
+          spheres.narrow(-1, spheres_center, 3) + spheres.narrow(-1, spheres_motion, 3);
+      spheres = at::cat({center, spheres.narrow(-1, 3, spheres_numbers - 3)}, -1);
     }
   };
   Tensor x = t.positions, v = t.velocities;

@@ -29,9 +29,8 @@ class StepTaken {
     check_vertices(t.after, call.plan.vertices);
     call.material =
         material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch, place);
-    const Tensor& stiffness = t.material[place_in_material("stiffness")];
     const Material<T>& m = call.material;
-    call.elastic = {keep(diagonal_typed<Backend, T>(stiffness, t.plan, true)),
+    call.elastic = {keep(diagonal_typed<Backend, T>(t.material, t.plan, true)),
                     m.stiffness.stride ? call.plan.vertices : 0};
     touching = m.planes_count + m.spheres_count > 0;
     call.time_step = time_step;
@@ -43,7 +42,7 @@ class StepTaken {
     call.velocities = keep(t.velocities);
     if (t.forces) call.forces = keep(*t.forces);
     call.elastic_gradient =
-        keep(run_field<Backend>(Field::gradient, t.after.contiguous(), {}, stiffness, t.plan));
+        keep(run_field<Backend>(Field::gradient, t.after.contiguous(), {}, t.material, t.plan));
   }
   StepTaken(const StepTaken&) = delete;
 

@@ -56,11 +56,11 @@ def system(
         torch.eye(3, dtype=dtype)
         - normal[..., None] * normal[..., None, :] * (torch.arange(sim.vertices) % 2)[:, None, None]
     )
-    stiffness = spread * sim.stiffness.cpu()
-    diagonal = inertia + ops.elastic_diagonal(stiffness.to(device), list(sim.plan.arrays), weighted=True).cpu()
+    material = [(spread * sim.stiffness.cpu()).to(device), *sim.material()[1:]]
+    diagonal = inertia + ops.elastic_diagonal(material, list(sim.plan.arrays), weighted=True).cpu()
     found = System(
         inertia.to(device), (moves / diagonal).to(device), projector.to(device) if contacts else None,
-        stiffness.to(device), list(sim.plan.arrays),
+        material, list(sim.plan.arrays),
     )  # fmt: skip
     # little enough for elements of any size to leave the Hessian positive
     smallest = min(length / count for length, count in zip((1.0, 0.4, 0.3), cells, strict=True))
@@ -70,8 +70,16 @@ def system(
 
 def environment(s: System, e: int) -> System:
     """One of them, alone."""
-    own: dict[str, Any] = {name: getattr(s, name)[e : e + 1] for name in ("inertia", "inverse", "stiffness")}
-    return replace(s, projector=None if s.projector is None else s.projector[e : e + 1], **own)
+    return environments(s, slice(e, e + 1))
+
+
+def environments(s: System, index: slice | Tensor) -> System:
+    """Some of them."""
+    stiffness, *rest = s.material
+    return replace(
+        s, inertia=s.inertia[index], inverse=s.inverse[index], material=[stiffness[index], *rest],
+        projector=None if s.projector is None else s.projector[index],
+    )  # fmt: skip
 
 
 def sliding_on(s: System, right: Tensor, push: float = 0.1) -> Tensor:
@@ -91,4 +99,4 @@ def sliding_on(s: System, right: Tensor, push: float = 0.1) -> Tensor:
 
 
 def given_of(s: System, positions: Tensor, right: Tensor) -> tuple[Any, ...]:
-    return positions, right, s.inertia, s.inverse, s.projector, s.stiffness, s.plan
+    return positions, right, s.inertia, s.inverse, s.projector, s.material, s.plan

@@ -82,7 +82,7 @@ class System:
     inertia: Tensor  # [1, V] or [B, V] N/m
     inverse: Tensor  # 1 / D of the same shape, 0 where a vertex does not move
     projector: Tensor | None  # of what contacts let through [B, V, 3, 3]
-    stiffness: Tensor
+    material: list[Tensor]
     plan: list[Tensor]
 
     def allowed(self, field: Tensor) -> Tensor:
@@ -96,7 +96,7 @@ class System:
     def solve(self, positions: Tensor, right: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
         """Solution and relative residual, by the op; `right` is `allowed`."""
         found: tuple[Tensor, Tensor] = ops.conjugate_gradients(
-            positions, right, self.inertia, self.inverse, self.projector, self.stiffness, self.plan, tolerance=tolerance
+            positions, right, self.inertia, self.inverse, self.projector, self.material, self.plan, tolerance=tolerance
         )
         return found
 
@@ -105,7 +105,7 @@ class System:
         inertia = self.inertia.unsqueeze(-1)
 
         def product(field: Tensor) -> Tensor:
-            elastic = ops.hessian_product(positions, field.contiguous(), self.stiffness, self.plan)
+            elastic = ops.hessian_product(positions, field.contiguous(), self.material, self.plan)
             return self.allowed(torch.addcmul(elastic, inertia, field))
 
         return product
@@ -120,7 +120,7 @@ class System:
 
         def product(field: Tensor) -> Tensor:
             pressed = field + normal * part(along, field)
-            elastic = ops.hessian_product(positions, pressed, self.stiffness, self.plan)
+            elastic = ops.hessian_product(positions, pressed, self.material, self.plan)
             turned = (across - lean) * part(across, field) - bend * part(bend, field)
             return self.allowed(elastic + inertia * field + turned)
 

@@ -30,7 +30,7 @@ def samples(
     def wanted(tensor: Tensor) -> Tensor:
         return tensor.detach().clone().requires_grad_()
 
-    w = wanted(sim.stiffness)
+    trained = [wanted(sim.stiffness), *material[1:]]
     found: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = {
         # near an equilibrium, where the adjoint of a step has a solution
         "step": (
@@ -50,11 +50,11 @@ def samples(
             (noise(still[None]), noise(still[None], 1), still[None], zero[None], still, zero, 0.01 * f, material, plan),
             {"time_step": sim.time_step, "wanted": [number % 3 != 1 for number in range(len(material))]},
         ),
-        "gradient": ((wanted(x), w, plan), {}),
-        "element_energy": ((wanted(x), w, plan), {}),
-        "element_energy_product": ((wanted(x), wanted(direction), w, plan), {}),
-        "hessian_product": ((x, wanted(direction), w.detach(), plan), {}),
-        "elastic_diagonal": ((w.detach(), plan), {"weighted": True}),
+        "gradient": ((wanted(x), trained, plan), {}),
+        "element_energy": ((wanted(x), trained, plan), {}),
+        "element_energy_product": ((wanted(x), wanted(direction), trained, plan), {}),
+        "hessian_product": ((x, wanted(direction), material, plan), {}),
+        "elastic_diagonal": ((material, plan), {"weighted": True}),
         "nearest_rotation": ((wanted(matrices),), {}),
         "rotation_differential": ((wanted(matrices), wanted(matrices.flip(0))), {}),
     }
@@ -66,27 +66,23 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
     material, plan = [array.detach() for array in sim.material()], plan_of(sim)
     f, direction = noise(x), noise(x, 1)
     still, zero = sim.rest_state(BATCH)
-    stiffness, h, double = (
-        sim.stiffness.detach(),
-        {"time_step": sim.time_step},
-        {"dtype": torch.float64, "device": x.device},
-    )
+    h, double = {"time_step": sim.time_step}, {"dtype": torch.float64, "device": x.device}
     progress, errors = torch.full((BATCH, 4), -1.0, **double), torch.tensor([0.0, 2.0, 1.0], **double)
     inertia = sim.masses / sim.time_step**2
     projector = torch.eye(3, dtype=x.dtype, device=x.device).repeat(*x.shape[:2], 1, 1)
     sliding = noise(projector.new_empty(*x.shape[:2], 5, 3), 3)
     return {
         "conjugate_gradients_": (
-            (0 * x, f.clone(), f.clone(), progress, x, sim.masses, 1 / sim.masses, None, stiffness, plan),
+            (0 * x, f.clone(), f.clone(), progress, x, sim.masses, 1 / sim.masses, None, material, plan),
             {"tolerance": 1e-3, "iterations": 2},
         ),
         "conjugate_gradients": (
-            (x, f, inertia, 1 / inertia, projector, stiffness, plan, 0.1 * sliding), {"tolerance": 1e-3},
+            (x, f, inertia, 1 / inertia, projector, material, plan, 0.1 * sliding), {"tolerance": 1e-3},
         ),
         "adjoint_system": ((f, direction, x, still, zero, 0.01 * f, material, plan), h),
         "contact_gradients": ((direction, f, f, direction, x, still, zero, 0.01 * f, material, plan), h),
         "adjoint_result": (
-            (f, errors, direction, sim.masses, sim.damping, f, direction, projector, x[..., 0] > 0.1, sliding), h,
+            (f, errors, direction, material, f, direction, projector, x[..., 0] > 0.1, sliding), h,
         ),
         "mend_adjoint": ((direction, errors, 0 * errors, still, f, 1 / inertia, None, material, plan), h),
     }  # fmt: skip

@@ -155,8 +155,12 @@ def plan_of(sim: pd.Simulator) -> list[Tensor]:
 
 def numbers_of(sim: pd.Simulator, **changed: Any) -> dict[str, Any]:
     """The keyword arguments of `step`."""
-    given = {"iterations": 4, "time_step": sim.time_step, "tolerance": 0.0, "inertial": False, "report": True}
-    return {**sim.solver.numbers(), **given, **changed}
+    return {**sim.numbers(inertial=False, report=True), "iterations": 4, "tolerance": 0.0, **changed}
+
+
+def material_with(sim: pd.Simulator, stiffness: Tensor) -> list[Tensor]:
+    """The simulator's material with another stiffness, which comes first."""
+    return [stiffness, *sim.material()[1:]]
 
 
 def full_scene() -> pd.Scene:

@@ -86,7 +86,7 @@ def products(sim: pd.Simulator, state: pd.State) -> int:
         if not bool((progress[:, 2] != 0.0).any()):
             return done
         torch.ops.torchpd.conjugate_gradients_(
-            solution, residual, direction, progress, after, inertia, inverse, projector, material[0],
+            solution, residual, direction, progress, after, inertia, inverse, projector, material,
             list(sim.plan.arrays), tolerance=1e-5, iterations=1,
         )  # fmt: skip
     raise AssertionError("not solved in 1000 products")

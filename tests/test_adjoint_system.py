@@ -83,11 +83,16 @@ def test_shapes_without_values(own: str, pins: bool, batch: int) -> None:
         assert [t.shape for t in found] == [t.shape for t in promised]
 
 
+def replaced(sim: pd.Simulator, **arrays: Tensor) -> list[Tensor]:
+    """The material with some arrays exchanged."""
+    return [arrays.get(name, array) for name, array in zip(NAMES, sim.material(), strict=True)]
+
+
 def test_a_right_side_of_any_strides(dtype: torch.dtype, device: torch.device) -> None:
     sim, (x, _) = small(dtype, device)
     right = noise(x)
     strided = right.transpose(0, 1).contiguous().transpose(0, 1)
-    given = (sim.masses, 1 / sim.masses, None, sim.stiffness.detach(), plan_of(sim))
+    given = (sim.masses, 1 / sim.masses, None, sim.material(), plan_of(sim))
     one, other = (ops.conjugate_gradients(x, t, *given, tolerance=1e-3) for t in (right, strided))
     assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
@@ -187,7 +192,8 @@ def test_the_result(own: bool, dtype: torch.dtype, device: torch.device) -> None
         masses, damping = factor[:, None] * masses, factor * damping
     multiplier, w = noise(x), noise(x, 1)
     errors = torch.tensor([[0.0, 9.0], [torch.nan, 9.0], [torch.inf, 9.0]], dtype=torch.float64, device=device)
-    found = ops.adjoint_result(multiplier, errors[:, 0], w, masses, damping, time_step=h)
+    material = replaced(sim, masses=masses, damping=damping)
+    found = ops.adjoint_result(multiplier, errors[:, 0], w, material, time_step=h)
     assert all(t[1].isnan().all() for t in found)
     inertia = masses / h**2 * (1 + damping.unsqueeze(-1) * h)
     wanted = inertia[..., None] * multiplier - w / h, masses[..., None] / h * multiplier, multiplier
@@ -209,7 +215,7 @@ def test_the_result_with_contacts(dtype: torch.dtype, device: torch.device) -> N
     sliding[stuck] = 0.0
     sliding[:, 1::2] = 0.0
     errors = torch.tensor([0.0, torch.nan, 1.0], dtype=torch.float64, device=device)
-    given = (multiplier, errors, w, sim.masses, sim.damping)
+    given = (multiplier, errors, w, sim.material())
     found = ops.adjoint_result(*given, g, elastic, projector, stuck, sliding, time_step=h)
     without = ops.adjoint_result(*given, time_step=h)
     assert all(torch.equal(one[::2], other[::2]) for one, other in zip(found[1:], without[1:], strict=True))
@@ -249,14 +255,17 @@ def test_the_result_with_contacts(dtype: torch.dtype, device: torch.device) -> N
 def test_the_result_refuses(change: dict[str, Any], said: str) -> None:
     sim, (x, _) = small(torch.float32)
     given = {
-        "multiplier": x, "error": torch.zeros(BATCH, dtype=torch.float64), "grad_velocities": x, "masses": sim.masses,
-        "damping": sim.damping, "grad_positions": x, "elastic": x, "projector": torch.zeros(*x.shape, 3),
+        "multiplier": x, "error": torch.zeros(BATCH, dtype=torch.float64), "grad_velocities": x,
+        "material": sim.material(), "grad_positions": x, "elastic": x, "projector": torch.zeros(*x.shape, 3),
         "stuck": torch.zeros(x.shape[:2], dtype=torch.bool), "sliding": torch.zeros(*x.shape[:2], 5, 3),
         "time_step": sim.time_step,
     }  # fmt: skip
     ops.adjoint_result(**given)
+    wrong = {name: value for name, value in change.items() if name not in NAMES}
+    if len(wrong) < len(change):
+        wrong["material"] = replaced(sim, **change)
     with pytest.raises((TypeError, ValueError), match=said):
-        ops.adjoint_result(**{**given, **change})
+        ops.adjoint_result(**{**given, **wrong})
 
 
 @pytest.mark.parametrize("name", ["adjoint_system", "contact_gradients"])

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 import torch
 from devices import missing_gpu
-from small_scene import call_step, numbers, small_simulator
+from small_scene import call_step, numbers, scene, small_simulator
 from torch import Tensor
 
 import torchpd as pd
 from torchpd.material import MATERIAL_ROWS
+from torchpd.solvers import Solver
+from torchpd.tables import SETTINGS_TABLE
 
 ops = torch.ops.torchpd
 PATCHES, MOST_SLOTS = 5, 8  # in the order of PlanSize
@@ -120,6 +122,18 @@ def test_numbers_are_checked(name: str, sim: pd.Simulator) -> None:
             call_step(sim, **{name: value})
 
 
+@pytest.mark.parametrize("solver", [pd.Jacobi(), pd.Chebyshev(), pd.Chebyshev("classic", rho=0.9), pd.Multilevel()])
+def test_a_simulator_gives_every_setting(solver: Solver) -> None:
+    """In the types of the schemas, which follow from the table."""
+    given = pd.Simulator(scene(), 1 / 60, 2, solver).numbers(inertial=False, report=True)
+    assert {name: type(value).__name__ for name, value in given.items()} == {
+        row.name: row.type for row in SETTINGS_TABLE
+    }
+    for op in (ops.step, ops.step_, ops.rollout):
+        named = [argument.name for argument in op.default._schema.arguments if argument.kwarg_only]
+        assert [name for name in named if name not in ("steps", "every")] == [row.name for row in SETTINGS_TABLE]
+
+
 @pytest.mark.parametrize(("steps", "every"), [(-1, 1), (4, 0), (4, -2)])
 def test_steps_of_a_rollout_are_checked(steps: int, every: int, sim: pd.Simulator) -> None:
     state = sim.rest_state()
@@ -151,8 +165,14 @@ def test_material_is_checked(sim: pd.Simulator) -> None:
     for name, value, message in wrong:
         with pytest.raises((TypeError, ValueError), match=message):
             call_step(sim, material=replaced(sim.material(), name, value, sim))
-    with pytest.raises(ValueError, match=r"material must be 8 arrays, got 7"):
-        call_step(sim, material=sim.material()[:-1])
+    x, few, plan = sim.rest_state(2).positions, sim.material()[:-1], list(sim.plan.arrays)
+    for call in (
+        lambda: call_step(sim, material=few),
+        lambda: ops.gradient(x, few, plan),
+        lambda: ops.elastic_diagonal(few, plan, weighted=True),
+    ):
+        with pytest.raises(ValueError, match=r"material must be 8 arrays, got 7"):
+            call()
 
 
 def test_plans_are_checked(sim: pd.Simulator) -> None:
@@ -185,15 +205,15 @@ def test_plans_are_checked(sim: pd.Simulator) -> None:
 def test_stiffness_of_another_mesh(change: int, sim: pd.Simulator) -> None:
     """One value too few would be read, and an energy written, past the end of an array."""
     count = len(sim.stiffness) + change
-    stiffness = torch.ones(count)
+    material = replaced(sim.material(), "stiffness", torch.ones(count), sim)
     x = sim.rest_state().positions
     plan = list(sim.plan.arrays)
     message = rf"stiffness must be \[48\] or \[batch, 48\], one value per tetrahedron .* got Float \[{count}\]"
     for call in (
-        lambda: ops.element_energy(x, stiffness, plan),
-        lambda: ops.gradient(x, stiffness, plan),
-        lambda: ops.elastic_diagonal(stiffness, plan, weighted=True),
-        lambda: call_step(sim, material=replaced(sim.material(), "stiffness", stiffness, sim)),
+        lambda: ops.element_energy(x, material, plan),
+        lambda: ops.gradient(x, material, plan),
+        lambda: ops.elastic_diagonal(material, plan, weighted=True),
+        lambda: call_step(sim, material=material),
     ):
         with pytest.raises(ValueError, match=message):
             call()
@@ -201,12 +221,17 @@ def test_stiffness_of_another_mesh(change: int, sim: pd.Simulator) -> None:
 
 def test_stiffness_of_a_diagonal_is_checked(sim: pd.Simulator) -> None:
     plan = list(sim.plan.arrays)
+
+    def diagonal(stiffness: Tensor) -> Tensor:
+        found: Tensor = ops.elastic_diagonal(replaced(sim.material(), "stiffness", stiffness, sim), plan, weighted=True)
+        return found
+
     with pytest.raises(
         TypeError, match=r"stiffness must be float32 or float64 \[tets\] or \[batch, tets\] \(Pa\), got Long"
     ):
-        ops.elastic_diagonal(sim.stiffness.long(), plan, weighted=True)
+        diagonal(sim.stiffness.long())
     with pytest.raises(TypeError, match=r"plan\.[a-z_]+ must be Double \(.*\), got Float"):
-        ops.elastic_diagonal(sim.stiffness.double(), plan, weighted=True)
+        diagonal(sim.stiffness.double())
 
 
 def test_step_in_place_checks_what_it_writes(sim: pd.Simulator) -> None:

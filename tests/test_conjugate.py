@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from conjugate_cases import BATCH, CELLS, MANY, environment, given_of, noise, sliding_on, system
+from conjugate_cases import BATCH, CELLS, MANY, environment, environments, given_of, noise, sliding_on, system
 from conjugate_reference import System, conjugate_gradients, stabilised_gradients
 from devices import missing_gpu
 from torch import Tensor
@@ -45,7 +45,7 @@ def start(s: System, right: Tensor) -> list[Tensor]:
 
 def iterate(s: System, state: list[Tensor], positions: Tensor, iterations: int, tolerance: float = 0.0) -> None:
     ops.conjugate_gradients_(
-        *state, positions, s.inertia, s.inverse, s.projector, s.stiffness, s.plan,
+        *state, positions, s.inertia, s.inverse, s.projector, s.material, s.plan,
         tolerance=tolerance, iterations=iterations,
     )  # fmt: skip
 
@@ -120,11 +120,10 @@ def test_more_environments_than_a_device_has_at_a_time(shape: str, dtype: torch.
     few = start(s, right)
     iterate(s, few, positions, 400, 1e-4)
     index = torch.arange(300 if device.type == "cuda" else 9, device=device) % BATCH
-    own: dict[str, Any] = {name: getattr(s, name)[index] for name in ("inertia", "inverse", "stiffness", "projector")}
     many = start(s, right[index])
     left_out = torch.arange(len(index), device=device) % 7 == 4
     many[3][left_out, 2] = 0.0
-    iterate(replace(s, **own), many, positions[index], 400, 1e-4)
+    iterate(environments(s, index), many, positions[index], 400, 1e-4)
     assert few[3][:2, 2].tolist() == [0.0, 0.0]
     for one, found in zip(few, many, strict=True):
         kept, wanted = found[~left_out], one[index[~left_out]]
@@ -250,7 +249,7 @@ def test_what_slides_is_harder_to_turn(shape: str, dtype: torch.dtype, device: t
     sliding[:, ::3, 2] = 20.0 * s.off_normals(noise(right.shape, dtype, 7).to(device))[:, ::3]
     across = sliding[:, :, 2]
     tolerance = 1e-6 if dtype == torch.float32 else 1e-12
-    given = (positions, right, s.inertia, s.inverse, s.projector, s.stiffness, s.plan)
+    given = (positions, right, s.inertia, s.inverse, s.projector, s.material, s.plan)
     found, _ = ops.conjugate_gradients(*given, sliding, tolerance=tolerance)
     plain, _ = ops.conjugate_gradients(*given, tolerance=tolerance)
     without = s.product_at(positions)
@@ -338,15 +337,18 @@ def test_friction_that_jams_is_an_error(shape: str, dtype: torch.dtype, device: 
         ("inertia", lambda t: t[:, :-1].contiguous(), "inertia must be"),
         ("inverse", lambda t: t.to(torch.float16), "inverse must be"),
         ("projector", lambda t: t[..., 0], "projector must be"),
-        ("stiffness", lambda t: t[..., :-1], "stiffness must be"),
+        ("material", lambda t: [t[0][..., :-1], *t[1:]], "stiffness must be"),
+        ("material", lambda t: t[1:], "material must be 8 arrays, got 7"),
     ],
 )
 def test_bad_input(name: str, change: Any, said: str, device: torch.device) -> None:
     s, positions, right = system(torch.float64, device, contacts=True)
     assert s.projector is not None
-    arguments = dict(zip(("solution", "residual", "direction", "progress"), start(s, right), strict=True))
+    arguments: dict[str, Any] = dict(
+        zip(("solution", "residual", "direction", "progress"), start(s, right), strict=True)
+    )
     arguments |= {"positions": positions, "inertia": s.inertia, "inverse": s.inverse}
-    arguments |= {"projector": s.projector, "stiffness": s.stiffness}
+    arguments |= {"projector": s.projector, "material": s.material}
     arguments[name] = change(arguments[name])
     with pytest.raises((TypeError, ValueError), match=said):
         ops.conjugate_gradients_(*arguments.values(), s.plan, tolerance=1e-3, iterations=1)

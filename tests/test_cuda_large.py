@@ -9,7 +9,7 @@ import pytest
 import torch
 from devices import require_gpu
 from on_gpu import GPU, bar, on_gpu
-from runs import noise, plan_of, same_bits
+from runs import material_with, noise, plan_of, same_bits
 from torch import Tensor
 
 import torchpd as pd
@@ -68,11 +68,11 @@ def test_fields(kernel: str) -> None:
     x, w, plan = kinds.positions, sim.stiffness.detach(), plan_of(sim)
     own = w * torch.linspace(0.5, 2.0, KINDS, device=GPU)[:, None]
     fields: tuple[tuple[Tensor, int, Callable[[Tensor], Tensor]], ...] = (
-        (x, 3 * sim.vertices, lambda x: ops.gradient(x, w, plan)),
-        (x, 3 * sim.vertices, lambda x: ops.hessian_product(x, x, w, plan)),
-        (x, len(w), lambda x: ops.element_energy(x, w, plan)),
-        (x, len(w), lambda x: ops.element_energy_product(x, x, w, plan)),
-        (own, len(w), lambda own: ops.elastic_diagonal(own, plan, weighted=True)),
+        (x, 3 * sim.vertices, lambda x: ops.gradient(x, material_with(sim, w), plan)),
+        (x, 3 * sim.vertices, lambda x: ops.hessian_product(x, x, material_with(sim, w), plan)),
+        (x, len(w), lambda x: ops.element_energy(x, material_with(sim, w), plan)),
+        (x, len(w), lambda x: ops.element_energy_product(x, x, material_with(sim, w), plan)),
+        (own, len(w), lambda own: ops.elastic_diagonal(material_with(sim, own), plan, weighted=True)),
     )
     for number, (given, numbers, field) in enumerate(fields):
         expected = field(given)

@@ -119,4 +119,4 @@ def test_more_blocks_than_32_bits_count_are_refused() -> None:
     sizes = arrays[0].clone()
     sizes[DEVICE_SIZES.index("blocks")] = 2**32 // 160 + 1
     with pytest.raises(ValueError, match=r"up to 26843545 blocks of 32 pairs of tetrahedra.* got 26843546; compile"):
-        torch.ops.torchpd.gradient(state.positions, sim.stiffness, [sizes, *arrays[1:]])
+        torch.ops.torchpd.gradient(state.positions, sim.material(), [sizes, *arrays[1:]])

@@ -28,7 +28,20 @@ from on_gpu import (
     still_works,
 )
 from op_samples import OPS, samples
-from runs import ULP, moving, noise, numbers_of, plan_of, same_bits, simulate, simulator, small, small_case, state_of
+from runs import (
+    ULP,
+    material_with,
+    moving,
+    noise,
+    numbers_of,
+    plan_of,
+    same_bits,
+    simulate,
+    simulator,
+    small,
+    small_case,
+    state_of,
+)
 from torch import Tensor
 
 import torchpd as pd
@@ -67,14 +80,16 @@ def test_fields_are_those_of_the_cpu(name: str, kernel: str, batch: int, precisi
         here = [t.to(GPU) for t in (x, direction, w)]
         there = [t.double() for t in (x, direction, w)]
         for field in ("gradient", "element_energy"):
-            found = getattr(ops, field)(here[0], here[2], plan)
-            assert relative(found, getattr(ops, field)(there[0], there[2], sure)) <= limit, field
+            found = getattr(ops, field)(here[0], material_with(sim, here[2]), plan)
+            wanted = getattr(ops, field)(there[0], material_with(exact, there[2]), sure)
+            assert relative(found, wanted) <= limit, field
         for field in ("hessian_product", "element_energy_product"):
-            found = getattr(ops, field)(*here, plan)
-            assert relative(found, getattr(ops, field)(*there, sure)) <= limit, field
+            found = getattr(ops, field)(*here[:2], material_with(sim, here[2]), plan)
+            wanted = getattr(ops, field)(*there[:2], material_with(exact, there[2]), sure)
+            assert relative(found, wanted) <= limit, field
         for weighted in (True, False):
-            found = ops.elastic_diagonal(here[2], plan, weighted=weighted)
-            expected = ops.elastic_diagonal(there[2], sure, weighted=weighted)
+            found = ops.elastic_diagonal(material_with(sim, here[2]), plan, weighted=weighted)
+            expected = ops.elastic_diagonal(material_with(exact, there[2]), sure, weighted=weighted)
             assert found.shape == expected.shape
             # positive terms only: nothing cancels, in no entry
             error = ((found.cpu().double() - expected) / expected).abs().max()
@@ -87,10 +102,10 @@ def test_fields_have_the_same_bits_in_any_batch(kernel: str, precision: str) -> 
     sim, state = small_on_gpu(DTYPES[precision], kernel, batch=4096)
     x, d, w, plan = state.positions, noise(state.positions), sim.stiffness.detach(), plan_of(sim)
     fields: tuple[Callable[[slice], Tensor], ...] = (
-        lambda s: ops.gradient(x[s], w, plan),
-        lambda s: ops.element_energy(x[s], w, plan),
-        lambda s: ops.hessian_product(x[s], d[s], w, plan),
-        lambda s: ops.element_energy_product(x[s], d[s], w, plan),
+        lambda s: ops.gradient(x[s], material_with(sim, w), plan),
+        lambda s: ops.element_energy(x[s], material_with(sim, w), plan),
+        lambda s: ops.hessian_product(x[s], d[s], material_with(sim, w), plan),
+        lambda s: ops.element_energy_product(x[s], d[s], material_with(sim, w), plan),
     )
     for field in fields:
         together = field(slice(None))
@@ -167,7 +182,7 @@ def test_gradcheck_of_the_energy(kernel: str) -> None:
     plan = plan_of(sim)
 
     def energy(positions: Tensor, w: Tensor) -> Tensor:
-        return ops.element_energy(positions, 1e4 * w, plan).sum(-1)
+        return ops.element_energy(positions, material_with(sim, 1e4 * w), plan).sum(-1)
 
     assert torch.autograd.gradcheck(energy, (x, unit), fast_mode=True, rtol=1e-5)
     assert torch.autograd.gradgradcheck(energy, (x, unit), fast_mode=True, rtol=1e-4)
@@ -303,7 +318,7 @@ def test_levels_are_refused_where_no_kernel_knows_them(kernel: str) -> None:
     sim, state = small_on_gpu(torch.float32, kernel)
     plain, whole = plan_of(sim), plan_of(simulator(small_case(), torch.float32, GPU, solver=pd.Multilevel()))
     with pytest.raises(ValueError, match=r"plan must be one for kernel 3 \(stream\) where .*, got kernel [012]"):
-        ops.gradient(state.positions, sim.stiffness, [*plain, *whole[len(plain) :]])
+        ops.gradient(state.positions, sim.material(), [*plain, *whole[len(plain) :]])
     still_works()
 
 
@@ -315,7 +330,7 @@ def test_other_precisions_are_refused() -> None:
         with pytest.raises(TypeError, match=r"state must be torch\.float32"):
             sim(moved(state, GPU, wrong))
         with pytest.raises(TypeError, match="float32 or float64"):
-            ops.gradient(state.positions.to(wrong), sim.stiffness, plan_of(sim))
+            ops.gradient(state.positions.to(wrong), sim.material(), plan_of(sim))
         with pytest.raises(TypeError, match="float32 or float64"):
             pd.nearest_rotation(torch.eye(3, device=GPU, dtype=wrong))
     still_works()

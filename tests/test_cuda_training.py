@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from conjugate_cases import MANY, environment, given_of, sliding_on, system
+from conjugate_cases import MANY, environment, environments, given_of, sliding_on, system
 from conjugate_reference import conjugate_gradients
 from devices import require_gpu
 from on_gpu import DTYPES, GPU, KERNELS, device_work, relative, small_on_gpu
@@ -120,7 +119,7 @@ def test_a_solve_is_one_kernel_behind_its_weights(kernel: str, precision: str) -
     """However many iterations it takes."""
     sim, state = simulator(kernel, precision)
     right = noise(state.positions)
-    diagonal = torch.ops.torchpd.elastic_diagonal(sim.stiffness, list(sim.plan.arrays), weighted=True)
+    diagonal = torch.ops.torchpd.elastic_diagonal(sim.material(), list(sim.plan.arrays), weighted=True)
     inertia = 0.1 * diagonal
     inverse = (1.0 / (inertia + diagonal)).contiguous()
     plan = list(sim.plan.arrays)
@@ -133,7 +132,7 @@ def test_a_solve_is_one_kernel_behind_its_weights(kernel: str, precision: str) -
             vector.copy_(torch.as_tensor(first, device=GPU))
         progress.fill_(-1.0)
         torch.ops.torchpd.conjugate_gradients_(
-            *vectors, progress, rest, inertia, inverse, None, sim.stiffness, plan, tolerance=1e-5, iterations=2000
+            *vectors, progress, rest, inertia, inverse, None, sim.material(), plan, tolerance=1e-5, iterations=2000
         )
 
     names = [name for name in device_work(solve) if "pd::" in name]
@@ -142,7 +141,7 @@ def test_a_solve_is_one_kernel_behind_its_weights(kernel: str, precision: str) -
     assert progress[:, 2].tolist() == [0.0] * len(right)
     product = torch.ops.torchpd.hessian_product
     wanted, *_ = conjugate_gradients(
-        lambda f: inertia[..., None] * f + product(rest, f.contiguous(), sim.stiffness, plan),
+        lambda f: inertia[..., None] * f + product(rest, f.contiguous(), sim.material(), plan),
         lambda f: inverse[..., None] * f, right, 1e-5,
     )  # fmt: skip
     assert relative(vectors[0], wanted) < 1e-3
@@ -186,8 +185,7 @@ def test_friction_goes_on_in_the_next_launch(precision: str) -> None:
     s, positions, right = system(dtype, GPU, contacts=True, kernel="stream", cells=(60, 26, 26))
     sliding = sliding_on(s, right)
     index = torch.arange(960, device=GPU) % len(right)
-    own = {name: getattr(s, name)[index] for name in ("inertia", "inverse", "stiffness", "projector")}
-    given = given_of(replace(s, **own), positions[index], right[index])
+    given = given_of(environments(s, index), positions[index], right[index])
     found: list[Tensor] = []
 
     def solve() -> None:

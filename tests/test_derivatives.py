@@ -6,7 +6,7 @@ from typing import cast
 
 import pytest
 import torch
-from runs import ULP, noise, plan_of, small
+from runs import ULP, material_with, noise, plan_of, small
 from torch import Tensor
 
 import torchpd as pd
@@ -24,7 +24,7 @@ def test_gradcheck_of_the_energy(shared: bool) -> None:
     plan = plan_of(sim)
 
     def energy(positions: Tensor, w: Tensor) -> Tensor:
-        return cast(Tensor, ops.element_energy(positions, 1e4 * w, plan)).sum(-1)
+        return cast(Tensor, ops.element_energy(positions, material_with(sim, 1e4 * w), plan)).sum(-1)
 
     assert torch.autograd.gradcheck(energy, (x, unit), fast_mode=True, rtol=1e-5)
     assert torch.autograd.gradgradcheck(energy, (x, unit), fast_mode=True, rtol=1e-4)
@@ -38,7 +38,7 @@ def test_gradcheck_of_the_fields(name: str) -> None:
     plan = plan_of(sim)
 
     def field(*given: Tensor) -> Tensor:
-        return cast(Tensor, getattr(ops, name)(*given[:-1], 1e4 * given[-1], plan))
+        return cast(Tensor, getattr(ops, name)(*given[:-1], material_with(sim, 1e4 * given[-1]), plan))
 
     leaves = tuple(tensor.clone().requires_grad_() for tensor in (*inputs, unit))
     assert torch.autograd.gradcheck(field, leaves, fast_mode=True, rtol=1e-4)
@@ -48,7 +48,7 @@ def test_hessian_product_is_linear_and_symmetric(dtype: torch.dtype, device: tor
     sim, state = small(dtype, device)
     x, plan = state.positions, plan_of(sim)
     one, other = noise(x, 1), noise(x, 2)
-    products = [ops.hessian_product(x, d, sim.stiffness, plan) for d in (one, other, one + 2 * other)]
+    products = [ops.hessian_product(x, d, sim.material(), plan) for d in (one, other, one + 2 * other)]
     sizes = [float(p.abs().max()) for p in products]
     limit = 40 * 50 * ULP[dtype]  # as for the fields above
     assert float((products[2] - products[0] - 2 * products[1]).abs().max()) <= limit * max(sizes)
@@ -59,7 +59,7 @@ def test_hessian_product_is_linear_and_symmetric(dtype: torch.dtype, device: tor
 def test_third_derivatives_are_refused() -> None:
     sim, state = small(torch.float64)
     x = state.positions.clone().requires_grad_()
-    product = ops.hessian_product(x, noise(x.detach()), sim.stiffness, plan_of(sim))
+    product = ops.hessian_product(x, noise(x.detach()), sim.material(), plan_of(sim))
     with pytest.raises(RuntimeError, match="third derivatives of the elastic energy are not provided"):
         product.sum().backward()
 
@@ -89,10 +89,11 @@ def test_gradients_flow_only_where_asked() -> None:
     sim, state = small(torch.float64)
     plan, w = plan_of(sim), sim.stiffness.detach().clone()
     x = state.positions.clone()
-    assert not ops.element_energy(x, w, plan).requires_grad
-    (only,) = torch.autograd.grad(ops.element_energy(x, w.requires_grad_(), plan).sum(), w)
+    assert not ops.element_energy(x, material_with(sim, w), plan).requires_grad
+    (only,) = torch.autograd.grad(ops.element_energy(x, material_with(sim, w.requires_grad_()), plan).sum(), w)
     # the energy is linear in the stiffness
-    assert float((only * w.detach()).sum()) == pytest.approx(float(ops.element_energy(x, w.detach(), plan).sum()))
+    linear = float((only * w.detach()).sum())
+    assert linear == pytest.approx(float(ops.element_energy(x, material_with(sim, w.detach()), plan).sum()))
     x.requires_grad_()
     with torch.no_grad():
         assert not sim.energy(x).requires_grad

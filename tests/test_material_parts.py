@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import torchpd as pd
+from torchpd.tables import PLANES, SPHERES
 
 H = 1 / 60
 G = 9.81
@@ -15,6 +16,12 @@ def cube(*contacts: pd.Ground | pd.Sphere, **options: object) -> pd.Simulator:
     body = pd.Solid(pd.shapes.box((0.1, 0.1, 0.1), (2, 2, 2)), 1e5, 1000.0)
     scene = pd.Scene(body, pd.Gravity((0.0, -G, 0.0)), *contacts)
     return pd.Simulator(scene, H, 200, dtype=torch.float64, progress=False, **options)  # type: ignore[arg-type]
+
+
+def test_columns_stand_where_files_have_them() -> None:
+    """Files of simulators and checkpoints hold whole rows: another order would read them as something else."""
+    assert {"normal": slice(0, 3), "height": 3, "friction": 4} == PLANES
+    assert {"center": slice(0, 3), "radius": 3, "friction": 4, "motion": slice(5, 8)} == SPHERES
 
 
 def test_every_environment_slides_by_its_own_friction(device: torch.device) -> None:

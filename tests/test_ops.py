@@ -9,7 +9,7 @@ import pytest
 import torch
 from cases import Case
 from op_samples import BATCH, OPS, samples
-from runs import ULP, noise, plan_of, rounded_problem, simulator, small, small_case, tensor_of
+from runs import ULP, material_with, noise, plan_of, rounded_problem, simulator, small, small_case, tensor_of
 from torch import Tensor
 
 import torchpd as pd
@@ -88,10 +88,10 @@ def test_fields_are_those_of_the_reference(scale: float, dtype: torch.dtype, dev
 
     w, plan = sim.stiffness, plan_of(sim)
     found = {
-        "energy": (ops.element_energy(seen, w, plan), energies),
-        "gradient": (ops.gradient(seen, w, plan), gradient),
-        "slope": (ops.element_energy_product(seen, direction, w, plan), slopes),
-        "product": (ops.hessian_product(seen, direction, w, plan), product),
+        "energy": (ops.element_energy(seen, material_with(sim, w), plan), energies),
+        "gradient": (ops.gradient(seen, material_with(sim, w), plan), gradient),
+        "slope": (ops.element_energy_product(seen, direction, material_with(sim, w), plan), slopes),
+        "product": (ops.hessian_product(seen, direction, material_with(sim, w), plan), product),
     }
     # slivers have grad N up to 40 times the inverse of their longest edge, and some fifty operations follow one another
     relative = 40 * 50 * ULP[dtype]
@@ -113,7 +113,7 @@ def test_elastic_diagonal_is_the_sum_over_elements(weighted: bool, dtype: torch.
     factor = shape.volumes * (shape.spread if weighted else 1.0)
     many = torch.stack([sim.stiffness, 3.0 * sim.stiffness.flip(0)])
     for stiffness in (sim.stiffness, many, many[:1], many[:0]):
-        found = ops.elastic_diagonal(stiffness, plan_of(sim), weighted=weighted)
+        found = ops.elastic_diagonal(material_with(sim, stiffness), plan_of(sim), weighted=weighted)
         assert found.dtype == dtype
         assert found.shape == (*stiffness.shape[:-1], sim.vertices)
         rows = zip(stiffness.reshape(-1, len(values.tets)), found.reshape(-1, sim.vertices), strict=True)
@@ -131,11 +131,16 @@ def test_elastic_diagonal_is_the_sum_over_elements(weighted: bool, dtype: torch.
 def test_elastic_diagonal_refuses_a_gradient() -> None:
     sim, _ = small(torch.float32)
     stiffness = sim.stiffness.detach().requires_grad_()
-    diagonal = ops.elastic_diagonal(stiffness, plan_of(sim), weighted=True)
+    diagonal = ops.elastic_diagonal(material_with(sim, stiffness), plan_of(sim), weighted=True)
     with pytest.raises(
         RuntimeError, match="the elastic diagonal, a preconditioner, has no derivative; detach stiffness"
     ):
         diagonal.sum().backward()
+    stiffness, masses, *rest = sim.material()
+    masses = masses.detach().requires_grad_()
+    diagonal = ops.elastic_diagonal([stiffness.detach(), masses, *rest], plan_of(sim), weighted=True)
+    (slope,) = torch.autograd.grad((masses + diagonal).sum(), masses)
+    assert torch.equal(slope, torch.ones_like(masses))
 
 
 def test_step_allocates_what_it_fills(poisoned: None, dtype: torch.dtype, device: torch.device) -> None:
@@ -192,7 +197,7 @@ def test_empty_batch(dtype: torch.dtype, device: torch.device) -> None:
     assert sim.rollout(empty, 4, 2).positions.shape == (2, 0, sim.vertices, 3)
     assert sim.energy(empty).shape == (0,)
     assert sim.gradient(empty.positions).shape == empty.positions.shape
-    assert ops.hessian_product(*empty, sim.stiffness, plan_of(sim)).shape == empty.positions.shape
+    assert ops.hessian_product(*empty, sim.material(), plan_of(sim)).shape == empty.positions.shape
     assert pd.nearest_rotation(torch.empty(0, 3, 3, dtype=dtype, device=device)).shape == (0, 3, 3)
     sim.step_(empty)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import torchpd as pd
 from torchpd import _C
+from torchpd.material import in_order, material_of
 from torchpd.plan import Plan, compile_plan
 from torchpd.reference import elements
 from torchpd.scene import SceneValues
@@ -190,11 +191,11 @@ def test_order_of_the_user_does_not_matter() -> None:
 
 def test_patch_size_does_not_matter() -> None:
     values = values_of("slivers")
-    w, x = torch.from_numpy(values.stiffness), torch.from_numpy(values.rest_positions)[None]
+    material, x = in_order(material_of(values, torch.float64)), torch.from_numpy(values.rest_positions)[None]
     x = x + 0.01 * torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(0))
     plans = [compile_plan(values, dtype=torch.float64, patch_size=size) for size in (16, 48, 512, 8192)]
     assert len({plan.patches for plan in plans}) == 4
-    gradients = [torch.ops.torchpd.gradient(x, w, list(plan.arrays)) for plan in plans]
+    gradients = [torch.ops.torchpd.gradient(x, material, list(plan.arrays)) for plan in plans]
     for other in gradients[1:]:
         # sums of about a hundred corner forces in another order
         assert float((gradients[0] - other).abs().max()) <= 100 * torch.finfo(x.dtype).eps * float(

@@ -192,12 +192,12 @@ def test_slow_slip_takes_no_more_products(pushed: float) -> None:
     right, inertia, inverse, projector, _, sliding = torch.ops.torchpd.adjoint_system(
         along, 0.0 * along, after, *state, push, material, list(sim.plan.arrays), time_step=sim.time_step
     )
-    system = System(inertia, inverse, projector, material[0], list(sim.plan.arrays))
+    system = System(inertia, inverse, projector, material, list(sim.plan.arrays))
     product = system.friction_product_at(after, sliding)
     _, products = stabilised_gradients(product, system.preconditioner(), right, 1e-10)
     assert 0 < products <= 100
     multiplier, error = torch.ops.torchpd.conjugate_gradients(
-        after, right, inertia, inverse, projector, material[0], system.plan, sliding, tolerance=1e-10
+        after, right, inertia, inverse, projector, material, system.plan, sliding, tolerance=1e-10
     )
     assert float(error) <= 1e-9
     left = right - product(system.off_normals(multiplier))
@@ -319,7 +319,7 @@ def test_without_friction_nothing_is_added() -> None:
         right, inertia, inverse, projector, _, sliding = torch.ops.torchpd.adjoint_system(
             x, still, after, x, still, None, material, list(sim.plan.arrays), time_step=sim.time_step
         )
-        given = (after, right, inertia, inverse, projector, material[0], list(sim.plan.arrays))
+        given = (after, right, inertia, inverse, projector, material, list(sim.plan.arrays))
         found, error = torch.ops.torchpd.conjugate_gradients(*given, sliding, tolerance=1e-5)
         wanted, same = torch.ops.torchpd.conjugate_gradients(*given, tolerance=1e-5)
         assert torch.equal(found, wanted)

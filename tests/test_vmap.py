@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 import torch
-from runs import ULP, noise, numbers_of, plan_of, small
+from runs import ULP, material_with, noise, numbers_of, plan_of, small
 from torch import Tensor
 
 import torchpd as pd
@@ -48,7 +48,7 @@ def test_vmap_over_another_dimension_and_nested(dtype: torch.dtype, device: torc
     w, plan = sim.stiffness, plan_of(sim)
 
     def energy(positions: Tensor) -> Tensor:
-        return cast(Tensor, ops.element_energy(positions, w, plan))
+        return cast(Tensor, ops.element_energy(positions, material_with(sim, w), plan))
 
     expected = torch.stack([torch.stack([energy(one) for one in row]) for row in x])
     assert torch.equal(torch.vmap(torch.vmap(energy))(x), expected)
@@ -66,13 +66,19 @@ def test_vmap_of_rollout_fields_and_rotations(dtype: torch.dtype, device: torch.
     matrices = noise(torch.empty(4, 5, 3, 3, dtype=dtype, device=device))
     cases: list[tuple[Any, tuple[Tensor, ...]]] = [
         (lambda y: ops.rollout(y, state.velocities, None, material, plan, **numbers)[0], (x,)),
-        (lambda y: ops.gradient(y, own, plan), (x,)),
-        (lambda y: ops.hessian_product(y, d[0], w, plan), (x,)),
-        (lambda e: ops.hessian_product(x[0], e, own, plan), (d,)),
-        (lambda y, e: ops.element_energy_product(y, e, w, plan), (x, d)),
-        (lambda s: ops.element_energy(x[0], s, plan), (torch.stack([w, 2 * w, 3 * w, 4 * w]),)),
-        (lambda s: ops.elastic_diagonal(s, plan, weighted=True), (torch.stack([w, 2 * w, 3 * w, 4 * w]),)),
-        (lambda s: ops.elastic_diagonal(s, plan, weighted=False), (torch.stack([own, 2 * own, 3 * own, 4 * own]),)),
+        (lambda y: ops.gradient(y, material_with(sim, own), plan), (x,)),
+        (lambda y: ops.hessian_product(y, d[0], material_with(sim, w), plan), (x,)),
+        (lambda e: ops.hessian_product(x[0], e, material_with(sim, own), plan), (d,)),
+        (lambda y, e: ops.element_energy_product(y, e, material_with(sim, w), plan), (x, d)),
+        (lambda s: ops.element_energy(x[0], material_with(sim, s), plan), (torch.stack([w, 2 * w, 3 * w, 4 * w]),)),
+        (
+            lambda s: ops.elastic_diagonal(material_with(sim, s), plan, weighted=True),
+            (torch.stack([w, 2 * w, 3 * w, 4 * w]),),
+        ),
+        (
+            lambda s: ops.elastic_diagonal(material_with(sim, s), plan, weighted=False),
+            (torch.stack([own, 2 * own, 3 * own, 4 * own]),),
+        ),
         (ops.nearest_rotation, (matrices,)),
         (ops.rotation_differential, (matrices, matrices.flip(0))),
     ]
@@ -104,7 +110,7 @@ def test_vmap_over_the_plan_is_refused() -> None:
 
     def energy(volume: Tensor) -> Tensor:
         arrays = [volume if t is sim.plan.tet_volume else t for t in plan]
-        return cast(Tensor, ops.element_energy(state.positions, sim.stiffness, arrays))
+        return cast(Tensor, ops.element_energy(state.positions, sim.material(), arrays))
 
     with pytest.raises(ValueError, match="the plan cannot be mapped"):
         torch.vmap(energy)(torch.stack([sim.plan.tet_volume] * 2))
@@ -121,12 +127,12 @@ def test_one_map_is_refused_as_it_is_alone(device: torch.device) -> None:
         (lambda a, b: sim((a, b)), (x, v)),
         (lambda a, b: sim.rollout((a, b), 2), (x, v)),
         (sim.energy, (x,)),
-        (lambda a: ops.gradient(a, w, plan), (x,)),
-        (lambda a: ops.element_energy(a, w, plan), (x,)),
-        (lambda a: ops.hessian_product(a, x, w, plan), (x,)),
+        (lambda a: ops.gradient(a, material_with(sim, w), plan), (x,)),
+        (lambda a: ops.element_energy(a, material_with(sim, w), plan), (x,)),
+        (lambda a: ops.hessian_product(a, x, material_with(sim, w), plan), (x,)),
         (lambda a: ops.precondition(a, plan), (x,)),
-        (lambda s: ops.elastic_diagonal(s, plan, weighted=False), (w.expand(2, 1, 1, -1),)),
-        (lambda s: ops.element_energy(x, s, plan), (w.expand(2, 2, -1),)),
+        (lambda s: ops.elastic_diagonal(material_with(sim, s), plan, weighted=False), (w.expand(2, 1, 1, -1),)),
+        (lambda s: ops.element_energy(x, material_with(sim, s), plan), (w.expand(2, 2, -1),)),
         (lambda a: ops.step(x, a, None, None, material, plan, **numbers), (maps * v[:1],)),
         (lambda a: ops.step(x, v, a, None, material, plan, **numbers), (maps * v[:2],)),
         (ops.nearest_rotation, (torch.eye(3, dtype=x.dtype, device=device),)),
@@ -249,10 +255,10 @@ def test_batched_gradients_of_every_op(dtype: torch.dtype, device: torch.device)
     rest = sim.material()[1:]
     F = noise(torch.empty(5, 3, 3, dtype=dtype, device=device))
     cases: list[tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = [
-        (lambda x, w: ops.element_energy(x, w, plan), (x, w)),
-        (lambda x, w: ops.gradient(x, w, plan), (x, own)),
-        (lambda d: ops.hessian_product(x, d, w, plan), (d,)),
-        (lambda x, d, w: ops.element_energy_product(x, d, w, plan), (x, d, w)),
+        (lambda x, w: ops.element_energy(x, material_with(sim, w), plan), (x, w)),
+        (lambda x, w: ops.gradient(x, material_with(sim, w), plan), (x, own)),
+        (lambda d: ops.hessian_product(x, d, material_with(sim, w), plan), (d,)),
+        (lambda x, d, w: ops.element_energy_product(x, d, material_with(sim, w), plan), (x, d, w)),
         (lambda d: ops.precondition(d, levels), (d,)),
         (ops.nearest_rotation, (F,)),
         (ops.rotation_differential, (F, F.flip(0))),
@@ -275,7 +281,7 @@ def test_batched_gradients_of_every_op(dtype: torch.dtype, device: torch.device)
 def test_batched_gradients_in_another_thread() -> None:
     """As autograd has for a GPU: what torch counts for its older vmap is not known there."""
     sim, (x, _) = small(torch.float64, torch.device("cpu"))
-    plan, w = plan_of(sim), sim.stiffness.detach()
+    plan, material = plan_of(sim), [array.detach() for array in sim.material()]
 
     class Elsewhere(torch.autograd.Function):
         @staticmethod
@@ -285,12 +291,12 @@ def test_batched_gradients_in_another_thread() -> None:
         @staticmethod
         def backward(ctx: Any, *grads: Tensor) -> Any:
             with ThreadPoolExecutor(1) as pool:
-                return pool.submit(ops.hessian_product, x, grads[0], w, plan).result()
+                return pool.submit(ops.hessian_product, x, grads[0], material, plan).result()
 
     field = x.clone().requires_grad_()
     many = noise(torch.empty(4, *x.shape, dtype=x.dtype), 2)
     (found,) = torch.autograd.grad(Elsewhere.apply(field), field, many, is_grads_batched=True)
-    assert torch.equal(found, torch.stack([ops.hessian_product(x, one, w, plan) for one in many]))
+    assert torch.equal(found, torch.stack([ops.hessian_product(x, one, material, plan) for one in many]))
 
 
 def test_the_older_vmap_is_not_nested() -> None:

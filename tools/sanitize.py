@@ -97,20 +97,21 @@ def fields(sim: pd.Simulator, batch: int) -> None:
     """Every field op, for one stiffness and for one of each environment."""
     x = sim.rest_state(batch).positions * 1.1
     d, plan = 0.01 * x, list(sim.plan.arrays)
-    for w in (sim.stiffness, sim.stiffness.expand(batch, -1).contiguous()):
-        ops.gradient(x, w, plan)
-        ops.element_energy(x, w, plan)
-        ops.hessian_product(x, d, w, plan)
-        ops.element_energy_product(x, d, w, plan)
+    one, *rest = sim.material()
+    for material in ([one, *rest], [one.expand(batch, -1).contiguous(), *rest]):
+        ops.gradient(x, material, plan)
+        ops.element_energy(x, material, plan)
+        ops.hessian_product(x, d, material, plan)
+        ops.element_energy_product(x, d, material, plan)
         for weighted in (False, True):
-            ops.elastic_diagonal(w, plan, weighted=weighted)
-        solve(sim, batch, w)
+            ops.elastic_diagonal(material, plan, weighted=weighted)
+        solve(sim, batch, material)
 
 
-def solve(sim: pd.Simulator, batch: int, stiffness: torch.Tensor) -> None:
+def solve(sim: pd.Simulator, batch: int, material: list[torch.Tensor]) -> None:
     """Conjugate gradients without contacts, with them and with what slides, from the first iteration and the second."""
     x, plan = sim.rest_state(batch).positions * 1.1, list(sim.plan.arrays)
-    diagonal = ops.elastic_diagonal(stiffness, plan, weighted=True)
+    diagonal = ops.elastic_diagonal(material, plan, weighted=True)
     inertia, inverse = 0.1 * diagonal, 1.0 / (1.1 * diagonal)
     active = torch.full((batch, 4), -1.0, dtype=torch.float64, device=x.device)
     projector = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape, 3)
@@ -119,9 +120,9 @@ def solve(sim: pd.Simulator, batch: int, stiffness: torch.Tensor) -> None:
         vectors = [torch.empty_like(x), 0.01 * x, torch.empty_like(x), active.clone()]
         for iterations in (2, 1):
             ops.conjugate_gradients_(
-                *vectors, x, inertia, inverse, held, stiffness, plan, tolerance=0.0, iterations=iterations
+                *vectors, x, inertia, inverse, held, material, plan, tolerance=0.0, iterations=iterations
             )
-    ops.conjugate_gradients(x, 0.01 * x, inertia, inverse, projector, stiffness, plan, sliding, tolerance=1e-2)
+    ops.conjugate_gradients(x, 0.01 * x, inertia, inverse, projector, material, plan, sliding, tolerance=1e-2)
 
 
 def adjoint(sim: pd.Simulator, batch: int) -> None:
@@ -135,7 +136,7 @@ def adjoint(sim: pd.Simulator, batch: int) -> None:
         right, _, _, *held = ops.adjoint_system(d, d, x + d, x, d, forces, arrays, plan, time_step=h)
         ops.contact_gradients(d, d, d, d, x + d, x, d, forces, arrays, plan, time_step=h)
         contacts = (d, d, *held) if arrays is material else ()
-        ops.adjoint_result(right, error, d, sim.masses, sim.damping, *contacts, time_step=h)
+        ops.adjoint_result(right, error, d, arrays, *contacts, time_step=h)
 
 
 def rotations(dtype: torch.dtype) -> None:
@@ -181,11 +182,11 @@ def levels(dtype: torch.dtype) -> int:
             sim = pd.Simulator(built, 1 / 60, iterations, progress=False, **options).to("cuda")
             step_all_ways(sim, batch)
             ops.precondition(sim.rest_state(batch).positions, list(sim.plan.arrays))
-            solve(sim, batch, sim.stiffness)
+            solve(sim, batch, sim.material())
     built = scene(BAR, contacts=False, pieces=False, pins=True)
     many = pd.Simulator(built, 1 / 60, 1, solver=pd.Multilevel(), dtype=dtype, progress=False)
     many.to("cuda")(many.rest_state(300))
-    solve(many, 300, many.stiffness)
+    solve(many, 300, many.material())
     torch.cuda.synchronize()
     return len(ways) + 1
 

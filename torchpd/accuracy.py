@@ -30,6 +30,7 @@ from .reference import StepProblem, step_problem
 from .scene import Part, Scene
 from .solvers import Chebyshev, Multilevel, Solver
 from .state import State
+from .tables import PLANES, SPHERES
 from .targets import Targets
 
 if TYPE_CHECKING:
@@ -143,8 +144,7 @@ def frictionless(sim: Stepper, dtype: torch.dtype | None = None) -> Stepper:
             twin = twin.to(dtype)
         twin.tolerance = 0.0
         smooth = {name: getattr(twin, name).detach().clone() for name in ("planes", "spheres")}
-        for array in smooth.values():
-            array[..., 4] = 0.0
+        smooth["planes"][..., PLANES["friction"]] = smooth["spheres"][..., SPHERES["friction"]] = 0.0
         twin.set_material(**smooth)
     return twin
 
@@ -160,8 +160,9 @@ def problem_of(
         shared = array.dim() == MATERIAL_ROWS[name].dims
         material[name] = _double(array if shared else array[item if len(array) > 1 else 0])
     planes, spheres = material["planes"], material["spheres"]
-    planes[:, 4] = 0.0
-    spheres[:, 4] = 0.0
+    planes[:, PLANES["friction"]] = 0.0
+    spheres[:, SPHERES["friction"]] = 0.0
+    motion = SPHERES["motion"]
     values = dataclasses.replace(
         sim.scene.values(),
         stiffness=material["stiffness"],
@@ -170,7 +171,7 @@ def problem_of(
         pin_stiffness=material["pin_stiffness"],
         pin_targets=material["pin_targets"],
         planes=planes,
-        spheres=spheres[:, :5],
+        spheres=spheres[:, : motion.start],
         damping=float(material["damping"]),
     )
     return step_problem(
@@ -179,8 +180,8 @@ def problem_of(
         _double(state[1][item]),
         sim.time_step,
         forces=None if forces is None else _double(forces[item]),
-        sphere_centers=spheres[:, :3],
-        sphere_starts=spheres[:, :3] - sim.time_step * spheres[:, 5:8],
+        sphere_centers=spheres[:, SPHERES["center"]],
+        sphere_starts=spheres[:, SPHERES["center"]] - sim.time_step * spheres[:, motion],
     )
 
 

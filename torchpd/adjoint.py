@@ -73,7 +73,7 @@ def step_gradient(call: AdjointCall) -> Tensor:
     masses, gravity = material["masses"].unsqueeze(-1), material["gravity"].unsqueeze(-2)
     pull = masses * (call.velocities / call.time_step + gravity)
     gradient = _inertial(material, call.time_step) * (call.after - call.positions) - pull
-    gradient = gradient + torch.ops.torchpd.gradient(call.after, material["stiffness"], call.plan)
+    gradient = gradient + torch.ops.torchpd.gradient(call.after, call.material, call.plan)
     pins = pinned_vertices(call.plan)
     springs = material["pin_stiffness"].unsqueeze(-1)
     hard = torch.isinf(springs)
@@ -148,7 +148,7 @@ def mend_adjoint(
         torch.where(torch.isfinite(inertia), inertia, 0.0),
         inverse,
         projector,
-        named_material(material)["stiffness"],
+        list(material),
         arrays,
         tolerance=tolerance,
     )

@@ -38,6 +38,7 @@ from .reference_solvers import (
     newton,
     preconditioned_lbfgs,
 )
+from .tables import PLANES, SPHERES
 
 __all__ = [
     "BASELINES",
@@ -328,7 +329,7 @@ def _newton_krylov(problem: StepProblem, first: Array) -> Run:
     if not len(planes) and not len(spheres):
         method = NewtonKrylov(problem, passes)
         return lambda iterations, observe: method.minimise(first, iterations, observe)
-    if (planes[:, 4] > 0.0).any() or (spheres[:, 4] > 0.0).any():
+    if (planes[:, PLANES["friction"]] > 0.0).any() or (spheres[:, SPHERES["friction"]] > 0.0).any():
         raise ValueError("this method knows no friction; friction=0 makes contacts smooth")
     sets = ContactNewton(problem, passes)
     return lambda iterations, observe: sets.minimise(first, iterations=iterations, observe=observe)

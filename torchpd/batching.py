@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from .vmap_rules import Rule, register_rule
 __all__ = ["rollout_vjp_rule", "step_vjp_rule"]
 
 _ops = torch.ops.torchpd
-_OWN = [row.dims for row in MATERIAL_TABLE]  # dimensions of an array without a batch; stiffness is the first
+_OWN = {row.name: row.dims for row in MATERIAL_TABLE}  # dimensions of an array without a batch
 
 
 def _shape_of_one(tensor: Tensor, dim: int | None) -> torch.Size:
@@ -48,36 +48,33 @@ def _check_plan(dims: Any) -> None:
         raise ValueError("torchpd: the plan cannot be mapped by vmap; it is the same for all environments")
 
 
-def _listed(material: Any) -> list[Any]:
-    """All arrays, or the stiffness alone."""
-    return material if isinstance(material, list) else [material]
-
-
-def _fits(state: Sequence[torch.Size], material: Sequence[torch.Size]) -> bool:
+def _fits(state: Sequence[torch.Size], material: Mapping[str, torch.Size]) -> bool:
     """Whether arrays of a state are [batch, V, 3], and those of the material for that batch or for all."""
     batch, *_ = *state[0], 0
     return all(len(shape) == 3 and shape == state[0] for shape in state) and all(
-        len(shape) == own or (len(shape) == own + 1 and shape[0] in (1, batch))
-        for shape, own in zip(material, _OWN, strict=False)
+        len(shape) == _OWN[name] or (len(shape) == _OWN[name] + 1 and shape[0] in (1, batch))
+        for name, shape in material.items()
     )
 
 
 def _join_all(
-    op: Any, info: Any, in_dims: Any, args: Any, tracks: int = 0, **numbers: Any
+    op: Any, info: Any, in_dims: Any, args: Any, tracks: int = 0, read: Iterable[str] = _OWN, **numbers: Any
 ) -> tuple[list[Any], tuple[int, int]]:
     """The arguments (arrays of a state, material, plan) of all maps in one call; how many maps and environments.
 
-    The first `tracks` arguments are of all steps, [step, batch, V, 3].
+    The first `tracks` arguments are of all steps, [step, batch, V, 3]. Of the material the op reads what is in `read`.
     """
     *state, material, plan = args
     *state_dims, material_dims, plan_dims = in_dims
     _check_plan(plan_dims)
-    arrays, array_dims = _listed(material), _listed(material_dims)
+    arrays = {
+        name: (array, dim) for name, array, dim in zip(_OWN, material, material_dims, strict=True) if name in read
+    }
     shapes = [_shape_of_one(t, d) for t, d in zip(state, state_dims, strict=True) if t is not None]
     of_steps = shapes[:tracks]
     shapes = shapes[tracks:]
     _check_one(
-        _fits(shapes, [_shape_of_one(t, d) for t, d in zip(arrays, array_dims, strict=True)])
+        _fits(shapes, {name: _shape_of_one(t, d) for name, (t, d) in arrays.items()})
         and all(len(shape) == 4 and shape == of_steps[0] and shape[1:] == shapes[0] for shape in of_steps),
         op, in_dims, args, **numbers,
     )  # fmt: skip
@@ -90,16 +87,16 @@ def _join_all(
         None if t is None else _join(t, d, size, batch, 2)
         for t, d in zip(state[tracks:], state_dims[tracks:], strict=True)
     ]
-    values = [_join(t, d, size, batch, own) for t, d, own in zip(arrays, array_dims, _OWN, strict=False)]
-    return [*joined, values if isinstance(material, list) else values[0], plan], (size, batch)
+    values = {name: _join(t, d, size, batch, _OWN[name]) for name, (t, d) in arrays.items()}
+    return [*joined, [values.get(name, t) for name, t in zip(_OWN, material, strict=True)], plan], (size, batch)
 
 
-def _batch_rule(name: str, dim: int = 0) -> Rule:
-    """For an op that has its batch at `dim` of everything that it returns."""
+def _batch_rule(name: str, dim: int = 0, read: Iterable[str] = _OWN) -> Rule:
+    """For an op that has its batch at `dim` of everything that it returns, and reads these arrays of the material."""
     op = getattr(_ops, name)
 
     def rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[Any, int]:
-        joined, maps = _join_all(op, info, in_dims, args, **numbers)
+        joined, maps = _join_all(op, info, in_dims, args, read=read, **numbers)
         return pytree.tree_map(lambda t: t.unflatten(dim, maps), op(*joined, **numbers)), dim
 
     return rule
@@ -120,12 +117,13 @@ def _vjp_rule(
 ) -> tuple[list[Tensor], int]:
     (*state, values, plan), maps = _join_all(op, info, in_dims, args, tracks, **numbers)
     each = [
-        t.expand(maps[0] * maps[1], *t.shape[t.dim() - n :]).contiguous() for t, n in zip(values, _OWN, strict=True)
+        t.expand(maps[0] * maps[1], *t.shape[t.dim() - own :]).contiguous()
+        for t, own in zip(values, _OWN.values(), strict=True)
     ]
     grads = [t.unflatten(0, maps) for t in op(*state, each, plan, **numbers)]
     shapes = [_shape_of_one(t, d) for t, d in zip(args[-2], in_dims[-2], strict=True)]
     asked = [True] * len(shapes) if numbers.get("wanted") is None else numbers["wanted"]
-    rows = [(shape, own) for shape, own, wanted in zip(shapes, _OWN, asked, strict=True) if wanted]
+    rows = [(shape, own) for shape, own, wanted in zip(shapes, _OWN.values(), asked, strict=True) if wanted]
     summed = [
         grad.sum(1, keepdim=len(shape) > own) if len(shape) == own or shape[0] < maps[1] else grad
         for grad, (shape, own) in zip(grads[3:], rows, strict=True)
@@ -133,12 +131,17 @@ def _vjp_rule(
     return [*grads[:3], *summed], 0
 
 
-def _diagonal_rule(info: Any, in_dims: Any, stiffness: Tensor, plan: list[Tensor], **options: Any) -> Any:
+def _diagonal_rule(info: Any, in_dims: Any, material: list[Tensor], plan: list[Tensor], **options: Any) -> Any:
     _check_plan(in_dims[1])
-    mapped = stiffness.movedim(in_dims[0], 0)
-    _check_one(mapped.dim() in (2, 3), _ops.elastic_diagonal, in_dims, (stiffness, plan), **options)
-    rows = _ops.elastic_diagonal(mapped.flatten(0, -2), plan, **options)
-    return rows.unflatten(0, mapped.shape[:-1]), 0
+    place = list(_OWN).index("stiffness")
+    stiffness, dim = material[place], in_dims[0][place]
+    if dim is None:
+        rows = _ops.elastic_diagonal(material, plan, **options)
+        return rows.expand(info.batch_size, *rows.shape), 0
+    mapped = stiffness.movedim(dim, 0)
+    _check_one(mapped.dim() in (2, 3), _ops.elastic_diagonal, in_dims, (material, plan), **options)
+    joined = [mapped.flatten(0, -2) if i == place else array for i, array in enumerate(material)]
+    return _ops.elastic_diagonal(joined, plan, **options).unflatten(0, mapped.shape[:-1]), 0
 
 
 def _precondition_rule(info: Any, in_dims: Any, field: Tensor, plan: list[Tensor]) -> tuple[Tensor, int]:
@@ -163,8 +166,9 @@ def _rotation_rule(name: str) -> Rule:
     return rule
 
 
-for _name in ("step", "gradient", "hessian_product", "element_energy", "element_energy_product"):
-    register_rule(_name, _batch_rule(_name))
+for _name in ("gradient", "hessian_product", "element_energy", "element_energy_product"):
+    register_rule(_name, _batch_rule(_name, read=("stiffness",)))
+register_rule("step", _batch_rule("step"))
 register_rule("rollout", _batch_rule("rollout", 1))
 register_rule("elastic_diagonal", _diagonal_rule)
 register_rule("precondition", _precondition_rule)

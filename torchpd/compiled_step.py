@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .material import in_order, material_of
 from .plan import compile_plan
 from .reference import StepProblem
 
@@ -39,10 +40,10 @@ class CompiledStep(CountedStep):
     """
 
     @cached_property
-    def _elements(self) -> tuple[Tensor, list[Tensor]]:
-        """Stiffness [E] and plan."""
+    def _elements(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Material and plan."""
         plan = compile_plan(self.values, dtype=torch.float64, progress=False)
-        return torch.from_numpy(self.values.stiffness.copy()), list(plan.arrays)
+        return in_order(material_of(self.values, torch.float64)), list(plan.arrays)
 
     @cached_property
     def _quadratic(self) -> Array:

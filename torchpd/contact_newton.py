@@ -16,6 +16,7 @@ from scipy.sparse import csr_array
 
 from .newton_krylov import NewtonKrylov, Observer
 from .reference import StepProblem
+from .tables import PLANES, SPHERES
 
 __all__ = ["ContactNewton"]
 
@@ -51,15 +52,15 @@ def _touching(problem: StepProblem, displacement: Array) -> _Touching:
     normals, radii = np.zeros((len(planes) + len(spheres), count, 3)), np.full((len(spheres), count), np.inf)
     gaps, depths = np.zeros(normals.shape[:2]), np.zeros(normals.shape[:2])
     for k, plane in enumerate(planes):
-        normals[k] = plane[:3]
-        gaps[k] = places @ plane[:3] - plane[3]
-        depths[k] = plane[3] - stepped @ plane[:3]
+        normals[k] = normal = plane[PLANES["normal"]]
+        gaps[k] = places @ normal - plane[PLANES["height"]]
+        depths[k] = plane[PLANES["height"]] - stepped @ normal
     for k, (center, sphere) in enumerate(zip(problem.sphere_centers, spheres, strict=True)):
         arms = places - center
         radii[k] = np.maximum(np.linalg.norm(arms, axis=1), 1e-300)
         normals[len(planes) + k] = outwards = arms / radii[k][:, None]
-        gaps[len(planes) + k] = radii[k] - sphere[3]
-        depths[len(planes) + k] = sphere[3] - ((stepped - center) * outwards).sum(axis=1)
+        gaps[len(planes) + k] = radii[k] - sphere[SPHERES["radius"]]
+        depths[len(planes) + k] = sphere[SPHERES["radius"]] - ((stepped - center) * outwards).sum(axis=1)
     pushes = _pushes(normals, depths) * problem.free
     bending = (diagonal * pushes[len(planes) :] / radii).sum(axis=0)
     return _Touching(gradient, *_tangents(pushes > 0.0, normals, gaps, problem.free), bending)

@@ -10,6 +10,7 @@ from torch import Tensor
 from .diagonal import named_material, pinned_vertices
 from .plan import Plan
 from .state import State
+from .tables import PLANES, SPHERES
 
 __all__ = ["course_of"]
 
@@ -37,13 +38,15 @@ def course_of(plan: Plan, arrays: Sequence[Tensor], time_step: float, state: Sta
     headed = x + moved
     places = headed
     for row in material["planes"].unbind(-2):
-        places = _out_of(places, row[..., None, :3], (places * row[..., None, :3]).sum(-1) - row[..., 3:4])
+        normals = row[..., None, PLANES["normal"]]
+        places = _out_of(places, normals, (places * normals).sum(-1) - row[..., PLANES["height"], None])
     for row in material["spheres"].unbind(-2):
         # by the normal at where the vertices were headed
-        arms = headed - row[..., None, :3]
+        centers = row[..., None, SPHERES["center"]]
+        arms = headed - centers
         lengths = arms.norm(dim=-1, keepdim=True)
         normals = torch.where(lengths > 0.0, arms / lengths, torch.eye(3, dtype=x.dtype, device=x.device)[1])
-        gaps = ((places - row[..., None, :3]) * normals).sum(-1) - row[..., 3:4]
+        gaps = ((places - centers) * normals).sum(-1) - row[..., SPHERES["radius"], None]
         places = _out_of(places, normals, gaps)
     return torch.where(free, moved + (places - headed), moved)
 

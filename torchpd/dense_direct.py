@@ -56,7 +56,7 @@ class DenseDirect:
         self._inverse[torch.from_numpy(free[:, None]), torch.from_numpy(free)] = inverse
         self._weight, self._target = here(problem.weight[:, None]), here(problem.target)
         self._positions = here(problem.positions)
-        self._stiffness, self._plan = sim.stiffness.detach(), list(sim.plan.arrays)
+        self._material, self._plan = [array.detach() for array in sim.material()], list(sim.plan.arrays)
 
     @property
     def bytes(self) -> int:
@@ -67,7 +67,7 @@ class DenseDirect:
         """u [V, 3] m after as many iterations as there are omegas, from `first`."""
         before = current = first
         for omega in omegas:
-            elastic = torch.ops.torchpd.gradient((self._positions + current)[None], self._stiffness, self._plan)[0]
+            elastic = torch.ops.torchpd.gradient((self._positions + current)[None], self._material, self._plan)[0]
             slope = torch.addcmul(elastic, self._weight, current - self._target)
             stepped = torch.addmm(current, self._inverse, slope, alpha=-1.0)
             current, before = stepped if omega == 1.0 else torch.lerp(before, stepped, omega), current

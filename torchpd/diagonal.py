@@ -35,4 +35,4 @@ def step_diagonal(
     held = masses.new_zeros((*springs.shape[:-1], masses.shape[-1]))
     held = held.index_copy(-1, pinned_vertices(plan), springs)
     inertia = masses / time_step**2 * (1 + material["damping"].unsqueeze(-1) * time_step) + held
-    return inertia, inertia + torch.ops.torchpd.elastic_diagonal(material["stiffness"], list(plan), weighted=weighted)
+    return inertia, inertia + torch.ops.torchpd.elastic_diagonal(list(material_arrays), list(plan), weighted=weighted)

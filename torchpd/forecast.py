@@ -28,6 +28,7 @@ from .diagonal import step_diagonal
 from .mesh import TetMesh
 from .quality import smallest_dihedral
 from .solvers import Chebyshev, Multilevel, Solver
+from .tables import PLANES, SPHERES
 
 __all__ = [
     "Forecast",
@@ -188,7 +189,8 @@ def _smallest_angle(mesh: TetMesh) -> float:
 
 def has_friction(compiled: CompiledScene) -> bool:
     """Whether any contact may hold a vertex by friction."""
-    return any(bool((compiled.named[name][..., 4] > 0.0).any()) for name in ("planes", "spheres"))
+    columns = {"planes": PLANES["friction"], "spheres": SPHERES["friction"]}
+    return any(bool((compiled.named[name][..., column] > 0.0).any()) for name, column in columns.items())
 
 
 def held_up_by(compiled: CompiledScene) -> str:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from .pins import PIN_HARD, hold_exactly, split_springs
 from .scene import SceneValues
-from .tables import MATERIAL_TABLE
+from .tables import MATERIAL_TABLE, PLANES, SPHERES
 
 __all__ = [
     "ARRAYS",
@@ -45,7 +45,8 @@ _UNIT_SLACK = 1e-4  # of the length of a plane's normal: float32 rounding and a 
 
 def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
     """What `named_arrays` gives, of a scene, in the precision of the simulation, checked after rounding to it."""
-    spheres = np.pad(values.spheres, ((0, 0), (0, 3)))  # at rest
+    at_rest = MATERIAL_ROWS["spheres"].width - values.spheres.shape[1]
+    spheres = np.pad(values.spheres, ((0, 0), (0, at_rest)))
     material = {
         name: torch.tensor(spheres if name == "spheres" else getattr(values, name), dtype=dtype)
         for name in MATERIAL_ROWS
@@ -98,12 +99,14 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
     elif name == "damping":
         _require(tensor >= 0, full, ">= 0", tensor)
     elif name == "planes":
-        lengths = tensor[..., :3].norm(dim=-1)
+        lengths = tensor[..., PLANES["normal"]].norm(dim=-1)
         _require((lengths - 1).abs() <= _UNIT_SLACK, f"{full}: the normal (columns 0 to 2)", "of unit length", tensor)
-        _require(tensor[..., 4] >= 0, f"{full}: friction (column 4)", ">= 0", tensor)
+        friction = PLANES["friction"]
+        _require(tensor[..., friction] >= 0, f"{full}: friction (column {friction})", ">= 0", tensor)
     elif name == "spheres":
-        _require(tensor[..., 3] > 0, f"{full}: the radius (column 3)", "positive", tensor)
-        _require(tensor[..., 4] >= 0, f"{full}: friction (column 4)", ">= 0", tensor)
+        radius, friction = SPHERES["radius"], SPHERES["friction"]
+        _require(tensor[..., radius] > 0, f"{full}: the radius (column {radius})", "positive", tensor)
+        _require(tensor[..., friction] >= 0, f"{full}: friction (column {friction})", ">= 0", tensor)
 
 
 def real_tensor(owner: str, name: str, value: Tensor | float) -> Tensor:

@@ -31,6 +31,7 @@ from .parametrized import invert, make, parametrization
 from .pins import PIN_HARD, split_springs
 from .placing import loosened_plan, plan_for_solver
 from .plan import Plan
+from .tables import PLANES, SPHERES
 from .warn import warn_user
 
 __all__ = [
@@ -47,9 +48,9 @@ __all__ = [
 _OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)
 # of each name the arrays that have it, and where
 COLUMNS = {
-    "friction": {"planes": 4, "spheres": 4},
-    "height": {"planes": 3},
-    "radius": {"spheres": 3},
+    "friction": {"planes": PLANES["friction"], "spheres": SPHERES["friction"]},
+    "height": {"planes": PLANES["height"]},
+    "radius": {"spheres": SPHERES["radius"]},
 }
 _THINGS = {"planes": "grounds", "spheres": "spheres"}
 

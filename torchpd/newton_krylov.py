@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .material import in_order, material_of
 from .multilevel import precondition_plan
 from .plan import compile_plan
 from .reference import StepProblem
@@ -41,9 +42,9 @@ class NewtonKrylov:
     def __init__(self, problem: StepProblem, passes: list[int]) -> None:
         values = problem.values
         plan = compile_plan(values, dtype=torch.float64, progress=False)
-        self.stiffness = torch.from_numpy(values.stiffness.copy())
+        self.material = in_order(material_of(values, torch.float64))
         inertia = torch.from_numpy(np.where(problem.free, problem.weight, np.inf))
-        levels = precondition_plan(plan, values, self.stiffness, inertia)
+        levels = precondition_plan(plan, values, torch.from_numpy(values.stiffness.copy()), inertia)
         self.elements, self.levels = list(plan.arrays), list(levels.arrays)
         self.free = torch.from_numpy(problem.free.copy())[:, None]
         self.weight = torch.from_numpy(problem.weight.copy())[:, None]
@@ -57,14 +58,14 @@ class NewtonKrylov:
         x = (self.start + u)[None]
         pull = torch.where(self.free, u - self.target, 0.0)
         energy = 0.5 * (self.weight * pull.square()).sum()
-        energy = energy + _ops.element_energy(x, self.stiffness, self.elements).sum()
-        gradient = self.weight * pull + _ops.gradient(x, self.stiffness, self.elements)[0]
+        energy = energy + _ops.element_energy(x, self.material, self.elements).sum()
+        gradient = self.weight * pull + _ops.gradient(x, self.material, self.elements)[0]
         return float(energy), torch.where(self.free, gradient, 0.0)
 
     def product(self, u: Tensor, p: Tensor) -> Tensor:
         """H(u) p, the derivative of the rotations in it."""
         self.passes[0] += 1
-        elastic = _ops.hessian_product((self.start + u)[None], p[None], self.stiffness, self.elements)[0]
+        elastic = _ops.hessian_product((self.start + u)[None], p[None], self.material, self.elements)[0]
         return torch.where(self.free, self.weight * p + elastic, 0.0)
 
     def precondition(self, g: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from .material import MATERIAL_ROWS
 from .overlaps import Overlap, boxes_meet, find_overlaps
 from .scene import Scene
 from .state import State
+from .tables import PLANES, SPHERES
 from .warn import SceneWarning, warn_user
 
 __all__ = ["Notices", "warn_of_overlaps"]
@@ -144,10 +145,11 @@ def _depth(scene: Scene, positions: Tensor, planes: Tensor, spheres: Tensor) -> 
     planes, spheres = (array if array.dim() == 3 else array[None] for array in (planes, spheres))
     depth = positions.new_zeros(positions.shape[:2])
     for plane in planes.unbind(1):
-        depth = torch.maximum(depth, plane[:, 3, None] - (positions * plane[:, None, :3]).sum(dim=-1))
+        normal = plane[:, None, PLANES["normal"]]
+        depth = torch.maximum(depth, plane[:, PLANES["height"], None] - (positions * normal).sum(dim=-1))
     for sphere in spheres.unbind(1):
-        start = (sphere[:, :3] - sphere[:, 5:])[:, None]
-        depth = torch.maximum(depth, sphere[:, 3, None] - (positions - start).norm(dim=-1))
+        start = (sphere[:, SPHERES["center"]] - sphere[:, SPHERES["motion"]])[:, None]
+        depth = torch.maximum(depth, sphere[:, SPHERES["radius"], None] - (positions - start).norm(dim=-1))
     if scene.pins:
         depth[:, scene._pinned()] = 0.0
     return depth

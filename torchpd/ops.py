@@ -10,16 +10,19 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
 
+from . import _C
 from .adjoint import mend_adjoint
 from .batching import rollout_vjp_rule, step_vjp_rule
+from .diagonal import named_material
 from .tables import MATERIAL_TABLE
 from .vmap_rules import register_rule
 
 __all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_tangents"]
 
-INFO_WIDTH = 7
+INFO_WIDTH = _C.info_numbers
 
 _ops = torch.ops.torchpd
+_STIFFNESS = [row.name for row in MATERIAL_TABLE].index("stiffness")
 
 
 def nearest_rotation(F: Tensor) -> Tensor:
@@ -62,14 +65,14 @@ def _register_fake(name: str) -> Callable[[Callable[..., Any]], None]:
     """Torch also takes a fake kernel where one argument of several is on "meta", and would return unwritten memory."""
 
     def register(kernel: Callable[..., Any]) -> None:
-        def checked(first: Tensor, *others: Any, **settings: Any) -> Any:
-            kinds = {leaf.device.type for leaf in tree_leaves(others) if isinstance(leaf, Tensor)}
-            if first.device.type != "meta" and "meta" in kinds:
+        def checked(*given: Any, **settings: Any) -> Any:
+            first, *others = (leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor))
+            if first.device.type != "meta" and any(other.device.type == "meta" for other in others):
                 raise RuntimeError(
                     f"torchpd::{name}: arguments must be on one device, got some on {first.device} and some on "
                     '"meta", where tensors have no values'
                 )
-            return kernel(first, *others, **settings)
+            return kernel(*given, **settings)
 
         torch.library.register_fake(f"torchpd::{name}", checked)
 
@@ -95,28 +98,28 @@ def _(positions: Tensor, *_: Any, steps: int, every: int, **__: Any) -> tuple[Te
 
 
 @_register_fake("gradient")
-def _(positions: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
+def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
     return positions.new_empty(positions.shape)
 
 
 @_register_fake("hessian_product")
-def _(positions: Tensor, direction: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
+def _(positions: Tensor, direction: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
     return positions.new_empty(positions.shape)
 
 
 @_register_fake("element_energy")
-def _(positions: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
-    return positions.new_empty((positions.shape[0], stiffness.shape[-1]))
+def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty((positions.shape[0], material[_STIFFNESS].shape[-1]))
 
 
 @_register_fake("element_energy_product")
-def _(positions: Tensor, direction: Tensor, stiffness: Tensor, plan: Sequence[Tensor]) -> Tensor:
-    return positions.new_empty((positions.shape[0], stiffness.shape[-1]))
+def _(positions: Tensor, direction: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty((positions.shape[0], material[_STIFFNESS].shape[-1]))
 
 
 @_register_fake("elastic_diagonal")
-def _(stiffness: Tensor, plan: Sequence[Tensor], *, weighted: bool) -> Tensor:
-    _, vertex_order, *_ = plan
+def _(material: Sequence[Tensor], plan: Sequence[Tensor], *, weighted: bool) -> Tensor:
+    stiffness, (_, vertex_order, *_) = material[_STIFFNESS], plan
     return stiffness.new_empty((*stiffness.shape[:-1], vertex_order.shape[0]))
 
 
@@ -143,16 +146,17 @@ def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
     held = batch if touching else 0
     projector = positions.new_empty((held, vertices, 3, 3))
     stuck = positions.new_empty((held, vertices), dtype=torch.bool)
-    sliding = positions.new_empty((held, vertices, 5, 3))
+    sliding = positions.new_empty((held, vertices, _C.slide_vectors, 3))
     return positions.new_empty(positions.shape), inertia, inverse, projector, stuck, sliding
 
 
 @_register_fake("contact_gradients")
 def _(multiplier: Tensor, *step: Any, time_step: float) -> tuple[Tensor, Tensor]:
-    material = dict(zip((row.name for row in MATERIAL_TABLE), step[-2], strict=True))
-    planes, spheres = (material[name] for name in ("planes", "spheres"))
-    batch = multiplier.shape[0]
-    return multiplier.new_empty((batch, planes.shape[-2], 5)), multiplier.new_empty((batch, spheres.shape[-2], 8))
+    material = named_material(step[-2])
+    planes, spheres = (
+        multiplier.new_empty((len(multiplier), *material[name].shape[-2:])) for name in ("planes", "spheres")
+    )
+    return planes, spheres
 
 
 @_register_fake("conjugate_gradients")
@@ -208,14 +212,14 @@ def _(*args: Any, time_step: float) -> Tensor:
 # ---- derivatives: each is another op
 
 
-def _save(*names: str) -> Callable[..., None]:
-    """A setup_context that saves the named inputs: by position, tensors first, the plan last."""
+def _save(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+    ctx.save_for_backward(*inputs)
 
-    def setup(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        ctx.save_for_backward(*inputs[: len(names)])
-        ctx.plan = inputs[len(names)] if len(inputs) > len(names) else None
 
-    return setup
+def _save_elastic(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+    """Of an op of a state, a material and a plan."""
+    *state, material, ctx.plan = inputs
+    ctx.save_for_backward(*state, *material)
 
 
 def _like_stiffness(per_environment: Tensor, stiffness: Tensor) -> Tensor:
@@ -223,8 +227,13 @@ def _like_stiffness(per_environment: Tensor, stiffness: Tensor) -> Tensor:
     return per_environment.sum(0) if stiffness.dim() == 1 else per_environment.sum_to_size(stiffness.shape)
 
 
-def _unit(stiffness: Tensor) -> Tensor:
-    return torch.ones_like(stiffness)
+def _with_stiffness(material: Sequence[Tensor], stiffness: Tensor) -> list[Tensor]:
+    return [stiffness if place == _STIFFNESS else array for place, array in enumerate(material)]
+
+
+def _for_material(stiffness: Tensor | None) -> list[Tensor | None]:
+    """The other arrays have no part in elastic energy."""
+    return [stiffness if row.name == "stiffness" else None for row in MATERIAL_TABLE]
 
 
 def _for_plan(ctx: Any) -> list[None]:
@@ -232,57 +241,64 @@ def _for_plan(ctx: Any) -> list[None]:
     return [None] * len(ctx.plan)
 
 
-def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, list[None]]:
-    positions, stiffness = ctx.saved_tensors
-    x = w = None
+def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
+    positions, *material = ctx.saved_tensors
+    stiffness, x, w = material[_STIFFNESS], None, None
     if ctx.needs_input_grad[0]:
-        x = _ops.gradient(positions, grad * stiffness, ctx.plan)
-    if ctx.needs_input_grad[1]:
-        w = _like_stiffness(grad * _ops.element_energy(positions, _unit(stiffness), ctx.plan), stiffness)
-    return x, w, _for_plan(ctx)
+        x = _ops.gradient(positions, _with_stiffness(material, grad * stiffness), ctx.plan)
+    if ctx.needs_input_grad[1][_STIFFNESS]:
+        unit = _with_stiffness(material, torch.ones_like(stiffness))
+        w = _like_stiffness(grad * _ops.element_energy(positions, unit, ctx.plan), stiffness)
+    return x, _for_material(w), _for_plan(ctx)
 
 
-def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, list[None]]:
-    positions, stiffness = ctx.saved_tensors
-    x = w = None
+def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
+    positions, *material = ctx.saved_tensors
+    stiffness, x, w = material[_STIFFNESS], None, None
     if ctx.needs_input_grad[0]:
-        x = _ops.hessian_product(positions, grad, stiffness, ctx.plan)
-    if ctx.needs_input_grad[1]:
-        w = _like_stiffness(_ops.element_energy_product(positions, grad, _unit(stiffness), ctx.plan), stiffness)
-    return x, w, _for_plan(ctx)
+        x = _ops.hessian_product(positions, grad, material, ctx.plan)
+    if ctx.needs_input_grad[1][_STIFFNESS]:
+        unit = _with_stiffness(material, torch.ones_like(stiffness))
+        w = _like_stiffness(_ops.element_energy_product(positions, grad, unit, ctx.plan), stiffness)
+    return x, _for_material(w), _for_plan(ctx)
 
 
 def _element_energy_product_backward(
     ctx: Any, grad: Tensor
-) -> tuple[Tensor | None, Tensor | None, Tensor | None, list[None]]:
-    positions, direction, stiffness = ctx.saved_tensors
-    x = d = w = None
+) -> tuple[Tensor | None, Tensor | None, list[Tensor | None], list[None]]:
+    positions, direction, *material = ctx.saved_tensors
+    stiffness, x, d, w = material[_STIFFNESS], None, None, None
+    scaled = _with_stiffness(material, grad * stiffness)
     if ctx.needs_input_grad[0]:
-        x = _ops.hessian_product(positions, direction, grad * stiffness, ctx.plan)
+        x = _ops.hessian_product(positions, direction, scaled, ctx.plan)
     if ctx.needs_input_grad[1]:
-        d = _ops.gradient(positions, grad * stiffness, ctx.plan)
-    if ctx.needs_input_grad[2]:
-        product = _ops.element_energy_product(positions, direction, _unit(stiffness), ctx.plan)
-        w = _like_stiffness(grad * product, stiffness)
-    return x, d, w, _for_plan(ctx)
+        d = _ops.gradient(positions, scaled, ctx.plan)
+    if ctx.needs_input_grad[2][_STIFFNESS]:
+        unit = _with_stiffness(material, torch.ones_like(stiffness))
+        w = _like_stiffness(grad * _ops.element_energy_product(positions, direction, unit, ctx.plan), stiffness)
+    return x, d, _for_material(w), _for_plan(ctx)
 
 
-def _hessian_product_backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor | None, None, list[None]]:
-    if ctx.needs_input_grad[0] or ctx.needs_input_grad[2]:
+def _hessian_product_backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor | None, list[Tensor | None], list[None]]:
+    if ctx.needs_input_grad[0] or ctx.needs_input_grad[2][_STIFFNESS]:
         raise RuntimeError(
             "torchpd: third derivatives of the elastic energy are not provided; detach positions and stiffness before "
             "differentiating a Hessian-vector product"
         )
-    positions, _, stiffness = ctx.saved_tensors
-    return None, _ops.hessian_product(positions, grad, stiffness, ctx.plan), None, _for_plan(ctx)
+    positions, _, *material = ctx.saved_tensors
+    d = _ops.hessian_product(positions, grad, material, ctx.plan) if ctx.needs_input_grad[1] else None
+    return None, d, _for_material(None), _for_plan(ctx)
 
 
 def _save_nothing(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
     """Nothing to save."""
 
 
-def _diagonal_backward(ctx: Any, grad: Tensor) -> tuple[None, None]:
-    raise RuntimeError("torchpd: the elastic diagonal, a preconditioner, has no derivative; detach stiffness")
+def _diagonal_backward(ctx: Any, grad: Tensor) -> tuple[list[Tensor | None], list[None]]:
+    wanted, of_plan = ctx.needs_input_grad
+    if wanted[_STIFFNESS]:
+        raise RuntimeError("torchpd: the elastic diagonal, a preconditioner, has no derivative; detach stiffness")
+    return _for_material(None), [None] * len(of_plan)
 
 
 def _precondition_setup(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -332,12 +348,12 @@ register_rule("rollout_vjp", rollout_vjp_rule)
 torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_save_nothing)
 torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)
 
-for _name, _backward, _inputs in (
-    ("element_energy", _element_energy_backward, ("positions", "stiffness")),
-    ("gradient", _gradient_backward, ("positions", "stiffness")),
-    ("element_energy_product", _element_energy_product_backward, ("positions", "direction", "stiffness")),
-    ("hessian_product", _hessian_product_backward, ("positions", "direction", "stiffness")),
-    ("nearest_rotation", _rotation_backward, ("matrices",)),
-    ("rotation_differential", _rotation_differential_backward, ("matrices", "direction")),
+for _name, _backward, _setup in (
+    ("element_energy", _element_energy_backward, _save_elastic),
+    ("gradient", _gradient_backward, _save_elastic),
+    ("element_energy_product", _element_energy_product_backward, _save_elastic),
+    ("hessian_product", _hessian_product_backward, _save_elastic),
+    ("nearest_rotation", _rotation_backward, _save),
+    ("rotation_differential", _rotation_differential_backward, _save),
 ):
-    torch.library.register_autograd(f"torchpd::{_name}", _backward, setup_context=_save(*_inputs))
+    torch.library.register_autograd(f"torchpd::{_name}", _backward, setup_context=_setup)

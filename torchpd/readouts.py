@@ -36,6 +36,7 @@ from .material import MATERIAL_ROWS
 from .reprs import by_sizes
 from .scene import Scene
 from .small_matrices import dot, inverse, length, product
+from .tables import PLANES, SPHERES
 
 __all__ = [
     "ContactForce",
@@ -210,12 +211,13 @@ def _contacts(call: AdjointCall) -> _Contacts:
     material = named_material(call.material)
     x = call.after[:, None]
     planes, spheres = (material[name].unsqueeze(-2) for name in ("planes", "spheres"))
-    offsets = x - spheres[..., :3]
+    normals, offsets = planes[..., PLANES["normal"]], x - spheres[..., SPHERES["center"]]
     distances = length(offsets)
     away = offsets / torch.where(distances > 0.0, distances, 1.0).unsqueeze(-1)
-    gaps = dot(planes[..., :3], x) - planes[..., 3], distances - spheres[..., 3]
-    rows = zip((planes, spheres), (planes[..., :3], away), gaps, strict=True)
-    parts = [(n.expand(*gap.shape, 3), gap, part[..., 4].expand_as(gap)) for part, n, gap in rows]
+    gaps = dot(normals, x) - planes[..., PLANES["height"]], distances - spheres[..., SPHERES["radius"]]
+    friction = planes[..., PLANES["friction"]], spheres[..., SPHERES["friction"]]
+    rows = zip((normals, away), gaps, friction, strict=True)
+    parts = [(n.expand(*gap.shape, 3), gap, part.expand_as(gap)) for n, gap, part in rows]
     return _Contacts(*(torch.cat(pair, dim=1) for pair in zip(*parts, strict=True)))
 
 

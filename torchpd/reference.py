@@ -23,6 +23,7 @@ from scipy.sparse import bsr_array, csr_array, diags_array, kron
 from .reference_piece import gaps_of
 from .reference_rigid import align, begin
 from .scene import SceneValues
+from .tables import PLANES, SPHERES
 
 __all__ = [
     "Elements",
@@ -276,15 +277,16 @@ class StepProblem:
         """
         moved = displacement
         for plane in self.values.planes:
-            gaps = (self.positions + moved) @ plane[:3] - plane[3]
-            normals = np.broadcast_to(plane[:3], moved.shape)
-            moved = _push_out(moved, normals, gaps, np.zeros(3), float(plane[4]))
+            normal = plane[PLANES["normal"]]
+            gaps = (self.positions + moved) @ normal - plane[PLANES["height"]]
+            normals = np.broadcast_to(normal, moved.shape)
+            moved = _push_out(moved, normals, gaps, np.zeros(3), float(plane[PLANES["friction"]]))
         for center, motion, sphere in zip(self.sphere_centers, self.sphere_motions, self.values.spheres, strict=True):
             arms = self.positions + (moved if around is None else around) - center
             lengths = np.linalg.norm(arms, axis=1, keepdims=True)
             normals = np.where(lengths > 0.0, arms / np.maximum(lengths, 1e-300), [0.0, 1.0, 0.0])
-            gaps = ((self.positions + moved - center) * normals).sum(axis=1) - sphere[3]
-            moved = _push_out(moved, normals, gaps, motion, float(sphere[4]))
+            gaps = ((self.positions + moved - center) * normals).sum(axis=1) - sphere[SPHERES["radius"]]
+            moved = _push_out(moved, normals, gaps, motion, float(sphere[SPHERES["friction"]]))
         return np.where(self.free[:, None], moved, displacement)
 
     def residual(self, displacement: Array, diagonal: Array | None = None) -> Array:
@@ -341,7 +343,8 @@ def step_problem(
     positions, velocities = np.asarray(positions, dtype=np.float64), np.asarray(velocities, dtype=np.float64)
     held, springs = values.pin_vertices, values.pin_stiffness
     targets = values.pin_targets if pin_targets is None else np.asarray(pin_targets, dtype=np.float64)
-    centers = values.spheres[:, :3] if sphere_centers is None else np.asarray(sphere_centers, dtype=np.float64)
+    placed = values.spheres[:, SPHERES["center"]]
+    centers = placed if sphere_centers is None else np.asarray(sphere_centers, dtype=np.float64)
     starts = centers if sphere_starts is None else np.asarray(sphere_starts, dtype=np.float64)
     inertia = values.masses / time_step**2
     force = values.masses[:, None] * (velocities / time_step + values.gravity)

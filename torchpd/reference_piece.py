@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .scene import SceneValues
+from .tables import PLANES, SPHERES
 
 __all__ = [
     "LYING",
@@ -24,6 +25,7 @@ __all__ = [
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+NORMAL, HEIGHT, FRICTION = (PLANES[name] for name in ("normal", "height", "friction"))
 LYING = 0.01  # of the way that a plane stops: a vertex lies on it that is no further off
 HALF_TURN = 1e-6  # 4 cos^2(angle / 2), at most, of what counts as half a turn
 
@@ -55,9 +57,9 @@ def gaps_of(positions: Array, planes: Array, centers: Array, spheres: Array) -> 
     """Distance of every position to the nearest of planes and spheres [n]; inf without any."""
     gaps = np.full(len(positions), np.inf)
     for plane in planes:
-        gaps = np.minimum(gaps, positions @ plane[:3] - plane[3])
+        gaps = np.minimum(gaps, positions @ plane[NORMAL] - plane[HEIGHT])
     for center, sphere in zip(centers, spheres, strict=True):
-        gaps = np.minimum(gaps, np.linalg.norm(positions - center, axis=1) - sphere[3])
+        gaps = np.minimum(gaps, np.linalg.norm(positions - center, axis=1) - sphere[SPHERES["radius"]])
     return gaps
 
 
@@ -103,9 +105,9 @@ class Piece:
             normals = np.where(length > 0.0, arm / np.maximum(length, 1e-300), [0.0, 1.0, 0.0])
             across = (normals * way).sum(axis=1)
             along = np.linalg.norm(way - across[:, None] * normals, axis=1)
-            rounding = 4 * np.finfo(np.float64).eps * (np.linalg.norm(self.y, axis=1) + sphere[3])
-            lies = length[:, 0] - sphere[3] <= LYING * size + rounding
-            after = np.where(lies, np.minimum(after, across - several * sphere[4] * along), after)
+            rounding = 4 * np.finfo(np.float64).eps * (np.linalg.norm(self.y, axis=1) + sphere[SPHERES["radius"]])
+            lies = length[:, 0] - sphere[SPHERES["radius"]] <= LYING * size + rounding
+            after = np.where(lies, np.minimum(after, across - several * sphere[SPHERES["friction"]] * along), after)
         return after
 
     def gain(self, way: Array) -> float:
@@ -116,7 +118,7 @@ class Piece:
         """Of its free motion, that brings it to planes."""
         least = 1.0
         for plane in planes:
-            before, after = (y @ plane[:3] - plane[3] for y in (self.y, free))
+            before, after = (y @ plane[NORMAL] - plane[HEIGHT] for y in (self.y, free))
             comes, touches = (before > 0.0) & (after <= 0.0), after <= 0.0
             shares = np.where(comes, before / np.where(comes, np.maximum(before - after, 1e-300), 1.0), 0.0)
             least = min(least, float(shares[touches].min(initial=1.0)))
@@ -127,7 +129,7 @@ class Piece:
 
     def way_on(self, planes: Array) -> Array:
         """How far it goes along all planes that it touches [3]."""
-        normals, friction = planes[:, :3], planes[:, 4]
+        normals, friction = planes[:, NORMAL], planes[:, FRICTION]
         _, sizes, directions = np.linalg.svd(normals)
         span = directions[: int((sizes > 1e-6).sum())]
         along = self.lag - span.T @ (span @ self.lag)
@@ -141,9 +143,9 @@ class Piece:
         pushes = np.linalg.solve(normals @ normals.T, -normals @ self.lag)
         if len(planes) > 1 and not (pushes > 0.0).all():
             return np.zeros(3)
-        rough = [plane for plane in planes if plane[4] > 0.0]
-        lies = [self.y @ plane[:3] - plane[3] < -LYING * float(self.lag @ plane[:3]) for plane in rough]
-        slips = np.concatenate([self.slips(plane[:3])[own] for plane, own in zip(rough, lies, strict=True)])
+        rough = [plane for plane in planes if plane[FRICTION] > 0.0]
+        lies = [self.y @ plane[NORMAL] - plane[HEIGHT] < -LYING * float(self.lag @ plane[NORMAL]) for plane in rough]
+        slips = np.concatenate([self.slips(plane[NORMAL])[own] for plane, own in zip(rough, lies, strict=True)])
         if not len(slips):
             return np.zeros(3)
         mean = slips.mean(axis=0)

@@ -12,7 +12,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .reference_piece import LYING, NearestRotation, Piece, Problem, gaps_of, part_of, turn_about
+from .reference_piece import (
+    FRICTION,
+    HEIGHT,
+    LYING,
+    NORMAL,
+    NearestRotation,
+    Piece,
+    Problem,
+    gaps_of,
+    part_of,
+    turn_about,
+)
 from .reference_tipping import Tipping
 
 __all__ = ["align", "begin"]
@@ -86,10 +97,11 @@ def motion_of(piece: Piece) -> Array:
     free = (piece.y - pivot) @ turn.T + pivot + shift
     if piece.left(free, piece.planes[TOLD:]).min() <= 0.0:
         return still
-    touched = np.array([bool((free @ plane[:3] <= plane[3]).any()) for plane in piece.planes[:TOLD]], dtype=bool)
+    first = piece.planes[:TOLD]
+    touched = np.array([bool((free @ plane[NORMAL] <= plane[HEIGHT]).any()) for plane in first], dtype=bool)
     if not touched.any():
         return np.asarray(free - piece.y)
-    planes = piece.planes[:TOLD][touched]
+    planes = first[touched]
     if len(planes) == 1 and not piece.pinned.any():
         tipped = Tipping(piece, planes[0]).motion(free)
         if tipped is not None:
@@ -102,11 +114,11 @@ def motion_of(piece: Piece) -> Array:
     if piece.pinned.any():
         return still
     turn, shift = np.eye(3), piece.way_on(planes)
-    if np.linalg.matrix_rank(planes[:, :3], tol=1e-6) == 1 and not planes[:, 4].any():
-        turn = turn_about(planes[0, :3], piece.covariance)
+    if np.linalg.matrix_rank(planes[:, NORMAL], tol=1e-6) == 1 and not planes[:, FRICTION].any():
+        turn = turn_about(planes[0, NORMAL], piece.covariance)
     along = (piece.y - piece.middle) @ (turn - np.eye(3)).T + shift
     beside = min(
-        piece.gaps(piece.y + along, piece.planes[:TOLD][~touched], balls=False).min(),
+        piece.gaps(piece.y + along, first[~touched], balls=False).min(),
         piece.left(piece.y + along, piece.planes[TOLD:]).min(),
     )
     return np.asarray(along if beside > 0.0 else still)

@@ -12,6 +12,7 @@ from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import eigsh, splu
 
 from .reference import StepProblem
+from .tables import PLANES, SPHERES
 
 __all__ = [
     "Iterates",
@@ -274,7 +275,8 @@ def guard_tolerance(problem: StepProblem) -> float:
     1e-5 for rounding. Sliding with friction does work that this energy does not contain: 1e-2 where there is friction.
     """
     planes, spheres = problem.values.planes, problem.values.spheres
-    return 1e-2 if (planes[:, 4] > 0.0).any() or (spheres[:, 4] > 0.0).any() else 1e-5
+    friction = np.append(planes[:, PLANES["friction"]], spheres[:, SPHERES["friction"]])
+    return 1e-2 if (friction > 0.0).any() else 1e-5
 
 
 def relative_error(displacement: Array, solution: Array, first: Array) -> float:

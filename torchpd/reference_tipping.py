@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .reference_piece import LYING, Piece, axis_of, part_of, rotation_about, turn_about
+from .reference_piece import FRICTION, HEIGHT, LYING, NORMAL, Piece, axis_of, part_of, rotation_about, turn_about
 
 __all__ = ["Tipping"]
 
@@ -38,8 +38,8 @@ class Tipping:
     """
 
     def __init__(self, piece: Piece, plane: Array) -> None:
-        self.piece, self.normal, self.friction = piece, plane[:3], float(plane[4])
-        self.gap = piece.y @ self.normal - float(plane[3])
+        self.piece, self.normal, self.friction = piece, plane[NORMAL], float(plane[FRICTION])
+        self.gap = piece.y @ self.normal - float(plane[HEIGHT])
         self.reach = -LYING * float(piece.lag @ self.normal)
         self.lies, self.slips = self.gap < self.reach, piece.slips(self.normal)
         self.free_slips, self.pressure, self.near = self.slips, piece.middle, 0.0  # of a motion
@@ -107,11 +107,11 @@ class Tipping:
         """
         piece, reach = self.piece, self.reach
         planes, none = piece.planes, piece.planes[:0]
-        each = [(piece.y @ plane[:3] - plane[3], moved @ plane[:3] - plane[3]) for plane in planes]
+        each = [(piece.y @ plane[NORMAL] - plane[HEIGHT], moved @ plane[NORMAL] - plane[HEIGHT]) for plane in planes]
         each.append((piece.gaps(piece.y, none), piece.gaps(moved, none)))
         before, after = (np.stack(part) for part in zip(*each, strict=True))
         depths = after - np.minimum(before, 0.0)
-        left = before - drop * np.append(planes[:, :3] @ self.normal, 0.0)[:, None]
+        left = before - drop * np.append(planes[:, NORMAL] @ self.normal, 0.0)[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             share = np.where(np.isfinite(left), left / (left - depths), 1.0)
         order = depths / reach

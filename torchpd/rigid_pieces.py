@@ -215,7 +215,7 @@ class RigidPieces:
         change = (moved * torch.where(free, pull + 0.5 * inertia * moved, 0.0)).double().sum((-2, -1))
         size = (0.5 * pull.square() / inertia).double().sum((-2, -1))
         before, after = (
-            torch.ops.torchpd.element_energy(x, sim.stiffness, list(sim.plan.arrays)).double().sum(-1)
+            torch.ops.torchpd.element_energy(x, sim.material(), list(sim.plan.arrays)).double().sum(-1)
             for x in (positions, positions + moved)
         )
         falls: Tensor = change + after - before <= _NOISE[positions.dtype] * (size + before)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, TypedDict, get_args
+from typing import Any, Literal, get_args
 
 import torch
 
 from .checks import check_scalar, check_whole
+from .tables import SETTINGS_TABLE
 
 __all__ = [
     "DEFAULT_ITERATIONS",
@@ -17,23 +18,15 @@ __all__ = [
     "Multilevel",
     "Solver",
     "SolverName",
-    "SolverNumbers",
     "check_solver",
 ]
 
 LARGEST_COUNT = 1_000_000_000  # of iterations, as the ops say
 Diagonal = Literal["weighted", "plain"]
+# settings of a step that the simulator says, whatever the solver
+_OTHERS = ("iterations", "time_step", "tolerance", "inertial", "report")
+_USUAL = {row.name: row.usual for row in SETTINGS_TABLE if row.name not in _OTHERS}
 _DESCENDS = ": a step of theta / D descends only there;"
-
-
-class SolverNumbers(TypedDict):
-    """A solver as the keyword arguments of the ops."""
-
-    schedule: int
-    relaxation: float
-    rho: float
-    delay: int
-    weighted: bool
 
 
 def _keep(solver: Solver, name: str, value: float) -> None:
@@ -72,13 +65,12 @@ class Jacobi:
         _keep_within(self, "relaxation", 2, _DESCENDS)
         _check_choice("Jacobi.diagonal", self.diagonal, ("weighted", "plain"))
 
-    def numbers(self) -> SolverNumbers:
+    def numbers(self) -> dict[str, Any]:
         """The keyword arguments of the ops."""
         return {
+            **_USUAL,
             "schedule": 0,
             "relaxation": float(self.relaxation),
-            "rho": 0.0,
-            "delay": 0,
             "weighted": self.diagonal == "weighted",
         }
 
@@ -129,10 +121,11 @@ class Chebyshev:
                     'Chebyshev.diagonal must be "weighted" when guarded: its descent rests on that diagonal'
                 )
 
-    def numbers(self) -> SolverNumbers:
+    def numbers(self) -> dict[str, Any]:
         """The keyword arguments of the ops."""
         guarded = self.schedule == "guarded"
         return {
+            **_USUAL,
             "schedule": 2 if guarded else 1,
             "relaxation": float(self.relaxation if self.relaxation is not None else (1.9 if guarded else 1.0)),
             "rho": float(self.rho or 0.0),
@@ -184,15 +177,13 @@ class Multilevel:
         if self.relaxation is not None:
             _keep_within(self, "relaxation", 2)
 
-    def numbers(self) -> SolverNumbers:
+    def numbers(self) -> dict[str, Any]:
         """The keyword arguments of the ops."""
         usual = 1.9 if self.outer == "momentum" else 1.8
         return {
+            **_USUAL,
             "schedule": _SCHEDULES[self.outer],
             "relaxation": float(self.relaxation if self.relaxation is not None else usual),
-            "rho": 0.0,
-            "delay": 0,
-            "weighted": True,
         }
 
 

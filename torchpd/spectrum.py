@@ -32,7 +32,8 @@ def _bound(sim: Stepper) -> float:
     numbers = sim.solver.numbers()
     inertia, diagonal = _diagonal(sim)
     ratio = torch.where(torch.isinf(inertia), torch.ones_like(inertia), inertia / diagonal)
-    return 1.0 - numbers["relaxation"] * float(ratio.min())
+    relaxation: float = numbers["relaxation"]
+    return 1.0 - relaxation * float(ratio.min())
 
 
 def _power(sim: Stepper, state: State, iterations: int) -> float:
@@ -43,11 +44,11 @@ def _power(sim: Stepper, state: State, iterations: int) -> float:
     inertia = torch.where(free, inertia, torch.zeros_like(inertia))
     generator = torch.Generator().manual_seed(0)
     vector = torch.randn(state[0].shape, generator=generator, dtype=torch.float64, device="cpu").to(state[0])
-    scale = torch.zeros((), dtype=sim.dtype)
+    scale, material, plan = torch.zeros((), dtype=sim.dtype), sim.material(), list(sim.plan.arrays)
     for _ in range(iterations):
         vector = torch.where(free, vector, torch.zeros_like(vector))
         vector = vector / vector.norm()
-        product = inertia * vector + _ops.hessian_product(state[0], vector, sim.stiffness, list(sim.plan.arrays))
+        product = inertia * vector + _ops.hessian_product(state[0], vector, material, plan)
         vector = vector - numbers["relaxation"] * product / diagonal
         scale = vector.norm()
     return float(scale)

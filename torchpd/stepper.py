@@ -228,8 +228,9 @@ class Stepper(Readable):
         """
         positions = self.positions_of(state)
         refuse_tangents(positions)
-        material = dict(zip(MATERIAL_ROWS, self.material_at(targets, positions.shape[0]), strict=True))
-        energy = cast(Tensor, _ops.element_energy(positions, material["stiffness"], list(self.plan.arrays))).sum(-1)
+        arrays = self.material_at(targets, positions.shape[0])
+        material = dict(zip(MATERIAL_ROWS, arrays, strict=True))
+        energy = cast(Tensor, _ops.element_energy(positions, arrays, list(self.plan.arrays))).sum(-1)
         weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
         energy = energy - (material["masses"] * weight).sum(-1)
         if len(self.plan.pin_vertex):
@@ -250,7 +251,7 @@ class Stepper(Readable):
             positions: [B, V, 3], or a `State`.
         """
         positions = self.positions_of(positions, "positions")
-        result: Tensor = _ops.gradient(positions, self.stiffness.contiguous(), list(self.plan.arrays))
+        result: Tensor = _ops.gradient(positions, self.material(), list(self.plan.arrays))
         return result
 
     def step_gradient(

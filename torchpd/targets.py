@@ -9,10 +9,12 @@ import torch
 from torch import Tensor
 
 from .scene import Scene
+from .tables import SPHERES
 
 __all__ = ["Anchors", "Targets"]
 
 Targets = Tensor | Mapping[Any, Tensor]
+_LASTING = slice(SPHERES["center"].stop, SPHERES["motion"].start)  # radius and friction
 
 
 def _overwrite(array: Tensor, rows: slice, value: Tensor) -> Tensor:
@@ -89,7 +91,7 @@ class Anchors:
 
     def _row(self, spheres: Tensor, number: int, value: Tensor, time_step: float) -> Tensor:
         """Centre at the end of the step, radius, friction, motion during the step."""
-        own = spheres[..., number : number + 1, 3:5]
+        own = spheres[..., number : number + 1, _LASTING]
         motion = value[..., 3:] * time_step if value.shape[-1] == 6 else torch.zeros_like(value)
         lead = torch.broadcast_shapes(own.shape[:-1], value.shape[:-1])
         return torch.cat([value[..., :3].expand(*lead, 3), own.expand(*lead, 2), motion.expand(*lead, 3)], dim=-1)
@@ -102,7 +104,7 @@ class Anchors:
         for part, value in targets.items():
             if id(part) not in self.spheres:
                 continue
-            last = before[..., self.spheres[id(part)], :3]
+            last = before[..., self.spheres[id(part)], SPHERES["center"]]
             value = self._checked("targets of a Sphere", value, batch, [(3,), (6,)], last)
             if value.shape[-1] == 3:
                 velocity = (value - last) / time_step
@@ -115,7 +117,7 @@ class Anchors:
         if spheres.shape[-2] == 0:
             return spheres
         # also where none moves: to ask would mean to wait for a GPU
-        centre = spheres[..., :3]
+        centre = spheres[..., SPHERES["center"]]
         for _ in range(steps):
-            centre = centre + spheres[..., 5:]
-        return torch.cat([centre, spheres[..., 3:]], dim=-1)
+            centre = centre + spheres[..., SPHERES["motion"]]
+        return torch.cat([centre, spheres[..., _LASTING.start :]], dim=-1)

@@ -33,6 +33,7 @@ from .pins import PIN_HARD
 from .promise import Promise, Trial
 from .solvers import Chebyshev, Multilevel, Solver
 from .state import State
+from .tables import PLANES
 from .targets import Targets
 from .tuning_checks import check_known, check_request, check_start
 from .warn import TuningWarning, warn_user
@@ -231,14 +232,14 @@ def _environments(sim: Stepper, batch: int) -> list[int]:
 def _other_ways(sim: Stepper, start: State) -> list[State]:
     """The start with its velocities turned about the normal of rough ground: what sticks when depends on the way."""
     planes = sim.planes.detach()
-    if not bool((planes[..., 4] > 0.0).any()):
+    if not bool((planes[..., PLANES["friction"]] > 0.0).any()):
         return []
-    planes = planes.reshape(-1, planes.shape[-2], 5)  # [1 or B, C, 5]
+    planes = planes.reshape(-1, *planes.shape[-2:])  # [1 or B, C, 5]
     # of each environment the rough one that bears most of the weight
-    bears = -(planes[..., :3] * sim.gravity.detach().reshape(-1, 1, 3)).sum(dim=-1)
-    most = bears.masked_fill(planes[..., 4] <= 0.0, -math.inf).argmax(dim=1)
+    bears = -(planes[..., PLANES["normal"]] * sim.gravity.detach().reshape(-1, 1, 3)).sum(dim=-1)
+    most = bears.masked_fill(planes[..., PLANES["friction"]] <= 0.0, -math.inf).argmax(dim=1)
     chosen = planes.expand(len(most), -1, -1)[torch.arange(len(most), device=most.device), most]
-    normal = chosen[:, None, :3]
+    normal = chosen[:, None, PLANES["normal"]]
     across = torch.linalg.cross(normal.expand_as(start[1]), start[1])
     along = (start[1] * normal).sum(dim=-1, keepdim=True) * normal
     return [

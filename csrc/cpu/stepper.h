@@ -82,7 +82,7 @@ class Stepper {
   void align() {
     const bool first = !started_;
     started_ = true;
-    if (plan_.groups == 0 || (first && set_.start == StartKind::given)) return;
+    if (plan_.groups == 0 || (first && set_.start() == StartKind::given)) return;
     if constexpr (Touching) {
       if (first && team_.rank == 0)
         begin_still(
@@ -107,8 +107,8 @@ class Stepper {
 
   // What the first iterate is made of.
   Value guess(std::int64_t i) const {
-    if (set_.start == StartKind::given) return in_.at_vertex(call_.start, i) - w_.x[i];
-    return set_.start == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
+    if (set_.start() == StartKind::given) return in_.at_vertex(call_.start, i) - w_.x[i];
+    return set_.start() == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
   }
 
   void iterate(int k) {
@@ -177,15 +177,16 @@ class Stepper {
     contacts_ = {w_.planes, w_.balls, material.planes_count, material.spheres_count};
     if (team_.rank == 0) {
       for (int c = 0; c < material.planes_count; ++c) {
-        w_.planes[c] = {Lanes::vec3(in_.vector(material.planes, 5 * c)),
-                        in_.number(material.planes, 5 * c + 3),
-                        in_.number(material.planes, 5 * c + 4)};
+        w_.planes[c] = {Lanes::vec3(in_.vector(material.planes, planes_numbers * c)),
+                        in_.number(material.planes, planes_numbers * c + planes_height),
+                        in_.number(material.planes, planes_numbers * c + planes_friction)};
       }
       for (int c = 0; c < material.spheres_count; ++c) {
-        w_.balls[c] = {Lanes::vec3(in_.vector(material.spheres, 8 * c)),
-                       Lanes::vec3(in_.vector(material.spheres, 8 * c + 5)),
-                       in_.number(material.spheres, 8 * c + 3),
-                       in_.number(material.spheres, 8 * c + 4)};
+        w_.balls[c] = {
+            Lanes::vec3(in_.vector(material.spheres, spheres_numbers * c)),
+            Lanes::vec3(in_.vector(material.spheres, spheres_numbers * c + spheres_motion)),
+            in_.number(material.spheres, spheres_numbers * c + spheres_radius),
+            in_.number(material.spheres, spheres_numbers * c + spheres_friction)};
       }
     }
     team_.barrier();

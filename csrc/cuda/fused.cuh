@@ -14,8 +14,8 @@
 namespace pd {
 
 static_assert(sizeof(Control<double>) <= fused_control_bytes);
-static_assert(sizeof(Plane<float>) == 5 * sizeof(float) &&
-              sizeof(Ball<float>) == 8 * sizeof(float));
+static_assert(sizeof(Plane<float>) == planes_numbers * sizeof(float) &&
+              sizeof(Ball<float>) == spheres_numbers * sizeof(float));
 
 // Shared memory that the device keeps of every block.
 constexpr std::size_t reserved_shared_bytes = 1024;

@@ -58,7 +58,7 @@ template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
 PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::align_pieces() {
   const bool first = !started_;
   started_ = true;
-  if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
+  if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
   Aligning how(plan_, Touching, first);
   do {
     sums_ = find_motions<T, Touching, Kind>(

@@ -79,12 +79,12 @@ struct Inputs {
   PD_DEVICE void read_contacts(Plane<T>* planes, Ball<T>* balls) const {
     const Material<T>& material = call->material;
     for (int c = 0; c < material.planes_count; ++c) {
-      const T* p = material.planes.of(environment) + 5 * c;
-      planes[c] = {read3(p), p[3], p[4]};
+      const T* p = material.planes.of(environment) + planes_numbers * c;
+      planes[c] = {read3(p), p[planes_height], p[planes_friction]};
     }
     for (int c = 0; c < material.spheres_count; ++c) {
-      const T* p = material.spheres.of(environment) + 8 * c;
-      balls[c] = {read3(p), read3(p + 5), p[3], p[4]};
+      const T* p = material.spheres.of(environment) + spheres_numbers * c;
+      balls[c] = {read3(p), read3(p + spheres_motion), p[spheres_radius], p[spheres_friction]};
     }
   }
 

@@ -360,7 +360,7 @@ class SeveralRunner {
   PD_DEVICE void align_pieces() {
     const bool first = !started_;
     started_ = true;
-    if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
+    if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
     align_out_of_line(whole_, shared_, first_, here_, first);
     // again, since what lives in registers across a call would be spilled in the iterations too
     read_ahead(first_pair_);

@@ -131,7 +131,7 @@ class StreamRunner {
   void align() {
     const bool first = !started_;
     started_ = true;
-    if (plan_.pieces == 0 || (first && set_.start == StartKind::given)) return;
+    if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
     RoundsCall<T> call = {call_, Aligning(plan_, Touching, first), teams_.count, teams_.blocks,
                           call_.memory.counter};
     launch_teams(rounds_kernel(), call, call.counter, rounds_threads, 0, stream_);

@@ -62,14 +62,14 @@ struct Vertices {
 
   // What the first iterate is made of, if it is not given.
   PD_DEVICE Vec3<T> guess(int i, const Settings& settings) const {
-    if (settings.start == StartKind::inertial) return vec3(target[i]);
+    if (settings.start() == StartKind::inertial) return vec3(target[i]);
     return straight(i, T(settings.time_step));
   }
 
   PD_DEVICE Vec3<T> first(int i, const Inputs<T>& in, int vertex,
                           const Contacts<T>& contacts) const {
     const Settings& settings = in.call->settings;
-    const bool given = settings.start == StartKind::given;
+    const bool given = settings.start() == StartKind::given;
     return at(i).first(contacts,
                        given ? in.first_iterate(vertex) - vec3(x[i]) : guess(i, settings));
   }

@@ -1,5 +1,7 @@
 // Shared memory that the kernels of a plan ask for: known without a GPU, because it decides which kernel a plan is for.
 #pragma once
+#include "plan/views.h"
+
 #include <cstddef>
 #include <cstdint>
 
@@ -22,12 +24,12 @@ constexpr std::size_t slots_bytes(std::size_t real, std::size_t slots, std::size
 }
 
 // With one patch position and u of every slot, with `many` position; an entry for every corner of a pair;
-// planes and balls as numbers of five and eight.
+// planes and balls as the numbers of their rows.
 constexpr std::size_t fused_shared_bytes(std::size_t real, bool many, std::size_t slots,
                                          std::size_t entries, std::size_t planes,
                                          std::size_t balls) {
   return fused_control_bytes + slots_bytes(real, slots, 1) * (many ? 1 : 2) +
-         real * (4 * entries + 5 * planes + 8 * balls);
+         real * (4 * entries + planes_numbers * planes + spheres_numbers * balls);
 }
 
 // A cluster of blocks: the most that one has, and what each keeps for sums (cuda/cluster_sums.h).
@@ -48,7 +50,7 @@ constexpr std::size_t cluster_vertices_begin(std::size_t real, std::size_t slots
                                              std::size_t entries, std::size_t planes,
                                              std::size_t balls) {
   return fused_control_bytes + cluster_sums_bytes + cluster_energy_bytes + halo_bytes(real, slots) +
-         aligned(real * (2 * 4 * entries + 5 * planes + 8 * balls));
+         aligned(real * (2 * 4 * entries + planes_numbers * planes + spheres_numbers * balls));
 }
 constexpr std::size_t cluster_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
                                            std::size_t interior, std::size_t planes,

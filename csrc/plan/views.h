@@ -112,6 +112,22 @@ DevicePlan<T> count_device_plan(const int32* sizes) {
 // Of pairs, by which kernels count the corners of all of them, 5 times 32 of a block, in 32 bits (cuda/patch.h).
 constexpr std::int64_t most_blocks = (std::int64_t(1) << 32) / (5 * 32);
 
+// Numbers in a row of each array of the material.
+enum MaterialWidth : int {
+#define X(name, width, rows, meaning) name##_numbers = width,
+#include "plan/material.def"
+#undef X
+};
+
+// Where the columns of such a row begin.
+enum MaterialColumn : int {
+#define X(name, width, rows, meaning) name##_before = -1,
+#define COLUMN(array, name, width, meaning) \
+  array##_##name, array##_##name##_last = array##_##name + width - 1,
+#include "plan/material.def"
+#undef X
+};
+
 // One array of the material: the same for all environments when stride is 0.
 template <class T>
 struct Values {
@@ -142,16 +158,11 @@ enum class StartKind : int { velocity = 0, inertial = 1, given = 2 };
 
 struct Settings {
   int steps = 1, every = 1;  // steps to take, and how many of them lie between two records
-  int iterations = 64;
-  ScheduleKind schedule = ScheduleKind::guarded;
-  StartKind start = StartKind::velocity;
-  double time_step = 0;   // s
-  double relaxation = 1;  // theta
-  double rho = 0;         // spectral radius; 0: derived from the weights of the step
-  double tolerance = 0;   // relative error that ends an environment's iterations; 0: never
-  int delay = 0;          // iterations before the classic schedule accelerates
-  bool weighted = true;   // the diagonal that cannot diverge, else the plain one
+#define X(name, type, usual, holds, contract, meaning) type name = usual;
+#include "plan/settings.def"
+#undef X
 
+  PD_HD StartKind start() const { return inertial; }
   PD_HD bool multilevel() const { return schedule >= ScheduleKind::lbfgs; }
   // by L-BFGS
   PD_HD bool learns() const { return multilevel() && schedule != ScheduleKind::momentum; }
@@ -287,8 +298,8 @@ struct ContactGradientsCall {
   const T* multiplier = nullptr;  // [batch, vertices, 3] each
   const T* elastic = nullptr;     // elastic Hessian times the multiplier
   // of every vertex, by the columns of plan/material.def; zeros where it touches nothing; null where nobody wants them
-  T* planes = nullptr;   // [batch, vertices, planes, plane_numbers]
-  T* spheres = nullptr;  // [batch, vertices, spheres, sphere_numbers]
+  T* planes = nullptr;   // [batch, vertices, planes, planes_numbers]
+  T* spheres = nullptr;  // [batch, vertices, spheres, spheres_numbers]
 };
 
 // What a solved adjoint says of the state before the step.

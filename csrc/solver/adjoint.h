@@ -111,9 +111,6 @@ struct HeldVertex {
   }
 };
 
-// Numbers of a contact, see plan/material.def.
-constexpr int plane_numbers = 5, sphere_numbers = 8;
-
 // adds(contact): of those by which `vertex` is held along one more normal.
 template <class T, class Adds>
 PD_HD void touch_all(HeldVertex<T>& vertex, const Material<T>& material, std::int64_t environment,
@@ -123,20 +120,25 @@ PD_HD void touch_all(HeldVertex<T>& vertex, const Material<T>& material, std::in
     if (vertex.touch(contact)) adds(contact);
   };
   for (int c = 0; c < material.planes_count; ++c) {
-    const T* p = material.planes.of(environment) + plane_numbers * c;
+    const T* p = material.planes.of(environment) + planes_numbers * c;
     const Vec3<T> normal = {p[0], p[1], p[2]};
-    touch({c, normal, dot(normal, x) - p[3], p[4], {T(0), T(0), T(0)}, T(0)});
+    touch({c,
+           normal,
+           dot(normal, x) - p[planes_height],
+           p[planes_friction],
+           {T(0), T(0), T(0)},
+           T(0)});
   }
   for (int c = 0; c < material.spheres_count; ++c) {
-    const T* p = material.spheres.of(environment) + sphere_numbers * c;
+    const T* p = material.spheres.of(environment) + spheres_numbers * c;
     const Vec3<T> offset = x - Vec3<T>{p[0], p[1], p[2]};
     const T length = square_root(dot(offset, offset));
     if (!(length > T(0))) continue;
     touch({material.planes_count + c,
            (T(1) / length) * offset,
-           length - p[3],
-           p[4],
-           {p[5], p[6], p[7]},
+           length - p[spheres_radius],
+           p[spheres_friction],
+           {p[spheres_motion], p[spheres_motion + 1], p[spheres_motion + 2]},
            T(1) / length});
   }
 }

@@ -39,10 +39,10 @@ class ContactGradients {
 
  private:
   PD_HD T* plane(int number) const {
-    return call_.planes + plane_numbers * (at() * call_.step.material.planes_count + number);
+    return call_.planes + planes_numbers * (at() * call_.step.material.planes_count + number);
   }
   PD_HD T* sphere(int number) const {
-    return call_.spheres + sphere_numbers * (at() * call_.step.material.spheres_count + number);
+    return call_.spheres + spheres_numbers * (at() * call_.step.material.spheres_count + number);
   }
   PD_HD std::int64_t at() const {
     return vertex_.environment * call_.step.plan.vertices + vertex_.vertex;
@@ -53,8 +53,9 @@ class ContactGradients {
 
   PD_HD void clear(T none) const {
     const Material<T>& m = call_.step.material;
-    for (int n = 0; call_.planes && n < plane_numbers * m.planes_count; ++n) plane(0)[n] = none;
-    for (int n = 0; call_.spheres && n < sphere_numbers * m.spheres_count; ++n) sphere(0)[n] = none;
+    for (int n = 0; call_.planes && n < planes_numbers * m.planes_count; ++n) plane(0)[n] = none;
+    for (int n = 0; call_.spheres && n < spheres_numbers * m.spheres_count; ++n)
+      sphere(0)[n] = none;
   }
 
   // The columns of a contact; a ball has its center where a plane has its normal.
@@ -63,15 +64,16 @@ class ContactGradients {
     if (!(is_plane(contact) ? call_.planes : call_.spheres)) return;
     T* const to = is_plane(contact) ? plane(contact.number)
                                     : sphere(contact.number - call_.step.material.planes_count);
+    static_assert(planes_height == spheres_radius && planes_friction == spheres_friction);
     to[0] = first.x;
     to[1] = first.y;
     to[2] = first.z;
-    to[3] = offset;
-    to[4] = friction;
+    to[planes_height] = offset;
+    to[planes_friction] = friction;
     if (is_plane(contact)) return;
-    to[5] = motion.x;
-    to[6] = motion.y;
-    to[7] = motion.z;
+    to[spheres_motion] = motion.x;
+    to[spheres_motion + 1] = motion.y;
+    to[spheres_motion + 2] = motion.z;
   }
 
   // `turning`: what multiplies the turning of its normal, tangential.

@@ -27,12 +27,18 @@ struct MaterialContacts {
 
   PD_HD Vec3<T> project(const Vec3<T>& x, Vec3<T> u, const Vec3<T>& around) const {
     for (int c = 0; c < material.planes_count; ++c) {
-      const T* p = material.planes.of(environment) + 5 * c;
-      u = pd::project(Plane<T>{{p[0], p[1], p[2]}, p[3], p[4]}, x, u, around);
+      const T* p = material.planes.of(environment) + planes_numbers * c;
+      const Plane<T> plane = {{p[0], p[1], p[2]}, p[planes_height], p[planes_friction]};
+      u = pd::project(plane, x, u, around);
     }
     for (int c = 0; c < material.spheres_count; ++c) {
-      const T* p = material.spheres.of(environment) + 8 * c;
-      u = pd::project(Ball<T>{{p[0], p[1], p[2]}, {p[5], p[6], p[7]}, p[3], p[4]}, x, u, around);
+      const T* p = material.spheres.of(environment) + spheres_numbers * c;
+      const T* motion = p + spheres_motion;
+      const Ball<T> ball = {{p[0], p[1], p[2]},
+                            {motion[0], motion[1], motion[2]},
+                            p[spheres_radius],
+                            p[spheres_friction]};
+      u = pd::project(ball, x, u, around);
     }
     return u;
   }
@@ -41,7 +47,7 @@ struct MaterialContacts {
   PD_HD double size(const Vec3<T>& place) const {
     double most = 0;
     for (int c = 0; c < material.planes_count; ++c) {
-      const T* p = material.planes.of(environment) + 5 * c;
+      const T* p = material.planes.of(environment) + planes_numbers * c;
       const double along = absolute(double(p[0]) * double(place.x)) +
                            absolute(double(p[1]) * double(place.y)) +
                            absolute(double(p[2]) * double(place.z));
