@@ -385,11 +385,13 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   // how far the material is from that of M, per lane
   void compare_with_reference() {
-    const MisfitMeter<T> meter{plan_, call_.material.stiffness, team_, o_.ratios};
     for (int lane = 0; lane < width; ++lane) {
-      misfit_[lane] = meter.measure(in_.environment(lane), [&](std::int64_t i) {
+      const auto inertia = [&](std::int64_t i) {
         return Lanes::lane(Lanes::widen(w_.inertia[i]), lane);
-      });
+      };
+      MisfitRunner<T, decltype(inertia)> run{plan_, team_, o_.ranges, inertia};
+      misfit_[lane] =
+          measure_misfit(run, plan_.levels, call_.material.stiffness.of(in_.environment(lane)));
       Lanes::set_lane(outliers_.trusted, lane, T(misfit_[lane].trusted));
       outliers_.some = outliers_.some || misfit_[lane].strangers;
     }
