@@ -31,6 +31,7 @@ struct Quad {
   PD_HD friend Quad subtract_product(const Quad& b, T s, const Quad& a) {
     return {subtract_product(b.q, Pack<T, 4>(s), a.q)};
   }
+  PD_HD friend Quad select(bool take, const Quad& a, const Quad& b) { return take ? a : b; }
 };
 
 template <class T>

@@ -1,71 +1,34 @@
-// How far the material of a step is from that which its preconditioner was made of.
+// Runner of measure_misfit (solver/misfit.h) on the CPU.
 #pragma once
 #include "cpu/team.h"
-#include "plan/views.h"
-#include "solver/multilevel.h"
-
-#include <algorithm>
+#include "solver/misfit.h"
 
 namespace pd::inline PD_TARGET {
 
-// All of a team measures together; the ranges do not depend on how it shares the work.
-template <class T>
-struct MisfitMeter {
+// `inertia(i)` is a of an internal vertex. The ranges do not depend on how the team shares the work.
+template <class T, class Inertia>
+struct MisfitRunner {
   const Plan<T>& plan;
-  const Values<T>& stiffness;
   const Team& team;
-  double (*ratios)[2];  // one a thread
+  Range (*ranges)[ranges_count];  // one row a thread
+  Inertia inertia;
 
-  // `inertia(i)` is a of an internal vertex, 0 where the step holds it
-  template <class Inertia>
-  Misfit measure(std::int64_t environment, const Inertia& inertia) const {
-    const T* values = stiffness.of(environment);
-    Range elements, inertias, common;
-    for (std::int64_t t = team.begin(plan.tets); t < team.end(plan.tets); ++t)
-      elements.count(double(values[t]) / double(plan.levels.reference_stiffness[t]));
-    each_inertia(inertia, [&](double ratio) { inertias.count(ratio); });
-    meet(elements);
-    meet(inertias);
-    Misfit m(elements, inertias);
-    const double most = known_inertia * m.trusted;
-    each_inertia(inertia, [&](double ratio) {
-      if (!(ratio > most)) common.count(ratio);
-    });
-    meet(common);
-    m.conclude(elements, inertias, common, other_pins(inertia));
-    return m;
+  template <class Visit>
+  void each_tet(const Visit& visit) const {
+    for (std::int64_t t = team.begin(plan.tets); t < team.end(plan.tets); ++t) visit(t);
   }
 
- private:
-  // whether the step holds other vertices than M does
-  template <class Inertia>
-  bool other_pins(const Inertia& inertia) const {
-    Range differ;
-    for (std::int64_t i = team.begin(plan.vertices); i < team.end(plan.vertices); ++i) {
-      if ((inertia(i) > 0) != (plan.levels.fine_inverse[i] > T(0))) differ.count(1);
-    }
-    meet(differ);
-    return differ.largest > 0;
+  template <class Visit>
+  void each_vertex(const Visit& visit) const {
+    for (std::int64_t i = team.begin(plan.vertices); i < team.end(plan.vertices); ++i)
+      visit(i, inertia(i));
   }
 
-  // visit(a / a_0) of this thread's vertices that neither the step nor M holds
-  template <class Inertia, class Visit>
-  void each_inertia(const Inertia& inertia, Visit visit) const {
-    for (std::int64_t i = team.begin(plan.vertices); i < team.end(plan.vertices); ++i) {
-      const double a = inertia(i);
-      if (a > 0 && plan.levels.fine_inverse[i] > T(0))
-        visit(a / double(plan.levels.reference_inertia[i]));
-    }
-  }
-
-  // the range over all threads
-  void meet(Range& range) const {
-    ratios[team.rank][0] = range.least;
-    ratios[team.rank][1] = range.largest;
+  void meet(Range (&range)[ranges_count]) const {
+    for (int n = 0; n < ranges_count; ++n) ranges[team.rank][n] = range[n];
     team.barrier();
     for (int rank = 0; rank < team.size; ++rank) {
-      range.least = std::min(range.least, ratios[rank][0]);
-      range.largest = std::max(range.largest, ratios[rank][1]);
+      for (int n = 0; n < ranges_count; ++n) range[n].add(ranges[rank][n]);
     }
     team.barrier();
   }

@@ -4,6 +4,7 @@
 #include "cpu/misfit.h"
 #include "cpu/outer_work.h"
 #include "cpu/stepper.h"
+#include "solver/trial_vertex.h"
 
 #include <algorithm>
 
@@ -93,9 +94,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       }
       const double work = outer_[lane].known ? Lanes::lane(sum.first, lane) : 0;
       const double energy = Lanes::lane(sum.energy, lane) + work;
-      const bool accepted = outer_[lane].accept(energy, lbfgs_);
-      // the friction of another base does other work
-      if (accepted) outer_[lane].energy -= work;
+      const bool accepted = outer_[lane].accept(energy, work, lbfgs_);
       Lanes::set_lane(accepted_, lane, T(accepted ? 1 : 0));
       Lanes::set_lane(finite_, lane, T(energy < HUGE_VAL ? 1 : 0));
     }
@@ -112,8 +111,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       }
       const Value change = w_.u[i] - o_.base[i];
       // directions are those of another step at first
-      const Value s = k == 0 ? none_ : let_through(i, change);
-      const Value y = k == 0 ? none_ : let_through(i, o_.fresh[i] - o_.pull[i]);
+      const Value s = k == 0 ? none_ : restricted(i, change);
+      const Value y = k == 0 ? none_ : restricted(i, o_.fresh[i] - o_.pull[i]);
       if constexpr (Touching) {
         for (int a = 0; corotates_ && a < 3; ++a) {
           const Value d = Lanes::value(o_.fresh_free[i].row[a]) - Lanes::value(o_.free[i].row[a]);
@@ -134,7 +133,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       // what is no number must not poison sums in which it has no part, those of the next environment among them
       o_.s[newest_][i] = pick(finite_, numbers(s), none_);
       o_.y[newest_][i] = pick(finite_, numbers(y), none_);
-      const Value g = let_through(i, o_.pull[i]);
+      const Value g = restricted(i, o_.pull[i]);
       for (int j = 0; j < history; ++j) {
         sum[j] = multiply_add(o_.s[j][i], y, sum[j]);
         sum[history + j] = multiply_add(o_.s[j][i], g, sum[history + j]);
@@ -148,16 +147,15 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       if (outer_[lane].accepted && !(total[2 * history + 3] == 0)) holds_[lane] = false;
       stop(lane, k, total[2 * history], total[2 * history + 1]);
       if (!lbfgs_) continue;
-      double with[history];
+      Pairs& pairs = pairs_[lane];
       for (int j = 0; j < history; ++j) {
-        with[j] = total[j];
-        pairs_[lane].pulled[j] = total[history + j];
+        pairs.product[j][newest_] = total[j];
+        pairs.pulled[j] = total[history + j];
       }
-      pairs_[lane].valid[newest_] = false;
-      if (k > 0) pairs_[lane].add(newest_, with, total[2 * history], total[2 * history + 2]);
-      if (!outer_[lane].teaches()) pairs_[lane].valid[newest_] = false;
-      if (outer_[lane].forgets()) pairs_[lane].clear();
-      pairs_[lane].first_loop(newest_);
+      const bool teaches = k > 0 && outer_[lane].teaches();
+      pairs.admit(newest_, teaches, total[2 * history], total[2 * history + 2]);
+      if (outer_[lane].forgets()) pairs.clear();
+      pairs.first_loop(newest_);
     }
     team_.barrier();
   }
@@ -180,10 +178,10 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
     Value* in = o_.cycle.input();
     each_vertex([&](std::int64_t i) {
-      Value q = let_through(i, o_.pull[i]);
+      Value q = restricted(i, o_.pull[i]);
       if (lbfgs_) {
         for (int j = 0; j < history; ++j) q = subtract_product(q, alpha[j], o_.y[j][i]);
-        q = let_through(i, q);
+        q = restricted(i, q);
       }
       in[i] = scale * q;
     });
@@ -198,37 +196,32 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi iteration
   void advance() {
-    Real beta, length, plain, diagonal;
-    bool some_plain = false, some_diagonal = false;
+    Real beta, length, fallback, diagonal;
+    bool some_fallback = false;
     for (int lane = 0; lane < width; ++lane) {
       Outer& outer = outer_[lane];
-      const bool goes = !done_[lane], accelerates = goes && outer.diagonal && !outer.plain;
-      const double limit = accelerates ? schedule_[lane].limit : Outer::momentum_limit();
-      const double b =
-          accelerates || (goes && !lbfgs_ && !outer.plain) ? outer.extrapolation(limit) : 0;
-      outer.send(b, has_[lane], corotates_ && made_[lane] == 0, is_held(lane));
+      const bool goes = !done_[lane], falls_back = goes && (outer.plain || outer.diagonal);
+      const double b = goes ? outer.send(schedule_[lane].limit, lbfgs_, has_[lane],
+                                         corotates_ && made_[lane] == 0, is_held(lane))
+                            : 0;
       Lanes::set_lane(beta, lane, T(b));
       Lanes::set_lane(length, lane, T(goes ? (1 + b) * outer.length() : 0));
-      Lanes::set_lane(plain, lane, T(goes && outer.plain ? 1 : 0));
-      Lanes::set_lane(diagonal, lane, T(accelerates ? 1 : 0));
-      some_plain = some_plain || (goes && outer.plain);
-      some_diagonal = some_diagonal || accelerates;
+      Lanes::set_lane(fallback, lane, T(falls_back ? 1 : 0));
+      Lanes::set_lane(diagonal, lane, T(outer.accelerates() ? 1 : 0));
+      some_fallback = some_fallback || falls_back;
       used_[lane] += goes ? 1 : 0;
     }
     const Real theta(T(set_.relaxation)), one(T(1));
     each_vertex([&](std::int64_t i) {
       const auto v = vertex(i);
-      const Value u = o_.base[i], before = w_.before[i];
+      const auto at = trial_vertex(v, i);
+      const Value before = w_.before[i];
       const Value& slope = Touching ? o_.gradient[i] : o_.pull[i];
-      Value next = u - way(i, length * o_.direction[i] - beta * (u - before));
-      next = v.land(contacts_, next, u, slope);
-      if (some_plain || some_diagonal) {
-        Value other = subtract_product(u, v.inverse, o_.pull[i]);
-        if (some_diagonal)
-          other =
-              pick(diagonal, accelerate(u, before, slope, theta * v.inverse, one + beta), other);
-        next = pick(plain + diagonal, v.project(contacts_, other, u), next);
-      }
+      Value next = at.step(contacts_, before, slope, o_.direction[i], length, beta);
+      if (some_fallback)
+        next = pick(fallback,
+                    at.jacobi(contacts_, before, slope, diagonal > Real(T(0)), theta, one + beta),
+                    next);
       w_.u[i] = v.hold(v.target, next);
     });
   }
@@ -312,13 +305,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   }
 
   static Value pick(const Real& flag, const Value& a, const Value& b) {
-    return pick_if(flag > Real(T(0)), a, b);
-  }
-
-  template <class Condition>
-  static Value pick_if(const Condition& take, const Value& a, const Value& b) {
-    const Vec3<Real> x = Lanes::vec3(a), y = Lanes::vec3(b);
-    return Lanes::value({select(take, x.x, y.x), select(take, x.y, y.y), select(take, x.z, y.z)});
+    return select(flag > Real(T(0)), a, b);
   }
 
   template <class Visit>
@@ -347,25 +334,13 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
   }
 
-  auto is_stranger(std::int64_t i) const {
-    return w_.inertia[i] > Real(T(known_inertia) * plan_.levels.reference_inertia[i]) * trusted_;
+  // from the base
+  TrialVertex<Lanes, Touching> trial_vertex(const Vertex<Lanes, Touching>& v,
+                                            std::int64_t i) const {
+    return {v, o_.base[i], o_.pull[i], o_.free + i, plan_.levels, i, outliers_};
   }
-
-  // the part of a field along which contacts let a vertex go
-  Value open(std::int64_t i, const Value& field) const {
-    if constexpr (!Touching) return field;
-    return Lanes::value(o_.free[i] * Lanes::vec3(field));
-  }
-
-  // the part of a field that M is to work on: not across contacts, nor where it knows nothing of a vertex
-  Value let_through(std::int64_t i, const Value& field) const {
-    return open(i, strangers_ ? for_strangers(i, none_, field) : field);
-  }
-
-  // `theirs` in lanes where M knows nothing of the vertex
-  Value for_strangers(std::int64_t i, const Value& theirs, const Value& known) const {
-    if (!(plan_.levels.fine_inverse[i] > T(0))) return theirs;
-    return pick_if(is_stranger(i), theirs, known);
+  Value restricted(std::int64_t i, const Value& field) const {
+    return trial_vertex(vertex(i), i).restricted(field);
   }
 
   void keep_directions(std::int64_t i) {
@@ -377,35 +352,23 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
   }
 
-  // A way that M has a say on, where it has: the rest goes along the pull, by the diagonal.
-  Value way(std::int64_t i, const Value& d) const {
-    Value mixed = d;
-    const Value plain = vertex(i).inverse * o_.pull[i];
-    if constexpr (Touching) mixed = open(i, d) + (plain - open(i, plain));
-    return strangers_ ? for_strangers(i, plain, mixed) : mixed;
-  }
-
   // the second loop of L-BFGS, and the slope g.d
   void correct() {
     const Value* z = o_.cycle.result();
     pass([&](std::int64_t i, Value(&sum)[dots]) {
       for (int j = 0; j < history; ++j) sum[j] = multiply_add(o_.y[j][i], z[i], sum[j]);
-      sum[history] = multiply_add(o_.pull[i], way(i, z[i]), sum[history]);
+      const Value d = trial_vertex(vertex(i), i).completed(z[i]);
+      sum[history] = multiply_add(o_.pull[i], d, sum[history]);
     });
     double total[dots], with[history], c[history];
     Real factor[history];
     for (int lane = 0; lane < width; ++lane) {
       add_up(lane, total);
       for (int j = 0; j < history; ++j) with[j] = total[j];
-      Outer& outer = outer_[lane];
       pairs_[lane].second_loop(newest_, with, c);
-      outer.slope = pairs_[lane].slope(total[history], c);
       for (int j = 0; j < history; ++j) Lanes::set_lane(factor[j], lane, T(c[j]));
-      // not downhill: what was learnt does not hold here
-      if (outer.slope >= 0 || done_[lane] || outer.plain || outer.diagonal) continue;
-      pairs_[lane].clear();
-      outer.plain = true;
-      ++outer.restarts;
+      const double slope = pairs_[lane].slope(total[history], c);
+      if (!done_[lane] && !outer_[lane].descends(slope)) pairs_[lane].clear();
     }
     each_vertex([&](std::int64_t i) {
       Value d = z[i];
@@ -422,27 +385,28 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   // how far the material is from that of M, per lane
   void compare_with_reference() {
-    const MisfitMeter<T> meter{plan_, call_.material.stiffness, team_, o_.ratios};
     for (int lane = 0; lane < width; ++lane) {
-      misfit_[lane] = meter.measure(in_.environment(lane), [&](std::int64_t i) {
+      const auto inertia = [&](std::int64_t i) {
         return Lanes::lane(Lanes::widen(w_.inertia[i]), lane);
-      });
-      Lanes::set_lane(trusted_, lane, T(misfit_[lane].trusted));
-      strangers_ = strangers_ || misfit_[lane].strangers;
+      };
+      MisfitRunner<T, decltype(inertia)> run{plan_, team_, o_.ranges, inertia};
+      misfit_[lane] =
+          measure_misfit(run, plan_.levels, call_.material.stiffness.of(in_.environment(lane)));
+      Lanes::set_lane(outliers_.trusted, lane, T(misfit_[lane].trusted));
+      outliers_.some = outliers_.some || misfit_[lane].strangers;
     }
   }
 
   Work& o_;
-  bool lbfgs_, corotates_,
-      corotated_ = false,
-      strangers_ = false;  // strangers: vertices that M knows too little of, in any lane
+  bool lbfgs_, corotates_, corotated_ = false;
+  Outliers<Real> outliers_{false, Real(T(1))};  // in any lane
   int newest_ = 0, iteration_ = 0;
   bool has_[width] = {};                        // a small problem
   bool holds_[width] = {};                      // and in it what contacts hold at the base
   int made_[width] = {}, doubted_[width] = {};  // times, and failed trials by then
   Corotation<Lanes> corotation_;
   Value none_ = Lanes::value({Real(T(0)), Real(T(0)), Real(T(0))});
-  Real accepted_{T(1)}, finite_{T(1)}, trusted_{T(1)};
+  Real accepted_{T(1)}, finite_{T(1)};
   Misfit misfit_[width];
   Outer outer_[width];
   Pairs pairs_[width];

@@ -24,8 +24,8 @@ struct OuterWork {
   Mat3<Real>*free, *fresh_free;  // [vertices] directions that contacts leave; none without contacts
   // [vertices] dE/du with what contacts balance, and their friction; none without contacts
   Value *gradient, *fresh_gradient, *friction, *fresh_friction;
-  Wide (*sums)[dots];   // [chunks]
-  double (*ratios)[2];  // [threads] least and largest, of the material to that of M
+  Wide (*sums)[dots];             // [chunks]
+  Range (*ranges)[ranges_count];  // [threads] of the material to that of M
   int chunks;
 
   OuterWork(const StepCall<typename Lanes::Scalar>& call, bool touching, int threads)
@@ -36,7 +36,7 @@ struct OuterWork {
     const std::int64_t n = call.plan.vertices, held = touching ? n : 0;
     const std::int64_t vectors = 4 * n + 4 * held + (pairs ? 2 * history * n : 0);
     storage_ = allocate_zeroed(vectors * sizeof(Value) + 2 * held * sizeof(Mat3<Real>) +
-                               chunks * sizeof(*sums) + threads * sizeof(*ratios) + 4 * alignment);
+                               chunks * sizeof(*sums) + threads * sizeof(*ranges) + 4 * alignment);
     std::byte* at = storage_.get();
     for (Value** field : {&base, &pull, &fresh, &direction}) *field = place<Value>(at, n);
     for (int i = 0; i < history; ++i) {
@@ -47,7 +47,7 @@ struct OuterWork {
       *field = place<Value>(at, held);
     for (Mat3<Real>** field : {&free, &fresh_free}) *field = place<Mat3<Real>>(at, held);
     sums = place<Wide[dots]>(at, chunks);
-    ratios = place<double[2]>(at, threads);
+    ranges = place<Range[ranges_count]>(at, threads);
   }
 
  private:

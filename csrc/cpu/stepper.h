@@ -245,7 +245,8 @@ class Stepper {
     const Value u = w_.u[i], before = w_.before[i];
     Value next = vertex(i).next(contacts_, u, before, force, Real(theta_), omega_);
     if (set_.tolerance > 0) {
-      next = freeze(u, next);
+      // environments that are done keep their iterate
+      next = select(active_ > Real(T(0)), next, u);
       // nothing of both where a pin holds the vertex on its target
       const Value change = next - u, way = u - w_.target[i];
       sums.first = multiply_add(change, change, sums.first);
@@ -253,14 +254,6 @@ class Stepper {
     }
     w_.before[i] = u;
     w_.u[i] = next;
-  }
-
-  // environments that are done keep their iterate
-  Value freeze(const Value& u, const Value& next) const {
-    const auto active = active_ > Real(T(0));
-    const Vec3<Real> a = Lanes::vec3(next), b = Lanes::vec3(u);
-    return Lanes::value(
-        {select(active, a.x, b.x), select(active, a.y, b.y), select(active, a.z, b.z)});
   }
 
   typename Workspace<Lanes>::Part total(int parity) const {

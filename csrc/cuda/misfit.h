@@ -1,15 +1,29 @@
-// How far the material of a step is from that which its preconditioner was made of, see solver/misfit.h.
+// Runner of measure_misfit (solver/misfit.h) on a GPU.
 #pragma once
 #include "cuda/multilevel.h"
 
 namespace pd::inline PD_TARGET {
 
-// Ranges of all threads of a team, by rounds.
-class Ranges {
+// All threads of a team.
+template <class T>
+class MisfitRunner {
  public:
-  PD_DEVICE Ranges(Range* memory, BlockTeam& team) : memory_(memory), team_(team) {}
+  PD_DEVICE MisfitRunner(const StreamWork<T, false>& w, Range* memory, BlockTeam& team)
+      : w_(w), memory_(memory), team_(team) {}
 
-  // All threads; each gets the ranges of all.
+  template <class Visit>
+  PD_DEVICE void each_tet(const Visit& visit) const {
+#pragma unroll 1
+    for (int t = team_.thread(); t < w_.plan.tets; t += team_.threads()) visit(t);
+  }
+
+  template <class Visit>
+  PD_DEVICE void each_vertex(const Visit& visit) const {
+#pragma unroll 1
+    for (int i = team_.thread(); i < w_.plan.vertices; i += team_.threads())
+      visit(i, double(w_.v.inertia(i)));
+  }
+
   PD_DEVICE void meet(Range (&range)[ranges_count]) {
     __shared__ double least[ranges_count][warp_size], largest[ranges_count][warp_size];
     const int lane = threadIdx.x % warp_size, warp = threadIdx.x / warp_size;
@@ -39,43 +53,10 @@ class Ranges {
   }
 
  private:
+  const StreamWork<T, false>& w_;
   Range* memory_;
   BlockTeam& team_;
   int round_ = 0;
 };
-
-// All threads of a team; each gets the answer.
-template <class T>
-PD_DEVICE Misfit measure_misfit(const StreamWork<T, false>& w, Ranges& ranges, BlockTeam& team) {
-  const Levels<T>& levels = w.plan.levels;
-  const T* stiffness = w.call.step.material.stiffness.of(w.environment);
-  // visit(a / a_0) of the vertices that neither the step nor M holds; says whether one of them alone holds any
-  const auto each_inertia = [&](const auto& visit) {
-    bool differ = false;
-#pragma unroll 1
-    for (int i = team.thread(); i < w.plan.vertices; i += team.threads()) {
-      const double a = double(w.v.inertia(i));
-      const bool free = levels.fine_inverse[i] > T(0);
-      if (a > 0 && free) visit(a / double(levels.reference_inertia[i]));
-      differ = differ || (a > 0) != free;
-    }
-    return differ;
-  };
-  Range first[ranges_count], second[ranges_count];
-  Range &elements = first[0], &inertias = first[1], &common = second[0], &others = second[1];
-#pragma unroll 1
-  for (int t = team.thread(); t < w.plan.tets; t += team.threads())
-    elements.count(double(stiffness[t]) / double(levels.reference_stiffness[t]));
-  if (each_inertia([&](double ratio) { inertias.count(ratio); })) others.count(1);
-  ranges.meet(first);
-  Misfit misfit(elements, inertias);
-  const double most = known_inertia * misfit.trusted;
-  each_inertia([&](double ratio) {
-    if (!(ratio > most)) common.count(ratio);
-  });
-  ranges.meet(second);
-  misfit.conclude(elements, inertias, common, others.largest > 0);
-  return misfit;
-}
 
 }  // namespace pd::inline PD_TARGET

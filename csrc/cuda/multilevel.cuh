@@ -36,9 +36,12 @@ __global__ void __launch_bounds__(outer_threads)
     compare_material(const __grid_constant__ OuterCall<T> call) {
   const int number = int(blockIdx.x) / call.blocks;
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
-  Ranges ranges(of_team(call, number).ranges, team);
+  Range* const ranges = of_team(call, number).ranges;
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
-    const Misfit misfit = measure_misfit(StreamWork<T, false>(call.stream, e), ranges, team);
+    const StreamWork<T, false> w(call.stream, e);
+    MisfitRunner<T> run(w, ranges, team);
+    const T* stiffness = call.stream.step.material.stiffness.of(e);
+    const Misfit misfit = measure_misfit(run, w.plan.levels, stiffness);
     if (team.thread() == 0) call.memory.misfit[e] = misfit;
   }
 }

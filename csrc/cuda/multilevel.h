@@ -3,6 +3,7 @@
 #pragma once
 #include "cuda/corotation_maker.h"
 #include "cuda/shared_vertices.h"
+#include "solver/trial_vertex.h"
 
 #include <type_traits>
 
@@ -29,8 +30,7 @@ class MultilevelRunner {
         corotates_(call.shared_corotation > 0),
         corotation_(call.plan().vertices, memory.corotation, shared + call.shared_corotation) {
     const Misfit& misfit = m_.misfit[environment];
-    strangers_ = misfit.strangers;
-    trusted_ = T(misfit.trusted);
+    outliers_ = {misfit.strangers, T(misfit.trusted)};
     if (threadIdx.x == 0) {
       const bool stops = w_.settings().tolerance > 0;
       c_.outer.begin(misfit, Touching, w_.contacts.friction() > T(0), corotates_, energy_noise<T>(),
@@ -81,9 +81,7 @@ class MultilevelRunner {
     if (threadIdx.x == 0) {
       const double work = c_.outer.known ? c_.total[dots_energy + 1] + sum[1] : 0;
       const double energy = (c_.total[dots_energy] + sum[0]) + work;
-      c_.accepted = c_.outer.accept(energy, lbfgs_);
-      // the friction of another base does other work
-      if (c_.accepted) c_.outer.energy -= work;
+      c_.accepted = c_.outer.accept(energy, work, lbfgs_);
     }
     __syncthreads();
     const bool moves = c_.accepted;
@@ -113,41 +111,35 @@ class MultilevelRunner {
 
   // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi iteration
   PD_DEVICE void advance() {
-    const bool plain = c_.outer.plain, accelerates = c_.outer.diagonal && !plain;
-    const bool extrapolates = accelerates || (!lbfgs_ && !plain);
-    const double limit = accelerates ? w_.progress.schedule.limit : Outer::momentum_limit();
     __syncthreads();
-    if (threadIdx.x == 0) {
-      c_.total[0] = extrapolates ? c_.outer.extrapolation(limit) : 0;
-      c_.outer.send(c_.total[0], corotated_, corotates_ && made_ == 0, is_held());
-    }
+    if (threadIdx.x == 0)
+      c_.total[0] = c_.outer.send(w_.progress.schedule.limit, lbfgs_, corotated_,
+                                  corotates_ && made_ == 0, is_held());
     ++used_;
     __syncthreads();
+    const bool accelerates = c_.outer.accelerates(), falls_back = accelerates || c_.outer.plain;
     const T beta = T(c_.total[0]), length = T((1 + c_.total[0]) * c_.outer.length());
     const T theta = T(w_.settings().relaxation);
     const bool moved = c_.accepted;
     each_vertex([&](int i) {
       const auto v = w_.v.at(i);
-      const Vec3<T> u = vec3(base_[i]), pull = vec3(pull_[i]);
+      const auto at = trial_vertex(v, i);
       // what momentum goes on along
       const Vec3<T> before = vec3(iteration_ == 0 ? w_.v.u[i]
                                   : moved         ? m_.base[i]
                                                   : w_.v.before[i]);
       if constexpr (Touching) keep_directions(i);
-      const Vec3<T> slope = Touching ? vec3(m_.gradient[i]) : pull;
-      Vec3<T> next;
-      if (plain) {
-        next = v.project(w_.contacts, subtract_product(u, v.inverse, pull), u);
-      } else if (accelerates) {
-        next = accelerate(u, before, slope, theta * v.inverse, T(1) + beta);
-        next = v.project(w_.contacts, next, u);
-      } else {
-        next = u - way(i, length * direction(i) - beta * (u - before));
-        if constexpr (Touching) next = v.land(w_.contacts, next, u, slope);
-      }
+      const Vec3<T> slope = Touching ? vec3(m_.gradient[i]) : at.residual;
+      const Vec3<T> next =
+          falls_back
+              ? at.jacobi(w_.contacts, before, slope, accelerates, theta, T(1) + beta)
+              : v.land(
+                    w_.contacts,
+                    at.iterate - completed(i, length * direction(i) - beta * (at.iterate - before)),
+                    at.iterate, slope);
       if (moved) w_.v.set_before(i, before);
-      m_.base[i] = quad(u);
-      m_.pull[i] = quad(pull);
+      m_.base[i] = quad(at.iterate);
+      m_.pull[i] = quad(at.residual);
       w_.v.set(i, v.hold(v.target, next));
     });
     base_ = m_.base;
@@ -223,8 +215,8 @@ class MultilevelRunner {
       }
       if (!lbfgs_) return;
       const Vec3<T> fresh = vec3(m_.fresh[i]), pull = vec3(m_.pull[i]);
-      const Vec3<T> s = let_through(i, change), y = let_through(i, fresh - pull);
-      const Vec3<T> g = known(i, Touching ? m_.fresh_free[i] * fresh : fresh);
+      const Vec3<T> s = restricted(i, change), y = restricted(i, fresh - pull);
+      const Vec3<T> g = trial_vertex(w_.v.at(i), i).restricted(fresh, m_.fresh_free + i);
       Vec3<T> ways[history];
       see_pairs(m_.s, i, ways);
 #pragma unroll
@@ -234,7 +226,7 @@ class MultilevelRunner {
         sum[dots_with + j] = dot(way, y);
         sum[dots_pulled + j] = dot(way, g);
       }
-      sum[dots_back] = dot(s, let_through(i, pull));
+      sum[dots_back] = dot(s, restricted(i, pull));
       sum[dots_turn] = dot(y, y);
       m_.s[newest_ * vertices() + i] = quad(s);
       m_.y[newest_ * vertices() + i] = quad(y);
@@ -340,11 +332,7 @@ class MultilevelRunner {
       }
     }
     if (j != 0) return;
-    pairs.valid[newest_] = false;
-    if (k > 0)
-      pairs.admit(newest_, c_.total[dots_with + newest_], c_.total[dots_change],
-                  c_.total[dots_turn]);
-    if (!c_.outer.teaches()) pairs.valid[newest_] = false;
+    pairs.admit(newest_, k > 0 && c_.outer.teaches(), c_.total[dots_change], c_.total[dots_turn]);
     if (c_.outer.forgets()) pairs.clear();
   }
 
@@ -355,17 +343,34 @@ class MultilevelRunner {
     m_.free[i] = m_.fresh_free[i];
   }
 
+  // from where it stands
+  PD_DEVICE TrialVertex<Thread<T>, Touching> trial_vertex(const Vertex<Thread<T>, Touching>& v,
+                                                          int i) const {
+    return {v, vec3(base_[i]), vec3(pull_[i]), free_ + i, w_.plan.levels, i, outliers_};
+  }
+  // TrialVertex::completed, which reads memory as late as it can: kept in registers, its numbers are spilled.
+  PD_DEVICE Vec3<T> completed(int i, const Vec3<T>& d) const {
+    const auto free = [&](const Vec3<T>& field) { return free_[i] * field; };
+    const Vec3<T> diagonal = w_.v.u[i].w * vec3(pull_[i]);
+    if (outliers_.some && is_outlier(i)) return diagonal;
+    if constexpr (!Touching) return d;
+    return free(d) + (diagonal - free(diagonal));
+  }
+  PD_DEVICE bool is_outlier(int i) const {
+    if (!(w_.plan.levels.fine_inverse[i] > T(0))) return true;
+    return w_.v.inertia(i) >
+           T(known_inertia) * w_.plan.levels.reference_inertia[i] * outliers_.trusted;
+  }
+  PD_DEVICE Vec3<T> restricted(int i, const Vec3<T>& field) const {
+    return trial_vertex(w_.v.at(i), i).restricted(field);
+  }
+
   // ---- direction of a trial: cuda/multilevel_direction.h
 
   PD_DEVICE void corotate();
   PD_DEVICE void correct(bool last);
   PD_DEVICE Vec3<T> direction(int i) const;
   PD_DEVICE void see_pairs(const Quad<T>* field, int i, Vec3<T> (&seen)[history]) const;
-  PD_DEVICE bool is_stranger(int i) const;
-  PD_DEVICE Vec3<T> open(int i, const Vec3<T>& field) const;
-  PD_DEVICE Vec3<T> let_through(int i, const Vec3<T>& field) const;
-  PD_DEVICE Vec3<T> known(int i, const Vec3<T>& field) const;
-  PD_DEVICE Vec3<T> way(int i, const Vec3<T>& d) const;
 
   const OuterCall<T>& call_;
   const StreamWork<T, Touching> w_;
@@ -374,10 +379,10 @@ class MultilevelRunner {
   OuterControl& c_;
   DeviceCycle<T> cycle_;
   std::byte* shared_;
-  bool lbfgs_, corotates_, corotated_ = false, strangers_;
+  bool lbfgs_, corotates_, corotated_ = false;
   bool holds_ = false;  // the small problem knows what contacts hold at the base
   DeviceCorotation<T> corotation_;
-  T trusted_;
+  Outliers<T> outliers_;
   // where it stands: of the trial that was accepted until the next one goes out
   const Quad<T>*base_ = nullptr, *pull_ = nullptr;
   const Mat3<T>* free_ = nullptr;

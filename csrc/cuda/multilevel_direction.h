@@ -10,7 +10,7 @@ PD_DEVICE void MultilevelRunner<T, Touching, Threads>::precondition() {
   if (corotates_) corotate();
   const double scale = c_.outer.weight(w_.settings().relaxation, is_held());
   const auto right_side = [&](int i) {
-    Vec3<T> q = let_through(i, vec3(pull_[i]));
+    Vec3<T> q = restricted(i, vec3(pull_[i]));
     if (lbfgs_) {
       Vec3<T> y[history];
       see_pairs(m_.y, i, y);
@@ -18,13 +18,13 @@ PD_DEVICE void MultilevelRunner<T, Touching, Threads>::precondition() {
       for (int j = 0; j < history; ++j) {
         if (c_.pairs.valid[j]) q = subtract_product(q, T(c_.pairs.alpha[j]), y[j]);
       }
-      q = let_through(i, q);
+      q = restricted(i, q);
     }
     return T(scale) * q;
   };
   // where something holds vertices that M has free, the small problem takes its part before the cycle, and gives what that
   // lacks after it
-  const bool around = corotated_ && !w_.plan.levels.direct && (Touching || strangers_);
+  const bool around = corotated_ && !w_.plan.levels.direct && (Touching || outliers_.some);
   if (corotated_) {
     pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
       const Vec3<T> q = right_side(i);
@@ -90,21 +90,15 @@ PD_DEVICE void MultilevelRunner<T, Touching, Threads>::correct(bool last) {
     for (int j = 0; j < history; ++j) {
       if (c_.pairs.valid[j]) sum[j] += dot(y[j], z);
     }
-    sum[history] += dot(vec3(pull_[i]), way(i, z));
+    sum[history] += dot(vec3(pull_[i]), completed(i, z));
   };
   pass<history + 1, T>(visit, [&](int rows, const auto& row) {
     if (last) cycle_.run_last(rows, row);
   });
   if (threadIdx.x < warp_size) PairLanes(c_.pairs, newest_).second_loop(c_.total, c_.factor);
   if (threadIdx.x == 0) {
-    Outer& outer = c_.outer;
-    outer.slope = c_.pairs.slope(c_.total[history], c_.factor);
-    // not downhill: what was learnt does not hold here
-    if (!(outer.slope >= 0 || outer.plain || outer.diagonal)) {
-      c_.pairs.clear();
-      outer.plain = true;
-      ++outer.restarts;
-    }
+    const double slope = c_.pairs.slope(c_.total[history], c_.factor);
+    if (!c_.outer.descends(slope)) c_.pairs.clear();
   }
   __syncthreads();
 }
@@ -131,41 +125,6 @@ PD_DEVICE void MultilevelRunner<T, Touching, Threads>::see_pairs(const Quad<T>* 
     const Quad<T>* from = c_.pairs.valid[j] ? field + j * vertices() : w_.v.u;
     seen[j] = vec3(from[i]);
   }
-}
-
-// whether M knows nothing of a vertex
-template <class T, bool Touching, int Threads>
-PD_DEVICE bool MultilevelRunner<T, Touching, Threads>::is_stranger(int i) const {
-  if (!(w_.plan.levels.fine_inverse[i] > T(0))) return true;
-  return w_.v.inertia(i) > T(known_inertia) * w_.plan.levels.reference_inertia[i] * trusted_;
-}
-
-// the part of a field along which contacts let a vertex go
-template <class T, bool Touching, int Threads>
-PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::open(int i, const Vec3<T>& field) const {
-  if constexpr (!Touching) return field;
-  return free_[i] * field;
-}
-
-// the part of a field that M is to work on: not across contacts, nor where it knows nothing of a vertex
-template <class T, bool Touching, int Threads>
-PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::let_through(int i,
-                                                                      const Vec3<T>& field) const {
-  return open(i, known(i, field));
-}
-
-template <class T, bool Touching, int Threads>
-PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::known(int i, const Vec3<T>& field) const {
-  return strangers_ && is_stranger(i) ? none() : field;
-}
-
-// A way that M has a say on, where it has: the rest goes along the pull, by the diagonal.
-template <class T, bool Touching, int Threads>
-PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::way(int i, const Vec3<T>& d) const {
-  const Vec3<T> plain = w_.v.u[i].w * vec3(pull_[i]);
-  if (strangers_ && is_stranger(i)) return plain;
-  if constexpr (!Touching) return d;
-  return open(i, d) + (plain - open(i, plain));
 }
 
 }  // namespace pd::inline PD_TARGET

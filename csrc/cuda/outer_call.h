@@ -15,7 +15,6 @@ constexpr int dots_back = dots_pulled + history, dots_change = dots_back + 1;
 constexpr int dots_way = dots_change + 1, dots_turn = dots_way + 1;
 constexpr int dots_held = dots_turn + 1, outer_dots = dots_held + 1;
 constexpr int most_sums = outer_dots > turning_modes ? outer_dots : turning_modes;  // of any pass
-constexpr int ranges_count = 2;   // that a round of Ranges compares
 constexpr int most_chunks = 640;  // of vertices, whose sums every block adds up
 // Threads of a block: a multiprocessor each, but for meshes of one patch, of which two share it. Few enough that each has the
 // registers for what it asks of memory at once.

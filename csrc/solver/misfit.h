@@ -1,6 +1,7 @@
 // How far the material of a step is from that which M of solver/multilevel.h was made of.
 #pragma once
 #include "math/config.h"
+#include "plan/views.h"
 
 #include <cmath>
 
@@ -45,5 +46,39 @@ struct Misfit {
   PD_HD static double larger(double a, double b) { return a < b ? b : a; }
   PD_HD static double smaller(double a, double b) { return b < a ? b : a; }
 };
+
+constexpr int ranges_count = 2;  // that threads compare at a time
+
+// Measures together with all threads of a team. The runner supplies each_tet(visit(t)) and each_vertex(visit(i, a)) over the
+// thread's share, a being 0 where the step holds the vertex, and meet(ranges), which makes them those of all threads.
+#if defined(__CUDACC__)
+#pragma nv_exec_check_disable
+#endif
+template <class Runner, class T>
+PD_HD Misfit measure_misfit(Runner& run, const Levels<T>& levels, const T* stiffness) {
+  Range first[ranges_count], second[ranges_count];
+  Range &elements = first[0], &inertias = first[1], &common = second[0], &differ = second[1];
+  run.each_tet([&](std::int64_t t) {
+    elements.count(double(stiffness[t]) / double(levels.reference_stiffness[t]));
+  });
+  // visit(a / a_0) of the vertices that neither the step nor M holds; counts those that one of them alone holds
+  const auto each_inertia = [&](const auto& visit) {
+    run.each_vertex([&](std::int64_t i, double a) {
+      const bool free = levels.fine_inverse[i] > T(0);
+      if (a > 0 && free) visit(a / double(levels.reference_inertia[i]));
+      if ((a > 0) != free) differ.count(1);
+    });
+  };
+  each_inertia([&](double ratio) { inertias.count(ratio); });
+  run.meet(first);
+  Misfit misfit(elements, inertias);
+  const double most = known_inertia * misfit.trusted;
+  each_inertia([&](double ratio) {
+    if (!(ratio > most)) common.count(ratio);
+  });
+  run.meet(second);
+  misfit.conclude(elements, inertias, common, differ.largest > 0);
+  return misfit;
+}
 
 }  // namespace pd::inline PD_TARGET

@@ -83,17 +83,13 @@ struct Pairs {
     for (bool& v : valid) v = false;
   }
 
-  // the pair in place `newest`: s_i . y of it with every s_i, |s|^2 and |y|^2
-  PD_HD void add(int newest, const double (&with)[history], double ss, double yy) {
-    for (int i = 0; i < history; ++i) product[i][newest] = with[i];
-    admit(newest, with[newest], ss, yy);
-  }
-
-  // the same when the products are there, s.y of the pair among them
-  PD_HD void admit(int newest, double curvature, double ss, double yy) {
+  // The pair in place `newest`, by |s|^2 and |y|^2, once its products are there; `teaches`: it may count.
+  PD_HD void admit(int newest, bool teaches, double ss, double yy) {
+    const double curvature = product[newest][newest];
     inverse[newest] = 1 / curvature;
     const double least = least_curvature * least_curvature * ss * yy;
-    valid[newest] = curvature > 0 && curvature * curvature > least && curvature < HUGE_VAL;
+    valid[newest] =
+        teaches && curvature > 0 && curvature * curvature > least && curvature < HUGE_VAL;
   }
 
   PD_HD static int older(int place, int by) { return (place - by + history) % history; }

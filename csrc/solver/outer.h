@@ -83,8 +83,9 @@ struct Outer {
     return full(held) * relaxation / scale;
   }
 
-  // Whether to go on from a trial of this energy. False for NaN, unless there is nothing to go back to.
-  PD_HD bool accept(double trial, bool armijo) {
+  // Whether to go on from a trial of this energy, of which `work` is that against friction. False for NaN, unless there is
+  // nothing to go back to.
+  PD_HD bool accept(double trial, double work, bool armijo) {
     const double took = length();
     const bool of_m = !plain && !diagonal;
     const double demanded = armijo && of_m ? sufficient * took * slope : 0;
@@ -97,7 +98,8 @@ struct Outer {
     if (!fell) momentum = 0;
     if (accepted) {
       known = true;
-      energy = trial;
+      // the friction of another base does other work
+      energy = trial - work;
     }
     if (searches && !diagonal) {
       plain = false;
@@ -154,32 +156,47 @@ struct Outer {
     return accepted && restarts > 0 && strayed > way_worth_making * walked;
   }
 
-  // Of the trial that goes out next, with momentum b, by a direction that has the small problem's part or not; `waits`: that is
-  // still to be made, and until then a part that turns may hardly move at all; `held`: it has contacts in it.
-  PD_HD void send(double b, bool corotated, bool waits, bool held) {
+  // Whether the slope g.d says that a direction leads downhill. If not, what was learnt does not hold here.
+  PD_HD bool descends(double along) {
+    slope = along;
+    if (slope >= 0 || plain || diagonal) return true;
+    plain = true;
+    ++restarts;
+    return false;
+  }
+
+  // whether the next trial is an accelerated Jacobi iteration
+  PD_HD bool accelerates() const { return diagonal && !plain; }
+
+  // Returns momentum b of the trial that goes out next, of which u + b (u - before) is the start; `limit`: of the schedule of
+  // Jacobi iterations; `learns`: by L-BFGS; `corotated`: its direction has the small problem's part; `waits`: that is still to
+  // be made, and until then a part that turns may hardly move at all; `held`: it has contacts in it.
+  PD_HD double send(double limit, bool learns, bool corotated, bool waits, bool held) {
+    const bool extrapolates = accelerates() || !(learns || plain);
+    const double b = extrapolates ? extrapolation(diagonal ? limit : momentum_limit()) : 0;
     omega = plain || diagonal ? 1 + b : 0;
     const double whole = corotated ? full(held) : waits ? 0 : share_of_turns;
     share = {whole * fits * length(), corotated ? kept_by_corotation : kept_by_turns};
+    return b;
   }
 
   PD_HD bool ends(double tolerance, const Schedule& schedule, double change, double way) {
     return stop.ends(tolerance, omega > 0 ? schedule.share_of(omega) : share, change, way);
   }
 
+ private:
   // the most that momentum with M takes
   PD_HD static double momentum_limit() {
     const double b = (1 - sqrt(1 - momentum_rho * momentum_rho)) / momentum_rho;
     return b * b;
   }
 
-  // beta of u + beta (u - before)
   PD_HD double extrapolation(double limit) {
     const double ramp = momentum / (momentum + 2.0);
     ++momentum;
     return ramp < limit ? ramp : limit;
   }
 
- private:
   PD_HD double full(bool held) const { return held && !friction ? relaxed_on_contacts : 1; }
 
   // After a trial of M that `took` that much, and was not the first of its base: `again`.

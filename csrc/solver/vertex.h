@@ -75,10 +75,7 @@ struct Vertex {
 
   // `held` where the vertex does not move, `free` elsewhere
   PD_HD Value hold(const Value& held, const Value& free) const {
-    const auto moves = inverse > Real(T(0));
-    const Vec3<Real> a = Lanes::vec3(free), b = Lanes::vec3(held);
-    return Lanes::value(
-        {select(moves, a.x, b.x), select(moves, a.y, b.y), select(moves, a.z, b.z)});
+    return select(inverse > Real(T(0)), free, held);
   }
 
   // `u` out of the contacts; `around`: see effects/contact.h
@@ -104,10 +101,7 @@ struct Vertex {
 
   // Where a rigid motion of its piece takes it from u, by `way`. By none it keeps its bits, the sign of a 0 too.
   PD_HD Value moved(const Value& u, const Vec3<Real>& way) const {
-    const Vec3<Real> to = Lanes::vec3(hold(u, u + Lanes::value(way))), stays = Lanes::vec3(u);
-    const auto moves = !(dot(way, way) <= Real(T(0)));
-    return Lanes::value(
-        {select(moves, to.x, stays.x), select(moves, to.y, stays.y), select(moves, to.z, stays.z)});
+    return select(!(dot(way, way) <= Real(T(0))), hold(u, u + Lanes::value(way)), u);
   }
 
   // dE/du, `force` being that of the elements, dE_elastic/du
