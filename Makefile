@@ -25,7 +25,9 @@ help:
 	@echo "make cuda-check  compile every CUDA source; no GPU needed    CHECK_ARGS=--quick"
 	@echo "make clean       remove what was built, but not $(VENV)"
 
-setup: $(VENV)/extension.stamp $(VENV)/package.stamp
+# Two jobs: what the extension is not built with is installed while it is compiled.
+setup:
+	@$(MAKE) --no-print-directory --jobs=2 $(VENV)/extension.stamp $(VENV)/package.stamp
 
 demo: setup
 	$(BIN)/python -m torchpd demo $(DEMO_ARGS)
@@ -72,15 +74,22 @@ $(BIN)/pip:
 	echo "torchpd needs python >= 3.10, but none of [$(PYTHONS)] is: install a newer python." >&2; \
 	exit 1
 
-$(VENV)/requirements.stamp: requirements/dev.txt requirements/lock.txt | $(BIN)/pip
-	$(BIN)/python -m pip install --disable-pip-version-check -r requirements/dev.txt -c requirements/lock.txt
+# Modules are byte-compiled when they are first imported: of most nothing ever is.
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --no-compile
+
+$(VENV)/build.stamp: requirements/build.txt requirements/lock.txt | $(BIN)/pip
+	$(PIP) -r requirements/build.txt -c requirements/lock.txt
+	@touch $@
+
+$(VENV)/requirements.stamp: requirements/dev.txt requirements/lock.txt $(VENV)/build.stamp
+	$(PIP) --quiet -r requirements/dev.txt -c requirements/lock.txt
 	@touch $@
 
 # Object files stay in build/, so that ninja compiles only what changed.
-$(VENV)/extension.stamp: $(NATIVE_SOURCES) setup.py torchpd/toolkit.py $(VENV)/requirements.stamp
+$(VENV)/extension.stamp: $(NATIVE_SOURCES) setup.py torchpd/toolkit.py $(VENV)/build.stamp
 	$(BIN)/python setup.py --quiet build_ext --inplace
 	@touch $@
 
 $(VENV)/package.stamp: pyproject.toml torchpd/version.py $(VENV)/requirements.stamp | $(VENV)/extension.stamp
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-build-isolation --no-deps -e .
+	$(PIP) --quiet --no-build-isolation --no-deps -e .
 	@touch $@

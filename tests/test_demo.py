@@ -57,11 +57,18 @@ def test_table_names_what_was_done(demo: tuple[str, Path]) -> None:
 
 def test_pictures_show_something(demo: tuple[str, Path]) -> None:
     _, folder = demo
-    for name in ("contact_sheet.png", "convergence.png"):
+    for name in ("picture.png", "contact_sheet.png", "convergence.png"):
         assert np.asarray(Image.open(folder / name).convert("RGB")).std() > 10.0
     sheet = np.asarray(Image.open(folder / "contact_sheet.png"))
     first, last = sheet[8:188, 8:248].astype(int), sheet[196:376, 504:744].astype(int)
     assert np.abs(first - last).mean() > 5.0  # the body has moved
+
+
+def test_first_picture_is_told_before_the_report(demo: tuple[str, Path]) -> None:
+    text, folder = demo
+    assert text.startswith(f"first picture: {folder / 'picture.png'}\n")
+    picture = np.asarray(Image.open(folder / "picture.png").convert("RGB"))
+    assert picture[:, 100:140].std() > 10.0
 
 
 def test_films_play_in_real_time(demo: tuple[str, Path]) -> None:

@@ -29,7 +29,9 @@ def requirement_names(lines: list[str]) -> set[str]:
 
 def pinned(file: str) -> list[str]:
     lines = (ROOT / "requirements" / file).read_text(encoding="utf-8").splitlines()
-    return [line for line in lines if line and not line.startswith("#")]
+    others = [line.removeprefix("-r ") for line in lines if line.startswith("-r ")]
+    own = [line for line in lines if line and not line.startswith(("#", "-r "))]
+    return [*own, *(line for other in others for line in pinned(other))]
 
 
 def test_version_is_stated_once() -> None:

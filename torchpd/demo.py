@@ -89,8 +89,9 @@ def run_demo(options: DemoOptions) -> str:
     options.out.mkdir(parents=True, exist_ok=True)
 
     motion = _simulate(sim, mesh, options.steps)
-    files = _draw(motion, options.out, _QUICK if options.quick else _GOOD)
-    plot = _study(f"{name}, {len(mesh.tets):,} tets", sim, motion, options)
+    hardest = int(motion.track.info.energy[:, 0].argmax())
+    files = _draw(motion, hardest, options.out, _QUICK if options.quick else _GOOD)
+    plot = _study(f"{name}, {len(mesh.tets):,} tets", sim, motion, hardest, options)
     files += [plot] if plot else []
     return _report(name, mesh, sim, motion, files)
 
@@ -133,9 +134,8 @@ def _simulate(sim: Simulator, mesh: TetMesh, steps: int) -> _Motion:
     return _Motion(start, track, seconds, mesh.embedding.apply(positions), mesh.embedding.surface.triangles)
 
 
-def _study(subject: str, sim: Simulator, motion: _Motion, options: DemoOptions) -> Path | None:
+def _study(subject: str, sim: Simulator, motion: _Motion, hardest: int, options: DemoOptions) -> Path | None:
     """The convergence plot of the step whose objective is highest: elastic energy and sudden braking together."""
-    hardest = int(motion.track.info.energy[:, 0].argmax())
     before = motion.start if hardest == 0 else motion.track.state(hardest - 1)
     try:
         curves = compare_solvers(sim, before, iterations=128 if options.quick else 256, progress=True)
@@ -145,8 +145,8 @@ def _study(subject: str, sim: Simulator, motion: _Motion, options: DemoOptions) 
     return plot_convergence(curves, options.out / "convergence.png", title=title, mark=options.iterations)
 
 
-def _draw(motion: _Motion, out: Path, pictures: _Pictures) -> list[Path]:
-    """Contact sheet, moving surface and films."""
+def _draw(motion: _Motion, hardest: int, out: Path, pictures: _Pictures) -> list[Path]:
+    """A picture after the hardest step at once, then contact sheet, moving surface and films."""
     frames, triangles = motion.frames, motion.triangles
     # the floor is drawn where the surface comes to lie: a lattice around it touches the ground a little earlier
     sheet_studio, film_studio = (
@@ -156,6 +156,9 @@ def _draw(motion: _Motion, out: Path, pictures: _Pictures) -> list[Path]:
             (pictures.film_size, pictures.film_samples),
         )
     )
+    first = out / "picture.png"
+    contact_sheet([sheet_studio.render(frames[hardest + 1])], columns=1, path=first)
+    print(f"first picture: {first}", flush=True)
     chosen = np.unique(np.linspace(0, len(frames) - 1, pictures.sheet_frames).round().astype(int))
     shown = range(0, len(frames), pictures.film_every)
     with tqdm(total=len(chosen) + len(shown), desc="pictures", unit="picture", leave=False) as bar:
@@ -170,6 +173,7 @@ def _draw(motion: _Motion, out: Path, pictures: _Pictures) -> list[Path]:
     contact_sheet(sheet, columns=pictures.sheet_columns, captions=captions, path=out / "contact_sheet.png")
     rate = 1.0 / TIME_STEP
     return [
+        first,
         out / "contact_sheet.png",
         *(
             write_film(out / f"animation{e}", film, frames_per_second=rate / pictures.film_every)
