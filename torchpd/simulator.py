@@ -21,7 +21,6 @@ from .stepper import Stepper
 from .summary import describe
 from .synonyms import no_attribute
 from .targets import Targets
-from .tuning import tune
 
 __all__ = ["Simulator", "Targets"]
 
@@ -157,6 +156,8 @@ class Simulator(Stepper):
             ValueError: states, forces or material that are not finite, a singular system, a scene without motion.
             RuntimeError: no converged step to compare with; solver and iterations stay.
         """
+        from .tuning import tune  # its methods of comparison take a tenth of a second to import
+
         return tune(
             self,
             state,
