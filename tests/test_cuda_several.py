@@ -159,4 +159,4 @@ def test_which_meshes_share_blocks(cells: tuple[int, int, int], share: bool) -> 
         assert (sim.plan.size("most_pairs") <= _C.most_sharing_pairs) == share
         state = sim.rest_state(3)
         (name,) = device_work(partial(sim, state))
-        assert ("several_step" in name) == (share and dtype == torch.float32), name
+        assert ("small_batch_step" in name) == (share and dtype == torch.float32), name

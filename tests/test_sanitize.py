@@ -17,7 +17,7 @@ from torchpd.plan import Plan
 
 TOOLS = ROOT / "tools"
 H100 = Properties(132, 232448, 16)
-FAR_THREADS = {torch.float32: 384, torch.float64: 192}  # far_threads of csrc/cuda/fused_kernels.cuh
+FAR_THREADS = {torch.float32: 384, torch.float64: 192}  # global_memory_threads of csrc/cuda/fused_kernels.cuh
 PIPELINE_SLOTS = 1024  # csrc/cuda/pipeline.h
 ROUNDS_WARPS = 4  # csrc/cuda/stream_rigid.h: with more parts a team has several blocks
 

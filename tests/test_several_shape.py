@@ -23,11 +23,11 @@ int main() {
   };
   while (read()) {
     const pd::SmallMesh mesh{int(n[0]), int(n[1])};
-    const auto bytes = [&](int together) { return std::size_t(together * n[6]); };
-    const pd::Room room{int(n[3]), std::size_t(n[4]), std::size_t(n[5])};
-    const pd::SeveralShape shape = pd::several_shape(mesh, n[2], room, bytes);
-    const long long most = pd::most_at_work(mesh, room, bytes);
-    std::printf("%d %d %d %lld\\n", shape.together, shape.threads, int(shape.lean), most);
+    const auto bytes = [&](int count) { return std::size_t(count * n[6]); };
+    const pd::DeviceLimits limits{int(n[3]), std::size_t(n[4]), std::size_t(n[5])};
+    const pd::SmallBatchShape shape = pd::small_batch_shape(mesh, n[2], limits, bytes);
+    const long long most = pd::most_at_work(mesh, limits, bytes);
+    std::printf("%d %d %d %lld\\n", shape.per_block, shape.threads, int(shape.few_registers), most);
   }
 }
 """
@@ -48,9 +48,9 @@ class Asked(NamedTuple):
 
 
 class Shape(NamedTuple):
-    together: int
+    per_block: int
     threads: int
-    lean: bool
+    few_registers: bool
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def told(program: Path, asked: list[Asked]) -> list[tuple[Shape, int]]:
     words = subprocess.run([program], input="\n".join(lines), stdout=subprocess.PIPE, text=True, check=True).stdout
     found = [tuple(map(int, line.split())) for line in words.splitlines()]
     assert len(found) == len(asked)
-    return [(Shape(together, threads, bool(lean)), most) for together, threads, lean, most in found]
+    return [(Shape(per_block, threads, bool(few)), most) for per_block, threads, few, most in found]
 
 
 def shapes(program: Path, asked: list[Asked]) -> list[Shape]:
@@ -82,29 +82,29 @@ def test_every_small_mesh_has_a_shape_that_fits(program: Path) -> None:
     fits = [a for a in asked if a.bytes <= a.most]
     assert len(fits) > 0.9 * len(asked)
     for a, (shape, most) in zip(fits, told(program, fits), strict=True):
-        assert 1 <= shape.together <= min(4, a.batch), (a, shape)
+        assert 1 <= shape.per_block <= min(4, a.batch), (a, shape)
         assert shape.threads % 32 == 0, (a, shape)
         assert 32 <= shape.threads <= 224, (a, shape)
-        rounds = -(-shape.together * a.pairs // shape.threads)
-        assert rounds <= (1 if shape.lean else 2), (a, shape)
-        assert shape.together * a.bytes <= a.most, (a, shape)
+        rounds = -(-shape.per_block * a.pairs // shape.threads)
+        assert rounds <= (1 if shape.few_registers else 2), (a, shape)
+        assert shape.per_block * a.bytes <= a.most, (a, shape)
         # no batch has more at work than memory is for
-        threads = 768 if shape.lean else 640
-        blocks = max(1, min(threads // shape.threads, 32, a.shared // (shape.together * a.bytes + 1024)))
-        assert shape.together * blocks * a.multiprocessors <= most, (a, shape, most)
+        threads = 768 if shape.few_registers else 640
+        blocks = max(1, min(threads // shape.threads, 32, a.shared // (shape.per_block * a.bytes + 1024)))
+        assert shape.per_block * blocks * a.multiprocessors <= most, (a, shape, most)
 
 
 def test_shapes_on_an_h100(program: Path) -> None:
     """The fastest that was measured, of a bar of 64 vertices in few and in many environments, and of the smallest."""
     expected = {
-        Asked(81, 64, 1): Shape(1, 96, lean=False),
-        Asked(81, 64, 132): Shape(1, 96, lean=False),
-        Asked(81, 64, 528): Shape(1, 96, lean=False),
-        Asked(81, 64, 1024): Shape(1, 96, lean=True),
-        Asked(81, 64, 8192): Shape(3, 128, lean=False),
-        Asked(3, 8, 8192): Shape(4, 32, lean=False),
-        Asked(192, 125, 1): Shape(1, 192, lean=False),
-        Asked(192, 125, 8192): Shape(1, 192, lean=True),
+        Asked(81, 64, 1): Shape(1, 96, few_registers=False),
+        Asked(81, 64, 132): Shape(1, 96, few_registers=False),
+        Asked(81, 64, 528): Shape(1, 96, few_registers=False),
+        Asked(81, 64, 1024): Shape(1, 96, few_registers=True),
+        Asked(81, 64, 8192): Shape(3, 128, few_registers=False),
+        Asked(3, 8, 8192): Shape(4, 32, few_registers=False),
+        Asked(192, 125, 1): Shape(1, 192, few_registers=False),
+        Asked(192, 125, 8192): Shape(1, 192, few_registers=True),
     }
     assert dict(zip(expected, shapes(program, list(expected)), strict=True)) == expected
 
@@ -115,20 +115,20 @@ def test_blocks_share_no_more_than_they_must(program: Path) -> None:
         for pairs in (3, 24, 81, 144):
             a = Asked(pairs, pairs, batch)
             (shape,) = shapes(program, [a])
-            threads = 768 if shape.lean else 640
-            blocks = 132 * min(threads // shape.threads, 32, a.shared // (shape.together * a.bytes + 1024))
-            assert batch > blocks * (shape.together - 1), (a, shape)
+            threads = 768 if shape.few_registers else 640
+            blocks = 132 * min(threads // shape.threads, 32, a.shared // (shape.per_block * a.bytes + 1024))
+            assert batch > blocks * (shape.per_block - 1), (a, shape)
 
 
 def test_where_nothing_else_fits_one_block_does(program: Path) -> None:
     (one,) = told(program, [Asked(24, 27, 8192, shared=65536, most=65536, each=65536)])
-    assert one[0].together == 1
+    assert one[0].per_block == 1
     assert one[1] == 132
 
 
 def test_memory_limits_how_many_share(program: Path) -> None:
     asked = [Asked(24, 27, 8192, each=each) for each in (2_000, 80_000, 200_000)]
-    many, few, one = (shape.together for shape in shapes(program, asked))
+    many, few, one = (shape.per_block for shape in shapes(program, asked))
     assert many == 4
     assert few <= 2
     assert one == 1

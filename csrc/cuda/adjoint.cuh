@@ -49,7 +49,7 @@ __global__ void __launch_bounds__(field_threads)
   double sum[1] = {0};
   for (std::int64_t i = threadIdx.x; i < call.vertices; i += blockDim.x)
     sum[0] += double(from[i * call.numbers]);
-  across_block<Add>(sum, warp_sums);
+  block_reduce<Add>(sum, warp_sums);
   if (threadIdx.x == 0) call.out[blockIdx.x] = T(sum[0]);
 }
 

@@ -23,7 +23,7 @@ class BlockTeam {
   PD_DEVICE void barrier() {
     __syncthreads();
     if (blocks_ == 1) return;
-    goal_ += unsigned(blocks_);
+    expected_arrivals_ += unsigned(blocks_);
     if (threadIdx.x == 0) {
       asm volatile("red.release.gpu.global.add.u32 [%0], 1;" ::"l"(counter_) : "memory");
       unsigned arrived;
@@ -32,7 +32,7 @@ class BlockTeam {
                      : "=r"(arrived)
                      : "l"(counter_)
                      : "memory");
-      } while (int(arrived - goal_) < 0);
+      } while (int(arrived - expected_arrivals_) < 0);
     }
     __syncthreads();
   }
@@ -40,7 +40,7 @@ class BlockTeam {
  private:
   int rank_, blocks_;
   unsigned* counter_;
-  unsigned goal_ = 0;  // arrivals that the next barrier waits for
+  unsigned expected_arrivals_ = 0;  // arrivals that the next barrier waits for
 };
 
 }  // namespace pd::inline PD_TARGET

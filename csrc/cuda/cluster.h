@@ -56,7 +56,7 @@ class ByteBarrier {
   PD_DEVICE SharedAddress address() const { return at_; }
 
   // one thread, before a barrier of the cluster
-  PD_DEVICE void open() const {
+  PD_DEVICE void init() const {
 #if PD_HAS_CLUSTERS
     asm volatile("mbarrier.init.shared::cta.b64 [%0], 1;" ::"r"(at_) : "memory");
     asm volatile("fence.mbarrier_init.release.cluster;" ::: "memory");

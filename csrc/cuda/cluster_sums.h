@@ -15,8 +15,8 @@ class ClusterSums {
         numbers_(reinterpret_cast<double*>(barrier_ + 2)) {}
 
   // one thread, before a barrier of the cluster
-  PD_DEVICE void open() const {
-    for (int round = 0; round < 2; ++round) barrier(round).open();
+  PD_DEVICE void init() const {
+    for (int round = 0; round < 2; ++round) barrier(round).init();
   }
 
   // one thread, once a round: numbers that all blocks together will send; rounds count from 1

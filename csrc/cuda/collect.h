@@ -6,36 +6,36 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr unsigned whole_warp = 0xffffffff;
+constexpr unsigned full_warp = 0xffffffff;
 constexpr int warp_size = 32;
 constexpr int sums_count = 3;  // numbers that are added up together
 
 struct Add {
-  static constexpr double none = 0;
+  static constexpr double identity = 0;
   PD_HD double operator()(double a, double b) const { return a + b; }
 };
-struct Least {
-  static constexpr double none = HUGE_VAL;
+struct Min {
+  static constexpr double identity = HUGE_VAL;
   PD_HD double operator()(double a, double b) const { return b < a ? b : a; }
 };
 
 // The same bits in all lanes, since both partners of an exchange combine the same two numbers.
 template <class Op>
-PD_DEVICE double across_warp(double value, Op op) {
+PD_DEVICE double warp_reduce(double value, Op op) {
 #pragma unroll
   for (int distance = warp_size / 2; distance > 0; distance /= 2) {
-    value = op(value, __shfl_xor_sync(whole_warp, value, distance));
+    value = op(value, __shfl_xor_sync(full_warp, value, distance));
   }
   return value;
 }
 
 // Several sums at once, whose chains overlap.
 template <int Count>
-PD_DEVICE void add_across_warp(double (&value)[Count]) {
+PD_DEVICE void warp_reduce_sums(double (&value)[Count]) {
 #pragma unroll
   for (int distance = warp_size / 2; distance > 0; distance /= 2) {
 #pragma unroll
-    for (int n = 0; n < Count; ++n) value[n] += __shfl_xor_sync(whole_warp, value[n], distance);
+    for (int n = 0; n < Count; ++n) value[n] += __shfl_xor_sync(full_warp, value[n], distance);
   }
 }
 
@@ -47,7 +47,7 @@ PD_DEVICE void write_warp_sums(const T (&value)[Count], double* to) {
   const bool high = lane & 16, odd = lane & 8;
   const auto half = [](bool upper, T a, T b, int distance) {
     const T keep = upper ? b : a, give = upper ? a : b;
-    return keep + __shfl_xor_sync(whole_warp, give, distance);
+    return keep + __shfl_xor_sync(full_warp, give, distance);
   };
 #pragma unroll
   for (int first = 0; first < Count; first += 4) {
@@ -58,18 +58,18 @@ PD_DEVICE void write_warp_sums(const T (&value)[Count], double* to) {
     T sum = half(odd, half(high, four[0], four[2], 16), half(high, four[1], four[3], 16), 8);
 #pragma unroll
     for (int distance = 4; distance > 0; distance /= 2)
-      sum += __shfl_xor_sync(whole_warp, sum, distance);
+      sum += __shfl_xor_sync(full_warp, sum, distance);
     const int own = first + 2 * high + odd;
     if (lane % 8 == 0 && own < Count) to[own] = double(sum);
   }
 }
 
 // Sixteen bytes that are written and read at once, so that a tag in them vouches for the rest.
-struct alignas(16) Word {
+struct alignas(16) TaggedWord {
   std::uint64_t value, tag;
 };
 
-PD_DEVICE void post(Word* to, Word word) {
+PD_DEVICE void store_tagged(TaggedWord* to, TaggedWord word) {
   asm volatile(
       "{.reg .b128 t; mov.b128 t, {%1, %2}; st.relaxed.gpu.global.b128 [%0], t;}" ::"l"(to),
       "l"(word.value), "l"(word.tag)
@@ -77,8 +77,8 @@ PD_DEVICE void post(Word* to, Word word) {
 }
 
 // The word, where that is `wanted`, else zeros. There is no branch, so several that follow each other are under way at once.
-PD_DEVICE Word look(const Word* from, bool wanted) {
-  Word word;
+PD_DEVICE TaggedWord load_tagged(const TaggedWord* from, bool wanted) {
+  TaggedWord word;
   asm volatile(
       "{.reg .b128 t; .reg .b64 none; .reg .pred p; setp.ne.b32 p, %3, 0; mov.b64 none, 0; "
       "mov.b128 t, {none, none}; @p ld.relaxed.gpu.global.b128 t, [%2]; mov.b128 {%0, %1}, t;}"
@@ -90,18 +90,18 @@ PD_DEVICE Word look(const Word* from, bool wanted) {
 
 // A vector with a tag: one word in float32, three in float64.
 template <class T>
-struct Letter;
+struct HaloMessage;
 
 template <>
-struct Letter<float> {
+struct HaloMessage<float> {
   static constexpr int words = 1;
-  Word word;
+  TaggedWord word;
 
-  PD_DEVICE static void post(Word* to, const Vec3<float>& a, unsigned tag) {
+  PD_DEVICE static void send(TaggedWord* to, const Vec3<float>& a, unsigned tag) {
     const auto bits = [](float f) { return std::uint64_t(__float_as_uint(f)); };
-    pd::post(to, {bits(a.x) | bits(a.y) << 32, bits(a.z) | std::uint64_t(tag) << 32});
+    store_tagged(to, {bits(a.x) | bits(a.y) << 32, bits(a.z) | std::uint64_t(tag) << 32});
   }
-  PD_DEVICE void look(const Word* from, bool wanted) { word = pd::look(from, wanted); }
+  PD_DEVICE void load(const TaggedWord* from, bool wanted) { word = load_tagged(from, wanted); }
   PD_DEVICE bool arrived(unsigned tag) const { return unsigned(word.tag >> 32) == tag; }
   PD_DEVICE Vec3<float> vector() const {
     return {__uint_as_float(unsigned(word.value)), __uint_as_float(unsigned(word.value >> 32)),
@@ -110,23 +110,25 @@ struct Letter<float> {
 };
 
 template <>
-struct Letter<double> {
+struct HaloMessage<double> {
   static constexpr int words = 3;
-  Word word[3];
+  TaggedWord word[3];
 
-  PD_DEVICE static void post(Word* to, const Vec3<double>& a, unsigned tag) {
+  PD_DEVICE static void send(TaggedWord* to, const Vec3<double>& a, unsigned tag) {
     const double numbers[3] = {a.x, a.y, a.z};
     for (int c = 0; c < 3; ++c)
-      pd::post(to + c, {std::uint64_t(__double_as_longlong(numbers[c])), tag});
+      store_tagged(to + c, {std::uint64_t(__double_as_longlong(numbers[c])), tag});
   }
-  PD_DEVICE void look(const Word* from, bool wanted) {
-    for (int c = 0; c < 3; ++c) word[c] = pd::look(from + c, wanted);
+  PD_DEVICE void load(const TaggedWord* from, bool wanted) {
+    for (int c = 0; c < 3; ++c) word[c] = load_tagged(from + c, wanted);
   }
   PD_DEVICE bool arrived(unsigned tag) const {
     return word[0].tag == tag && word[1].tag == tag && word[2].tag == tag;
   }
   PD_DEVICE Vec3<double> vector() const {
-    const auto number = [](const Word& w) { return __longlong_as_double((long long)w.value); };
+    const auto number = [](const TaggedWord& w) {
+      return __longlong_as_double((long long)w.value);
+    };
     return {number(word[0]), number(word[1]), number(word[2])};
   }
 };

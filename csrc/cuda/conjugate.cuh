@@ -6,15 +6,15 @@
 namespace pd {
 
 template <class T>
-bool is_alone(const DeviceConjugate<T>& call) {
+bool fits_one_block(const DeviceConjugate<T>& call) {
   return call.plan.kernel == int(DeviceKernel::block);
 }
 
 template <class T>
 std::int64_t conjugate_bytes(const DeviceConjugate<T>& call) {
   Arena arena(nullptr);
-  if (is_alone(call)) {
-    arrange_alone(arena, call);
+  if (fits_one_block(call)) {
+    arrange_block(arena, call);
   } else {
     arrange_teams(arena, call, ConjugateLaunch<T>(call));
   }
@@ -24,8 +24,8 @@ std::int64_t conjugate_bytes(const DeviceConjugate<T>& call) {
 template <class T>
 void run_conjugate(const DeviceConjugate<T>& call, void* memory, Stream to) {
   const auto stream = static_cast<cudaStream_t>(to);
-  is_alone(call) ? run_conjugate_alone(call, memory, stream)
-                 : run_conjugate_teams(call, memory, stream);
+  fits_one_block(call) ? run_conjugate_block(call, memory, stream)
+                       : run_conjugate_teams(call, memory, stream);
 }
 
 }  // namespace pd

@@ -9,7 +9,7 @@
 namespace pd {
 
 template <class T>
-struct ConjugateAlone {
+struct ConjugateBlock {
   DeviceConjugate<T> call;
   FieldWork<T> product;  // of the direction
   T* image;              // [batch, vertices, 3], the product
@@ -19,9 +19,9 @@ struct ConjugateAlone {
 // All iterations of an environment, until it is done: no other one enters, and nobody asks in between. A thread has the same
 // vertices from the first loop to the last, so what it writes of them in device memory it finds there.
 // `Slides`: with friction.
-template <class T, bool Slides>
+template <class T, bool WithFriction>
 __global__ void __launch_bounds__(conjugate_threads<T>)
-    conjugate_alone(const __grid_constant__ ConjugateAlone<T> work) {
+    conjugate_block(const __grid_constant__ ConjugateBlock<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
   __shared__ WarpSums warp_sums;
   const DeviceConjugate<T>& call = work.call;
@@ -42,12 +42,12 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
   // the largest number, and whether any vertex slides
   double largest[2] = {0, 0};
   each_slot([&](int, int, std::int64_t at) {
-    largest[0] = Largest()(largest[0], largest_of(read3(call.residual + at)));
-    if constexpr (Slides) {
+    largest[0] = Max()(largest[0], largest_of(read3(call.residual + at)));
+    if constexpr (WithFriction) {
       if (slides(call.sliding + slide_count * at)) largest[1] = 1;
     }
   });
-  across_block<Largest>(largest, warp_sums);
+  block_reduce<Max>(largest, warp_sums);
   const T unit = unit_near(T(largest[0]));
   const auto times = [&](T factor, T* vectors, std::int64_t at) {
     write3(vectors + at, factor * read3(vectors + at));
@@ -68,7 +68,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
       sums[0] += square_of_right(right, read3(call.positions + at));
       sums[1] += double(inverse[i]) * wide_dot(right, right);
     });
-    across_block<Add>(sums, warp_sums);
+    block_reduce<Add>(sums, warp_sums);
     numbers.begin(sums[0], sums[1]);
   }
   const PatchFields<2, T> fields(work.product.field, shared);
@@ -92,7 +92,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
       write3(work.image + at, image);
       curvature[0] += wide_dot(direction, image);
     });
-    across_block<Add>(curvature, warp_sums);
+    block_reduce<Add>(curvature, warp_sums);
     const T step = T(numbers.step(curvature[0]));
     if (!numbers.active) break;
     double sums[2] = {0, 0};
@@ -105,7 +105,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
       sums[0] += square;
       sums[1] += double(inverse[i]) * square;
     });
-    across_block<Add>(sums, warp_sums);
+    block_reduce<Add>(sums, warp_sums);
     numbers.judge(sums[0], call.tolerance);
     if (!numbers.active) break;
     const T keep = T(numbers.keep(sums[1]));
@@ -115,11 +115,11 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     });
     __syncthreads();
   }
-  if constexpr (Slides) {
+  if constexpr (WithFriction) {
     if (largest[1] > 0 && adds_friction(numbers, call.tolerance)) {
       FrictionSolve friction(nullptr, numbers.scale);
       friction.begin(products, adjoint_iterations);
-      FrictionAlone<T>(work.product, call, work.friction, work.image, fields, unit, warp_sums)
+      FrictionBlock<T>(work.product, call, work.friction, work.image, fields, unit, warp_sums)
           .run(friction);
       if (threadIdx.x == 0) friction.write(call.friction + environment * friction_count);
     }
@@ -135,8 +135,8 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
 }
 
 template <class T>
-ConjugateAlone<T> arrange_alone(Arena& arena, const DeviceConjugate<T>& call) {
-  ConjugateAlone<T> work{call, arrange(arena, conjugate_field(call), 0), nullptr, {}};
+ConjugateBlock<T> arrange_block(Arena& arena, const DeviceConjugate<T>& call) {
+  ConjugateBlock<T> work{call, arrange(arena, conjugate_field(call), 0), nullptr, {}};
   const std::int64_t count = call.batch * call.plan.vertices * 3;
   arena.place(work.image, count);
   FrictionVectors<T>& f = work.friction;
@@ -146,12 +146,12 @@ ConjugateAlone<T> arrange_alone(Arena& arena, const DeviceConjugate<T>& call) {
 }
 
 template <class T>
-void run_conjugate_alone(const DeviceConjugate<T>& call, void* memory, cudaStream_t stream) {
+void run_conjugate_block(const DeviceConjugate<T>& call, void* memory, cudaStream_t stream) {
   Arena arena(memory);
-  const ConjugateAlone<T> work = arrange_alone(arena, call);
+  const ConjugateBlock<T> work = arrange_block(arena, call);
   const DevicePlan<T>& plan = call.plan;
-  weigh_field<false>(work.product, stream);
-  const auto kernel = call.friction ? conjugate_alone<T, true> : conjugate_alone<T, false>;
+  compute_field_weights<false>(work.product, stream);
+  const auto kernel = call.friction ? conjugate_block<T, true> : conjugate_block<T, false>;
   const std::size_t bytes = pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, 2);
   // Half as many threads where two blocks then share a multiprocessor, which is for many environments. How many there are in
   // this call does not enter, since the threads decide the order of sums.

@@ -23,20 +23,20 @@ __device__ ConjugateMemory<T> memory_of_team(const ConjugateTeams<T>& work, int 
 }
 
 // `Slides`: with friction.
-template <class T, bool Leveled, bool Computed, bool Slides>
+template <class T, bool WithLevels, bool Computed, bool WithFriction>
 __global__ void __launch_bounds__(conjugate_threads<T>)
     conjugate_teams(const __grid_constant__ ConjugateTeams<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
   __shared__ WarpSums warp_sums;
-  __shared__ Quad<T> cycle_sums[Leveled ? 4 * conjugate_threads<T> / warp_size : 1];
+  __shared__ Quad<T> cycle_sums[WithLevels ? 4 * conjugate_threads<T> / warp_size : 1];
   const int number = int(blockIdx.x) / work.blocks;
   BlockTeam team(int(blockIdx.x) % work.blocks, work.blocks, work.counter + number);
-  using Team = std::conditional_t<Slides, FrictionTeam<T, Leveled, Computed>,
-                                  ConjugateTeam<T, Leveled, Computed>>;
+  using Team = std::conditional_t<WithFriction, FrictionTeam<T, WithLevels, Computed>,
+                                  ConjugateTeam<T, WithLevels, Computed>>;
   const ConjugateMemory<T> of_team = memory_of_team(work, number);
   for (std::int64_t e = number; e < work.call.batch; e += work.teams) {
     ConjugateMemory<T> memory = of_team;
-    if constexpr (Slides) {
+    if constexpr (WithFriction) {
       memory.shadow += work.call.plan.vertices * e;
       memory.correction += work.call.plan.vertices * e;
     }
@@ -70,14 +70,15 @@ struct ConjugateLaunch {
   }
 
  private:
-  template <bool Slides>
+  template <bool WithFriction>
   static const void* kernel_for(const DevicePlan<T>& plan) {
-    if (!computes_rests(plan)) return function<false, false, Slides>();
-    return plan.levels.there() ? function<true, true, Slides>() : function<false, true, Slides>();
+    if (!computes_rests(plan)) return function<false, false, WithFriction>();
+    return plan.levels.there() ? function<true, true, WithFriction>()
+                               : function<false, true, WithFriction>();
   }
-  template <bool Leveled, bool Computed, bool Slides>
+  template <bool WithLevels, bool Computed, bool WithFriction>
   static const void* function() {
-    return reinterpret_cast<const void*>(conjugate_teams<T, Leveled, Computed, Slides>);
+    return reinterpret_cast<const void*>(conjugate_teams<T, WithLevels, Computed, WithFriction>);
   }
   int resident() const {
     const int blocks = resident_blocks(kernel, threads, shared);
@@ -126,9 +127,9 @@ void run_conjugate_teams(const DeviceConjugate<T>& call, void* memory, cudaStrea
   Arena arena(memory);
   ConjugateTeams<T> work = arrange_teams(arena, call, launch);
   if (computes_rests(call.plan)) {
-    weigh_field<true>(work.product, stream);
+    compute_field_weights<true>(work.product, stream);
   } else {
-    weigh_field<false>(work.product, stream);
+    compute_field_weights<false>(work.product, stream);
   }
   const int most = launch.most_iterations(call);
   for (std::int64_t done = 0; done < call.iterations; done += most) {

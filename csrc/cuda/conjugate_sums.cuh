@@ -13,24 +13,24 @@ constexpr int conjugate_threads = sizeof(T) == 4 ? 512 : 256;
 
 using WarpSums = double[conjugate_threads<float> / warp_size][2];
 
-struct Largest {
-  static constexpr double none = 0;
+struct Max {
+  static constexpr double identity = 0;
   // of no number and another one that
   __device__ double operator()(double a, double b) const { return b > a ? b : a; }
 };
 
 // Of all threads of a block, the same in each of them. `warp_sums` is free again when it returns.
 template <class Op, int Count>
-__device__ void across_block(double (&value)[Count], WarpSums& warp_sums) {
+__device__ void block_reduce(double (&value)[Count], WarpSums& warp_sums) {
   const Op op;
   const int warp = int(threadIdx.x) / warp_size, lane = int(threadIdx.x) % warp_size;
   for (int n = 0; n < Count; ++n) {
-    value[n] = across_warp(value[n], op);
+    value[n] = warp_reduce(value[n], op);
     if (lane == 0) warp_sums[warp][n] = value[n];
   }
   __syncthreads();
   for (int n = 0; n < Count; ++n) {
-    value[n] = Op::none;
+    value[n] = Op::identity;
     for (int w = 0; w < int(blockDim.x) / warp_size; ++w) value[n] = op(value[n], warp_sums[w][n]);
   }
   __syncthreads();
@@ -38,23 +38,23 @@ __device__ void across_block(double (&value)[Count], WarpSums& warp_sums) {
 
 // Of the parts of an environment: blocks of a team leave them and, once they have met, all put them together in one order.
 template <class Op, int Count>
-struct Parts {
+struct PartialSums {
   double* values;  // [count, Count]
   int count;
 
-  __device__ void leave(int part, double (&value)[Count], WarpSums& warp_sums) const {
-    across_block<Op>(value, warp_sums);
+  __device__ void store(int part, double (&value)[Count], WarpSums& warp_sums) const {
+    block_reduce<Op>(value, warp_sums);
     if (threadIdx.x != 0) return;
     for (int n = 0; n < Count; ++n) values[part * std::int64_t(Count) + n] = value[n];
   }
-  __device__ void join(double (&value)[Count], WarpSums& warp_sums) const {
+  __device__ void reduce(double (&value)[Count], WarpSums& warp_sums) const {
     const Op op;
-    for (int n = 0; n < Count; ++n) value[n] = Op::none;
+    for (int n = 0; n < Count; ++n) value[n] = Op::identity;
     for (int part = threadIdx.x; part < count; part += int(blockDim.x)) {
       for (int n = 0; n < Count; ++n)
         value[n] = op(value[n], values[part * std::int64_t(Count) + n]);
     }
-    across_block<Op>(value, warp_sums);
+    block_reduce<Op>(value, warp_sums);
   }
 };
 
@@ -65,7 +65,7 @@ __device__ double wide_dot(const Vec3<T>& a, const Vec3<T>& b) {
 
 template <class T>
 __device__ double largest_of(const Vec3<T>& a) {
-  const Largest larger;
+  const Max larger;
   return larger(larger(double(absolute(a.x)), double(absolute(a.y))), double(absolute(a.z)));
 }
 

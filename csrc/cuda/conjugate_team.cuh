@@ -39,7 +39,7 @@ struct ConjugateTeams {
 };
 
 // `Leveled`: with a preconditioner; `Computed`: see rest_of.
-template <class T, bool Leveled, bool Computed>
+template <class T, bool WithLevels, bool Computed>
 class ConjugateTeam {
   static_assert(conjugate_threads<T> % (most_parts * warp_size) == 0);
 
@@ -88,13 +88,13 @@ class ConjugateTeam {
   }
 
   // visit(vertex) of every part of this block, after which leave(part)
-  template <class Visit, class Leave>
-  __device__ void each_part(int first, int count, const Visit& visit, const Leave& leave) {
+  template <class Visit, class Store>
+  __device__ void each_part(int first, int count, const Visit& visit, const Store& store) {
 #pragma unroll 1
     for (int part = team_.rank(); part * int(blockDim.x) < count; part += team_.blocks()) {
       const int i = part * int(blockDim.x) + int(threadIdx.x);
       if (i < count) visit(first + i);
-      leave(part);
+      store(part);
     }
   }
 
@@ -113,14 +113,14 @@ class ConjugateTeam {
         [&](int i) {
           const Vec3<T> r = read3(call_.residual + 3 * row(i));
           m_.residual[i] = quad(r, call_.inverse.of(environment_)[plan_.vertex_order[i]]);
-          largest[0] = Largest()(largest[0], largest_of(r));
+          largest[0] = Max()(largest[0], largest_of(r));
         },
         [&](int part) {
-          largest_.leave(part, largest, warp_sums_);
+          largest_.store(part, largest, warp_sums_);
           largest[0] = 0;
         });
     team_.barrier();
-    largest_.join(largest, warp_sums_);
+    largest_.reduce(largest, warp_sums_);
     unit_ = unit_near(T(largest[0]));
     const T none(0), per_unit = T(1) / unit_;
     double sum[2] = {0, 0};
@@ -140,12 +140,12 @@ class ConjugateTeam {
           }
           m_.solution[i] = quad(solution);
           last_[i] = quad(direction, inertia);
-          if constexpr (Leveled) cycle_.set(i, r);
+          if constexpr (WithLevels) cycle_.set(i, r);
           sum[0] += square_of_right(r, x);
           sum[1] += double(inverse) * wide_dot(r, r);
         },
         [&](int part) {
-          squares_.leave(part, sum, warp_sums_);
+          squares_.store(part, sum, warp_sums_);
           sum[0] = sum[1] = 0;
         });
     team_.barrier();
@@ -153,16 +153,16 @@ class ConjugateTeam {
 
   __device__ void begin(Conjugate& numbers) {
     double sum[2];
-    squares_.join(sum, warp_sums_);
-    if constexpr (Leveled) sum[1] = apply_levels();
+    squares_.reduce(sum, warp_sums_);
+    if constexpr (WithLevels) sum[1] = apply_levels();
     numbers.begin(sum[0], sum[1]);
-    turns_ = true;
+    direction_pending_ = true;
   }
 
   __device__ void iterate(Conjugate& numbers) {
     multiply();
     double curvature[1];
-    curvature_.join(curvature, warp_sums_);
+    curvature_.reduce(curvature, warp_sums_);
     const T step = T(numbers.step(curvature[0]));
     if (!numbers.active) return;
     double sum[2] = {0, 0};
@@ -173,29 +173,29 @@ class ConjugateTeam {
           m_.solution[i] = quad(multiply_add(step, vec3(last_[i]), vec3(m_.solution[i])));
           const Vec3<T> r = subtract_product(vec3(residual), step, vec3(m_.image[i]));
           m_.residual[i] = quad(r, residual.w);
-          if constexpr (Leveled) cycle_.set(i, r);
+          if constexpr (WithLevels) cycle_.set(i, r);
           const double square = wide_dot(r, r);
           sum[0] += square;
           sum[1] += double(residual.w) * square;
         },
         [&](int part) {
-          squares_.leave(part, sum, warp_sums_);
+          squares_.store(part, sum, warp_sums_);
           sum[0] = sum[1] = 0;
         });
     team_.barrier();
-    squares_.join(sum, warp_sums_);
+    squares_.reduce(sum, warp_sums_);
     numbers.judge(sum[0], call_.tolerance);
     if (!numbers.active) return;
-    if constexpr (Leveled) sum[1] = apply_levels();
+    if constexpr (WithLevels) sum[1] = apply_levels();
     keep_ = T(numbers.keep(sum[1]));
-    turns_ = true;
+    direction_pending_ = true;
   }
 
   // The next direction, by the last one: nobody has it before it is used. Without `turns_` the last one is in use still.
   __device__ Vec3<T> direction(int i) const {
     const Vec3<T> last_one = vec3(last_[i]);
-    if (!turns_) return last_one;
-    if constexpr (Leveled) return multiply_add(keep_, last_one, cycle_.result(i));
+    if (!direction_pending_) return last_one;
+    if constexpr (WithLevels) return multiply_add(keep_, last_one, cycle_.result(i));
     const Quad<T> residual = m_.residual[i];
     return multiply_add(keep_, last_one, residual.w * vec3(residual));
   }
@@ -204,7 +204,7 @@ class ConjugateTeam {
   __device__ void multiply() {
     double sum[1] = {0};
     const auto next = [&](int i) { return direction(i); };
-    const auto look = [&](int i, const Vec3<T>& elastic, const Vec3<T>& d) {
+    const auto visit = [&](int i, const Vec3<T>& elastic, const Vec3<T>& d) {
       const T inertia = last_[i].w;
       const Vec3<T> image = conjugate_image(elastic, d, inertia, m_.residual[i].w != T(0),
                                             projector(i), across_of(call_, 3 * row(i)));
@@ -212,23 +212,23 @@ class ConjugateTeam {
       next_[i] = quad(d, inertia);
       sum[0] += wide_dot(d, image);
     };
-    multiply(next, look, [&](int part) {
-      curvature_.leave(part, sum, warp_sums_);
+    multiply(next, visit, [&](int part) {
+      curvature_.store(part, sum, warp_sums_);
       sum[0] = 0;
     });
     Quad<T>* const last = last_;
     last_ = next_;
     next_ = last;
-    turns_ = false;
+    direction_pending_ = false;
   }
 
   // Of a field, what(vertex): look(vertex, elastic product, field) at all vertices of this block, after whose parts leave(part)
-  template <class What, class Look, class Leave>
-  __device__ void multiply(const What& what, const Look& look, const Leave& leave) {
+  template <class What, class Visit, class Store>
+  __device__ void multiply(const What& what, const Visit& visit, const Store& store) {
 #pragma unroll 1
     for (int number = team_.rank(); number < plan_.patches; number += team_.blocks()) {
-      multiply_patch(Patch<T>(plan_, number), what, look);
-      leave(number);
+      multiply_patch(Patch<T>(plan_, number), what, visit);
+      store(number);
     }
     team_.barrier();
     if (plan_.shared > 0) {
@@ -240,16 +240,16 @@ class ConjugateTeam {
             const int end = plan_.shared_start[i - first + 1];
             for (int at = plan_.shared_start[i - first]; at < end; ++at)
               force = force + vec3(m_.shared_force[plan_.shared_slot[at]]);
-            look(i, force, what(i));
+            visit(i, force, what(i));
           },
-          [&](int part) { leave(plan_.patches + part); });
+          [&](int part) { store(plan_.patches + part); });
       team_.barrier();
     }
   }
 
   // of a patch: look at the vertices that it has alone
-  template <class What, class Look>
-  __device__ void multiply_patch(const Patch<T>& patch, const What& what, const Look& look) {
+  template <class What, class Visit>
+  __device__ void multiply_patch(const Patch<T>& patch, const What& what, const Visit& visit) {
     const Vec3<T> anchor = vec3(m_.x[patch.vertex(0)]);
     for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
       const int i = patch.vertex(s);
@@ -263,7 +263,7 @@ class ConjugateTeam {
       if (s < patch.interior) {
         Vec3<T> vectors[2];
         slots_(unsigned(8 * s), vectors);
-        look(patch.first_vertex + s, sum_entries(entries_, plan_.slot_row[slot]), vectors[1]);
+        visit(patch.first_vertex + s, sum_entries(entries_, plan_.slot_row[slot]), vectors[1]);
       } else if (plan_.shared >
                  0) {  // of a cluster none are, and their owners have all of the force
         m_.shared_force[slot] = quad(sum_entries(entries_, plan_.slot_row[slot]));
@@ -286,11 +286,11 @@ class ConjugateTeam {
           sum[0] += wide_dot(r, z);
         },
         [&](int part) {
-          weighted_.leave(part, sum, warp_sums_);
+          weighted_.store(part, sum, warp_sums_);
           sum[0] = 0;
         });
     team_.barrier();
-    weighted_.join(sum, warp_sums_);
+    weighted_.reduce(sum, warp_sums_);
     return sum[0];
   }
 
@@ -314,13 +314,13 @@ class ConjugateTeam {
   Slots<T> slots_;
   Quad<T>* entries_;
   WarpSums& warp_sums_;
-  Parts<Add, 1> curvature_;
-  Parts<Add, 2> squares_;
-  Parts<Add, 1> weighted_;
-  Parts<Largest, 1> largest_;
+  PartialSums<Add, 1> curvature_;
+  PartialSums<Add, 2> squares_;
+  PartialSums<Add, 1> weighted_;
+  PartialSums<Max, 1> largest_;
   Quad<T>*last_, *next_;  // directions
   T unit_ = T(1), keep_ = T(0);
-  bool turns_ = false;
+  bool direction_pending_ = false;
 };
 
 }  // namespace pd

@@ -225,7 +225,7 @@ class CorotationMaker {
   // A tetrahedron of the patch, to place threadIdx.x of the tile.
   PD_DEVICE void see(const Patch<T>& patch, int first, const TurningTile<T>& tile) const {
     const int place = threadIdx.x, tet = first + place;
-    const HalfNumbers<T> numbers = read_half<true>(patch, in_.weights, tet);
+    const TetInputs<T> numbers = load_tet<true>(patch, in_.weights, tet);
     const bool there = tet < 2 * patch.pairs && numbers.weight > T(0);
     Vec3<T> x[4];
     T weight[turning_groups][4];
@@ -235,7 +235,7 @@ class CorotationMaker {
       for (int k = 0; k < turning_groups; ++k) weight[k][c] = m_.numbers[at(k, vertex)].x;
     }
     const ComputedRest<T> rest = rest_of<true>(patch);
-    Mat3<T> inverse = half_rest(numbers, T(1) / rest.unit, rest.position).inverse(0);
+    Mat3<T> inverse = tet_rest(numbers, T(1) / rest.unit, rest.position).inverse(0);
     Mat3<T> f = deformation_gradient(x, inverse);
     // what is not there may be anything
     const auto keep = [&](T& a, T other) { a = select(there, a, other); };
@@ -293,7 +293,7 @@ class CorotationMaker {
       double sum = 0;
 #pragma unroll 4
       for (int row = lane; row < rows; row += warp_size) sum += from[std::int64_t(row) * width];
-      sum = across_warp(sum, Add{});
+      sum = warp_reduce(sum, Add{});
       if (lane == 0) m_.totals[t] = sum;
     }
   }
@@ -310,7 +310,7 @@ class CorotationMaker {
     for (int first = chunk * count; first < end; first += warp_size) {
       const int i = first + lane;
       unsigned held =
-          __ballot_sync(whole_warp, i < end && in_.u[i].w > T(0) && !leaves_all(free[i]));
+          __ballot_sync(full_warp, i < end && in_.u[i].w > T(0) && !leaves_all(free[i]));
 #pragma unroll 1
       for (; held; held &= held - 1) {
         const int vertex = first + __ffs(int(held)) - 1;
@@ -410,7 +410,7 @@ class CorotationMaker {
   // of two sums a lane keeps one and adds its neighbour's
   PD_DEVICE static Quad<T> halve(bool upper, const Quad<T>& a, const Quad<T>& b, int distance) {
     const auto half = [&](T x, T y) {
-      return select(upper, y, x) + __shfl_xor_sync(whole_warp, select(upper, x, y), distance);
+      return select(upper, y, x) + __shfl_xor_sync(full_warp, select(upper, x, y), distance);
     };
     return {half(a.x, b.x), half(a.y, b.y), half(a.z, b.z), half(a.w, b.w)};
   }

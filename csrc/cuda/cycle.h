@@ -33,11 +33,11 @@ PD_DEVICE CycleMemory<T> cycle_of_team(const Levels<T>& levels, CycleMemory<T> m
 }
 
 template <class T>
-PD_DEVICE Vec3<T> across_lanes(Vec3<T> sum, int most, int least) {
+PD_DEVICE Vec3<T> sum_over_lanes(Vec3<T> sum, int most, int least) {
   for (int distance = most; distance >= least; distance /= 2) {
-    sum = sum + Vec3<T>{__shfl_xor_sync(whole_warp, sum.x, distance),
-                        __shfl_xor_sync(whole_warp, sum.y, distance),
-                        __shfl_xor_sync(whole_warp, sum.z, distance)};
+    sum = sum + Vec3<T>{__shfl_xor_sync(full_warp, sum.x, distance),
+                        __shfl_xor_sync(full_warp, sum.y, distance),
+                        __shfl_xor_sync(full_warp, sum.z, distance)};
   }
   return sum;
 }
@@ -134,7 +134,7 @@ class DeviceCycle {
 #pragma unroll 1
     for (int t = int(threadIdx.x) / lanes; t < count; t += int(blockDim.x) / lanes) {
       const int at = min(row(t), last);
-      const Vec3<T> sum = across_lanes(lifted(fine, below_fine(), at, 0, lane), lanes / 2, 1);
+      const Vec3<T> sum = sum_over_lanes(lifted(fine, below_fine(), at, 0, lane), lanes / 2, 1);
       if (lane == 0 && row(t) <= last) m_.fine.z[at] = quad(vec3(m_.fine.z[at]) + sum);
     }
   }
@@ -191,7 +191,7 @@ class DeviceCycle {
     for (int first = (team_.warps() - 1 - team_.warp()) * per_warp; first < count;
          first += team_.warps() * per_warp) {
       const int at = min(first + own, count - 1);
-      const Vec3<T> sum = across_lanes(part(at / B, at % B, lane), Lanes / 2, 1);
+      const Vec3<T> sum = sum_over_lanes(part(at / B, at % B, lane), Lanes / 2, 1);
       if (lane == 0 && first + own < count) visit(at, sum);
     }
   }
@@ -312,7 +312,7 @@ class DeviceCycle {
         add_node(level, f.in, node, warp % parts * warp_size + lane, parts * warp_size, sum);
 #pragma unroll
       for (int j = 0; j < 4; ++j) {
-        const Vec3<T> total = across_lanes(sum[j], warp_size / 2, 1);
+        const Vec3<T> total = sum_over_lanes(sum[j], warp_size / 2, 1);
         if (lane != j) continue;
         if (parts > 1) {
           part_[warp * 4 + j] = quad(total);

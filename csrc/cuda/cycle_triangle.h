@@ -86,7 +86,7 @@ __device__ __noinline__ void DeviceCycle<T>::dots_of(Triangle a, int i) {
   for (; chunk * warp_size < other.end; ++chunk) add_part(n, x, stretch, chunk, sum);
 #pragma unroll
   for (int r = 0; r < Rows; ++r) {
-    const Vec3<T> total = across_lanes(sum[r], warp_size / 2, 1);
+    const Vec3<T> total = sum_over_lanes(sum[r], warp_size / 2, 1);
     if (lane == 0 && i + r < n) a.out[i + r] = quad(total);
   }
 }

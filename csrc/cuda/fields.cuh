@@ -43,8 +43,8 @@ __global__ void __launch_bounds__(field_threads)
   const DevicePlan<T>& plan = work.field.plan;
   const std::int64_t set = blockIdx.x / plan.patches;
   const Patch<T> patch(plan, int(blockIdx.x % plan.patches));
-  weigh_pairs(patch, rest_of<Computed>(patch), work.field.stiffness.of(set), work.field.weighted,
-              work.weights + set * plan.blocks * 2 * pair_lanes);
+  compute_patch_weights(patch, rest_of<Computed>(patch), work.field.stiffness.of(set),
+                        work.field.weighted, work.weights + set * plan.blocks * 2 * pair_lanes);
 }
 
 // What a block works on, a patch of one environment: its positions, relative to its first vertex, and with two Fields also
@@ -142,7 +142,7 @@ __global__ void __launch_bounds__(field_threads)
   const T* weights = work.weights_of(environment);
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const PairPlace place = place_of(patch, number);
-    const PairNumbers<T> pair = read_pair(patch.plan, weights, place);
+    const PairInputs<T> pair = load_pair(patch.plan, weights, place);
     const auto numbers = rest_of<Computed>(patch).read(place, pair);
     const Mat3<T> rest[2] = {numbers.face.inverse(0), numbers.face.inverse(1)};
     for (int e = 0; e < 2; ++e) {
@@ -208,7 +208,7 @@ void run_vertices(const FieldWork<T>& work, cudaStream_t stream) {
 }
 
 template <bool Computed, class T>
-void weigh_field(const FieldWork<T>& work, cudaStream_t stream) {
+void compute_field_weights(const FieldWork<T>& work, cudaStream_t stream) {
   const std::int64_t sets = work.field.stiffness.stride ? work.field.batch : 1;
   field_weights<Computed, T>
       <<<blocks_of(sets * work.field.plan.patches), field_threads, 0, stream>>>(work);
@@ -217,7 +217,7 @@ void weigh_field(const FieldWork<T>& work, cudaStream_t stream) {
 
 template <bool Computed, class T>
 void run_field_with(const FieldWork<T>& work, cudaStream_t stream) {
-  weigh_field<Computed>(work, stream);
+  compute_field_weights<Computed>(work, stream);
   const DeviceField<T>& field = work.field;
   switch (field.field) {
     case Field::gradient:

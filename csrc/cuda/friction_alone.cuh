@@ -13,9 +13,9 @@ struct FrictionVectors {
 
 // One environment, whose fields are in shared memory. A thread has the same vertices in every loop.
 template <class T>
-class FrictionAlone {
+class FrictionBlock {
  public:
-  __device__ FrictionAlone(const FieldWork<T>& product, const DeviceConjugate<T>& call,
+  __device__ FrictionBlock(const FieldWork<T>& product, const DeviceConjugate<T>& call,
                            const FrictionVectors<T>& vectors, T* image,
                            const PatchFields<2, T>& fields, T unit, WarpSums& warp_sums)
       : product_(product),
@@ -88,7 +88,7 @@ class FrictionAlone {
         sums[1] += wide_dot(image, image);
       }
     });
-    across_block<Add>(sums, warp_sums_);
+    block_reduce<Add>(sums, warp_sums_);
     if (stage == FrictionStage::residual) return correct(friction, sums[0]);
     const bool first = stage == FrictionStage::first;
     const T step = T(first ? friction.go(sums[0]) : friction.smooth(sums[0], sums[1]));
@@ -103,7 +103,7 @@ class FrictionAlone {
       left[1] += wide_dot(read3(v_.shadow + at), rest);
     });
     if (first) return;
-    across_block<Add>(left, warp_sums_);
+    block_reduce<Add>(left, warp_sums_);
     const T keep = T(friction.judge(left[0], left[1], call_.tolerance));
     each_slot([&](int, int, std::int64_t at) {
       const Vec3<T> last = subtract_product(read3(call_.direction + at), step, read3(image_ + at));

@@ -5,11 +5,12 @@
 
 namespace pd {
 
-template <class T, bool Leveled, bool Computed>
-class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
-  using Base = ConjugateTeam<T, Leveled, Computed>;
+template <class T, bool WithLevels, bool Computed>
+class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
+  using Base = ConjugateTeam<T, WithLevels, Computed>;
   using Base::call_;
   using Base::cycle_;
+  using Base::direction_pending_;
   using Base::each_part;
   using Base::environment_;
   using Base::last_;
@@ -19,7 +20,6 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
   using Base::row;
   using Base::squares_;
   using Base::team_;
-  using Base::turns_;
   using Base::unit_;
   using Base::warp_sums_;
 
@@ -33,7 +33,7 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
     FrictionSolve friction(of_friction, numbers.scale);
     // all of the team alike
     if (!numbers.active && !friction.active()) return;
-    const bool slides = some_slide();
+    const bool slides = any_slides();
     Base::load(numbers.begins);
     if (friction.active()) {
       scale_cycle(T(1) / unit_);
@@ -70,18 +70,18 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
 
   __device__ const T* sliding(int i) const { return call_.sliding + 3 * slide_count * row(i); }
 
-  __device__ bool some_slide() {
-    double some[1] = {0};
+  __device__ bool any_slides() {
+    double any[1] = {0};
     each_part(
-        0, plan_.vertices, [&](int i) { some[0] = slides(sliding(i)) ? 1 : some[0]; },
+        0, plan_.vertices, [&](int i) { any[0] = slides(sliding(i)) ? 1 : any[0]; },
         [&](int part) {
-          Base::largest_.leave(part, some, warp_sums_);
-          some[0] = 0;
+          Base::largest_.store(part, any, warp_sums_);
+          any[0] = 0;
         });
     team_.barrier();
-    Base::largest_.join(some, warp_sums_);
+    Base::largest_.reduce(any, warp_sums_);
     team_.barrier();  // before others stand there
-    return some[0] > 0;
+    return any[0] > 0;
   }
 
   // what a cycle keeps from launch to launch
@@ -100,7 +100,7 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
   // after the solve of the symmetric part
   __device__ void begin(FrictionSolve& friction) {
     friction.begin(friction.left, adjoint_iterations);
-    turns_ = false;
+    direction_pending_ = false;
     each_part(
         0, plan_.vertices, [&](int i) { m_.correction[i] = quad(Vec3<T>{T(0), T(0), T(0)}); },
         [](int) {});
@@ -109,7 +109,7 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
 
   __device__ Vec3<T> z(FrictionStage stage, int i) const {
     if (stage == FrictionStage::residual) return vec3(m_.solution[i]) + vec3(m_.correction[i]);
-    if constexpr (Leveled) return cycle_.result(i);
+    if constexpr (WithLevels) return cycle_.result(i);
     const Quad<T> residual = m_.residual[i];
     return residual.w * vec3(stage == FrictionStage::first ? last_[i] : residual);
   }
@@ -119,7 +119,7 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
     const T per_unit = T(1) / unit_;
     double sum[2] = {0, 0};
     const auto pressed = [&](int i) { return press(z(stage, i), sliding(i)); };
-    const auto look = [&](int i, const Vec3<T>& elastic, const Vec3<T>&) {
+    const auto visit = [&](int i, const Vec3<T>& elastic, const Vec3<T>&) {
       const Quad<T> residual = m_.residual[i];
       const Vec3<T> image = friction_image(elastic, z(stage, i), last_[i].w, residual.w != T(0),
                                            projector(i), sliding(i));
@@ -136,8 +136,8 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
         sum[1] += wide_dot(image, image);
       }
     };
-    Base::multiply(pressed, look, [&](int part) {
-      products_.leave(part, sum, warp_sums_);
+    Base::multiply(pressed, visit, [&](int part) {
+      products_.store(part, sum, warp_sums_);
       sum[0] = sum[1] = 0;
     });
   }
@@ -145,12 +145,12 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
   __device__ void advance(FrictionSolve& friction) {
     const FrictionStage stage = friction.stage;
     const bool first = stage == FrictionStage::first;
-    if constexpr (Leveled) {
+    if constexpr (WithLevels) {
       if (stage != FrictionStage::residual) precondition(first ? last_ : m_.residual);
     }
     multiply(stage);
     double sum[2];
-    products_.join(sum, warp_sums_);
+    products_.reduce(sum, warp_sums_);
     if (stage == FrictionStage::residual) return correct(friction, sum[0]);
     const T step = T(first ? friction.go(sum[0]) : friction.smooth(sum[0], sum[1]));
     // before the next product leaves its sums
@@ -168,12 +168,12 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
           left[1] += wide_dot(vec3(m_.shadow[i]), rest);
         },
         [&](int part) {
-          squares_.leave(part, left, warp_sums_);
+          squares_.store(part, left, warp_sums_);
           left[0] = left[1] = 0;
         });
     team_.barrier();
     if (first) return;
-    squares_.join(left, warp_sums_);
+    squares_.reduce(left, warp_sums_);
     const T keep = T(friction.judge(left[0], left[1], call_.tolerance));
     each_part(
         0, plan_.vertices,
@@ -217,7 +217,7 @@ class FrictionTeam : ConjugateTeam<T, Leveled, Computed> {
     team_.barrier();
   }
 
-  Parts<Add, 2> products_{m_.products, Base::curvature_.count};
+  PartialSums<Add, 2> products_{m_.products, Base::curvature_.count};
 };
 
 }  // namespace pd

@@ -25,10 +25,10 @@ extern template FusedKernel<float> fused_kernel_for<float, true, true>(Blocks, b
 extern template FusedKernel<double> fused_kernel_for<double, true, true>(Blocks, bool, int);
 
 template <class T>
-FusedKernel<T> fused_kernel(const DeviceStep<T>& step, Blocks kind, bool near, int threads) {
-  if (touches(step)) return fused_kernel_for<T, true, true>(kind, near, threads);
-  return has_loose(step) ? fused_kernel_for<T, false, true>(kind, near, threads)
-                         : fused_kernel_for<T, false, false>(kind, near, threads);
+FusedKernel<T> fused_kernel(const DeviceStep<T>& step, Blocks kind, bool in_shared, int threads) {
+  if (has_contacts(step)) return fused_kernel_for<T, true, true>(kind, in_shared, threads);
+  return has_free_pieces(step) ? fused_kernel_for<T, false, true>(kind, in_shared, threads)
+                               : fused_kernel_for<T, false, false>(kind, in_shared, threads);
 }
 
 // How a call is launched.
@@ -52,14 +52,14 @@ struct FusedLaunch {
 
 // A block that has an environment to itself: its threads, and how many such blocks a multiprocessor runs.
 struct BlockShape {
-  int threads = warp_size, together = 0;
+  int threads = warp_size, per_multiprocessor = 0;
   double pairs = 0;        // that the multiprocessor works on at a time
   double cost = HUGE_VAL;  // of the environments that it is for, where they are known
 
-  int resident() const { return threads * together; }
+  int resident() const { return threads * per_multiprocessor; }
   // Threads hide the time that memory takes; then few of them should be idle in the last round of pairs, and few wait for each
   // other.
-  auto rank() const { return std::tuple(resident(), pairs, together); }
+  auto rank() const { return std::tuple(resident(), pairs, per_multiprocessor); }
   bool is_worse_than(const BlockShape& other) const {
     if (cost != other.cost) return cost > other.cost;
     return std::tuple(resident(), pairs) < std::tuple(other.resident(), other.pairs);
@@ -85,16 +85,17 @@ BlockShape block_shape(const DevicePlan<T>& plan, std::size_t shared) {
   if (shared > shared_memory_per_block()) return best;
   const int fit = int(shared_memory_per_multiprocessor() / (shared + reserved_shared_bytes));
   for (int threads = warp_size; threads <= resident_threads<T>; threads += warp_size) {
-    const int together = std::min(fit, resident_threads<T> / threads);
+    const int per_multiprocessor = std::min(fit, resident_threads<T> / threads);
     const int rounds = (plan.most_pairs + threads - 1) / threads;
-    BlockShape shape = {threads, together, double(together) * plan.most_pairs / rounds};
+    BlockShape shape = {threads, per_multiprocessor,
+                        double(per_multiprocessor) * plan.most_pairs / rounds};
     if (shape.rank() > best.rank()) best = shape;
-    const bool few = plan.environments > 0 && plan.environments <= together;
+    const bool few = plan.environments > 0 && plan.environments <= per_multiprocessor;
     if (!few || rounds > most_fitted_rounds) continue;
     shape.cost = shape_cost(plan.environments, threads / warp_size, rounds);
     if (shape.cost < cheapest.cost) cheapest = shape;
   }
-  return cheapest.together > 0 ? cheapest : best;
+  return cheapest.per_multiprocessor > 0 ? cheapest : best;
 }
 
 // One patch a block: a thread for every tetrahedron and slot, as far as there are, and a warp without any to lead.
@@ -105,7 +106,7 @@ int patch_threads(const DevicePlan<T>& plan) {
 }
 
 template <class T>
-bool near_with(const DevicePlan<T>& plan, int threads) {
+bool fits_in_shared(const DevicePlan<T>& plan, int threads) {
   return is_near(sizeof(T), plan.most_slots, plan.most_pairs, threads);
 }
 
@@ -125,9 +126,9 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
   } else {
     threads = patch_threads(step.plan);
     keep_vertices(step);
-    const bool near = kept == vertex_arrays && near_with(step.plan, threads);
-    if (!near) threads = far_threads<T>;
-    kernel = fused_kernel(step, kind, near, threads);
+    const bool in_shared = kept == vertex_arrays && fits_in_shared(step.plan, threads);
+    if (!in_shared) threads = global_memory_threads<T>;
+    kernel = fused_kernel(step, kind, in_shared, threads);
   }
   const int resident = resident_blocks(function(), threads, shared);
   if (resident < patches)
@@ -146,7 +147,7 @@ void FusedLaunch<T>::form_block(const DeviceStep<T>& step) {
   const BlockShape least = block_shape(step.plan, shared);
   BlockShape taken = least;
   kept = 1;
-  for (int arrays = 2; least.together > 0 && arrays <= block_arrays; ++arrays) {
+  for (int arrays = 2; least.per_multiprocessor > 0 && arrays <= block_arrays; ++arrays) {
     const BlockShape shape = block_shape(step.plan, begin + (arrays - 1) * each);
     if (shape.is_worse_than(least)) break;
     taken = shape;
@@ -162,8 +163,8 @@ template <class T>
 void FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
   shared = cluster_shared_bytes(step);
   threads = int(cluster_threads(sizeof(T), step.plan.most_pairs, step.plan.most_interior));
-  const bool near = halo_lanes(sizeof(T), step.plan.most_pairs, step.plan.most_interior) == 8;
-  kernel = fused_kernel(step, Blocks::cluster, near, threads);
+  const bool in_shared = halo_lanes(sizeof(T), step.plan.most_pairs, step.plan.most_interior) == 8;
+  kernel = fused_kernel(step, Blocks::cluster, in_shared, threads);
   int clusters = 0;
   if (threads <= most_grid_threads<T> && resident_blocks(function(), threads, shared) > 0)
     clusters = resident_clusters(function(), threads, shared, patches);
@@ -207,7 +208,7 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaun
   const std::int64_t teams = launch.teams;
   FusedScratch<T> s;
   // what must start as zero comes first
-  arena.place(s.letters, grid ? teams * 2 * plan.slots * Letter<T>::words : 0);
+  arena.place(s.messages, grid ? teams * 2 * plan.slots * HaloMessage<T>::words : 0);
   arena.place(s.sums, grid ? teams * 2 * plan.patches * sums_count : 0);
   for (int a = 0; a < vertex_arrays; ++a) {
     arena.place(s.vertex[a], a < launch.kept ? 0 : teams * plan.slots);
@@ -223,7 +224,7 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaun
 template <class T>
 std::int64_t fused_bytes(const DeviceStep<T>& step) {
   if constexpr (sizeof(T) == 4)
-    if (takes_several(step)) return several_bytes(step);
+    if (takes_small_batch(step)) return small_batch_bytes(step);
   Arena arena(nullptr);
   arrange(arena, step, FusedLaunch<T>(step));
   return arena.size();
@@ -232,7 +233,7 @@ std::int64_t fused_bytes(const DeviceStep<T>& step) {
 template <class T>
 void run_fused(const DeviceStep<T>& step, void* memory, Stream to) {
   if constexpr (sizeof(T) == 4)
-    if (takes_several(step)) return run_several(step, memory, to);
+    if (takes_small_batch(step)) return run_small_batch(step, memory, to);
   const auto stream = static_cast<cudaStream_t>(to);
   const FusedLaunch<T> launch(step);
   Arena arena(memory);
@@ -244,9 +245,9 @@ void run_fused(const DeviceStep<T>& step, void* memory, Stream to) {
                            launch.shared, stream));
     return;
   }
-  const auto* begin = reinterpret_cast<const std::byte*>(call.scratch.letters);
+  const auto* begin = reinterpret_cast<const std::byte*>(call.scratch.messages);
   const auto* end = reinterpret_cast<const std::byte*>(call.scratch.vertex[0]);
-  if (begin != end) check(cudaMemsetAsync(call.scratch.letters, 0, end - begin, stream));
+  if (begin != end) check(cudaMemsetAsync(call.scratch.messages, 0, end - begin, stream));
   pd::launch(launch.function(), blocks, launch.threads, arguments, launch.shared,
              launch.kind == Blocks::cluster ? launch.patches : 0, stream);
 }

@@ -20,22 +20,22 @@ namespace pd::inline PD_TARGET {
 // sums and motions would only take registers from the iterations. `Near`: of one patch, whose vertex arrays fit shared memory, as far as iterations ask for
 // them; of several, which are so small that theirs fit and that no thread has more than one slot, nor in float32 more than one
 // tetrahedron; of a cluster, where all are as small, with so few own vertices that each has eight lanes and not four.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 class FusedRunner {
   static constexpr bool Many = Kind != Blocks::one;  // patches an environment
   static constexpr bool Clustered = Kind == Blocks::cluster;
-  static constexpr bool Once = (Near || Clustered) && near_once(sizeof(T));
+  static constexpr bool OnePerThread = (InShared || Clustered) && near_once(sizeof(T));
   // whether each thread keeps its first tetrahedron, or else of a grid its first pair
-  static constexpr bool Halves = Clustered || (Kind == Blocks::grid && Near);
+  static constexpr bool TetPerLane = Clustered || (Kind == Blocks::grid && InShared);
   // near patches have their vertices at hand
-  static constexpr bool looks_ahead = Kind == Blocks::grid && !Near;
+  static constexpr bool prefetches = Kind == Blocks::grid && !InShared;
   using Lanes = Thread<T>;
-  using Letter = pd::Letter<T>;
-  using OwnHalo = Halo<T, Near ? 8 : 4>;
-  using Seen = typename Vertices<T, Touching>::Seen;
+  using HaloMessage = pd::HaloMessage<T>;
+  using OwnHalo = Halo<T, InShared ? 8 : 4>;
+  using LoadedVertex = typename Vertices<T, HasContacts>::LoadedVertex;
 
   // A slot as a pass visits it.
-  struct Seat {
+  struct WorkItem {
     int slot, row;
     Vec3<T> origin;
 
@@ -50,7 +50,7 @@ class FusedRunner {
         set_(call.step.settings),
         index_(Many ? int(blockIdx.x) % call.step.plan.patches : 0),
         patch_(call.step.plan, index_),
-        soon_(patch_.pairs),
+        outer_pairs_(patch_.pairs),
         team_(Many ? int(blockIdx.x) / call.step.plan.patches : int(blockIdx.x)),
         memory_(call.scratch),
         control_(*reinterpret_cast<Control<T>*>(shared)),
@@ -61,21 +61,21 @@ class FusedRunner {
         theta_(in_register(T(call.step.settings.relaxation))),
         halo_(shared + halo_begin, plan_.most_slots) {
     lay_out(call, shared);
-    open(shared);
+    init(shared);
   }
 
   // All steps of one environment, with a record every `every`.
-  PD_DEVICE void roll(std::int64_t environment) {
+  PD_DEVICE void rollout(std::int64_t environment) {
     in_ = {&call_, environment};
     load();
-    weigh();
+    assemble_diagonal();
     for (int t = 0; t < set_.steps; ++t) {
       step(*this, set_);
       if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
-      move_balls();
+      move_spheres();
     }
     // nothing is under way to a block when it ends
-    if constexpr (Clustered) await_positions();
+    if constexpr (Clustered) wait_for_positions();
     __syncthreads();
   }
 
@@ -96,9 +96,9 @@ class FusedRunner {
     });
     if (threadIdx.x == 0) {
       control_.progress.schedule =
-          Schedule(set_, control_.progress.least, contacts_.friction() > T(0));
+          Schedule(set_, control_.progress.min_share, contacts_.friction() > T(0));
       if constexpr (Clustered) control_.omega = T(control_.progress.schedule.next(0));
-      if (set_.tolerance > 0) control_.progress.stop = {in_.fall()};
+      if (set_.tolerance > 0) control_.progress.stop = {in_.free_fall_squared()};
       control_.progress.used = 0;
       control_.progress.done = false;
     }
@@ -110,9 +110,9 @@ class FusedRunner {
 
   // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
   PD_DEVICE void align() {
-    if constexpr (Clustered) release();
-    settle();
-    if constexpr (Loose) align_pieces();
+    if constexpr (Clustered) store_iterate();
+    apply_last_sums();
+    if constexpr (HasFreePieces) align_pieces();
   }
 
   // When the sums of an iteration are sent and concluded: with one block, or where they may stop it, in the next one before
@@ -120,51 +120,52 @@ class FusedRunner {
   PD_DEVICE void iterate(int k) {
     if constexpr (Clustered) return stops_ ? iterate_own<true>(k) : iterate_own<false>(k);
     const bool guard = set_.schedule == ScheduleKind::guarded && k % guard_period == 0;
-    const bool stops = set_.tolerance > 0, early = guard && leaves_early();
-    if (pending_ && !leaves_early() && leads()) sums_.send(Add{});
+    const bool stops = set_.tolerance > 0, early = guard && stores_early();
+    if (pending_ && !stores_early() && in_leading_warp()) sums_.send(Add{});
     const auto lead = [&] {
       if (is_leader()) {
-        if (!Many || k == 0) coming_ = T(control_.progress.schedule.next(k));
-        if (stops) control_.turn_omega[k % 2] = coming_;
-        control_.omega = coming_;
+        if (!Many || k == 0) next_omega_ = T(control_.progress.schedule.next(k));
+        if (stops) control_.omega_by_parity[k % 2] = next_omega_;
+        control_.omega = next_omega_;
       }
-      if (pending_ && (stops || !Many)) conclude();
+      if (pending_ && (stops || !Many)) apply_sums();
       if (is_leader() && !control_.progress.done) ++control_.progress.used;
     };
     if constexpr (Many) {
       // one copy of the code, which several patches have to hold in the cache
       pass<true>(SolidGradient<true>{guard}, lead, early,
-                 [&](const Seat& at, const Seen& seen, const Vec3<T>& force) {
-                   if (guard && !early && at.owned()) energy_ += seen.energy();
-                   update(at, seen, force);
+                 [&](const WorkItem& at, const LoadedVertex& loaded, const Vec3<T>& force) {
+                   if (guard && !early && at.owned()) energy_ += loaded.energy();
+                   update(at, loaded, force);
                  });
     } else if (guard) {
       pass<true>(SolidGradient<true>{}, lead, false,
-                 [&](const Seat& at, const Seen& seen, const Vec3<T>& force) {
-                   energy_ += seen.energy();
-                   update(at, seen, force);
+                 [&](const WorkItem& at, const LoadedVertex& loaded, const Vec3<T>& force) {
+                   energy_ += loaded.energy();
+                   update(at, loaded, force);
                  });
     } else {
-      pass<true>(
-          SolidGradient<false>{}, lead, false,
-          [&](const Seat& at, const Seen& seen, const Vec3<T>& force) { update(at, seen, force); });
+      pass<true>(SolidGradient<false>{}, lead, false,
+                 [&](const WorkItem& at, const LoadedVertex& loaded, const Vec3<T>& force) {
+                   update(at, loaded, force);
+                 });
     }
     if (finished_) {
       pending_ = false;
       return;
     }
     if ((guard && !early) || stops)
-      sums_.leave({energy_, first_, second_}, stops ? sums_count : 1, Add{});
+      sums_.store_partial({energy_, first_, second_}, stops ? sums_count : 1, Add{});
     if constexpr (Many) {
       // while others are still busy
-      if (leads()) {
+      if (in_leading_warp()) {
         if (early) {
-          sums_.await_early();
+          sums_.wait_for_early();
           sums_.send(Add{});
         } else if (pending_ && !stops) {
-          conclude();
+          apply_sums();
         }
-        if (is_leader()) coming_ = T(control_.progress.schedule.next(k + 1));
+        if (is_leader()) next_omega_ = T(control_.progress.schedule.next(k + 1));
       }
     }
     guarding_ = guard;
@@ -193,8 +194,9 @@ class FusedRunner {
   PD_DEVICE double* part_sums() const {
     return memory_.part_sum + std::int64_t(team_) * plan_.parts * PartSums::count;
   }
-  PD_DEVICE Word* letter_box() const {
-    return memory_.letters + (std::int64_t(team_) * 2 + (round_ & 1)) * plan_.slots * Letter::words;
+  PD_DEVICE TaggedWord* mailbox() const {
+    return memory_.messages +
+           (std::int64_t(team_) * 2 + (round_ & 1)) * plan_.slots * HaloMessage::words;
   }
   // Of a cluster its own vertices.
   PD_DEVICE int own_slots() const { return Clustered ? patch_.interior : patch_.slots; }
@@ -217,44 +219,44 @@ class FusedRunner {
     place(s, vec3(origin_[s]) + u);
   }
 
-  PD_DEVICE void update(const Seat& at, const Seen& seen, const Vec3<T>& force) {
+  PD_DEVICE void update(const WorkItem& at, const LoadedVertex& loaded, const Vec3<T>& force) {
     const bool counts = set_.tolerance > 0 && at.owned();
-    if (counts) second_ += seen.square_of_way();
-    const Vec3<T> next = seen.next(contacts_, force, theta_, omega_);
+    if (counts) second_ += loaded.square_of_displacement();
+    const Vec3<T> next = loaded.next(contacts_, force, theta_, omega_);
     if (counts) {
-      const Vec3<T> change = next - seen.u;
+      const Vec3<T> change = next - loaded.u;
       first_ += double(dot(change, change));
     }
-    v_.set_before(at.slot, seen.u);
+    v_.set_before(at.slot, loaded.u);
     v_.set(at.slot, next);
     place(at.slot, at.origin + next);
   }
 
   template <class Element>
   PD_DEVICE T each_element(const Element& element) {
-    if constexpr (Halves) {
-      const auto shape_of = [&](int number, const HalfNumbers<T>&, const Quad<T>(&)[4]) {
-        return Once || number == int(threadIdx.x) ? rest_ : half_rest(patch_, number);
+    if constexpr (TetPerLane) {
+      const auto shape_of = [&](int number, const TetInputs<T>&, const Quad<T>(&)[4]) {
+        return OnePerThread || number == int(threadIdx.x) ? rest_ : tet_rest(patch_, number);
       };
-      const auto counts = [&](int number, T met) {
-        return !Clustered || this->counts(number, met);
+      const auto counts = [&](int number, T tet_energy) {
+        return !Clustered || this->counts(number, tet_energy);
       };
       if constexpr (Clustered) {
-        return each_half<Once, false>(patch_, halo_.positions(round_), shape_of, counts, weights(),
-                                      entries_of_round(), element, half_);
+        return each_tet<OnePerThread, false>(patch_, halo_.positions(round_), shape_of, counts,
+                                             weights(), entries_of_round(), element, tet_);
       } else {
-        return each_half<Once, false>(patch_, SlotPositions<T>{position_}, shape_of, counts,
-                                      weights(), entries_, element, half_);
+        return each_tet<OnePerThread, false>(patch_, SlotPositions<T>{position_}, shape_of, counts,
+                                             weights(), entries_, element, tet_);
       }
     } else if constexpr (Many) {
       T energy = T(0);
 #pragma unroll 1
-      for (int begin = 0, end = soon_;; begin = end, end = patch_.pairs) {
-        energy +=
-            each_pair_ahead(patch_, position_, weights(), entries_, element, pair_, begin, end);
+      for (int begin = 0, end = outer_pairs_;; begin = end, end = patch_.pairs) {
+        energy += each_prefetched_pair(patch_, position_, weights(), entries_, element, pair_,
+                                       begin, end);
         if (end == patch_.pairs) return energy;
         __syncthreads();
-        post_shared();
+        send_shared_forces();
       }
     } else {
       const auto read = [&](unsigned corner, Vec3<T>(&x)[1]) {
@@ -273,63 +275,63 @@ class FusedRunner {
     energy_ = double(each_element(element));
     first_ = second_ = 0;
     late_ = Many && MayStop && pending_ && set_.tolerance > 0;
-    if (!late_ && leads()) lead();
-    if constexpr (looks_ahead) see_first();
+    if (!late_ && in_leading_warp()) lead();
+    if constexpr (prefetches) prefetch_first();
     __syncthreads();
     if (!late_) {
-      heed<MayStop>();
-    } else if (leads()) {
+      read_control<MayStop>();
+    } else if (in_leading_warp()) {
       lead();
     }
     // of several patches only late, when what others wait for has been sent
     if (finished_) return;
-    if constexpr (Many && Near) {
-      visit_seat<MayStop>(early, visit);
+    if constexpr (Many && InShared) {
+      visit_one_item<MayStop>(early, visit);
     } else if constexpr (Many) {
-      visit_patch<MayStop>(visit);
+      visit_items<MayStop>(visit);
     } else {
       each_slot([&](int s) {
-        const Seen seen = v_.see(s);
-        const Seat at = {s, 0, vec3(origin_[s])};
-        visit(at, seen, sum_entries(entries_, plan_.slot_row[s]));
+        const LoadedVertex loaded = v_.load(s);
+        const WorkItem at = {s, 0, vec3(origin_[s])};
+        visit(at, loaded, sum_entries(entries_, plan_.slot_row[s]));
       });
     }
   }
 
   // What the leading warp has decided.
   template <bool MayStop>
-  PD_DEVICE void heed() {
+  PD_DEVICE void read_control() {
     finished_ = MayStop && control_.progress.done;
     omega_ = control_.omega;
   }
   // With several patches it may have waited for the sums of the others meanwhile.
   template <bool MayStop>
-  PD_DEVICE void heed_late() {
+  PD_DEVICE void read_control_late() {
     if (!late_) return;
     __syncthreads();
-    heed<MayStop>();
+    read_control<MayStop>();
   }
 
   // ---- visits: cuda/fused_visit.h
 
-  PD_DEVICE int slot_of_seat(int seat) const;
-  PD_DEVICE int row_of_seat(int seat) const;
-  PD_DEVICE int rounds(int seats) const;
-  PD_DEVICE int seat_of_visit(int visit) const;
-  PD_DEVICE void see(int seat);
+  PD_DEVICE int slot_of_item(int item) const;
+  PD_DEVICE int row_of_item(int item) const;
+  PD_DEVICE int rounds(int items) const;
+  PD_DEVICE int item_of_visit(int visit) const;
+  PD_DEVICE void load_item(int item);
 
   // shared slots of earlier patches
   PD_DEVICE int earlier_shared() const { return patch_.first_slot - patch_.first_vertex; }
 
-  PD_DEVICE void post(int seat, const Vec3<T>& force) const;
-  PD_DEVICE void post_shared();
-  PD_DEVICE Vec3<T> read(int seat) const;
+  PD_DEVICE void send_force(int item, const Vec3<T>& force) const;
+  PD_DEVICE void send_shared_forces();
+  PD_DEVICE Vec3<T> receive_force(int item) const;
   template <bool MayStop, class Visit>
-  PD_DEVICE void visit_patch(const Visit& visit);
-  PD_DEVICE void see_first();
+  PD_DEVICE void visit_items(const Visit& visit);
+  PD_DEVICE void prefetch_first();
   template <bool MayStop, class Visit>
-  PD_DEVICE void visit_seat(bool early, const Visit& visit);
-  PD_DEVICE void leave_energy(bool owned);
+  PD_DEVICE void visit_one_item(bool early, const Visit& visit);
+  PD_DEVICE void store_energy(bool owned);
 
   // ---- what is different in a cluster: cuda/fused_halo.h
 
@@ -338,15 +340,15 @@ class FusedRunner {
   PD_DEVICE bool is_first() const {
     return OwnHalo::part() == 0 && OwnHalo::vertex() < patch_.interior;
   }
-  PD_DEVICE bool counts(int number, T met) const;
+  PD_DEVICE bool counts(int number, T tet_energy) const;
   PD_DEVICE bool counts_energy(int number) const;
   PD_DEVICE Vec3<T> anchor_of_step();
   PD_DEVICE Quad<T>* entries_of_round() const {
     return entries_ + (round_ & 1) * plan_.most_entries;
   }
-  PD_DEVICE void hold();
-  PD_DEVICE void release();
-  PD_DEVICE void await_positions();
+  PD_DEVICE void load_iterate();
+  PD_DEVICE void store_iterate();
+  PD_DEVICE void wait_for_positions();
   PD_DEVICE void send_positions();
   template <bool Stops>
   PD_DEVICE void iterate_own(int k);
@@ -355,17 +357,17 @@ class FusedRunner {
 
   // Whether nobody waits for the sums of the last iteration but the leading warp: energies are left before the wait for letters,
   // and sent once it has made its own visits.
-  PD_DEVICE bool leaves_early() const {
-    return Many && (Near || Clustered) && !(set_.tolerance > 0);
+  PD_DEVICE bool stores_early() const {
+    return Many && (InShared || Clustered) && !(set_.tolerance > 0);
   }
 
   // The weight of the last iteration that was counted, whose sums are concluded.
   PD_DEVICE double omega_of_sums() const {
-    return double(control_.turn_omega[(control_.progress.used - 1) & 1]);
+    return double(control_.omega_by_parity[(control_.progress.used - 1) & 1]);
   }
 
   // Leading warp: what follows from the sums of the last iteration.
-  PD_DEVICE void conclude() {
+  PD_DEVICE void apply_sums() {
     sums_.receive(Add{});
     if (lane() == 0) {
       Progress& progress = control_.progress;
@@ -378,11 +380,11 @@ class FusedRunner {
   }
 
   // The last iteration's sums, which no iteration follows.
-  PD_DEVICE void settle() {
+  PD_DEVICE void apply_last_sums() {
     if (!pending_) return;
-    if (leads()) {
-      if (!leaves_early()) sums_.send(Add{});
-      conclude();
+    if (in_leading_warp()) {
+      if (!stores_early()) sums_.send(Add{});
+      apply_sums();
     }
     pending_ = false;
     __syncthreads();
@@ -391,13 +393,13 @@ class FusedRunner {
   // ---- start of a call: cuda/fused_start.h
 
   PD_DEVICE void lay_out(const FusedCall<T>& call, std::byte* shared);
-  PD_DEVICE void open(std::byte* shared);
+  PD_DEVICE void init(std::byte* shared);
   PD_DEVICE void load();
-  PD_DEVICE void move_balls();
-  PD_DEVICE void weigh();
-  PD_DEVICE void weigh_with(const T* stiffness, bool bounded);
-  PD_DEVICE T weigh_own(const T* stiffness, bool bounded);
-  PD_DEVICE void read_own();
+  PD_DEVICE void move_spheres();
+  PD_DEVICE void assemble_diagonal();
+  PD_DEVICE void compute_weights(const T* stiffness, bool bounded);
+  PD_DEVICE T compute_own_weight(const T* stiffness, bool bounded);
+  PD_DEVICE void load_own();
 
   // ---- rigid motions: cuda/fused_rigid.h
 
@@ -418,7 +420,7 @@ class FusedRunner {
   const Settings& set_;
   int index_;  // of the patch
   Patch<T> patch_;
-  int soon_;  // of a far grid: pairs after which forces on shared vertices are complete, a multiple of the threads, or all
+  int outer_pairs_;  // of a far grid: pairs after which forces on shared vertices are complete, a multiple of the threads, or all
   int team_;
   const FusedScratch<T>& memory_;
   Control<T>& control_;
@@ -427,29 +429,29 @@ class FusedRunner {
   Quad<T>* position_;
   Quad<T>* entries_;  // forces of elements
   double* energies_;  // of a cluster: what each thread has met of them
-  Vertices<T, Touching> v_;
+  Vertices<T, HasContacts> v_;
   Quad<T>* origin_;  // start of the step, from the patch's first vertex, of a cluster the mesh's
   Plane<T>* planes_;
-  Ball<T>* balls_;
+  Ball<T>* spheres_;
   Inputs<T> in_;
   Contacts<T> contacts_;
-  OwnHalo halo_;         // of a cluster
-  HalfNumbers<T> half_;  // with Halves: this thread's first tetrahedron,
-  FaceRest<T, 1> rest_;  // and its rest shape
-  PairAhead<T> pair_;    // of a grid without: this thread's first pair, between passes
+  OwnHalo halo_;            // of a cluster
+  TetInputs<T> tet_;        // with Halves: this thread's first tetrahedron,
+  FaceRest<T, 1> rest_;     // and its rest shape
+  PrefetchedPair<T> pair_;  // of a grid without: this thread's first pair, between passes
   int row_ =
       0;  // slot_row of a grid's first seat of this thread, of the vertex that it has in a cluster
-  Seat at_;    // the seat that comes next,
-  Seen seen_;  // with what a pass knows of its vertex
+  WorkItem item_;        // the seat that comes next,
+  LoadedVertex loaded_;  // with what a pass knows of its vertex
   T h_, theta_, omega_ = T(1);
   double energy_ = 0, first_ = 0, second_ = 0;  // this thread's part of the sums
   unsigned round_ = 0;                          // exchanges so far
-  unsigned awaited_ = 0;                        // of a cluster: those that were waited for
+  unsigned waited_ = 0;                         // of a cluster: those that were waited for
   bool finished_ = false, pending_ = false, guarding_ = false, started_ = false, late_ = false;
-  T coming_ = T(1);  // of the leader: the next omega
+  T next_omega_ = T(1);  // of the leader: the next omega
   // of a cluster: whether vertices have moved since they were sent, whether seen_ is newer than their arrays, whether the environment
   // has just been loaded, whether the energy of this thread's first tetrahedron counts; whether a tolerance may stop it
-  bool moved_ = false, held_ = false, loaded_ = false, counts_ = false;
+  bool moved_ = false, in_registers_ = false, just_loaded_ = false, counts_ = false;
   int stops_ = in_register(int(set_.tolerance > 0));
 };
 

@@ -23,8 +23,8 @@ struct FusedScratch {
   T* weights;                      // [teams, blocks, 2, 32] w V
   Piece<T>* pieces;                // [teams, patches, pieces]
   double* part_sum;  // [teams, parts, PartSums::count] of the vertices that a patch owns of a piece
-  Word* letters;     // of a grid: [teams, 2, slots, words] forces on shared vertices
-  Word* sums;        // of a grid: [teams, 2, patches, sums_count]
+  TaggedWord* messages;  // of a grid: [teams, 2, slots, words] forces on shared vertices
+  TaggedWord* sums;      // of a grid: [teams, 2, patches, sums_count]
 };
 
 template <class T>
@@ -68,7 +68,7 @@ struct Control {
   Progress progress;
   T omega;
   // of even and of odd iterations, of a cluster and where they may stop
-  T turn_omega[2];
+  T omega_by_parity[2];
   // of a cluster: where the first vertex of the mesh is when a call begins
   Vec3<T> anchor;
   TeamTotals totals;

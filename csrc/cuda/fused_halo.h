@@ -5,23 +5,25 @@
 namespace pd::inline PD_TARGET {
 
 // Of the patches that work out a tetrahedron one counts its energy.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE bool FusedRunner<T, Touching, Loose, Kind, Near>::counts(int number, T met) const {
-  if (Once || number == int(threadIdx.x)) return counts_;
-  return !(met == T(0)) && counts_energy(number);
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE bool FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::counts(
+    int number, T tet_energy) const {
+  if (OnePerThread || number == int(threadIdx.x)) return counts_;
+  return !(tet_energy == T(0)) && counts_energy(number);
 }
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE bool FusedRunner<T, Touching, Loose, Kind, Near>::counts_energy(int number) const {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE bool FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::counts_energy(
+    int number) const {
   const PairPlace place = place_of(patch_, min(number / 2, patch_.pairs - 1));
   return plan_.pair_tet[place.in(2) + number % 2 * pair_lanes] >= 0;
 }
 
 // What positions are relative to: for all patches of a cluster the same, since they tell each other their own.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE Vec3<T> FusedRunner<T, Touching, Loose, Kind, Near>::anchor_of_step() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE Vec3<T> FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::anchor_of_step() {
   if constexpr (!Clustered) return vec3(v_.x[0]);
-  if (loaded_) {
-    loaded_ = false;
+  if (just_loaded_) {
+    just_loaded_ = false;
     return control_.anchor;
   }
   cluster_barrier();
@@ -32,36 +34,36 @@ PD_DEVICE Vec3<T> FusedRunner<T, Touching, Loose, Kind, Near>::anchor_of_step() 
   return read3(anchor);
 }
 
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::await_positions() {
-  if (awaited_ != round_) halo_.wait(round_);
-  awaited_ = round_;
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::wait_for_positions() {
+  if (waited_ != round_) halo_.wait(round_);
+  waited_ = round_;
 }
 
 // What iterations go by and change: in registers from the first to the last.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::hold() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_iterate() {
   const int own = OwnHalo::vertex();
   if (own >= patch_.interior) return;
-  seen_ = v_.see(own);
-  at_ = {own, row_, vec3(origin_[own])};
-  held_ = true;
+  loaded_ = v_.load(own);
+  item_ = {own, row_, vec3(origin_[own])};
+  in_registers_ = true;
 }
 
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::release() {
-  if (held_ && is_first()) {
-    v_.set(at_.slot, seen_.u);
-    v_.set_before(at_.slot, seen_.before);
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::store_iterate() {
+  if (in_registers_ && is_first()) {
+    v_.set(item_.slot, loaded_.u);
+    v_.set_before(item_.slot, loaded_.before);
   }
-  held_ = false;
+  in_registers_ = false;
 }
 
 // Own vertices that were moved by something else than an iteration.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::send_positions() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::send_positions() {
   __syncthreads();
-  await_positions();
+  wait_for_positions();
   ++round_;
   moved_ = false;
   if (has_own()) {
@@ -72,26 +74,26 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::send_positions() {
 
 // As iterate(). Nobody waits at its end but for the positions, with which the next begins: what warps write before its barrier
 // and read after it has two places, for even and for odd iterations.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 template <bool Stops>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::iterate_own(int k) {
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::iterate_own(int k) {
   const bool guard = set_.schedule == ScheduleKind::guarded && k % guard_period == 0;
   if (moved_) {
     send_positions();
-    hold();
+    load_iterate();
   }
-  if (Stops && pending_ && leads()) sums_.send(Add{});
-  energy_ = guard && is_first() ? seen_.energy() : 0;
-  await_positions();
+  if (Stops && pending_ && in_leading_warp()) sums_.send(Add{});
+  energy_ = guard && is_first() ? loaded_.energy() : 0;
+  wait_for_positions();
   energy_ += double(each_element(SolidGradient<true>{guard}));
   if (guard && !Stops) energies_[threadIdx.x] = energy_;
   if (Stops) first_ = second_ = 0;
-  if (leads()) {
-    if (Stops && pending_) conclude();
+  if (in_leading_warp()) {
+    if (Stops && pending_) apply_sums();
     if (is_leader()) {
-      control_.turn_omega[k % 2] = k == 0 ? control_.omega : coming_;
+      control_.omega_by_parity[k % 2] = k == 0 ? control_.omega : next_omega_;
       // before the energy that might change it is known: while others are busy
-      coming_ = T(control_.progress.schedule.next(k + 1));
+      next_omega_ = T(control_.progress.schedule.next(k + 1));
       if (!control_.progress.done) ++control_.progress.used;
     }
   }
@@ -104,30 +106,30 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::iterate_own(int k) {
   const Quad<T>* const entries = entries_of_round();
   ++round_;
   if (has_own()) {
-    const T omega = control_.turn_omega[k % 2];
+    const T omega = control_.omega_by_parity[k % 2];
     const Vec3<T> force = OwnHalo::sum_entries(entries, row_);
-    if (Stops && is_first()) second_ = seen_.square_of_way();
-    const Vec3<T> next = seen_.next(contacts_, force, theta_, omega);
-    halo_.send(at_.origin + next, round_);
+    if (Stops && is_first()) second_ = loaded_.square_of_displacement();
+    const Vec3<T> next = loaded_.next(contacts_, force, theta_, omega);
+    halo_.send(item_.origin + next, round_);
     if (Stops && is_first()) {
-      const Vec3<T> change = next - seen_.u;
+      const Vec3<T> change = next - loaded_.u;
       first_ = double(dot(change, change));
     }
-    seen_.before = seen_.u;
-    seen_.u = next;
+    loaded_.before = loaded_.u;
+    loaded_.u = next;
   }
-  if (Stops) sums_.leave({energy_, first_, second_}, sums_count, Add{});
-  if (leads()) {
+  if (Stops) sums_.store_partial({energy_, first_, second_}, sums_count, Add{});
+  if (in_leading_warp()) {
     if (!Stops && guard) {
       sums_.gather(energies_, Add{});
       sums_.send(Add{});
     } else if (!Stops && pending_) {
       const Schedule& schedule = control_.progress.schedule;
       const int before = schedule.restarts;
-      conclude();
+      apply_sums();
       // after a restart an omega hangs on nothing that came before it
       if (is_leader() && schedule.restarts > before)
-        coming_ = T(control_.progress.schedule.next(k + 1));
+        next_omega_ = T(control_.progress.schedule.next(k + 1));
     }
   }
   guarding_ = guard;
@@ -136,12 +138,12 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::iterate_own(int k) {
 }
 
 // As pass(), of which nobody moves anything.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 template <class Element, class Visit>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::pass_own(const Element& element,
-                                                                     const Visit& visit) {
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::pass_own(
+    const Element& element, const Visit& visit) {
   if (moved_) send_positions();
-  await_positions();
+  wait_for_positions();
   energy_ = double(each_element(element));
   first_ = second_ = 0;
   __syncthreads();
@@ -149,7 +151,7 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::pass_own(const Eleme
   const Vec3<T> force = OwnHalo::sum_entries(entries_of_round(), row_);
   if (is_first()) {
     const int own = OwnHalo::vertex();
-    visit({own, row_, vec3(origin_[own])}, v_.see(own), force);
+    visit({own, row_, vec3(origin_[own])}, v_.load(own), force);
   }
   __syncwarp();
 }

@@ -6,10 +6,10 @@
 namespace pd::inline PD_TARGET {
 
 // What finds the motions: by itself, so that what lives across its calls is spilled here, and not in the iterations.
-template <class T, bool Touching, Blocks Kind>
+template <class T, bool HasContacts, Blocks Kind>
 struct MotionFinder {
   const DevicePlan<T>& plan;
-  Vertices<T, Touching> v;
+  Vertices<T, HasContacts> v;
   Contacts<T> contacts;
   const Settings& settings;
   Piece<T>* pieces;  // of this block
@@ -19,14 +19,14 @@ struct MotionFinder {
 
   template <Rigid What>
   PD_DEVICE void find(const Aligning& how) {
-    if constexpr (Kind != Blocks::one) sums.meet();  // everyone has read the sums of the last time
+    if constexpr (Kind != Blocks::one) sums.sync();  // everyone has read the sums of the last time
     const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
     for (int n = first_part + warp; n < end_part; n += warps) {
       const Part part(plan, n, nullptr, -first_slot);
       sum_part<What>(v, contacts, settings, how, part, pieces[part.piece(plan)],
                      part_sums + PartSums::count * n);
     }
-    sums.meet();
+    sums.sync();
     for (int n = warp; n < plan.pieces; n += warps)
       move_piece<What>(plan, n, contacts, how, part_sums, pieces[n]);
     __syncthreads();
@@ -48,20 +48,21 @@ struct MotionFinder {
 };
 
 // Returns where the team stands.
-template <class T, bool Touching, Blocks Kind>
-PD_DEVICE_COLD TeamSums<Kind> find_motions(MotionFinder<T, Touching, Kind> finder, Aligning how) {
-  find_in_rounds<Touching>(finder, how, finder.contacts.has_several());
+template <class T, bool HasContacts, Blocks Kind>
+PD_DEVICE_COLD TeamSums<Kind> find_motions(MotionFinder<T, HasContacts, Kind> finder,
+                                           Aligning how) {
+  find_in_rounds<HasContacts>(finder, how, finder.contacts.has_several());
   return finder.sums;
 }
 
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::align_pieces() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::align_pieces() {
   const bool first = !started_;
   started_ = true;
   if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
-  Aligning how(plan_, Touching, first);
+  Aligning how(plan_, HasContacts, first);
   do {
-    sums_ = find_motions<T, Touching, Kind>(
+    sums_ = find_motions<T, HasContacts, Kind>(
         {plan_, v_, contacts_, set_, &piece(0), part_sums(), plan_.patch_part[index_],
          plan_.patch_part[index_ + 1], patch_.first_slot, own_slots(), sums_},
         how);
@@ -75,9 +76,9 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::align_pieces() {
     moved_ = true;
     __syncthreads();
     how.go_on();
-  } while (Touching && some_of(plan_.pieces, [&](int n) { return piece(n).leg == how.leg; }));
+  } while (HasContacts && some_of(plan_.pieces, [&](int n) { return piece(n).leg == how.leg; }));
   // again, since registers that live across calls would be spilled in the iterations too
-  if constexpr (Many) read_own();
+  if constexpr (Many) load_own();
 }
 
 }  // namespace pd::inline PD_TARGET

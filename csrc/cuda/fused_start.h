@@ -5,9 +5,9 @@
 namespace pd::inline PD_TARGET {
 
 // Where everything lies in the memory of the block, and what does not fit there.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::lay_out(const FusedCall<T>& call,
-                                                                    std::byte* shared) {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::lay_out(
+    const FusedCall<T>& call, std::byte* shared) {
   if constexpr (Clustered) {
     energies_ = reinterpret_cast<double*>(shared + cluster_energy_begin);
     entries_ =
@@ -23,42 +23,42 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::lay_out(const FusedC
     if constexpr (Kind == Blocks::one) {
       if (a == array_u) return position_ + plan_.most_slots;
       Quad<T>* const near = kept + (a - 1) * plan_.most_slots;
-      if constexpr (Near) return a < block_arrays ? near : far;
+      if constexpr (InShared) return a < block_arrays ? near : far;
       return a < call.kept ? near : far;
     }
-    if constexpr (Near) return kept + a * plan_.most_slots;
+    if constexpr (InShared) return kept + a * plan_.most_slots;
     return a < call.kept ? kept + a * plan_.most_slots : far;
   };
   v_ = {array(array_x), array(array_velocity), array(array_target), array(array_u),
         array(array_before)};
   origin_ = array(array_origin);
-  balls_ = reinterpret_cast<Ball<T>*>(entries_ + (Clustered ? 2 : 1) * plan_.most_entries);
-  planes_ = reinterpret_cast<Plane<T>*>(balls_ + call_.material.spheres_count);
+  spheres_ = reinterpret_cast<Ball<T>*>(entries_ + (Clustered ? 2 : 1) * plan_.most_entries);
+  planes_ = reinterpret_cast<Plane<T>*>(spheres_ + call_.material.spheres_count);
 }
 
 // What a thread knows of its patch.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::open(std::byte* shared) {
-  if constexpr (!Near) {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::init(std::byte* shared) {
+  if constexpr (!InShared) {
     const int threads = blockDim.x;
-    soon_ = min((patch_.outer + threads - 1) / threads * threads, soon_);
+    outer_pairs_ = min((patch_.outer + threads - 1) / threads * threads, outer_pairs_);
   }
   if constexpr (Clustered) {
     if (OwnHalo::vertex() < patch_.interior) row_ = patch_.row(OwnHalo::vertex());
-    halo_.open(patch_);
-    if (threadIdx.x == 0) ClusterSums(shared + cluster_sums_begin).open();
+    halo_.init(patch_);
+    if (threadIdx.x == 0) ClusterSums(shared + cluster_sums_begin).init();
     cluster_barrier();
   } else if constexpr (Many) {
-    if (int(threadIdx.x) < patch_.slots) row_ = patch_.row(slot_of_seat(threadIdx.x));
+    if (int(threadIdx.x) < patch_.slots) row_ = patch_.row(slot_of_item(threadIdx.x));
   }
 }
 
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::load() {
-  if (threadIdx.x == 0) in_.read_contacts(planes_, balls_);
-  contacts_ = {planes_, balls_, call_.material.planes_count, call_.material.spheres_count};
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load() {
+  if (threadIdx.x == 0) in_.read_contacts(planes_, spheres_);
+  contacts_ = {planes_, spheres_, call_.material.planes_count, call_.material.spheres_count};
   each_slot([&](int s) {
-    v_.load(s, in_, patch_.vertex(s), h_);
+    v_.init(s, in_, patch_.vertex(s), h_);
     const Vec3<T> none = {T(0), T(0), T(0)};
     if constexpr (Clustered) {
       return;
@@ -68,30 +68,30 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::load() {
   });
   // before the other blocks may write a step's result to the same place
   if (Clustered && threadIdx.x == 0) control_.anchor = in_.at_vertex(call_.positions, 0);
-  loaded_ = true;
+  just_loaded_ = true;
   moved_ = false;
   __syncthreads();
 }
 
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::move_balls() {
-  if constexpr (!Touching) return;
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::move_spheres() {
+  if constexpr (!HasContacts) return;
   __syncthreads();
   for (int b = threadIdx.x; b < contacts_.ball_count; b += blockDim.x)
-    balls_[b].center = balls_[b].center + balls_[b].motion;
+    spheres_[b].center = spheres_[b].center + spheres_[b].motion;
   __syncthreads();
 }
 
 // a and 1 / D of every vertex, w V of every element, and the smallest a / D
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::weigh() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::assemble_diagonal() {
   const T* stiffness = call_.material.stiffness.of(in_.environment);
-  constexpr bool own = Clustered && Once;
+  constexpr bool own = Clustered && OnePerThread;
   T plain = T(0);
   if constexpr (own) {
-    plain = weigh_own(stiffness, set_.weighted);
+    plain = compute_own_weight(stiffness, set_.weighted);
   } else {
-    weigh_with(stiffness, set_.weighted);
+    compute_weights(stiffness, set_.weighted);
   }
   if (threadIdx.x == 0) control_.progress.done = false;
   pending_ = false;
@@ -99,60 +99,60 @@ PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::weigh() {
   double least = HUGE_VAL;
   pass<false>(
       SolidDiagonal{}, [] {}, false,
-      [&](const Seat& at, const Seen&, const Vec3<T>& elastic) {
-        least = Least{}(least, v_.weigh(at.slot, elastic.x));
+      [&](const WorkItem& at, const LoadedVertex&, const Vec3<T>& elastic) {
+        least = Min{}(least, v_.set_diagonal(at.slot, elastic.x));
       });
-  sums_.all_reduce({least, 0, 0}, 1, Least{});
-  if (threadIdx.x == 0) control_.progress.least = sums_.total(0);
+  sums_.all_reduce({least, 0, 0}, 1, Min{});
+  if (threadIdx.x == 0) control_.progress.min_share = sums_.total(0);
   if constexpr (own) {
-    half_.weight = plain;
+    tet_.weight = plain;
   } else if (set_.weighted) {
-    weigh_with(stiffness, false);
+    compute_weights(stiffness, false);
   }
   __syncthreads();
 }
 
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::weigh_with(const T* stiffness,
-                                                                       bool bounded) {
-  weigh_pairs(patch_, rest_of<false>(patch_), stiffness, bounded, weights());
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::compute_weights(
+    const T* stiffness, bool bounded) {
+  compute_patch_weights(patch_, rest_of<false>(patch_), stiffness, bounded, weights());
   __syncthreads();  // one lane has left the weights of two
-  if constexpr (Many) read_own();
+  if constexpr (Many) load_own();
 }
 
 // What a thread keeps of its first tetrahedron, or its first pair.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE void FusedRunner<T, Touching, Loose, Kind, Near>::read_own() {
-  if constexpr (!Halves) {
-    pair_ = read_ahead(patch_, weights(), threadIdx.x);
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_own() {
+  if constexpr (!TetPerLane) {
+    pair_ = prefetch_pair(patch_, weights(), threadIdx.x);
     return;
   }
-  if constexpr (Clustered && Once) {
-    const T weight = half_.weight;
-    half_ = read_half<false, false, T>(patch_, nullptr, threadIdx.x);
-    half_.weight = weight;
+  if constexpr (Clustered && OnePerThread) {
+    const T weight = tet_.weight;
+    tet_ = load_tet<false, false, T>(patch_, nullptr, threadIdx.x);
+    tet_.weight = weight;
   } else {
-    half_ = read_half<false>(patch_, weights(), threadIdx.x);
+    tet_ = load_tet<false>(patch_, weights(), threadIdx.x);
   }
-  rest_ = half_rest(patch_, threadIdx.x);
+  rest_ = tet_rest(patch_, threadIdx.x);
   if constexpr (Clustered) counts_ = counts_energy(threadIdx.x);
 }
 
 // The same without memory where no thread has more than one tetrahedron. Returns its weight without the bound.
-template <class T, bool Touching, bool Loose, Blocks Kind, bool Near>
-PD_DEVICE T FusedRunner<T, Touching, Loose, Kind, Near>::weigh_own(const T* stiffness,
-                                                                   bool bounded) {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+PD_DEVICE T FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::compute_own_weight(
+    const T* stiffness, bool bounded) {
   const PairPlace place = place_of(patch_, min(int(threadIdx.x) / 2, patch_.pairs - 1));
   const int which = int(threadIdx.x) % 2, tet = tet_of(plan_, place, which);
   const auto rest = rest_of<false>(patch_).read(place);
   const T bound = bounded ? plan_.pair_bound[place.in(2) + which * pair_lanes] : T(1);
   T plain = T(0);
   if (tet >= 0) {
-    plain = which ? rest.template weight<OneOf<T, 1>>(stiffness[tet])
-                  : rest.template weight<OneOf<T, 0>>(stiffness[tet]);
+    plain = which ? rest.template weight<PairSide<T, 1>>(stiffness[tet])
+                  : rest.template weight<PairSide<T, 0>>(stiffness[tet]);
   }
-  half_.weight = bound * plain;
-  read_own();
+  tet_.weight = bound * plain;
+  load_own();
   return plain;
 }
 

@@ -9,7 +9,7 @@ namespace pd::inline PD_TARGET {
 
 // What the plan and an environment say of a lane's tetrahedron: the even lane has the first of the pair.
 template <class T>
-struct HalfNumbers {
+struct TetInputs {
   unsigned corner[4];  // 8 times the slot, plus 65536 times the entry
   T weight, factor;    // w V, pair_factor where rest shapes are computed
 
@@ -17,9 +17,9 @@ struct HalfNumbers {
 };
 
 // `number`: of the tetrahedron; `Computed`: see rest_of. Without `Weighed` the weight is not known yet.
-template <bool Computed, bool Weighed = true, class T>
-PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int number) {
-  HalfNumbers<T> numbers;
+template <bool Computed, bool WithWeights = true, class T>
+PD_DEVICE TetInputs<T> load_tet(const Patch<T>& patch, const T* weights, int number) {
+  TetInputs<T> numbers;
   // lanes past the end repeat the last pair
   const unsigned pair = unsigned(min(number / 2, patch.pairs - 1)), which = unsigned(number) & 1;
   // as of PairPlace, but by what the block of the patch knows
@@ -33,7 +33,7 @@ PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int 
   numbers.corner[3] = corner(3 + which);
   const unsigned own = of_two + which * pair_lanes;
   numbers.weight = T(0);
-  if constexpr (Weighed) numbers.weight = weights[own];
+  if constexpr (WithWeights) numbers.weight = weights[own];
   numbers.factor = T(1);
   if constexpr (Computed) numbers.factor = patch.plan.pair_factor[own];
   return numbers;
@@ -41,45 +41,45 @@ PD_DEVICE HalfNumbers<T> read_half(const Patch<T>& patch, const T* weights, int 
 
 // Rest shape of a lane's tetrahedron, as the plan has it.
 template <class T>
-PD_DEVICE FaceRest<T, 1> half_rest(const Patch<T>& patch, int number) {
+PD_DEVICE FaceRest<T, 1> tet_rest(const Patch<T>& patch, int number) {
   const PairPlace place = place_of(patch, min(number / 2, patch.pairs - 1));
   return rest_of<false>(patch).read_one(place, number % 2);
 }
 
 // The same worked out from the rest positions of its slots, which were looked at.
 template <class T>
-PD_DEVICE FaceRest<T, 1> half_rest(const HalfNumbers<T>& numbers, T per_unit, const Slots<T>& slots,
-                                   const Quad<T> (&seen)[4]) {
+PD_DEVICE FaceRest<T, 1> tet_rest(const TetInputs<T>& numbers, T per_unit, const Slots<T>& slots,
+                                  const Quad<T> (&loaded)[4]) {
   RestPoint<T> point[4];
   for (int c = 0; c < 4; ++c)
-    point[c] = RestPoint<T>::of(slots.second(numbers.slot_times_8(c), seen[c]));
+    point[c] = RestPoint<T>::of(slots.second(numbers.slot_times_8(c), loaded[c]));
   return ComputedRest<T>::between(point, per_unit, {numbers.factor});
 }
 
 // The same from the rest positions themselves.
 template <class T>
-PD_DEVICE FaceRest<T, 1> half_rest(const HalfNumbers<T>& numbers, T per_unit,
-                                   const RestPoint<T>* rest) {
+PD_DEVICE FaceRest<T, 1> tet_rest(const TetInputs<T>& numbers, T per_unit,
+                                  const RestPoint<T>* rest) {
   RestPoint<T> point[4];
   for (int c = 0; c < 4; ++c) point[c] = rest[numbers.slot_times_8(c) / 8];
   return ComputedRest<T>::between(point, per_unit, {numbers.factor});
 }
 
 template <class T, class Slots>
-PD_DEVICE void look(const HalfNumbers<T>& numbers, const Slots& slots, Quad<T> (&seen)[4]) {
-  for (int c = 0; c < 4; ++c) seen[c] = slots.look(numbers.slot_times_8(c));
+PD_DEVICE void load_corners(const TetInputs<T>& numbers, const Slots& slots, Quad<T> (&loaded)[4]) {
+  for (int c = 0; c < 4; ++c) loaded[c] = slots.load(numbers.slot_times_8(c));
 }
 
 // A tetrahedron as effects see elements that work on rest shapes and weights alone.
 template <class T>
-struct HalfElement {
+struct TetElement {
   using R = T;
   Mat3<T> inverse;
-  T weighs;
+  T own_weight;
   Vec3<T> (&force)[4];
 
   PD_HD const Mat3<T>& rest(int) const { return inverse; }
-  PD_HD const T& weight(int) const { return weighs; }
+  PD_HD const T& weight(int) const { return own_weight; }
   PD_HD void add(int, const Vec3<T> (&g)[4]) const {
     for (int c = 0; c < 4; ++c) force[c] = g[c];
   }
@@ -87,34 +87,34 @@ struct HalfElement {
 
 template <class T>
 PD_DEVICE Vec3<T> add_partner(const Vec3<T>& a) {
-  return {a.x + __shfl_xor_sync(whole_warp, a.x, 1), a.y + __shfl_xor_sync(whole_warp, a.y, 1),
-          a.z + __shfl_xor_sync(whole_warp, a.z, 1)};
+  return {a.x + __shfl_xor_sync(full_warp, a.x, 1), a.y + __shfl_xor_sync(full_warp, a.y, 1),
+          a.z + __shfl_xor_sync(full_warp, a.z, 1)};
 }
 
 // Runs an effect on the tetrahedra of all pairs; returns the sum of energies that this thread has met. `slots`: where positions
 // are. `now`: what `read_half` gave for this thread's first tetrahedron. `shape_of(number, numbers, seen)`: rest shape of a
 // tetrahedron, given what was seen of its slots; `counts(number, met)`: whether its energy does. `Once`: no thread has a second.
-template <bool Once, bool Computed, class T, class Slots, class Element, class ShapeOf,
+template <bool OnePerThread, bool Computed, class T, class Slots, class Element, class ShapeOf,
           class Counts>
-PD_DEVICE T each_half(const Patch<T>& patch, const Slots& slots, const ShapeOf& shape_of,
-                      const Counts& counts, const T* weights, Quad<T>* entries,
-                      const Element& element, HalfNumbers<T> now) {
+PD_DEVICE T each_tet(const Patch<T>& patch, const Slots& slots, const ShapeOf& shape_of,
+                     const Counts& counts, const T* weights, Quad<T>* entries,
+                     const Element& element, TetInputs<T> now) {
   T energy = T(0);
   const int lane = int(threadIdx.x) % warp_size, all = 2 * patch.pairs;
   for (int first = int(threadIdx.x) - lane; first < all; first += blockDim.x) {
-    HalfNumbers<T> next = now;
-    if (!Once && first + int(blockDim.x) < all)
-      next = read_half<Computed>(patch, weights, first + int(blockDim.x) + lane);
+    TetInputs<T> next = now;
+    if (!OnePerThread && first + int(blockDim.x) < all)
+      next = load_tet<Computed>(patch, weights, first + int(blockDim.x) + lane);
     Vec3<T> x[4], force[4];
-    Quad<T> seen[4];
-    look(now, slots, seen);
-    for (int c = 0; c < 4; ++c) x[c] = vec3(seen[c]);
-    T met = T(0);
-    const FaceRest<T, 1> rest = shape_of(first + lane, now, seen);
+    Quad<T> loaded[4];
+    load_corners(now, slots, loaded);
+    for (int c = 0; c < 4; ++c) x[c] = vec3(loaded[c]);
+    T tet_energy = T(0);
+    const FaceRest<T, 1> rest = shape_of(first + lane, now, loaded);
     if constexpr (OnFaces<Element>) {
-      element.run_face(x, rest, {now.weight}, force, met);
+      element.run_face(x, rest, {now.weight}, force, tet_energy);
     } else {
-      element.template run<1>(HalfElement<T>{rest.inverse(0), now.weight, force});
+      element.template run<1>(TetElement<T>{rest.inverse(0), now.weight, force});
     }
     for (int c = 0; c < 3; ++c) force[c] = add_partner(force[c]);
     const bool here = first + lane < all, second = lane & 1;
@@ -125,12 +125,12 @@ PD_DEVICE T each_half(const Patch<T>& patch, const Slots& slots, const ShapeOf& 
     const int entry = int((second ? now.corner[2] : now.corner[0]) >> 16);
     const int apex = int(now.corner[3] >> 16);
     if (here) {
-      if (counts(first + lane, met)) energy += met;
+      if (counts(first + lane, tet_energy)) energy += tet_energy;
       entries[entry] = quad(own);
       if (!second) entries[now.corner[1] >> 16] = quad(force[1]);
       if (apex != no_entry) entries[apex] = quad(force[3]);
     }
-    if (Once) break;
+    if (OnePerThread) break;
     now = next;
   }
   return energy;

@@ -14,7 +14,7 @@ struct SlotPositions {
   const Quad<T>* first;
 
   // as pair_corner has slots
-  PD_DEVICE Quad<T> look(unsigned slot_times_8) const {
+  PD_DEVICE Quad<T> load(unsigned slot_times_8) const {
     const auto* bytes = reinterpret_cast<const std::byte*>(first);
     return *reinterpret_cast<const Quad<T>*>(bytes + slot_times_8 * (unsigned(sizeof(*first)) / 8));
   }
@@ -39,7 +39,7 @@ class Halo {
   PD_DEVICE static int part() { return int(threadIdx.x) % warp_size / vertices; }
 
   // All threads, before a barrier of the cluster.
-  PD_DEVICE void open(const Patch<T>& patch) {
+  PD_DEVICE void init(const Patch<T>& patch) {
     if (vertex() < patch.interior) {
       const int32* copies =
           patch.plan.slot_copy + (patch.first_vertex + vertex()) * int(most_cluster_blocks);
@@ -51,10 +51,10 @@ class Halo {
         places_ += place >= 0;
       }
     }
-    most_ = __reduce_max_sync(whole_warp, places_);
+    most_ = __reduce_max_sync(full_warp, places_);
     expected_ = patch.slots * int(sizeof(Quad<T>));
     if (threadIdx.x == 0) {
-      for (int round = 0; round < 2; ++round) barrier(round).open();
+      for (int round = 0; round < 2; ++round) barrier(round).init();
     }
   }
 
@@ -62,16 +62,16 @@ class Halo {
 
   // Whole warps that have own vertices, once a round, numbered from 1, after the wait for the one before.
   PD_DEVICE void send(const Vec3<T>& position, unsigned round) const {
-    const Quad<T> letter = quad(position);
+    const Quad<T> payload = quad(position);
     const Quad<T>* const row = place(round);
-    const SharedAddress meets = barrier(round).address();
+    const SharedAddress barrier_address = barrier(round).address();
     if (threadIdx.x == 0) barrier(round).expect(expected_);
 #pragma unroll
     for (int j = 0; j < most_places; ++j) {
       if (j > 0 && j >= most_) break;
       const int patch = place_[j] >> 16, slot = place_[j] & 0xffff;
-      pd::send(at_block(shared_address(row + slot), patch), at_block(meets, patch), letter,
-               j < places_);
+      pd::send(at_block(shared_address(row + slot), patch), at_block(barrier_address, patch),
+               payload, j < places_);
     }
     __syncwarp();
   }
@@ -81,27 +81,27 @@ class Halo {
 
   // Whole warps: the force on the vertex of this lane, whose entries its lanes take by turns, four at a time.
   PD_DEVICE static Vec3<T> sum_entries(const Quad<T>* entries, int row) {
-    constexpr int together = 4, step = Lanes * entry_stride;
+    constexpr int in_flight = 4, step = Lanes * entry_stride;
     const int count = row >> 16 & 0x7fff;
     const Quad<T>* entry = entries + (unsigned(row) & 0xffff) + part() * entry_stride;
     Vec3<T> sum = {T(0), T(0), T(0)};
 #pragma unroll 1
-    for (int j = part(); j < count; j += together * Lanes, entry += together * step) {
-      Vec3<T> force[together];
+    for (int j = part(); j < count; j += in_flight * Lanes, entry += in_flight * step) {
+      Vec3<T> force[in_flight];
 #pragma unroll
-      for (int i = 0; i < together; ++i) {
+      for (int i = 0; i < in_flight; ++i) {
         force[i] = {T(0), T(0), T(0)};
         if (j + i * Lanes < count) force[i] = vec3(entry[i * step]);
       }
 #pragma unroll
-      for (int i = 0; i < together; ++i) sum = sum + force[i];
+      for (int i = 0; i < in_flight; ++i) sum = sum + force[i];
     }
     __syncwarp();
 #pragma unroll
     for (int distance = vertices; distance < warp_size; distance *= 2) {
-      sum = sum + Vec3<T>{__shfl_xor_sync(whole_warp, sum.x, distance),
-                          __shfl_xor_sync(whole_warp, sum.y, distance),
-                          __shfl_xor_sync(whole_warp, sum.z, distance)};
+      sum = sum + Vec3<T>{__shfl_xor_sync(full_warp, sum.x, distance),
+                          __shfl_xor_sync(full_warp, sum.y, distance),
+                          __shfl_xor_sync(full_warp, sum.z, distance)};
     }
     return sum;
   }

@@ -12,14 +12,14 @@ namespace pd::inline PD_TARGET {
 // What decides how an environment goes on.
 struct Progress {
   Schedule schedule;
-  double least;  // smallest a / D
+  double min_share;  // smallest a / D
   SoftStop stop;
   int used;  // iterations
   bool done;
 
   // the soft stop, by sums of an iteration of weight omega
-  PD_HD bool ends(double tolerance, double omega, double change, double way) {
-    return stop.ends(tolerance, schedule.share_of(omega), change, way);
+  PD_HD bool ends(double tolerance, double omega, double change, double displacement) {
+    return stop.ends(tolerance, schedule.share_of(omega), change, displacement);
   }
 };
 
@@ -45,7 +45,7 @@ struct Inputs {
     return call->plan.pins ? call->plan.vertex_pin[vertex] : -1;
   }
 
-  PD_DEVICE T spring(int pin) const {
+  PD_DEVICE T pin_stiffness(int pin) const {
     return pin < 0 ? T(0) : call->material.pin_stiffness.of(environment)[pin];
   }
 
@@ -53,17 +53,17 @@ struct Inputs {
 
   // a, zero where a pin holds the vertex exactly
   PD_DEVICE T inertia(int vertex, T h) const {
-    const T stiffness = spring(pin(vertex));
+    const T stiffness = pin_stiffness(pin(vertex));
     return held_inertia(inertia_weight(mass(vertex), damping(), stiffness, h), stiffness);
   }
 
   // s, the displacement that everything but elasticity wants
   PD_DEVICE Vec3<T> target(int vertex, const Vec3<T>& x, const Vec3<T>& velocity, T h) const {
-    const int held = pin(vertex);
-    const T stiffness = spring(held);
+    const int index = pin(vertex);
+    const T stiffness = pin_stiffness(index);
     Vec3<T> offset = {T(0), T(0), T(0)}, force = offset;
-    if (held >= 0)
-      offset = read3(call->material.pin_targets.of(environment) + 3 * std::int64_t(held)) - x;
+    if (index >= 0)
+      offset = read3(call->material.pin_targets.of(environment) + 3 * std::int64_t(index)) - x;
     if (!(stiffness < T(HUGE_VAL))) return offset;
     if (call->forces) force = at_vertex(call->forces, vertex);
     const T weight = inertia_weight(mass(vertex), damping(), stiffness, h);
@@ -71,12 +71,12 @@ struct Inputs {
     return inertia_target(weight, mass(vertex), velocity, gravity, force, stiffness, offset, h);
   }
 
-  PD_DEVICE double fall() const {
+  PD_DEVICE double free_fall_squared() const {
     const Vec3<T> gravity = read3(call->material.gravity.of(environment));
     return square_of_fall(call->plan.vertices, call->settings.time_step, gravity);
   }
 
-  PD_DEVICE void read_contacts(Plane<T>* planes, Ball<T>* balls) const {
+  PD_DEVICE void read_contacts(Plane<T>* planes, Ball<T>* spheres) const {
     const Material<T>& material = call->material;
     for (int c = 0; c < material.planes_count; ++c) {
       const T* p = material.planes.of(environment) + planes_numbers * c;
@@ -84,7 +84,7 @@ struct Inputs {
     }
     for (int c = 0; c < material.spheres_count; ++c) {
       const T* p = material.spheres.of(environment) + spheres_numbers * c;
-      balls[c] = {read3(p), read3(p + spheres_motion), p[spheres_radius], p[spheres_friction]};
+      spheres[c] = {read3(p), read3(p + spheres_motion), p[spheres_radius], p[spheres_friction]};
     }
   }
 
@@ -100,7 +100,7 @@ struct Inputs {
     to[info_residual] = to[info_energy] = NAN;
     to[info_iterations] = progress.used;
     to[info_restarts] = progress.schedule.restarts;
-    to[info_converged] = progress.done && progress.least >= 0;
+    to[info_converged] = progress.done && progress.min_share >= 0;
     to[info_rho] = progress.schedule.rho;
     to[info_inverted] = -1;
   }

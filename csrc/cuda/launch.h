@@ -26,11 +26,11 @@ using Stream = void*;  // cudaStream_t
 
 // What a scene asks of the kernels beside elements and vertices: contacts; pieces that pins leave to move.
 template <class T>
-bool touches(const DeviceStep<T>& call) {
+bool has_contacts(const DeviceStep<T>& call) {
   return call.material.planes_count + call.material.spheres_count > 0;
 }
 template <class T>
-bool has_loose(const DeviceStep<T>& call) {
+bool has_free_pieces(const DeviceStep<T>& call) {
   return call.plan.pieces > 0;
 }
 
@@ -41,11 +41,11 @@ template <class T>
 void run_fused(const DeviceStep<T>& call, void* memory, Stream stream);
 // The same of kernel block for meshes so small that a block may have several environments, in float32.
 template <class T>
-bool takes_several(const DeviceStep<T>& call);
+bool takes_small_batch(const DeviceStep<T>& call);
 template <class T>
-std::int64_t several_bytes(const DeviceStep<T>& call);
+std::int64_t small_batch_bytes(const DeviceStep<T>& call);
 template <class T>
-void run_several(const DeviceStep<T>& call, void* memory, Stream stream);
+void run_small_batch(const DeviceStep<T>& call, void* memory, Stream stream);
 
 // Blocks of the largest cluster that the current device runs; 1: it has none, or this build no code for them.
 int largest_cluster();

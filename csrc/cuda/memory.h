@@ -52,7 +52,7 @@ PD_DEVICE double in_register(double value) {
 
 // Any number, for no instruction.
 template <class T>
-PD_DEVICE T unwritten() {
+PD_DEVICE T undefined_number() {
   T any;
   if constexpr (sizeof(T) == 4) {
     asm volatile("" : "=f"(any));
@@ -64,20 +64,20 @@ PD_DEVICE T unwritten() {
 
 // Has some threads, by default those of the block, bring items into the L2 cache, for whoever reads them later.
 template <class Item>
-PD_DEVICE void bring_near(const Item* items, int count, int thread, int threads) {
+PD_DEVICE void prefetch_to_l2(const Item* items, int count, int thread, int threads) {
   constexpr int line = 128 / sizeof(Item);
 #pragma unroll 1
   for (int i = thread * line; i < count; i += threads * line)
     asm volatile("prefetch.global.L2 [%0];" ::"l"(items + i));
 }
 template <class Item>
-PD_DEVICE void bring_near(const Item* items, int count) {
-  bring_near(items, count, int(threadIdx.x), int(blockDim.x));
+PD_DEVICE void prefetch_to_l2(const Item* items, int count) {
+  prefetch_to_l2(items, count, int(threadIdx.x), int(blockDim.x));
 }
 
 // The same by one thread in one instruction where there is one, from compute capability 9.0 on; else by `threads` of them.
 template <class Item>
-PD_DEVICE void bring_all_near(const Item* items, int count, int thread, int threads) {
+PD_DEVICE void bulk_prefetch_to_l2(const Item* items, int count, int thread, int threads) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   constexpr std::uintptr_t unit = 16;
   const auto begin = reinterpret_cast<std::uintptr_t>(items) / unit * unit;
@@ -86,7 +86,7 @@ PD_DEVICE void bring_all_near(const Item* items, int count, int thread, int thre
     asm volatile("cp.async.bulk.prefetch.L2.global [%0], %1;" ::"l"(begin),
                  "r"(unsigned((end - begin) / unit * unit)));
 #else
-  bring_near(items, count, thread, threads);
+  prefetch_to_l2(items, count, thread, threads);
 #endif
 }
 

@@ -29,8 +29,8 @@ class MisfitRunner {
     const int lane = threadIdx.x % warp_size, warp = threadIdx.x / warp_size;
     __syncthreads();  // the shared arrays of the round before have been read
     for (int n = 0; n < ranges_count; ++n) {
-      const double low = across_warp(range[n].least, Least{});
-      const double high = -across_warp(-range[n].largest, Least{});
+      const double low = warp_reduce(range[n].least, Min{});
+      const double high = -warp_reduce(-range[n].largest, Min{});
       if (lane == 0) {
         least[n][warp] = low;
         largest[n][warp] = high;
@@ -48,7 +48,7 @@ class MisfitRunner {
     for (int n = 0; n < ranges_count; ++n) {
       Range all;
       for (int b = lane; b < team_.blocks(); b += warp_size) all.add(rows[b * ranges_count + n]);
-      range[n] = {across_warp(all.least, Least{}), -across_warp(-all.largest, Least{})};
+      range[n] = {warp_reduce(all.least, Min{}), -warp_reduce(-all.largest, Min{})};
     }
   }
 

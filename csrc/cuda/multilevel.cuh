@@ -12,7 +12,7 @@ namespace pd {
 static_assert(sizeof(OuterControl) + pass_static_bytes <= outer_static_bytes);
 static_assert(sizeof(OuterControl::warp_dot) >= 4 * outer_warps * sizeof(Quad<double>));
 
-template <class T, bool Touching, int Threads>
+template <class T, bool HasContacts, int Threads>
 __global__ void __launch_bounds__(Threads, Threads == outer_threads ? 1 : small_outer_blocks)
     outer_iterations(const __grid_constant__ OuterCall<T> call) {
   extern __shared__ __align__(16) std::byte shared[];
@@ -25,7 +25,7 @@ __global__ void __launch_bounds__(Threads, Threads == outer_threads ? 1 : small_
     arrange(arena, call.plan().levels, 1, memory.cycle);
   }
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
-    MultilevelRunner<T, Touching, Threads> runner(
+    MultilevelRunner<T, HasContacts, Threads> runner(
         call, memory, e, team, *reinterpret_cast<OuterControl*>(control), shared);
     multilevel_iterations(runner, call.stream.step.settings);
   }
@@ -136,8 +136,8 @@ struct OuterLaunch {
 
   static OuterKernel<T> kernel_of(const DeviceStep<T>& step) {
     const auto of = [&]<int Threads>() {
-      return touches(step) ? outer_iterations<T, true, Threads>
-                           : outer_iterations<T, false, Threads>;
+      return has_contacts(step) ? outer_iterations<T, true, Threads>
+                                : outer_iterations<T, false, Threads>;
     };
     return is_small(step) ? of.template operator()<small_outer_threads>()
                           : of.template operator()<outer_threads>();
@@ -159,7 +159,7 @@ OuterMemory<T> arrange(Arena& arena, const OuterCall<T>& call) {
   const std::int64_t teams = call.teams, n = step.plan.vertices;
   const std::int64_t pairs = step.settings.learns() ? history * n : 0;
   const std::int64_t small = step.settings.schedule == ScheduleKind::corotated ? teams : 0;
-  const std::int64_t held = touches(step) ? n : 0;
+  const std::int64_t held = has_contacts(step) ? n : 0;
   OuterMemory<T> m;
   // what must start as zero comes first
   arena.place(m.counter, teams);

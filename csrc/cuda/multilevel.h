@@ -9,7 +9,7 @@
 
 namespace pd::inline PD_TARGET {
 
-template <class T, bool Touching, int Threads>
+template <class T, bool HasContacts, int Threads>
 class MultilevelRunner {
   static constexpr int warps = Threads / warp_size;
   struct Nothing {};
@@ -33,8 +33,8 @@ class MultilevelRunner {
     outliers_ = {misfit.strangers, T(misfit.trusted)};
     if (threadIdx.x == 0) {
       const bool stops = w_.settings().tolerance > 0;
-      c_.outer.begin(misfit, Touching, w_.contacts.friction() > T(0), corotates_, energy_noise<T>(),
-                     stops ? w_.progress.stop.fall : 0);
+      c_.outer.begin(misfit, HasContacts, w_.contacts.friction() > T(0), corotates_,
+                     energy_noise<T>(), stops ? w_.progress.stop.fall : 0);
       c_.pairs = {};
       c_.done = false;
     }
@@ -50,7 +50,7 @@ class MultilevelRunner {
     for (int patch = team_.rank(); patch < w_.plan.patches; patch += team_.blocks()) {
       ThreadSums sums = {{0, 0, 0}};
       sums.value[0] += pass_over_patch(
-          w_, patch, shared_, SolidGradient<true>{}, [&](int i) { return w_.v.see(i); },
+          w_, patch, shared_, SolidGradient<true>{}, [&](int i) { return w_.v.load(i); },
           [&](int i, const auto& seen, const Vec3<T>& force) { look_at(i, seen, force, sums); });
       write_sums<Visit::update>(sums, m_.patch_sums + patch * sums_count);
     }
@@ -68,7 +68,7 @@ class MultilevelRunner {
   PD_DEVICE void judge(int) {
     // the shared vertices' part is there
     double sum[2] = {patch_sum_[0], patch_sum_[1]};
-    add_across_warp(sum);
+    warp_reduce_sums(sum);
     const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
     if (lane == 0) {
       for (int n = 0; n < 2; ++n) c_.warp_dot[warp][n] = sum[n];
@@ -76,7 +76,7 @@ class MultilevelRunner {
     __syncthreads();
     if (warp == 0) {
       for (int n = 0; n < 2; ++n) sum[n] = lane < warps ? c_.warp_dot[lane][n] : 0;
-      add_across_warp(sum);
+      warp_reduce_sums(sum);
     }
     if (threadIdx.x == 0) {
       const double work = c_.outer.known ? c_.total[dots_energy + 1] + sum[1] : 0;
@@ -128,8 +128,8 @@ class MultilevelRunner {
       const Vec3<T> before = vec3(iteration_ == 0 ? w_.v.u[i]
                                   : moved         ? m_.base[i]
                                                   : w_.v.before[i]);
-      if constexpr (Touching) keep_directions(i);
-      const Vec3<T> slope = Touching ? vec3(m_.gradient[i]) : at.residual;
+      if constexpr (HasContacts) keep_directions(i);
+      const Vec3<T> slope = HasContacts ? vec3(m_.gradient[i]) : at.residual;
       const Vec3<T> next =
           falls_back
               ? at.jacobi(w_.contacts, before, slope, accelerates, theta, T(1) + beta)
@@ -167,14 +167,14 @@ class MultilevelRunner {
   PD_DEVICE static Vec3<T> none() { return {T(0), T(0), T(0)}; }
 
   // whether contacts are in the small problem
-  PD_DEVICE bool is_held() const { return Touching && made_ > 0 && corotation_.control().held; }
+  PD_DEVICE bool is_held() const { return HasContacts && made_ > 0 && corotation_.control().held; }
 
-  PD_DEVICE void look_at(int i, const typename Vertices<T, Touching>::Seen& seen,
+  PD_DEVICE void look_at(int i, const typename Vertices<T, HasContacts>::LoadedVertex& seen,
                          const Vec3<T>& force, ThreadSums& sums) const {
     const auto& v = seen.vertex;
     sums.value[0] += seen.energy();
     m_.fresh[i] = quad(v.unbalanced(w_.contacts, seen.u, force));
-    if constexpr (Touching) {
+    if constexpr (HasContacts) {
       const Leeway<T> left = v.leeway(w_.contacts, seen.u, force);
       m_.fresh_free[i] = left.free;
       m_.fresh_friction[i] = quad(v.friction(left.taken));
@@ -194,7 +194,7 @@ class MultilevelRunner {
     pass<outer_dots, T>([&](int i, T(&sum)[outer_dots]) {
       if (i >= first_shared) {
         ThreadSums sums = {{0, 0, 0}};
-        const auto seen = w_.v.see(i);
+        const auto seen = w_.v.load(i);
         look_at(i, seen, shared_force(w_, SharedPlaces(w_.plan, i - first_shared)), sums);
         for (int n = 0; n < 2; ++n) sum[dots_energy + n] = T(sums.value[n]);
       }
@@ -207,7 +207,7 @@ class MultilevelRunner {
       if (k == 0 || k == w_.settings().iterations) return;
       const Vec3<T> change = u - vec3(m_.base[i]);
       sum[dots_change] = dot(change, change);
-      if constexpr (Touching) {
+      if constexpr (HasContacts) {
         for (int a = 0; corotates_ && a < 3; ++a) {
           const Vec3<T> d = m_.fresh_free[i].row[a] - m_.free[i].row[a];
           sum[dots_held] += dot(d, d);
@@ -304,7 +304,7 @@ class MultilevelRunner {
         for (int n = 0; n < each; ++n) sum[n] += chunk + u * warp_size < chunks ? part[u][n] : 0;
       }
     }
-    add_across_warp(sum);
+    warp_reduce_sums(sum);
 #pragma unroll
     for (int n = 0; n < each; ++n) {
       if (lane == 0 && warp + n * warps < Count) c_.total[warp + n * warps] = sum[n];
@@ -344,8 +344,8 @@ class MultilevelRunner {
   }
 
   // from where it stands
-  PD_DEVICE TrialVertex<Thread<T>, Touching> trial_vertex(const Vertex<Thread<T>, Touching>& v,
-                                                          int i) const {
+  PD_DEVICE TrialVertex<Thread<T>, HasContacts> trial_vertex(
+      const Vertex<Thread<T>, HasContacts>& v, int i) const {
     return {v, vec3(base_[i]), vec3(pull_[i]), free_ + i, w_.plan.levels, i, outliers_};
   }
   // TrialVertex::completed, which reads memory as late as it can: kept in registers, its numbers are spilled.
@@ -353,7 +353,7 @@ class MultilevelRunner {
     const auto free = [&](const Vec3<T>& field) { return free_[i] * field; };
     const Vec3<T> diagonal = w_.v.u[i].w * vec3(pull_[i]);
     if (outliers_.some && is_outlier(i)) return diagonal;
-    if constexpr (!Touching) return d;
+    if constexpr (!HasContacts) return d;
     return free(d) + (diagonal - free(diagonal));
   }
   PD_DEVICE bool is_outlier(int i) const {
@@ -373,7 +373,7 @@ class MultilevelRunner {
   PD_DEVICE void see_pairs(const Quad<T>* field, int i, Vec3<T> (&seen)[history]) const;
 
   const OuterCall<T>& call_;
-  const StreamWork<T, Touching> w_;
+  const StreamWork<T, HasContacts> w_;
   const OuterMemory<T>& m_;
   BlockTeam& team_;
   OuterControl& c_;

@@ -5,8 +5,8 @@
 namespace pd::inline PD_TARGET {
 
 // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
-template <class T, bool Touching, int Threads>
-PD_DEVICE void MultilevelRunner<T, Touching, Threads>::precondition() {
+template <class T, bool HasContacts, int Threads>
+PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::precondition() {
   if (corotates_) corotate();
   const double scale = c_.outer.weight(w_.settings().relaxation, is_held());
   const auto right_side = [&](int i) {
@@ -24,7 +24,7 @@ PD_DEVICE void MultilevelRunner<T, Touching, Threads>::precondition() {
   };
   // where something holds vertices that M has free, the small problem takes its part before the cycle, and gives what that
   // lacks after it
-  const bool around = corotated_ && !w_.plan.levels.direct && (Touching || outliers_.some);
+  const bool around = corotated_ && !w_.plan.levels.direct && (HasContacts || outliers_.some);
   if (corotated_) {
     pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
       const Vec3<T> q = right_side(i);
@@ -50,9 +50,9 @@ PD_DEVICE void MultilevelRunner<T, Touching, Threads>::precondition() {
   if (lbfgs_) correct(!apart);
 }
 
-template <class T, bool Touching, int Threads>
-PD_DEVICE void MultilevelRunner<T, Touching, Threads>::corotate() {
-  const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_, Touching,
+template <class T, bool HasContacts, int Threads>
+PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::corotate() {
+  const TurningPlan plan(iteration_, made_, c_.outer.restarts - doubted_, HasContacts,
                          c_.outer.turns());
   const CorotationInput<T> in = {w_.v.x, w_.v.u, w_.v.target, base_, w_.weights};
   if (plan.forget) corotated_ = false;
@@ -65,7 +65,7 @@ PD_DEVICE void MultilevelRunner<T, Touching, Threads>::corotate() {
                             c_.outer.scale, corotation_.with_plan(call_.plan()));
     if (threadIdx.x == 0) c_.outer.strayed = 0;
   }
-  if constexpr (Touching) {
+  if constexpr (HasContacts) {
     if (corotated_ && !holds_)
       team_ = hold_corotation(in, free_, m_.corotation, team_, shared_, c_.outer.scale,
                               corotation_.control());
@@ -75,8 +75,8 @@ PD_DEVICE void MultilevelRunner<T, Touching, Threads>::corotate() {
 
 // the second loop of L-BFGS, and the slope g.d
 // `last`: the last part of the cycle has still to be done.
-template <class T, bool Touching, int Threads>
-PD_DEVICE void MultilevelRunner<T, Touching, Threads>::correct(bool last) {
+template <class T, bool HasContacts, int Threads>
+PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::correct(bool last) {
   const auto visit = [&](int i, T(&sum)[history + 1]) {
     // before anything is written, that it may be asked for with the rest
     Vec3<T> y[history];
@@ -103,8 +103,8 @@ PD_DEVICE void MultilevelRunner<T, Touching, Threads>::correct(bool last) {
   __syncthreads();
 }
 
-template <class T, bool Touching, int Threads>
-PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::direction(int i) const {
+template <class T, bool HasContacts, int Threads>
+PD_DEVICE Vec3<T> MultilevelRunner<T, HasContacts, Threads>::direction(int i) const {
   Vec3<T> d = cycle_.result(i);
   if (!lbfgs_) return d;
   Vec3<T> s[history];
@@ -117,9 +117,9 @@ PD_DEVICE Vec3<T> MultilevelRunner<T, Touching, Threads>::direction(int i) const
 }
 
 // A field of the pairs at a vertex, all asked for at once: in place of one that is not valid any that is there.
-template <class T, bool Touching, int Threads>
-PD_DEVICE void MultilevelRunner<T, Touching, Threads>::see_pairs(const Quad<T>* field, int i,
-                                                                 Vec3<T> (&seen)[history]) const {
+template <class T, bool HasContacts, int Threads>
+PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::see_pairs(
+    const Quad<T>* field, int i, Vec3<T> (&seen)[history]) const {
 #pragma unroll
   for (int j = 0; j < history; ++j) {
     const Quad<T>* from = c_.pairs.valid[j] ? field + j * vertices() : w_.v.u;

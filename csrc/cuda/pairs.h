@@ -58,7 +58,7 @@ class PairLanes {
   PD_DEVICE int place(int age) const { return Pairs::older(newest_, age); }
   PD_DEVICE int age() const { return (newest_ - own_ + history) % history; }
   PD_DEVICE static double across(double value, int from) {
-    return __shfl_sync(whole_warp, value, from);
+    return __shfl_sync(full_warp, value, from);
   }
 
   Pairs& pairs_;

@@ -56,7 +56,7 @@ struct Pair {
 
 // One tetrahedron of a pair.
 template <class T, int Which>
-struct OneOf {
+struct PairSide {
   using R = T;
   static constexpr int which = Which;
 
@@ -95,7 +95,7 @@ PD_DEVICE PairPlace place_of(const Patch<T>& patch, int pair) {
 
 // What the plan and an environment say of a pair, but for its rest shape.
 template <class T>
-struct PairNumbers {
+struct PairInputs {
   unsigned corner[5];
   T weight[2];
 
@@ -104,14 +104,14 @@ struct PairNumbers {
 };
 
 // Without `Weighed` the weights are not known yet.
-template <bool Weighed = true, class T>
-PD_DEVICE PairNumbers<T> read_pair(const DevicePlan<T>& plan, const T* weights, PairPlace place) {
-  PairNumbers<T> numbers;
+template <bool WithWeights = true, class T>
+PD_DEVICE PairInputs<T> load_pair(const DevicePlan<T>& plan, const T* weights, PairPlace place) {
+  PairInputs<T> numbers;
   const int32* const corner = plan.pair_corner + place.in(5);
   for (int c = 0; c < 5; ++c) numbers.corner[c] = unsigned(corner[c * pair_lanes]);
   for (int e = 0; e < 2; ++e) {
     numbers.weight[e] = T(0);
-    if constexpr (Weighed) numbers.weight[e] = (weights + place.in(2))[e * pair_lanes];
+    if constexpr (WithWeights) numbers.weight[e] = (weights + place.in(2))[e * pair_lanes];
   }
   return numbers;
 }
@@ -134,13 +134,13 @@ struct StoredRest {
     T volume[2];
 
     // w V
-    template <class Take>
+    template <class Side>
     PD_HD T weight(T stiffness) const {
-      return volume[Take::which] * stiffness;
+      return volume[Side::which] * stiffness;
     }
   };
 
-  PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>&) const { return read(place); }
+  PD_DEVICE Numbers read(PairPlace place, const PairInputs<T>&) const { return read(place); }
   PD_DEVICE Numbers read(PairPlace place) const {
     const Quad<T>* const quad = quads(place);
     const Quad<T> face = quad[0], one = quad[pair_lanes], other = quad[2 * pair_lanes];
@@ -215,13 +215,13 @@ struct ComputedRest {
     FaceRest<T, 2> face;
     T factor[2], unit;
 
-    template <class Take>
+    template <class Side>
     PD_HD T weight(T stiffness) const {
-      return tet_weight(patch_weight(unit, stiffness), factor[Take::which]);
+      return tet_weight(patch_weight(unit, stiffness), factor[Side::which]);
     }
   };
 
-  PD_DEVICE Numbers read(PairPlace place, const PairNumbers<T>& pair) const {
+  PD_DEVICE Numbers read(PairPlace place, const PairInputs<T>& pair) const {
     Numbers numbers;
     RestPoint<T> corner[5];
     for (int c = 0; c < 5; ++c) corner[c] = position[pair.slot(c)];
@@ -260,37 +260,37 @@ PD_DEVICE auto rest_of(const Patch<T>& patch) {
 }
 
 // A pair as effects see elements.
-template <class T, int Fields, class Take>
+template <class T, int Fields, class Side>
 struct PairElement {
-  using R = typename Take::R;
+  using R = typename Side::R;
   Pair<T, Fields>& pair;
   Mat3<R> inverse;
-  R weighs;
+  R own_weight;
   R& energy;
 
   PD_HD void corners(int, int field, Vec3<R> (&x)[4]) const {
-    for (int c = 0; c < 3; ++c) x[c] = Take::pick(pair.corner[field][c], pair.corner[field][c]);
-    x[3] = Take::pick(pair.corner[field][3], pair.corner[field][4]);
+    for (int c = 0; c < 3; ++c) x[c] = Side::pick(pair.corner[field][c], pair.corner[field][c]);
+    x[3] = Side::pick(pair.corner[field][3], pair.corner[field][4]);
   }
   PD_HD const Mat3<R>& rest(int) const { return inverse; }
-  PD_HD const R& weight(int) const { return weighs; }
+  PD_HD const R& weight(int) const { return own_weight; }
   PD_HD R& sum(int) const { return energy; }
-  PD_HD void add(int, const Vec3<R> (&g)[4]) const { Take::add(pair, g); }
+  PD_HD void add(int, const Vec3<R> (&g)[4]) const { Side::add(pair, g); }
 };
 
 // A force in its entry, whose fourth number nobody reads: whatever stands in the register.
 template <class T>
-PD_DEVICE void leave(const Vec3<T>& force, Quad<T>& entry) {
-  entry = quad(force, unwritten<T>());
+PD_DEVICE void write_entry(const Vec3<T>& force, Quad<T>& entry) {
+  entry = quad(force, undefined_number<T>());
 }
 
 // Runs an effect on one pair, adds what it meets of energy, and leaves the forces. `read(corner, vectors)`: those that elements
 // want of the slot of a corner, as pair_corner has it.
 template <int Fields, class T, class Read, class Shape, class Element>
-PD_DEVICE void work_on_pair(const Read& read, const Shape& shape, const PairNumbers<T>& numbers,
+PD_DEVICE void process_pair(const Read& read, const Shape& shape, const PairInputs<T>& numbers,
                             Quad<T>* entries, const Element& element, T& energy) {
-  using First = OneOf<T, 0>;
-  using Second = OneOf<T, 1>;
+  using First = PairSide<T, 0>;
+  using Second = PairSide<T, 1>;
   Pair<T, Fields> pair;
   for (int c = 0; c < 5; ++c) {
     Vec3<T> vectors[Fields];
@@ -305,8 +305,8 @@ PD_DEVICE void work_on_pair(const Read& read, const Shape& shape, const PairNumb
     element.template run<1>(
         PairElement<T, Fields, Second>{pair, shape.face.inverse(1), numbers.weight[1], energy});
   }
-  for (int c = 0; c < 4; ++c) leave(pair.force[c], entries[numbers.entry(c)]);
-  if (numbers.entry(4) != no_entry) leave(pair.force[4], entries[numbers.entry(4)]);
+  for (int c = 0; c < 4; ++c) write_entry(pair.force[c], entries[numbers.entry(c)]);
+  if (numbers.entry(4) != no_entry) write_entry(pair.force[4], entries[numbers.entry(4)]);
 }
 
 // The same for every pair of a patch, a thread a pair; returns the sum of energies that this thread has met.
@@ -316,12 +316,12 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
   T energy = T(0);
   weights = in_register(weights);
   const auto read_numbers = [&](int number) {
-    return read_pair(patch.plan, weights, place_of(patch, min(number, patch.pairs - 1)));
+    return load_pair(patch.plan, weights, place_of(patch, min(number, patch.pairs - 1)));
   };
-  PairNumbers<T> now = read_numbers(threadIdx.x);
+  PairInputs<T> now = read_numbers(threadIdx.x);
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const typename Rest::Numbers shape = rest.read(place_of(patch, number), now);
-    work_on_pair<Fields>(read, shape, now, entries, element, energy);
+    process_pair<Fields>(read, shape, now, entries, element, energy);
     // here rather than at the top: fewer registers are spilled
     now = read_numbers(number + int(blockDim.x));
   }
@@ -330,27 +330,27 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
 
 // w V of a pair, times l_e when `bounded`.
 template <class T, class Rest>
-PD_DEVICE void weigh_pair(const DevicePlan<T>& plan, const Rest& rest, PairPlace place,
-                          const T* stiffness, bool bounded, T* weights) {
+PD_DEVICE void compute_pair_weights(const DevicePlan<T>& plan, const Rest& rest, PairPlace place,
+                                    const T* stiffness, bool bounded, T* weights) {
   const typename Rest::Numbers numbers =
-      rest.read(place, read_pair<false, T>(plan, nullptr, place));
-  const auto weigh = [&](auto take) {
-    using Take = decltype(take);
-    const unsigned at = place.in(2) + Take::which * pair_lanes;
-    const int tet = tet_of(plan, place, Take::which);
+      rest.read(place, load_pair<false, T>(plan, nullptr, place));
+  const auto compute = [&](auto side) {
+    using Side = decltype(side);
+    const unsigned at = place.in(2) + Side::which * pair_lanes;
+    const int tet = tet_of(plan, place, Side::which);
     const T bound = bounded ? plan.pair_bound[at] : T(1);
-    weights[at] = tet < 0 ? T(0) : bound * numbers.template weight<Take>(stiffness[tet]);
+    weights[at] = tet < 0 ? T(0) : bound * numbers.template weight<Side>(stiffness[tet]);
   };
-  weigh(OneOf<T, 0>{});
-  weigh(OneOf<T, 1>{});
+  compute(PairSide<T, 0>{});
+  compute(PairSide<T, 1>{});
 }
 
 // of every pair of a patch
 template <class T, class Rest>
-PD_DEVICE void weigh_pairs(const Patch<T>& patch, const Rest& rest, const T* stiffness,
-                           bool bounded, T* weights) {
+PD_DEVICE void compute_patch_weights(const Patch<T>& patch, const Rest& rest, const T* stiffness,
+                                     bool bounded, T* weights) {
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x)
-    weigh_pair(patch.plan, rest, place_of(patch, number), stiffness, bounded, weights);
+    compute_pair_weights(patch.plan, rest, place_of(patch, number), stiffness, bounded, weights);
 }
 
 // The stiffness of all of a patch, which all threads of the block ask for, or -1 where there are several.
@@ -379,46 +379,46 @@ PD_DEVICE Vec3<T> sum_entries(const Quad<T>* entries, int row) {
 
 // The same where somebody waits for it: eight entries are asked for at once.
 template <class T>
-PD_DEVICE Vec3<T> sum_entries_soon(const Quad<T>* entries, int row) {
-  constexpr int together = 8;
+PD_DEVICE Vec3<T> sum_entries_by_8(const Quad<T>* entries, int row) {
+  constexpr int in_flight = 8;
   const Quad<T>* entry = entries + (unsigned(row) & 0xffff);
   const int count = row >> 16 & 0x7fff;
   Vec3<T> sum = {T(0), T(0), T(0)};
 #pragma unroll 1
-  for (int j = 0; j < count; j += together, entry += together * entry_stride) {
-    Vec3<T> force[together];
+  for (int j = 0; j < count; j += in_flight, entry += in_flight * entry_stride) {
+    Vec3<T> force[in_flight];
 #pragma unroll
-    for (int i = 0; i < together; ++i) {
+    for (int i = 0; i < in_flight; ++i) {
       force[i] = {T(0), T(0), T(0)};
       if (j + i < count) force[i] = vec3(entry[entry_stride * i]);
     }
 #pragma unroll
-    for (int i = 0; i < together; ++i) sum = sum + force[i];
+    for (int i = 0; i < in_flight; ++i) sum = sum + force[i];
   }
   return sum;
 }
 
 // The same by few instructions, where a multiprocessor has no room for more. `Entries`: like a pointer; so many are asked for at
 // once, each of which takes registers.
-template <class T, int together = 4, class Entries>
-PD_DEVICE Vec3<T> sum_entries_briefly(const Entries& entries, int row) {
+template <class T, int in_flight = 4, class Entries>
+PD_DEVICE Vec3<T> sum_entries_compact(const Entries& entries, int row) {
   Entries entry = entries + (unsigned(row) & 0xffff);
   int left = row >> 16 & 0x7fff;
   Vec3<T> sum = {T(0), T(0), T(0)};
 #pragma unroll 1
-  for (; left >= together; left -= together, entry += together * entry_stride) {
-    Vec3<T> force[together];
+  for (; left >= in_flight; left -= in_flight, entry += in_flight * entry_stride) {
+    Vec3<T> force[in_flight];
 #pragma unroll
-    for (int i = 0; i < together; ++i) force[i] = vec3(entry[entry_stride * i]);
+    for (int i = 0; i < in_flight; ++i) force[i] = vec3(entry[entry_stride * i]);
 #pragma unroll
-    for (int i = 0; i < together; ++i) sum = sum + force[i];
+    for (int i = 0; i < in_flight; ++i) sum = sum + force[i];
   }
-  Vec3<T> force[together - 1];
+  Vec3<T> force[in_flight - 1];
 #pragma unroll
-  for (int i = 0; i < together - 1; ++i)
+  for (int i = 0; i < in_flight - 1; ++i)
     if (i < left) force[i] = vec3(entry[entry_stride * i]);
 #pragma unroll
-  for (int i = 0; i < together - 1; ++i)
+  for (int i = 0; i < in_flight - 1; ++i)
     if (i < left) sum = sum + force[i];
   return sum;
 }

@@ -27,8 +27,8 @@ namespace pd::inline PD_TARGET {
 // A register that is written under a condition is kept from before, all around a loop: so where a thread has no slot, it
 // reads what is the first one's. And whoever writes to a register waits for a load that is on its way there, the fourth number of
 // 16 bytes included, which nobody reads.
-constexpr int mover_threads = 128, bringer_threads = 128, element_threads = 384;
-constexpr int pipeline_threads = mover_threads + bringer_threads + element_threads;
+constexpr int updater_threads = 128, loader_threads = 128, element_threads = 384;
+constexpr int pipeline_threads = updater_threads + loader_threads + element_threads;
 
 // The patches of a block, of all environments: item after item, from its own number on as far apart as there are blocks.
 template <class T, Visit What>
@@ -43,41 +43,41 @@ class Pipeline {
 
   // All threads of the block, each its own task.
   PD_DEVICE void run() const {
-    const bool moves = mover() < mover_threads, brings = !moves && bringer() < bringer_threads;
-    if (threadIdx.x == 0) open_signals();
-    if (brings) {
-      if (call_.step.settings.tolerance > 0) await_kernel_before();
-      if (bringer() == 0) ahead() = {int(blockIdx.x), 0};
-      if (bringer() < warp_size) tell_stops(0);
+    const bool updates = updater() < updater_threads, loads = !updates && loader() < loader_threads;
+    if (threadIdx.x == 0) init_signals();
+    if (loads) {
+      if (call_.step.settings.tolerance > 0) wait_for_previous_kernel();
+      if (loader() == 0) schedule_cursor() = {int(blockIdx.x), 0};
+      if (loader() < warp_size) extend_schedule(0);
     }
     __syncthreads();
-    if (told(0).blocks == 0) return await_kernel_before();
-    if (moves) {
-      move_vertices();
-    } else if (brings) {
-      bring_slots();
+    if (scheduled(0).blocks == 0) return wait_for_previous_kernel();
+    if (updates) {
+      update_vertices();
+    } else if (loads) {
+      load_slots();
     } else {
-      work_on_elements();
+      process_elements();
     }
   }
 
  private:
   using Work = StreamWork<T, false>;
-  using Seen = typename Vertices<T, false>::Seen;
+  using LoadedVertex = typename Vertices<T, false>::LoadedVertex;
 
   static constexpr int element_warps = element_threads / warp_size;
   // Slots that bringers have in registers at once; those of larger patches follow one by one.
   static constexpr int usual_slots = 640;
-  static constexpr int brought = usual_slots / bringer_threads;
+  static constexpr int loaded_slots = usual_slots / loader_threads;
   // From left_slots on bringers add up the forces of slots that are not inside the patch.
-  static constexpr int moved = 3, left_slots = moved * mover_threads;
+  static constexpr int updated = 3, updated_slots = updated * updater_threads;
   // Of moved, what visits of so many want is asked for before forces are awaited, that of the others after.
-  static constexpr int soon = 2;
+  static constexpr int prefetched = 2;
 
-  PD_DEVICE static int mover() { return int(threadIdx.x); }
-  PD_DEVICE static int bringer() { return int(threadIdx.x) - mover_threads; }
+  PD_DEVICE static int updater() { return int(threadIdx.x); }
+  PD_DEVICE static int loader() { return int(threadIdx.x) - updater_threads; }
   PD_DEVICE static int element_warp() {
-    return (int(threadIdx.x) - mover_threads - bringer_threads) / warp_size;
+    return (int(threadIdx.x) - updater_threads - loader_threads) / warp_size;
   }
 
   PD_DEVICE const DevicePlan<T>& plan() const { return call_.step.plan; }
@@ -91,20 +91,20 @@ class Pipeline {
     __shared__ std::uint64_t words[2 * events];
     return Signal(words + 2 * event + (n & 1));
   }
-  PD_DEVICE void open_signals() const {
+  PD_DEVICE void init_signals() const {
     for (unsigned n = 0; n < 2; ++n) {
-      signal(slots_ready, n).open(mover_threads + bringer_threads);
-      signal(forces_ready, n).open(element_threads);
+      signal(slots_ready, n).init(updater_threads + loader_threads);
+      signal(forces_ready, n).init(element_threads);
     }
   }
-  PD_DEVICE void give(Event event, unsigned n) const { signal(event, n).give(); }
-  PD_DEVICE void await(Event event, unsigned n) const { signal(event, n).await(n / 2); }
+  PD_DEVICE void arrive(Event event, unsigned n) const { signal(event, n).arrive(); }
+  PD_DEVICE void wait(Event event, unsigned n) const { signal(event, n).wait(n / 2); }
 
   // ---- stops of the block
 
   // Where a patch lies in the arrays. Those that have numbers for every environment are read as one array of all of them, from
   // that of the first on, which takes one instruction; 32 bits count them (StreamRunner::pipe).
-  struct alignas(16) Stop {
+  struct alignas(16) ScheduledPatch {
     unsigned vertex, slot, place;  // the first of those before the environment's
     int first_vertex, interior;    // of the plan, as are the next three
     int first_slot, slots, first_place;
@@ -121,21 +121,21 @@ class Pipeline {
   // Stop `n` of the block. Whoever wants to know reads it there, since registers for it would be too many. A warp tells as many
   // at once as it has lanes, in turn n of bringers those from n + 16 on, in place of n - 48 to n - 17: nobody is so far behind,
   // since movers are past n - 4 and elements past n - 2 by then.
-  static constexpr unsigned told_at_once = warp_size;
-  PD_DEVICE Stop& told(unsigned n) const {
-    __shared__ Stop stops[2 * told_at_once];
-    return stops[n % (2 * told_at_once)];
+  static constexpr unsigned schedule_chunk = warp_size;
+  PD_DEVICE ScheduledPatch& scheduled(unsigned n) const {
+    __shared__ ScheduledPatch table[2 * schedule_chunk];
+    return table[n % (2 * schedule_chunk)];
   }
   // what comes after the stops that are told
-  struct Ahead {
+  struct ScheduleCursor {
     int item, first_warp;
   };
-  PD_DEVICE Ahead& ahead() const {
-    __shared__ Ahead stops;
-    return stops;
+  PD_DEVICE ScheduleCursor& schedule_cursor() const {
+    __shared__ ScheduleCursor table;
+    return table;
   }
 
-  PD_DEVICE void tell_stops(unsigned first) const;  // cuda/pipeline_stops.h
+  PD_DEVICE void extend_schedule(unsigned first) const;  // cuda/pipeline_stops.h
 
   PD_DEVICE std::byte* half(unsigned n) const {
     return shared_ +
@@ -169,45 +169,46 @@ class Pipeline {
     return energies[n & 1];
   }
 
-  PD_DEVICE unsigned place_of_force(const Stop& at, int s) const {
+  PD_DEVICE unsigned place_of_force(const ScheduledPatch& at, int s) const {
     return at.place + unsigned(plan().shared_place[at.first_place + s]);
   }
 
   // ---- slots: cuda/pipeline_bring.h
 
-  struct Held;
-  struct Left;
-  PD_DEVICE void bring_slots() const;
-  PD_DEVICE static int first_left(const Stop& at);
-  PD_DEVICE Left left_at(const Stop& at, int s) const;
-  PD_DEVICE void sum_shared(unsigned n, Left left) const;
-  PD_DEVICE unsigned vertex_of(const Stop& at, int slot) const;
-  PD_DEVICE void find(const Stop& in, unsigned (&vertex)[brought]) const;
-  PD_DEVICE void ask(const Stop& in, const unsigned (&vertex)[brought], Held& held) const;
-  PD_DEVICE void put(int slots, unsigned n, const Held& held) const;
+  struct SlotData;
+  struct RemainingForce;
+  PD_DEVICE void load_slots() const;
+  PD_DEVICE static int first_remaining(const ScheduledPatch& at);
+  PD_DEVICE RemainingForce remaining_at(const ScheduledPatch& at, int s) const;
+  PD_DEVICE void sum_remaining(unsigned n, RemainingForce remaining) const;
+  PD_DEVICE unsigned vertex_of(const ScheduledPatch& at, int slot) const;
+  PD_DEVICE void load_vertices(const ScheduledPatch& in, unsigned (&vertex)[loaded_slots]) const;
+  PD_DEVICE void load_slot_data(const ScheduledPatch& in, const unsigned (&vertex)[loaded_slots],
+                                SlotData& data) const;
+  PD_DEVICE void store_slots(int slots, unsigned n, const SlotData& data) const;
 
   // ---- elements: cuda/pipeline_elements.h
 
-  struct PairInputs;
+  struct PairData;
   struct Share;
   class SharedSlots;
-  PD_DEVICE void work_on_elements() const;
+  PD_DEVICE void process_elements() const;
   PD_DEVICE Share share_of(unsigned n) const;
-  PD_DEVICE PairInputs read(const Share& share) const;
+  PD_DEVICE PairData read(const Share& share) const;
   PD_DEVICE const T* weights_of(unsigned block, unsigned weights) const;
-  PD_DEVICE static void take(PairInputs& now, const PairInputs& read, T patch_weight);
-  PD_DEVICE void bring_pairs_near(unsigned n) const;
+  PD_DEVICE static void finish_load(PairData& now, const PairData& read, T patch_weight);
+  PD_DEVICE void prefetch_pairs(unsigned n) const;
   template <class ReadNext>
-  PD_DEVICE void work_on_pair(const PairInputs& now, const SharedSlots& slots, T unit, T& energy,
+  PD_DEVICE void process_pair(const PairData& now, const SharedSlots& slots, T unit, T& energy,
                               const ReadNext& read_next) const;
 
   // ---- vertices: cuda/pipeline_move.h
 
-  PD_DEVICE void move_vertices() const;
-  PD_DEVICE void move_patch(unsigned n) const;
-  PD_DEVICE void bring_patch_near(unsigned n) const;
-  PD_DEVICE void write_mover_sums(const ThreadSums& sums, unsigned n, double* row) const;
-  PD_DEVICE static void meet_movers();
+  PD_DEVICE void update_vertices() const;
+  PD_DEVICE void update_patch(unsigned n) const;
+  PD_DEVICE void prefetch_patch(unsigned n) const;
+  PD_DEVICE void write_updater_sums(const ThreadSums& sums, unsigned n, double* row) const;
+  PD_DEVICE static void sync_updaters();
 
   const StreamCall<T>& call_;
   int k_;

@@ -6,80 +6,82 @@ namespace pd::inline PD_TARGET {
 
 // What is on its way to the slots.
 template <class T, Visit What>
-struct Pipeline<T, What>::Held {
-  Vec3<T> u[brought], origin[brought];
-  RestPoint<T> rest[brought];
+struct Pipeline<T, What>::SlotData {
+  Vec3<T> u[loaded_slots], origin[loaded_slots];
+  RestPoint<T> rest[loaded_slots];
 };
 
 // The forces that movers leave to bringers, who have the time.
 template <class T, Visit What>
-struct Pipeline<T, What>::Left {
+struct Pipeline<T, What>::RemainingForce {
   int row;
   unsigned place;
 };
 
 // Past the last stop, too: nothing is brought, but the forces of the two before are there.
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::bring_slots() const {
-  unsigned vertex[brought];
-  find(told(0), vertex);
-  await_kernel_before();
+PD_DEVICE void Pipeline<T, What>::load_slots() const {
+  unsigned vertex[loaded_slots];
+  load_vertices(scheduled(0), vertex);
+  wait_for_previous_kernel();
 #pragma unroll 1
-  for (unsigned n = 0; n < 2 || told(n - 2).blocks > 0; ++n) {
-    Held held;
-    ask(told(n), vertex, held);
-    find(told(n + 1), vertex);
-    Left left{};
+  for (unsigned n = 0; n < 2 || scheduled(n - 2).blocks > 0; ++n) {
+    SlotData data;
+    load_slot_data(scheduled(n), vertex, data);
+    load_vertices(scheduled(n + 1), vertex);
+    RemainingForce remaining{};
     if (n >= 2) {
-      const Stop at = told(n - 2);
-      left = left_at(at, first_left(at));
-      await(forces_ready, n - 2);
+      const ScheduledPatch at = scheduled(n - 2);
+      remaining = remaining_at(at, first_remaining(at));
+      wait(forces_ready, n - 2);
     }
     // first the forces, while slots are on their way
-    if (n >= 2) sum_shared(n - 2, left);
-    put(told(n).slots, n, held);
-    give(slots_ready, n);
-    if (n % told_at_once == told_at_once / 2 && bringer() < warp_size)
-      tell_stops(n + told_at_once / 2);
+    if (n >= 2) sum_remaining(n - 2, remaining);
+    store_slots(scheduled(n).slots, n, data);
+    arrive(slots_ready, n);
+    if (n % schedule_chunk == schedule_chunk / 2 && loader() < warp_size)
+      extend_schedule(n + schedule_chunk / 2);
   }
 }
 
 template <class T, Visit What>
-PD_DEVICE int Pipeline<T, What>::first_left(const Stop& at) {
-  return max(left_slots, at.interior) + bringer();
+PD_DEVICE int Pipeline<T, What>::first_remaining(const ScheduledPatch& at) {
+  return max(updated_slots, at.interior) + loader();
 }
 
 template <class T, Visit What>
-PD_DEVICE typename Pipeline<T, What>::Left Pipeline<T, What>::left_at(const Stop& at, int s) const {
+PD_DEVICE typename Pipeline<T, What>::RemainingForce Pipeline<T, What>::remaining_at(
+    const ScheduledPatch& at, int s) const {
   if (s >= at.slots) return {0, 0};
   return {plan().slot_row[at.first_slot + s], place_of_force(at, s)};
 }
 
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::sum_shared(unsigned n, Left left) const {
-  const Stop at = told(n);
+PD_DEVICE void Pipeline<T, What>::sum_remaining(unsigned n, RemainingForce remaining) const {
+  const ScheduledPatch at = scheduled(n);
   const Work all = work();
   const Entries entries = entries_of(n);
 #pragma unroll 1
-  for (int s = first_left(at); s < at.slots;) {
-    all.leave_force(left.place, sum_entries_briefly<T, 2>(entries, left.row), round_);
-    s += bringer_threads;
-    left = left_at(at, s);
+  for (int s = first_remaining(at); s < at.slots;) {
+    all.store_force(remaining.place, sum_entries_compact<T, 2>(entries, remaining.row), round_);
+    s += loader_threads;
+    remaining = remaining_at(at, s);
   }
 }
 
 template <class T, Visit What>
-PD_DEVICE unsigned Pipeline<T, What>::vertex_of(const Stop& at, int slot) const {
+PD_DEVICE unsigned Pipeline<T, What>::vertex_of(const ScheduledPatch& at, int slot) const {
   return at.vertex + unsigned(slot < at.interior ? at.first_vertex + slot
                                                  : plan().slot_vertex[at.first_slot + slot]);
 }
 
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::find(const Stop& in, unsigned (&vertex)[brought]) const {
-  const Stop at = in;
+PD_DEVICE void Pipeline<T, What>::load_vertices(const ScheduledPatch& in,
+                                                unsigned (&vertex)[loaded_slots]) const {
+  const ScheduledPatch at = in;
 #pragma unroll
-  for (int r = 0; r < brought; ++r) {
-    const int s = bringer() + r * bringer_threads;
+  for (int r = 0; r < loaded_slots; ++r) {
+    const int s = loader() + r * loader_threads;
     int found = at.first_vertex + (s < at.interior ? s : 0);
     if (s >= at.interior && s < at.slots) found = plan().slot_vertex[at.first_slot + s];
     vertex[r] = unsigned(found);
@@ -87,34 +89,35 @@ PD_DEVICE void Pipeline<T, What>::find(const Stop& in, unsigned (&vertex)[brough
 }
 
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::ask(const Stop& in, const unsigned (&vertex)[brought],
-                                      Held& held) const {
-  const Stop at = in;
+PD_DEVICE void Pipeline<T, What>::load_slot_data(const ScheduledPatch& in,
+                                                 const unsigned (&vertex)[loaded_slots],
+                                                 SlotData& data) const {
+  const ScheduledPatch at = in;
   const Work all = work();
   const RestPoint<T>* rest = rest_positions(plan(), 0);
 #pragma unroll
-  for (int r = 0; r < brought; ++r) {
-    const int s = bringer() + r * bringer_threads;
+  for (int r = 0; r < loaded_slots; ++r) {
+    const int s = loader() + r * loader_threads;
     const unsigned slot = unsigned(at.first_slot + (s < at.slots ? s : 0));
-    held.u[r] = vec3(all.v.u[at.vertex + vertex[r]]);
-    held.origin[r] = vec3(all.origin[at.slot + slot]);
-    held.rest[r] = rest[slot];
+    data.u[r] = vec3(all.v.u[at.vertex + vertex[r]]);
+    data.origin[r] = vec3(all.origin[at.slot + slot]);
+    data.rest[r] = rest[slot];
   }
 }
 
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::put(int slots, unsigned n, const Held& held) const {
+PD_DEVICE void Pipeline<T, What>::store_slots(int slots, unsigned n, const SlotData& data) const {
   const Slots<T> to = slots_of(n);
 #pragma unroll
-  for (int r = 0; r < brought; ++r) {
-    const int s = bringer() + r * bringer_threads;
-    if (s < slots) to.set(s, held.origin[r] + held.u[r], held.rest[r].bits());
+  for (int r = 0; r < loaded_slots; ++r) {
+    const int s = loader() + r * loader_threads;
+    if (s < slots) to.set(s, data.origin[r] + data.u[r], data.rest[r].bits());
   }
   if (slots <= usual_slots) return;
-  const Stop at = told(n);
+  const ScheduledPatch at = scheduled(n);
   const Work all = work();
 #pragma unroll 1
-  for (int s = bringer() + usual_slots; s < slots; s += bringer_threads) {
+  for (int s = loader() + usual_slots; s < slots; s += loader_threads) {
     const unsigned slot = unsigned(at.first_slot + s);
     const Vec3<T> origin = vec3(all.origin[at.slot + slot]);
     to.set(s, origin + vec3(all.v.u[vertex_of(at, s)]), rest_positions(plan(), 0)[slot].bits());

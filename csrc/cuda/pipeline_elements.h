@@ -5,7 +5,7 @@
 namespace pd::inline PD_TARGET {
 
 template <class T, Visit What>
-struct Pipeline<T, What>::PairInputs : PairNumbers<T> {
+struct Pipeline<T, What>::PairData : PairInputs<T> {
   T factor[2];  // pair_factor
 };
 
@@ -32,21 +32,21 @@ class Pipeline<T, What>::SharedSlots {
   }
 
   // `corner`: of PairNumbers. What is volatile keeps its order, so nothing is looked at before it is awaited.
-  PD_DEVICE void look(unsigned corner, Vec3<T>& position, RestPoint<T>& rest) const {
+  PD_DEVICE void load(unsigned corner, Vec3<T>& position, RestPoint<T>& rest) const {
     const SharedAddress slot_times_8 = in_register(corner & 0xffff);
-    Quad<T> seen;
+    Quad<T> loaded;
     Vec3<T> bits;
     asm volatile("ld.shared.v4.f32 {%0, %1, %2, %3}, [%4];"
-                 : "=f"(seen.x), "=f"(seen.y), "=f"(seen.z), "=f"(bits.x)
+                 : "=f"(loaded.x), "=f"(loaded.y), "=f"(loaded.z), "=f"(bits.x)
                  : "r"(first_ + 2 * slot_times_8));
     asm volatile("ld.shared.v2.f32 {%0, %1}, [%2];"
                  : "=f"(bits.y), "=f"(bits.z)
                  : "r"(second_ + slot_times_8));
-    position = vec3(seen);
+    position = vec3(loaded);
     rest = RestPoint<T>::of(bits);
   }
   // Unless the corner has no entry.
-  PD_DEVICE void leave(unsigned corner, const Vec3<T>& force) const {
+  PD_DEVICE void write_entry(unsigned corner, const Vec3<T>& force) const {
     asm volatile(
         "{.reg .pred p; setp.lt.u32 p, %0, 0xffff0000; @p st.shared.v2.f32 [%1], {%3, %4}; "
         "@p st.shared.f32 [%2], %5;}" ::"r"(corner),
@@ -60,46 +60,46 @@ class Pipeline<T, What>::SharedSlots {
 };
 
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::work_on_elements() const {
+PD_DEVICE void Pipeline<T, What>::process_elements() const {
   Share share = share_of(0);
-  PairInputs now;
-  take(now, read(share), share.patch_weight);
+  PairData now;
+  finish_load(now, read(share), share.patch_weight);
 #pragma unroll 1
   for (unsigned n = 0;; ++n) {
-    bring_pairs_near(n + 1);
-    await(slots_ready, n);
+    prefetch_pairs(n + 1);
+    wait(slots_ready, n);
     const SharedSlots slots(*this, n);
     T energy = T(0);
-    const T unit = told(n).unit;
+    const T unit = scheduled(n).unit;
     bool more = share.block < share.end;
     // else the last turn has read the first pairs of the next stop
     if (!more) {
       share = share_of(n + 1);
-      take(now, read(share), share.patch_weight);
+      finish_load(now, read(share), share.patch_weight);
     }
 #pragma unroll 1
     while (more) {
-      PairInputs then;
-      work_on_pair(now, slots, unit, energy, [&] {
+      PairData then;
+      process_pair(now, slots, unit, energy, [&] {
         share.block += element_warps;
         more = share.block < share.end;
         if (!more) share = share_of(n + 1);
         then = read(share);
       });
-      take(now, then, share.patch_weight);
+      finish_load(now, then, share.patch_weight);
     }
     if constexpr (What == Visit::update_guarded) {
-      const double sum = across_warp(double(energy), Add{});
+      const double sum = warp_reduce(double(energy), Add{});
       if (threadIdx.x % warp_size == 0) energies_of(n)[element_warp()] = sum;
     }
-    give(forces_ready, n);
-    if (told(n + 1).blocks == 0) return;
+    arrive(forces_ready, n);
+    if (scheduled(n + 1).blocks == 0) return;
   }
 }
 
 template <class T, Visit What>
 PD_DEVICE typename Pipeline<T, What>::Share Pipeline<T, What>::share_of(unsigned n) const {
-  const Stop& in = told(n);
+  const ScheduledPatch& in = scheduled(n);
   unsigned turn = unsigned(element_warp() + element_warps - in.first_warp);
   if (turn >= unsigned(element_warps)) turn -= element_warps;
   const auto first = unsigned(in.first_block);
@@ -110,11 +110,11 @@ PD_DEVICE typename Pipeline<T, What>::Share Pipeline<T, What>::share_of(unsigned
 
 // A lane a pair, of the next block; where none is left, some of the stop's that nobody wants.
 template <class T, Visit What>
-PD_DEVICE typename Pipeline<T, What>::PairInputs Pipeline<T, What>::read(const Share& share) const {
+PD_DEVICE typename Pipeline<T, What>::PairData Pipeline<T, What>::read(const Share& share) const {
   const unsigned lane = threadIdx.x % warp_size, block = share.block;
   const int32* corner = plan().pair_corner + (block * (5 * pair_lanes) + lane);
   const T* factor = plan().pair_factor + (block * (2 * pair_lanes) + lane);
-  PairInputs pair;
+  PairData pair;
   // once a patch: the caches had better keep something else
   for (int c = 0; c < 5; ++c) pair.corner[c] = unsigned(__ldcs(corner + c * pair_lanes));
   for (int e = 0; e < 2; ++e) pair.factor[e] = __ldcs(factor + e * pair_lanes);
@@ -134,7 +134,7 @@ PD_DEVICE const T* Pipeline<T, What>::weights_of(unsigned block, unsigned weight
 
 // Not before its end is what was read looked at, since whoever moves a number waits for it. `patch_weight`: of its stop.
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::take(PairInputs& now, const PairInputs& read, T patch_weight) {
+PD_DEVICE void Pipeline<T, What>::finish_load(PairData& now, const PairData& read, T patch_weight) {
   for (int c = 0; c < 5; ++c) now.corner[c] = in_register(read.corner[c]);
   for (int e = 0; e < 2; ++e) now.factor[e] = in_register(read.factor[e]);
   for (int e = 0; e < 2; ++e) {
@@ -146,30 +146,32 @@ PD_DEVICE void Pipeline<T, What>::take(PairInputs& now, const PairInputs& read, 
 
 // Has all pairs of a stop brought into the L2 cache.
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::bring_pairs_near(unsigned n) const {
-  const Stop in = told(n);
-  const auto near = [](const auto* items, int count) {
-    bring_all_near(items, count, int(threadIdx.x) - mover_threads - bringer_threads,
-                   element_threads);
+PD_DEVICE void Pipeline<T, What>::prefetch_pairs(unsigned n) const {
+  const ScheduledPatch in = scheduled(n);
+  const auto prefetch = [](const auto* items, int count) {
+    bulk_prefetch_to_l2(items, count, int(threadIdx.x) - updater_threads - loader_threads,
+                        element_threads);
   };
   constexpr int two = 2 * pair_lanes, five = 5 * pair_lanes;
-  near(plan().pair_corner + std::size_t(in.first_block) * five, in.blocks * five);
-  near(plan().pair_factor + std::size_t(in.first_block) * two, in.blocks * two);
+  prefetch(plan().pair_corner + std::size_t(in.first_block) * five, in.blocks * five);
+  prefetch(plan().pair_factor + std::size_t(in.first_block) * two, in.blocks * two);
   if (in.patch_weight < T(0))
-    near(weights_of(unsigned(in.first_block), in.weights), in.blocks * two);
+    prefetch(weights_of(unsigned(in.first_block), in.weights), in.blocks * two);
 }
 
 // `read_next`: between its tetrahedra. Lanes past the last pair leave no force, and what they strain weighs nothing.
 template <class T, Visit What>
 template <class ReadNext>
-PD_DEVICE void Pipeline<T, What>::work_on_pair(const PairInputs& now, const SharedSlots& slots,
+PD_DEVICE void Pipeline<T, What>::process_pair(const PairData& now, const SharedSlots& slots,
                                                T unit, T& energy, const ReadNext& read_next) const {
-  const auto look = [&](int c, Vec3<T>& position, RestPoint<T>& rest) {
-    slots.look(now.corner[c], position, rest);
+  const auto load = [&](int c, Vec3<T>& position, RestPoint<T>& rest) {
+    slots.load(now.corner[c], position, rest);
   };
-  const auto leave = [&](int c, const Vec3<T>& force) { slots.leave(now.corner[c], force); };
-  solid_pair_gradient<What == Visit::update_guarded, RestPoint<T>>(now.factor, now.weight, unit,
-                                                                   energy, look, leave, read_next);
+  const auto write_entry = [&](int c, const Vec3<T>& force) {
+    slots.write_entry(now.corner[c], force);
+  };
+  solid_pair_gradient<What == Visit::update_guarded, RestPoint<T>>(
+      now.factor, now.weight, unit, energy, load, write_entry, read_next);
 }
 
 }  // namespace pd::inline PD_TARGET

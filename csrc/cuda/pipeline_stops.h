@@ -6,21 +6,21 @@ namespace pd::inline PD_TARGET {
 
 // Stops from `first` on, by a warp: items of environments that go on.
 template <class T, Visit What>
-PD_DEVICE void Pipeline<T, What>::tell_stops(unsigned first) const {
+PD_DEVICE void Pipeline<T, What>::extend_schedule(unsigned first) const {
   __syncwarp();
-  Ahead next = ahead();
-  const int lane = bringer(), patches = plan().patches, stride = int(gridDim.x);
+  ScheduleCursor next = schedule_cursor();
+  const int lane = loader(), patches = plan().patches, stride = int(gridDim.x);
   const bool own = call_.step.material.stiffness.stride != 0;
   int found = 0;
-  while (found < int(told_at_once)) {
+  while (found < int(schedule_chunk)) {
     const int item = next.item + lane * stride;
     const int environment = item / patches, patch = item - environment * patches;
     const bool there = environment < call_.step.batch;
     const unsigned goes_on =
-        __ballot_sync(whole_warp, there && !skips<What>(work(there ? environment : 0)));
+        __ballot_sync(full_warp, there && !skips<What>(work(there ? environment : 0)));
     const int rank = found + __popc(goes_on & ((1u << lane) - 1));
-    const bool mine = (goes_on >> lane & 1) && rank < int(told_at_once);
-    Stop s{};
+    const bool mine = (goes_on >> lane & 1) && rank < int(schedule_chunk);
+    ScheduledPatch s{};
     if (mine) {
       s.environment = environment;
       s.patch = patch;
@@ -43,23 +43,24 @@ PD_DEVICE void Pipeline<T, What>::tell_stops(unsigned first) const {
       int until = s.blocks;
 #pragma unroll
       for (int distance = 1; distance < warp_size; distance *= 2) {
-        const int before = __shfl_up_sync(whole_warp, until, distance);
+        const int before = __shfl_up_sync(full_warp, until, distance);
         if (lane >= distance) until += before;
       }
       s.first_warp = (next.first_warp + until - s.blocks) % element_warps;
       next.first_warp =
-          (next.first_warp + __shfl_sync(whole_warp, until, warp_size - 1)) % element_warps;
+          (next.first_warp + __shfl_sync(full_warp, until, warp_size - 1)) % element_warps;
     }
-    if (mine) told(first + unsigned(rank)) = s;
+    if (mine) scheduled(first + unsigned(rank)) = s;
     found += __popc(goes_on);
-    if (!__any_sync(whole_warp, there)) {
-      if (found + lane < int(told_at_once)) told(first + unsigned(found + lane)) = Stop{};
+    if (!__any_sync(full_warp, there)) {
+      if (found + lane < int(schedule_chunk))
+        scheduled(first + unsigned(found + lane)) = ScheduledPatch{};
       break;
     }
     next.item =
-        __reduce_max_sync(whole_warp, mine || found < int(told_at_once) ? item : 0) + stride;
+        __reduce_max_sync(full_warp, mine || found < int(schedule_chunk) ? item : 0) + stride;
   }
-  if (lane == 0) ahead() = next;
+  if (lane == 0) schedule_cursor() = next;
 }
 
 }  // namespace pd::inline PD_TARGET

@@ -8,10 +8,10 @@
 namespace pd {
 
 // The sums of a block's threads, in thread 0.
-PD_DEVICE void add_across_block(double (&sum)[report_sums]) {
+PD_DEVICE void block_reduce_sums(double (&sum)[report_sums]) {
   constexpr int warps = report_chunk / warp_size;
   __shared__ double warp_sum[warps][report_sums];
-  add_across_warp(sum);
+  warp_reduce_sums(sum);
   const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
   if (lane == 0) {
     for (int s = 0; s < report_sums; ++s) warp_sum[warp][s] = sum[s];
@@ -19,7 +19,7 @@ PD_DEVICE void add_across_block(double (&sum)[report_sums]) {
   __syncthreads();
   if (warp != 0) return;
   for (int s = 0; s < report_sums; ++s) sum[s] = lane < warps ? warp_sum[lane][s] : 0;
-  add_across_warp(sum);
+  warp_reduce_sums(sum);
 }
 
 template <class T>
@@ -33,7 +33,7 @@ __global__ void __launch_bounds__(report_chunk)
     const int pin = plan.pins ? plan.vertex_pin[i] : -1;
     ReportVertex<T, DevicePlan<T>>{call, environment, plan.vertex_order[i], pin}.add_to(sum);
   }
-  add_across_block(sum);
+  block_reduce_sums(sum);
   if (threadIdx.x != 0) return;
   for (int s = 0; s < report_sums; ++s)
     call.sums[std::int64_t(blockIdx.x) * report_sums + s] = sum[s];
@@ -47,7 +47,7 @@ __global__ void __launch_bounds__(report_chunk)
   for (int chunk = threadIdx.x; chunk < call.chunks(); chunk += report_chunk) {
     for (int s = 0; s < report_sums; ++s) sum[s] += of[chunk * report_sums + s];
   }
-  add_across_block(sum);
+  block_reduce_sums(sum);
   if (threadIdx.x == 0) write_report<T>(sum, call.info + std::int64_t(blockIdx.x) * info_count);
 }
 

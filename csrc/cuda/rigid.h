@@ -65,7 +65,7 @@ PD_DEVICE double share_out(const double (&value)[Count], Op op) {
   static_assert(Count <= warp_size);
   double left[warp_size];
 #pragma unroll
-  for (int n = 0; n < warp_size; ++n) left[n] = n < Count ? value[n < Count ? n : 0] : Op::none;
+  for (int n = 0; n < warp_size; ++n) left[n] = n < Count ? value[n < Count ? n : 0] : Op::identity;
 #pragma unroll
   for (int half = warp_size / 2; half > 0; half /= 2) {
     const bool upper = int(threadIdx.x) & half;
@@ -73,7 +73,7 @@ PD_DEVICE double share_out(const double (&value)[Count], Op op) {
     for (int n = 0; n < half; ++n) {
       if (n >= Count) break;  // nothing but `none` in both halves
       const double give = upper ? left[n] : left[n + half];
-      left[n] = op(upper ? left[n + half] : left[n], __shfl_xor_sync(whole_warp, give, half));
+      left[n] = op(upper ? left[n + half] : left[n], __shfl_xor_sync(full_warp, give, half));
     }
   }
   return left[0];
@@ -117,9 +117,9 @@ PD_DEVICE bool some_of(int count, const Is& is) {
 }
 
 // The rounds of a leg. `run` finds what each is for, sets pieces to where they start, and knows whether some tip.
-template <bool Touching, class Run>
+template <bool HasContacts, class Run>
 PD_DEVICE void find_in_rounds(Run& run, const Aligning& how, bool several_contacts) {
-  if constexpr (Touching) {
+  if constexpr (HasContacts) {
     if (how.starts) {
       run.template find<Rigid::start>(how);
       run.begin_still();
@@ -127,7 +127,7 @@ PD_DEVICE void find_in_rounds(Run& run, const Aligning& how, bool several_contac
   }
   if (!how.starts && !how.whole) run.template find<Rigid::mean>(how);
   run.template find<Rigid::free>(how);
-  if constexpr (Touching) {
+  if constexpr (HasContacts) {
     run.template find<Rigid::touching>(how);
     while (run.some_tip()) run.template find<Rigid::tipping>(how);
     if (several_contacts) run.template find<Rigid::beside>(how);
@@ -136,8 +136,8 @@ PD_DEVICE void find_in_rounds(Run& run, const Aligning& how, bool several_contac
 
 // The lane of a warp that has the least number, the first of them.
 PD_DEVICE int lane_of_least(double number) {
-  const double least = across_warp(number, Least{});
-  const unsigned have = __ballot_sync(whole_warp, number == least);
+  const double least = warp_reduce(number, Min{});
+  const unsigned have = __ballot_sync(full_warp, number == least);
   return have ? __ffs(int(have)) - 1 : 0;
 }
 
@@ -158,8 +158,8 @@ PD_DEVICE bool stands(const Aligning& how, const Piece<T>& piece) {
 }
 
 // `to`: PartSums
-template <Rigid What, class T, bool Touching>
-PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts,
+template <Rigid What, class T, bool HasContacts>
+PD_DEVICE_COLD void sum_part(Vertices<T, HasContacts> v, Contacts<T> contacts,
                              const Settings& settings, Aligning how, Part part,
                              const Piece<T>& piece, double* to) {
   using S = RigidSums;
@@ -180,7 +180,7 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts,
       const auto vertex = v.at(i);
       const Vec3<T> u = vec3(v.u[i]), still = vertex.still(contacts);
       add_start(sum, contacts, vertex.x, vertex.target, vertex.inertia, vertex.inverse, u, still,
-                u - v.guess(i, settings));
+                u - v.predicted(i, settings));
       const Vec3<double> way = double(vertex.inertia) * (wide(still) - wide(u));
       back[0] += way.x;
       back[1] += way.y;
@@ -195,7 +195,7 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts,
     if (how.at_once()) {
       const double own = sum_mean();
       double sum[S::lag];
-      for (int n = 0; n < S::lag; ++n) sum[n] = __shfl_sync(whole_warp, own, n);
+      for (int n = 0; n < S::lag; ++n) sum[n] = __shfl_sync(full_warp, own, n);
       center = center_of(sum);
     } else {
       center = piece.center;
@@ -218,10 +218,10 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts,
       const Vec3<T> u = vec3(v.u[i]);
       add_touch(sums, bounds, contacts, vec3(v.x[i]) + u, u, piece.motion, !how.first, near);
     });
-    touched = __reduce_or_sync(whole_warp, touched);
+    touched = __reduce_or_sync(full_warp, touched);
     if (threadIdx.x % warp_size == 0) to[PartSums::touched] = double(touched);
     write_shares(sums, Add{}, to + PartSums::touch);
-    write_shares(bounds, Least{}, to + PartSums::bounds);
+    write_shares(bounds, Min{}, to + PartSums::bounds);
   } else if constexpr (What == Rigid::tipping) {
     if (!piece.tipping.goes_on()) return;
     const TippingSearch<double> s =
@@ -249,9 +249,9 @@ PD_DEVICE_COLD void sum_part(Vertices<T, Touching> v, Contacts<T> contacts,
     part.each([&](int i) {
       const Vec3<T> y = vec3(v.x[i]) + vec3(v.u[i]);
       const T beside = least_gap_beside(contacts, y, piece.motion.of(y), !how.first, touches);
-      least = Least{}(least, double(beside));
+      least = Min{}(least, double(beside));
     });
-    least = across_warp(least, Least{});
+    least = warp_reduce(least, Min{});
     if (threadIdx.x % warp_size == 0) to[PartSums::least_gap] = least;
   }
 }
@@ -264,10 +264,10 @@ PD_DEVICE double read_part(const DevicePlan<T>& plan, const double* from, int at
 
 // Lane n gets number n of many parts together: a lane adds up all numbers of every 32nd of them.
 template <int Count, class T, class Op>
-PD_DEVICE_COLD double over_many_parts(const DevicePlan<T>& plan, int begin, int end,
-                                      const double* from, Op op) {
+PD_DEVICE_COLD double reduce_over_many_parts(const DevicePlan<T>& plan, int begin, int end,
+                                             const double* from, Op op) {
   double part[Count];
-  for (int n = 0; n < Count; ++n) part[n] = Op::none;
+  for (int n = 0; n < Count; ++n) part[n] = Op::identity;
   for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size) {
     for (int n = 0; n < Count; ++n) part[n] = op(part[n], read_part(plan, from, at, n));
   }
@@ -277,18 +277,18 @@ PD_DEVICE_COLD double over_many_parts(const DevicePlan<T>& plan, int begin, int 
 // Combines Count numbers, from the `first` on, of the parts of a piece, in memory that all lanes can read then: to broadcast them one by
 // one takes longer. With few parts a lane adds up one number of all of them.
 template <int Count, class T, class Op>
-PD_DEVICE void over_parts(const DevicePlan<T>& plan, int piece, const double* part_sum, Op op,
-                          int first, double* total) {
+PD_DEVICE void reduce_over_parts(const DevicePlan<T>& plan, int piece, const double* part_sum,
+                                 Op op, int first, double* total) {
   constexpr int few = 16;
   const int lane = int(threadIdx.x) % warp_size;
   const int begin = plan.piece_start[piece], end = plan.piece_start[piece + 1];
   const double* from = part_sum + first;
-  double own = Op::none;
+  double own = Op::identity;
   if (end - begin <= few) {
     for (int at = begin; at < end && lane < Count; ++at)
       own = op(own, read_part(plan, from, at, lane));
   } else {
-    own = over_many_parts<Count>(plan, begin, end, from, op);
+    own = reduce_over_many_parts<Count>(plan, begin, end, from, op);
   }
   if (lane < Count) total[lane] = own;
   __syncwarp();
@@ -303,7 +303,7 @@ PD_DEVICE RigidMotion<T> motion_in(const RigidMotion<double>& m) {
 
 // Of bits in numbers.
 struct Or {
-  static constexpr double none = 0;
+  static constexpr double identity = 0;
   PD_DEVICE double operator()(double a, double b) const {
     return double(unsigned(a) | unsigned(b));
   }
@@ -321,7 +321,7 @@ PD_DEVICE void find_over_parts(const DevicePlan<T>& plan, int piece, const doubl
     const double order = read_part(plan, from, at, Found::order);
     if (order < least) best = at, least = order;
   }
-  best = __shfl_sync(whole_warp, best, lane_of_least(least));
+  best = __shfl_sync(full_warp, best, lane_of_least(least));
   for (int n = 0; n < Found::count; ++n) found[n] = read_part(plan, from, best, n);
 }
 
@@ -359,8 +359,8 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
     return;
   }
   if constexpr (What == Rigid::start) {
-    over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
-    over_parts<PartSums::starts>(plan, piece, part_sum, Add{}, PartSums::start, to.start);
+    reduce_over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+    reduce_over_parts<PartSums::starts>(plan, piece, part_sum, Add{}, PartSums::start, to.start);
     if (!leader) return;
     double sum[StartSums::count];
     for (int n = 0; n < StartSums::count; ++n) sum[n] = to.start[n];
@@ -368,26 +368,27 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
     for (int n = 0; n < 3 && to.still; ++n) to.sum[S::position + n] += to.start[PartSums::back + n];
     to.center = center_of(to.sum);
   } else if constexpr (What == Rigid::mean) {
-    over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+    reduce_over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
     if (leader) to.center = center_of(to.sum);
   } else if constexpr (What == Rigid::free) {
-    if (how.at_once()) over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
-    over_parts<S::pins - S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid + S::lag,
-                                 to.sum + S::lag);
+    if (how.at_once())
+      reduce_over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+    reduce_over_parts<S::pins - S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid + S::lag,
+                                        to.sum + S::lag);
     if (how.pins)
-      over_parts<S::count - S::pins>(plan, piece, part_sum, Add{}, PartSums::rigid + S::pins,
-                                     to.sum + S::pins);
+      reduce_over_parts<S::count - S::pins>(plan, piece, part_sum, Add{}, PartSums::rigid + S::pins,
+                                            to.sum + S::pins);
     if (!leader) return;
     if (!how.pins) {
       for (int n = S::pins; n < S::count; ++n) to.sum[n] = 0;
     }
     to.motion = motion_in<T>(RigidFit(to.sum).free());
   } else if constexpr (What == Rigid::touching) {
-    over_parts<1>(plan, piece, part_sum, Or{}, PartSums::touched, &to.touched);
+    reduce_over_parts<1>(plan, piece, part_sum, Or{}, PartSums::touched, &to.touched);
     if (leader) to.tipping.end(), to.leg = 0;
     if (to.touched == 0) return;
-    over_parts<Touch::sums>(plan, piece, part_sum, Add{}, PartSums::touch, to.touch);
-    over_parts<Touch::bounds>(plan, piece, part_sum, Least{}, PartSums::bounds, to.bounds);
+    reduce_over_parts<Touch::sums>(plan, piece, part_sum, Add{}, PartSums::touch, to.touch);
+    reduce_over_parts<Touch::bounds>(plan, piece, part_sum, Min{}, PartSums::bounds, to.bounds);
     if (!leader) return;
     begin_tipping(to.tipping, how.first, RigidFit(to.sum), unsigned(to.touched), to.touch, plane);
     if (!to.tipping.goes_on()) move_on_contacts(contacts, how, to);
@@ -404,7 +405,7 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
       move_on_contacts(contacts, how, to);
     }
   } else {
-    over_parts<1>(plan, piece, part_sum, Least{}, PartSums::least_gap, &to.least_gap);
+    reduce_over_parts<1>(plan, piece, part_sum, Min{}, PartSums::least_gap, &to.least_gap);
     if (leader && !to.tipping.tips && !(to.least_gap > 0)) stand_still(to);
   }
 }

@@ -37,8 +37,8 @@ void refuse_shared_memory(std::size_t shared_bytes) {
                            "compiles the scene for this one");
 }
 
-static int ask_for_resident_blocks(const void* kernel, int device, int threads,
-                                   std::size_t shared_bytes) {
+static int query_resident_blocks(const void* kernel, int device, int threads,
+                                 std::size_t shared_bytes) {
   int most_shared = 0, multiprocessors = 0, blocks = 0;
   check(cudaDeviceGetAttribute(&most_shared, cudaDevAttrMaxSharedMemoryPerBlockOptin, device));
   check(cudaDeviceGetAttribute(&multiprocessors, cudaDevAttrMultiProcessorCount, device));
@@ -52,22 +52,22 @@ static int ask_for_resident_blocks(const void* kernel, int device, int threads,
 }
 
 // What a kernel, launched so, gets, asked for once; every `Ask` has answers of its own.
-template <class Ask>
-static int known_or(const void* kernel, int threads, std::size_t shared_bytes, int cluster,
-                    const Ask& ask) {
+template <class Query>
+static int cached(const void* kernel, int threads, std::size_t shared_bytes, int cluster,
+                  const Query& query) {
   static std::mutex lock;
-  static std::map<std::tuple<const void*, int, int, std::size_t, int>, int> known;
+  static std::map<std::tuple<const void*, int, int, std::size_t, int>, int> results;
   int device = 0;
   check(cudaGetDevice(&device));
   const std::lock_guard guard(lock);
   const std::tuple key{kernel, device, threads, shared_bytes, cluster};
-  if (const auto found = known.find(key); found != known.end()) return found->second;
-  return known[key] = ask(device);
+  if (const auto found = results.find(key); found != results.end()) return found->second;
+  return results[key] = query(device);
 }
 
 int resident_blocks(const void* kernel, int threads, std::size_t shared_bytes) {
-  return known_or(kernel, threads, shared_bytes, 0, [&](int device) {
-    return ask_for_resident_blocks(kernel, device, threads, shared_bytes);
+  return cached(kernel, threads, shared_bytes, 0, [&](int device) {
+    return query_resident_blocks(kernel, device, threads, shared_bytes);
   });
 }
 
@@ -103,12 +103,12 @@ static bool has_code_for_90(const void* kernel, int device) {
 }
 
 bool runs_code_for_90(const void* kernel) {
-  return known_or(kernel, 0, 0, 0,
-                  [&](int device) { return int(has_code_for_90(kernel, device)); }) != 0;
+  return cached(kernel, 0, 0, 0,
+                [&](int device) { return int(has_code_for_90(kernel, device)); }) != 0;
 }
 
-static int ask_for_resident_clusters(const void* kernel, int device, int threads,
-                                     std::size_t shared_bytes, int blocks) {
+static int query_resident_clusters(const void* kernel, int device, int threads,
+                                   std::size_t shared_bytes, int blocks) {
   int clusters = 0;
   if (!has_code_for_90(kernel, device)) return 0;
   constexpr int portable = 8;
@@ -127,33 +127,33 @@ static int ask_for_resident_clusters(const void* kernel, int device, int threads
 }
 
 int resident_clusters(const void* kernel, int threads, std::size_t shared_bytes, int blocks) {
-  return known_or(kernel, threads, shared_bytes, blocks, [&](int device) {
-    return ask_for_resident_clusters(kernel, device, threads, shared_bytes, blocks);
+  return cached(kernel, threads, shared_bytes, blocks, [&](int device) {
+    return query_resident_clusters(kernel, device, threads, shared_bytes, blocks);
   });
 }
 
 void launch(const void* kernel, unsigned blocks, int threads, void** arguments,
             std::size_t shared_bytes, int cluster, cudaStream_t stream) {
-  GroupLaunch how(blocks, threads, shared_bytes, cluster);
-  how.config.stream = stream;
-  check(cudaLaunchKernelExC(&how.config, kernel, arguments));
+  GroupLaunch group(blocks, threads, shared_bytes, cluster);
+  group.config.stream = stream;
+  check(cudaLaunchKernelExC(&group.config, kernel, arguments));
 }
 
-static int fact(cudaDeviceAttr which) {
+static int device_attribute(cudaDeviceAttr which) {
   int device = 0, value = 0;
   check(cudaGetDevice(&device));
   check(cudaDeviceGetAttribute(&value, which, device));
   return value;
 }
 
-int multiprocessors() { return fact(cudaDevAttrMultiProcessorCount); }
+int multiprocessors() { return device_attribute(cudaDevAttrMultiProcessorCount); }
 
 std::size_t shared_memory_per_multiprocessor() {
-  return std::size_t(fact(cudaDevAttrMaxSharedMemoryPerMultiprocessor));
+  return std::size_t(device_attribute(cudaDevAttrMaxSharedMemoryPerMultiprocessor));
 }
 
 std::size_t shared_memory_per_block() {
-  return std::size_t(fact(cudaDevAttrMaxSharedMemoryPerBlockOptin));
+  return std::size_t(device_attribute(cudaDevAttrMaxSharedMemoryPerBlockOptin));
 }
 
 unsigned blocks_of(std::int64_t count) {

@@ -15,18 +15,18 @@ namespace pd::inline PD_TARGET {
 
 // `Touching`, `Loose`: see cuda/fused.h. `Once`: no thread has a second pair, so that each keeps what the plan says of its own.
 // `Lean`: there are too few registers to ask for all forces on a vertex at once.
-template <class T, bool Touching, bool Loose, bool Once, bool Lean>
-class SeveralRunner {
-  using Seen = typename Vertices<T, Touching>::Seen;
+template <class T, bool HasContacts, bool HasFreePieces, bool OnePerThread, bool FewRegisters>
+class SmallBatchRunner {
+  using LoadedVertex = typename Vertices<T, HasContacts>::LoadedVertex;
 
   // A pair or a vertex of one of the environments.
-  struct Seat {
+  struct WorkItem {
     int environment, at;
   };
 
  public:
-  // `shared`: SeveralLayout::bytes
-  PD_DEVICE SeveralRunner(const SeveralCall<T>& call, std::byte* shared)
+  // `shared`: SmallBatchLayout::bytes
+  PD_DEVICE SmallBatchRunner(const SmallBatchCall<T>& call, std::byte* shared)
       : whole_(call),
         shared_(shared),
         call_(call.step),
@@ -35,61 +35,61 @@ class SeveralRunner {
         memory_(call.scratch),
         pair_stride_(call.pair_stride),
         slot_stride_(call.slot_stride),
-        first_of_block_(blockIdx.x * unsigned(call.together)),
+        first_of_block_(blockIdx.x * unsigned(call.per_block)),
         h_(T(call.step.settings.time_step)),
         theta_(call.relaxation) {
-    const SeveralLayout<T> layout(call.step, call.together);
-    course_ = reinterpret_cast<Course<T>*>(shared);
+    const SmallBatchLayout<T> layout(call.step, call.per_block);
+    control_ = reinterpret_cast<EnvironmentControl<T>*>(shared);
     position_ = reinterpret_cast<Quad<T>*>(shared + layout.vectors);
-    const int all = call.together * plan_.most_slots;
+    const int all = call.per_block * plan_.most_slots;
     const std::int64_t far = std::int64_t(first_of_block_) * plan_.most_slots;
     v_ = {memory_.x + far, memory_.velocity + far, position_ + all, position_ + 2 * all,
           position_ + 3 * all};
     origin_ = position_ + 4 * all;
     entries_ = reinterpret_cast<Quad<T>*>(shared + layout.entries);
     pair_energy_ = reinterpret_cast<T*>(shared + layout.energies);
-    vertex_sum_ = pair_energy_ + call.together * plan_.most_pairs;
-    balls_ = reinterpret_cast<Ball<T>*>(shared + layout.contacts);
-    planes_ = reinterpret_cast<Plane<T>*>(balls_ + call.together * call_.material.spheres_count);
+    vertex_sum_ = pair_energy_ + call.per_block * plan_.most_pairs;
+    spheres_ = reinterpret_cast<Ball<T>*>(shared + layout.contacts);
+    planes_ = reinterpret_cast<Plane<T>*>(spheres_ + call.per_block * call_.material.spheres_count);
     vertex_sums_ = all;
-    first_pair_ = seat_of(threadIdx.x, pairs());
-    first_slot_ = seat_of(threadIdx.x, slots());
+    first_pair_ = item_of(threadIdx.x, pairs());
+    first_slot_ = item_of(threadIdx.x, slots());
   }
 
   // All steps of environments `first` to `first + here - 1`.
-  PD_DEVICE void roll(std::int64_t first, int here) {
+  PD_DEVICE void rollout(std::int64_t first, int here) {
     first_ = first;
     here_ = here;
     load();
-    weigh();
+    assemble_diagonal();
     for (int t = 0; t < set_.steps; ++t) {
       step(*this, set_);
       if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
-      move_balls();
+      move_spheres();
     }
     __syncthreads();
   }
 
   PD_DEVICE void predict() {
     __syncthreads();
-    each_slot([&](const Seat& seat, int i) {
-      v_.predict(i, inputs(seat.environment), seat.at, h_);
-      origin_[i] = quad(vec3(v_.x[i]) - vec3(v_.x[i - seat.at]));
+    each_slot([&](const WorkItem& item, int i) {
+      v_.predict(i, inputs(item.environment), item.at, h_);
+      origin_[i] = quad(vec3(v_.x[i]) - vec3(v_.x[i - item.at]));
     });
   }
 
   PD_DEVICE void start() {
-    each_slot([&](const Seat& seat, int i) {
-      const Vec3<T> u = v_.first(i, inputs(seat.environment), seat.at, contacts(seat.environment));
+    each_slot([&](const WorkItem& item, int i) {
+      const Vec3<T> u = v_.first(i, inputs(item.environment), item.at, contacts(item.environment));
       move(i, u);
       v_.set_before(i, u);
     });
     for (int e = threadIdx.x; e < here_; e += blockDim.x) {
-      Course<T>& course = course_[e];
-      Progress& progress = course.progress;
-      progress.schedule = Schedule(set_, progress.least, contacts(e).friction() > T(0));
-      course.omega[0] = T(progress.schedule.next(0));
-      if (stops()) progress.stop = {inputs(e).fall()};
+      EnvironmentControl<T>& control = control_[e];
+      Progress& progress = control.progress;
+      progress.schedule = Schedule(set_, progress.min_share, contacts(e).friction() > T(0));
+      control.omega[0] = T(progress.schedule.next(0));
+      if (stops()) progress.stop = {inputs(e).free_fall_squared()};
       progress.used = set_.iterations;
       progress.done = false;
     }
@@ -99,8 +99,8 @@ class SeveralRunner {
 
   // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
   PD_DEVICE void align() {
-    settle();
-    if constexpr (Loose) align_pieces();
+    apply_last_sums();
+    if constexpr (HasFreePieces) align_pieces();
   }
 
   PD_DEVICE void iterate(int k) {
@@ -114,12 +114,12 @@ class SeveralRunner {
   PD_DEVICE bool finished() const { return finished_; }
 
   PD_DEVICE void finish() {
-    each_slot([&](const Seat&, int i) { v_.finish(i, h_); });
+    each_slot([&](const WorkItem&, int i) { v_.finish(i, h_); });
   }
 
  private:
   // What vertices leave of themselves for the sums of their environment.
-  enum VertexSum { energy_sum, change_sum, way_sum };
+  enum VertexSum { energy_sum, change_sum, displacement_sum };
 
   PD_DEVICE bool stops() const { return stops_; }
   // of the plan's one patch
@@ -127,8 +127,8 @@ class SeveralRunner {
   PD_DEVICE int slots() const { return plan_.most_slots; }
   PD_DEVICE Inputs<T> inputs(int environment) const { return {&call_, first_ + environment}; }
   PD_DEVICE Contacts<T> contacts(int environment) const {
-    const int planes = call_.material.planes_count, balls = call_.material.spheres_count;
-    return {planes_ + environment * planes, balls_ + environment * balls, planes, balls};
+    const int planes = call_.material.planes_count, spheres = call_.material.spheres_count;
+    return {planes_ + environment * planes, spheres_ + environment * spheres, planes, spheres};
   }
   PD_DEVICE T* weights(int environment) const {
     return memory_.weights +
@@ -144,20 +144,20 @@ class SeveralRunner {
 
   // ---- who works on what
 
-  PD_DEVICE static Seat seat_of(int number, int each) { return {number / each, number % each}; }
+  PD_DEVICE static WorkItem item_of(int number, int each) { return {number / each, number % each}; }
   // the one of this thread after it
-  PD_DEVICE static Seat after(const Seat& seat, int each, const Stride& stride) {
-    const int at = seat.at + stride.rest;
+  PD_DEVICE static WorkItem after(const WorkItem& item, int each, const Stride& stride) {
+    const int at = item.at + stride.rest;
     const bool next = at >= each;
-    return {seat.environment + stride.whole + next, next ? at - each : at};
+    return {item.environment + stride.whole + next, next ? at - each : at};
   }
 
   // visit(seat, number in arrays of all)
   template <class Visit>
   PD_DEVICE void each_slot(const Visit& visit) {
-    for (Seat seat = first_slot_; seat.environment < here_;
-         seat = after(seat, slots(), slot_stride_))
-      visit(seat, seat.environment * slots() + seat.at);
+    for (WorkItem item = first_slot_; item.environment < here_;
+         item = after(item, slots(), slot_stride_))
+      visit(item, item.environment * slots() + item.at);
   }
   // A warp for each; the last ones, whose pairs are the fewest.
   template <class Visit>
@@ -173,72 +173,72 @@ class SeveralRunner {
     position_[i] = quad(vec3(origin_[i]) + u);
   }
 
-  PD_DEVICE Vec3<T> force_on(const Seat& seat) const {
-    const Quad<T>* entries = entries_ + seat.environment * plan_.most_entries;
-    const int row = plan_.slot_row[seat.at];
-    return Lean ? sum_entries(entries, row) : sum_entries_soon<T>(entries, row);
+  PD_DEVICE Vec3<T> force_on(const WorkItem& item) const {
+    const Quad<T>* entries = entries_ + item.environment * plan_.most_entries;
+    const int row = plan_.slot_row[item.at];
+    return FewRegisters ? sum_entries(entries, row) : sum_entries_by_8<T>(entries, row);
   }
 
   // of this thread's next one, or again of its first
-  PD_DEVICE void read_ahead(const Seat& next) {
+  PD_DEVICE void prefetch_pair(const WorkItem& next) {
     if (first_pair_.environment >= here_) return;
-    const Seat& seat = next.environment < here_ ? next : first_pair_;
-    now_ = read_pair(plan_, weights(seat.environment), PairPlace{unsigned(seat.at)});
+    const WorkItem& item = next.environment < here_ ? next : first_pair_;
+    pair_ = load_pair(plan_, weights(item.environment), PairPlace{unsigned(item.at)});
   }
 
   // Runs an effect on all pairs, a thread a pair.
   template <bool Energies, class Element>
   PD_DEVICE void each_pair(const Element& element) {
     const StoredRest<T> rest{plan_.pair_rest};
-    for (Seat seat = first_pair_; seat.environment < here_;) {
-      const Quad<T>* position = position_ + seat.environment * slots();
-      Quad<T>* entries = entries_ + seat.environment * plan_.most_entries;
+    for (WorkItem item = first_pair_; item.environment < here_;) {
+      const Quad<T>* position = position_ + item.environment * slots();
+      Quad<T>* entries = entries_ + item.environment * plan_.most_entries;
       const auto read = [&](unsigned corner, Vec3<T>(&x)[1]) {
         x[0] = at_corner(position, corner);
       };
       T energy = T(0);
-      work_on_pair<1>(read, rest.read(PairPlace{unsigned(seat.at)}, now_), now_, entries, element,
+      process_pair<1>(read, rest.read(PairPlace{unsigned(item.at)}, pair_), pair_, entries, element,
                       energy);
-      if constexpr (Energies) pair_energy_[seat.environment * pairs() + seat.at] = energy;
-      if constexpr (Once) break;
-      seat = after(seat, pairs(), pair_stride_);
-      read_ahead(seat);
+      if constexpr (Energies) pair_energy_[item.environment * pairs() + item.at] = energy;
+      if constexpr (OnePerThread) break;
+      item = after(item, pairs(), pair_stride_);
+      prefetch_pair(item);
     }
   }
 
   template <bool Guard>
   PD_DEVICE void iterate_with(int k) {
     each_pair<Guard>(SolidGradient<Guard>{});
-    if (stops() && pending_) conclude(k, [](int) {});
+    if (stops() && pending_) apply_sums(k, [](int) {});
     __syncthreads();
     if (stops() && all_done()) {
       finished_ = true;
       pending_ = false;
       return;
     }
-    each_slot([&](const Seat& seat, int i) {
-      const Course<T>& course = course_[seat.environment];
-      if (stops() && course.progress.done) return;
-      const Seen seen = v_.see(i);
-      const Vec3<T> force = force_on(seat);
-      if constexpr (Guard) leave(energy_sum, i, seen.energy());
+    each_slot([&](const WorkItem& item, int i) {
+      const EnvironmentControl<T>& control = control_[item.environment];
+      if (stops() && control.progress.done) return;
+      const LoadedVertex loaded = v_.load(i);
+      const Vec3<T> force = force_on(item);
+      if constexpr (Guard) store_sum(energy_sum, i, loaded.energy());
       const Vec3<T> next =
-          seen.next(contacts(seat.environment), force, theta_, course.omega[k & 1]);
+          loaded.next(contacts(item.environment), force, theta_, control.omega[k & 1]);
       if (stops()) {
-        const Vec3<T> change = next - seen.u;
-        leave(change_sum, i, double(dot(change, change)));
-        leave(way_sum, i, seen.square_of_way());
+        const Vec3<T> change = next - loaded.u;
+        store_sum(change_sum, i, double(dot(change, change)));
+        store_sum(displacement_sum, i, loaded.square_of_displacement());
       }
-      v_.set_before(i, seen.u);
+      v_.set_before(i, loaded.u);
       v_.set(i, next);
       position_[i] = quad(vec3(origin_[i]) + next);
     });
     // by those who have the fewest vertices, while others move theirs
-    const auto look_ahead = [&](int e) { course_[e].look_ahead(k + 1); };
+    const auto compute_omega = [&](int e) { control_[e].compute_omega(k + 1); };
     if (!stops() && pending_) {
-      conclude(k, look_ahead);
-    } else if (leads() && lane() < here_) {
-      look_ahead(lane());
+      apply_sums(k, compute_omega);
+    } else if (in_leading_warp() && lane() < here_) {
+      compute_omega(lane());
     }
     pending_ = stops() || Guard;
     __syncthreads();
@@ -246,46 +246,46 @@ class SeveralRunner {
 
   PD_DEVICE bool all_done() const {
     for (int e = 0; e < here_; ++e)
-      if (!course_[e].progress.done) return false;
+      if (!control_[e].progress.done) return false;
     return true;
   }
 
   // ---- sums
 
   // a number of T, kept as such
-  PD_DEVICE void leave(VertexSum which, int i, double value) {
+  PD_DEVICE void store_sum(VertexSum which, int i, double value) {
     vertex_sum_[int(which) * vertex_sums_ + i] = T(value);
   }
 
   template <class Op>
-  PD_DEVICE double over_vertices(VertexSum which, int environment, Op op) const {
+  PD_DEVICE double reduce_over_vertices(VertexSum which, int environment, Op op) const {
     const T* values = vertex_sum_ + int(which) * vertex_sums_ + environment * slots();
-    double sum = Op::none;
+    double sum = Op::identity;
     for (int s = lane(); s < slots(); s += warp_size) sum = op(sum, double(values[s]));
-    return across_warp(sum, op);
+    return warp_reduce(sum, op);
   }
   PD_DEVICE double energy_of(int environment) const {
     const T* values = pair_energy_ + environment * pairs();
     double sum = 0;
     for (int p = lane(); p < pairs(); p += warp_size) sum += double(values[p]);
-    return across_warp(sum, Add{}) + over_vertices(energy_sum, environment, Add{});
+    return warp_reduce(sum, Add{}) + reduce_over_vertices(energy_sum, environment, Add{});
   }
 
   // What follows from the sums of iteration k - 1, and then for one thread of each environment.
   template <class Then>
-  PD_DEVICE void conclude(int k, const Then& then) {
+  PD_DEVICE void apply_sums(int k, const Then& then) {
     const bool guarded = (k - 1) % guard_period == 0 && set_.schedule == ScheduleKind::guarded;
     each_environment([&](int e) {
-      Course<T>& course = course_[e];
-      Progress& progress = course.progress;
+      EnvironmentControl<T>& control = control_[e];
+      Progress& progress = control.progress;
       if (stops() && progress.done) return;
       const double energy = guarded ? energy_of(e) : 0;
-      const double change = stops() ? over_vertices(change_sum, e, Add{}) : 0;
-      const double way = stops() ? over_vertices(way_sum, e, Add{}) : 0;
+      const double change = stops() ? reduce_over_vertices(change_sum, e, Add{}) : 0;
+      const double displacement = stops() ? reduce_over_vertices(displacement_sum, e, Add{}) : 0;
       if (lane() == 0) {
         if (guarded) progress.schedule.check(energy);
-        if (stops() &&
-            progress.ends(set_.tolerance, double(course.omega[(k - 1) & 1]), change, way)) {
+        if (stops() && progress.ends(set_.tolerance, double(control.omega[(k - 1) & 1]), change,
+                                     displacement)) {
           progress.done = true;
           progress.used = k;
         }
@@ -296,9 +296,9 @@ class SeveralRunner {
   }
 
   // The last iteration's sums, which no iteration follows.
-  PD_DEVICE void settle() {
+  PD_DEVICE void apply_last_sums() {
     if (!pending_) return;
-    conclude(set_.iterations, [](int) {});
+    apply_sums(set_.iterations, [](int) {});
     pending_ = false;
     __syncthreads();
   }
@@ -308,49 +308,50 @@ class SeveralRunner {
   PD_DEVICE void load() {
     for (int e = threadIdx.x; e < here_; e += blockDim.x)
       inputs(e).read_contacts(planes_ + e * call_.material.planes_count,
-                              balls_ + e * call_.material.spheres_count);
-    each_slot([&](const Seat& seat, int i) {
-      v_.load(i, inputs(seat.environment), seat.at, h_);
+                              spheres_ + e * call_.material.spheres_count);
+    each_slot([&](const WorkItem& item, int i) {
+      v_.init(i, inputs(item.environment), item.at, h_);
       position_[i] = {T(0), T(0), T(0), T(0)};
     });
     __syncthreads();
   }
 
-  PD_DEVICE void move_balls() {
-    if constexpr (!Touching) return;
+  PD_DEVICE void move_spheres() {
+    if constexpr (!HasContacts) return;
     __syncthreads();
     for (int b = threadIdx.x; b < here_ * call_.material.spheres_count; b += blockDim.x)
-      balls_[b].center = balls_[b].center + balls_[b].motion;
+      spheres_[b].center = spheres_[b].center + spheres_[b].motion;
     __syncthreads();
   }
 
   // a and 1 / D of every vertex, w V of every element, and the smallest a / D
-  PD_DEVICE void weigh() {
-    weigh_with(set_.weighted);
-    for (int e = threadIdx.x; e < here_; e += blockDim.x) course_[e].progress.done = false;
+  PD_DEVICE void assemble_diagonal() {
+    compute_weights(set_.weighted);
+    for (int e = threadIdx.x; e < here_; e += blockDim.x) control_[e].progress.done = false;
     pending_ = false;
     each_pair<false>(SolidDiagonal{});
     __syncthreads();
-    each_slot(
-        [&](const Seat& seat, int i) { leave(energy_sum, i, v_.weigh(i, force_on(seat).x)); });
+    each_slot([&](const WorkItem& item, int i) {
+      store_sum(energy_sum, i, v_.set_diagonal(i, force_on(item).x));
+    });
     __syncthreads();
     each_environment([&](int e) {
-      const double least = over_vertices(energy_sum, e, Least{});
-      if (lane() == 0) course_[e].progress.least = least;
+      const double least = reduce_over_vertices(energy_sum, e, Min{});
+      if (lane() == 0) control_[e].progress.min_share = least;
     });
-    if (set_.weighted) weigh_with(false);
+    if (set_.weighted) compute_weights(false);
     __syncthreads();
   }
 
-  PD_DEVICE void weigh_with(bool bounded) {
+  PD_DEVICE void compute_weights(bool bounded) {
     const StoredRest<T> rest{plan_.pair_rest};
-    for (Seat seat = first_pair_; seat.environment < here_;
-         seat = after(seat, pairs(), pair_stride_))
-      weigh_pair(plan_, rest, PairPlace{unsigned(seat.at)},
-                 call_.material.stiffness.of(first_ + seat.environment), bounded,
-                 weights(seat.environment));
+    for (WorkItem item = first_pair_; item.environment < here_;
+         item = after(item, pairs(), pair_stride_))
+      compute_pair_weights(plan_, rest, PairPlace{unsigned(item.at)},
+                           call_.material.stiffness.of(first_ + item.environment), bounded,
+                           weights(item.environment));
     // each thread reads what it has written itself
-    read_ahead(first_pair_);
+    prefetch_pair(first_pair_);
   }
 
   // ---- rigid motions: cuda/several_rigid.h
@@ -363,14 +364,14 @@ class SeveralRunner {
     if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
     align_out_of_line(whole_, shared_, first_, here_, first);
     // again, since what lives in registers across a call would be spilled in the iterations too
-    read_ahead(first_pair_);
+    prefetch_pair(first_pair_);
   }
 
   // By a runner of its own, so that this one stays in registers. `first`: there is no iterate before this one.
-  PD_DEVICE_COLD static void align_out_of_line(const SeveralCall<T>& call, std::byte* shared,
+  PD_DEVICE_COLD static void align_out_of_line(const SmallBatchCall<T>& call, std::byte* shared,
                                                std::int64_t first_environment, int here,
                                                bool first) {
-    SeveralRunner run(call, shared);
+    SmallBatchRunner run(call, shared);
     run.first_ = first_environment;
     run.here_ = here;
     run.move_pieces(first);
@@ -381,34 +382,34 @@ class SeveralRunner {
   // ---- results
 
   PD_DEVICE void store(int record) {
-    each_slot([&](const Seat& seat, int i) {
-      inputs(seat.environment).write(record, seat.at, vec3(v_.x[i]), vec3(v_.velocity[i]));
+    each_slot([&](const WorkItem& item, int i) {
+      inputs(item.environment).write(record, item.at, vec3(v_.x[i]), vec3(v_.velocity[i]));
     });
     for (int e = threadIdx.x; e < here_; e += blockDim.x)
-      inputs(e).write_info(record, course_[e].progress);
+      inputs(e).write_info(record, control_[e].progress);
   }
 
-  const SeveralCall<T>& whole_;
+  const SmallBatchCall<T>& whole_;
   std::byte* shared_;
   const DeviceStep<T>& call_;
   const DevicePlan<T>& plan_;
   const Settings& set_;
-  const SeveralScratch<T>& memory_;
+  const SmallBatchScratch<T>& memory_;
   const Stride &pair_stride_, &slot_stride_;
-  unsigned first_of_block_;  // in the scratch memory
-  std::int64_t first_ = 0;   // environment,
-  int here_ = 0;             // and how many
-  Course<T>* course_;        // of each
-  Quad<T>* position_;        // where elements read vertices
-  Quad<T>* origin_;          // start of the step, from the first vertex
-  Quad<T>* entries_;         // forces of elements
-  Vertices<T, Touching> v_;
+  unsigned first_of_block_;         // in the scratch memory
+  std::int64_t first_ = 0;          // environment,
+  int here_ = 0;                    // and how many
+  EnvironmentControl<T>* control_;  // of each
+  Quad<T>* position_;               // where elements read vertices
+  Quad<T>* origin_;                 // start of the step, from the first vertex
+  Quad<T>* entries_;                // forces of elements
+  Vertices<T, HasContacts> v_;
   T *pair_energy_, *vertex_sum_;  // of all environments, for sums; the latter for each of VertexSum
   int vertex_sums_;
-  Ball<T>* balls_;
+  Ball<T>* spheres_;
   Plane<T>* planes_;
-  Seat first_pair_, first_slot_;  // of this thread
-  PairNumbers<T> now_;            // of its next pair
+  WorkItem first_pair_, first_slot_;  // of this thread
+  PairInputs<T> pair_;                // of its next pair
   T h_;
   const T& theta_;
   int stops_ = in_register(int(set_.tolerance > 0));

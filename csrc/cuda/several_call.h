@@ -9,16 +9,16 @@ namespace pd::inline PD_TARGET {
 
 // How an environment goes on, in shared memory.
 template <class T>
-struct Course {
+struct EnvironmentControl {
   Progress progress;
   T omega[2];  // of even and of odd iterations
 
-  PD_DEVICE void look_ahead(int k) { omega[k & 1] = T(progress.schedule.next(k)); }
+  PD_DEVICE void compute_omega(int k) { omega[k & 1] = T(progress.schedule.next(k)); }
 };
 
 // Device memory of the blocks.
 template <class T>
-struct SeveralScratch {
+struct SmallBatchScratch {
   Quad<T>*x, *velocity;  // [blocks, together, slots]
   T* weights;            // [blocks, together, blocks of pairs, 2, 32] w V
   Piece<T>* pieces;      // [blocks, together, pieces]
@@ -34,10 +34,10 @@ struct Stride {
 };
 
 template <class T>
-struct SeveralCall {
+struct SmallBatchCall {
   DeviceStep<T> step;
-  SeveralScratch<T> scratch;
-  int together;  // environments of a block
+  SmallBatchScratch<T> scratch;
+  int per_block;  // environments of a block
   Stride pair_stride, slot_stride;
   T relaxation;  // of the settings, in T
 };
@@ -45,13 +45,13 @@ struct SeveralCall {
 // Where the parts of a block's shared memory lie: courses; position, target, u, before and origin of every slot; entries;
 // energies of pairs, then three numbers of every slot; balls and planes.
 template <class T>
-struct SeveralLayout {
+struct SmallBatchLayout {
   std::size_t vectors, entries, energies, contacts, bytes;
 
-  PD_HD SeveralLayout(const DeviceStep<T>& step, int together) {
+  PD_HD SmallBatchLayout(const DeviceStep<T>& step, int per_block) {
     const DevicePlan<T>& plan = step.plan;
-    const std::size_t many = together, slots = many * plan.most_slots;
-    vectors = aligned(many * sizeof(Course<T>));
+    const std::size_t many = per_block, slots = many * plan.most_slots;
+    vectors = aligned(many * sizeof(EnvironmentControl<T>));
     entries = vectors + 5 * sizeof(Quad<T>) * slots;
     energies = entries + sizeof(Quad<T>) * many * plan.most_entries;
     contacts = aligned(energies + sizeof(T) * (many * plan.most_pairs + sums_count * slots));

@@ -22,19 +22,19 @@ class Slots {
         behind_(reinterpret_cast<Two*>(first_ + count)) {}
 
   // As much of a slot as one load brings.
-  PD_DEVICE Quad<T> look(unsigned slot_times_8) const { return *at(first_, slot_times_8); }
+  PD_DEVICE Quad<T> load(unsigned slot_times_8) const { return *at(first_, slot_times_8); }
   // the second vector of a slot that was looked at
-  PD_DEVICE Vec3<T> second(unsigned slot_times_8, const Quad<T>& seen) const {
+  PD_DEVICE Vec3<T> second(unsigned slot_times_8, const Quad<T>& loaded) const {
     const Two two = *at(behind_, slot_times_8);
-    return {seen.w, two.a, two.b};
+    return {loaded.w, two.a, two.b};
   }
 
   // both, of the slot of a corner as pair_corner has it, for elements
   PD_DEVICE void operator()(unsigned corner, Vec3<T> (&vectors)[2]) const {
     const unsigned slot_times_8 = corner & 0xffff;
-    const Quad<T> seen = look(slot_times_8);
-    vectors[0] = vec3(seen);
-    vectors[1] = second(slot_times_8, seen);
+    const Quad<T> loaded = load(slot_times_8);
+    vectors[0] = vec3(loaded);
+    vectors[1] = second(slot_times_8, loaded);
   }
 
   PD_DEVICE void set(int slot, const Vec3<T>& first, const Vec3<T>& second) const {

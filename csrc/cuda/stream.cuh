@@ -43,7 +43,7 @@ StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
   arena.place(m.part_sum, step.batch * plan.parts * PartSums::count);
   arena.place(m.counter, plan.pieces > 0 ? step.batch : 0);
   arena.place(m.planes, step.batch * material.planes_count);
-  arena.place(m.balls, step.batch * material.spheres_count);
+  arena.place(m.spheres, step.batch * material.spheres_count);
   return m;
 }
 
@@ -63,8 +63,8 @@ class Launcher {
 
   // The same for a kernel that waits by itself (cuda/handoff.h), so that it may start before the one before has ended.
   template <class Call, class... Arguments>
-  void run_early(void (*kernel)(Call, Arguments...), std::int64_t count, int threads,
-                 std::size_t shared, const Call& call, Arguments... arguments) const {
+  void run_overlapped(void (*kernel)(Call, Arguments...), std::int64_t count, int threads,
+                      std::size_t shared, const Call& call, Arguments... arguments) const {
     if (count == 0) return;
     cudaLaunchAttribute attribute = {};
     attribute.id = cudaLaunchAttributeProgrammaticStreamSerialization;
@@ -83,7 +83,7 @@ class Launcher {
   cudaStream_t stream_;
 };
 
-template <class T, bool Touching>
+template <class T, bool HasContacts>
 class StreamRunner {
  public:
   // `outer`: memory of outer_bytes, for the multilevel solver alone
@@ -102,9 +102,9 @@ class StreamRunner {
 
   StreamRunner(const StreamRunner&) = delete;
 
-  void roll() {
+  void rollout() {
     vertices<VertexTask::load>(0);
-    weigh();
+    assemble_diagonal();
     if (set_.multilevel()) run_comparison(call_, outer_, stream_);
     for (int t = 0; t < set_.steps; ++t) {
       if (set_.multilevel()) {
@@ -113,7 +113,7 @@ class StreamRunner {
         step(*this, set_);
       }
       if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
-      if (Touching && t + 1 < set_.steps) environments<EnvironmentTask::move_balls>(0);
+      if (HasContacts && t + 1 < set_.steps) environments<EnvironmentTask::move_spheres>(0);
     }
   }
 
@@ -132,7 +132,7 @@ class StreamRunner {
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
-    RoundsCall<T> call = {call_, Aligning(plan_, Touching, first), teams_.count, teams_.blocks,
+    RoundsCall<T> call = {call_, Aligning(plan_, HasContacts, first), teams_.count, teams_.blocks,
                           call_.memory.counter};
     launch_teams(rounds_kernel(), call, call.counter, rounds_threads, 0, stream_);
   }
@@ -156,14 +156,14 @@ class StreamRunner {
   void finish() { vertices<VertexTask::finish>(0); }
 
  private:
-  void weigh() {
+  void assemble_diagonal() {
     const bool own = call_.step.material.stiffness.stride != 0;
     const std::int64_t sets = own ? patches_ : plan_.patches;
     launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, set_.weighted);
     // the pass starts from u = 0 at no particular place
     launcher_.run(stream_origins<T>, patches_, vertex_threads, 0, call_);
-    pass<Visit::weigh>(0);
-    decide<Decision::weigh>(0);
+    pass<Visit::diagonal>(0);
+    decide<Decision::diagonal>(0);
     if (set_.weighted) launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, false);
   }
 
@@ -180,10 +180,11 @@ class StreamRunner {
     const unsigned round = set_.tolerance > 0 ? 0 : ++round_;
     const bool piped = pipe<What>(k, round);
     if (!piped)
-      launcher_.run(stream_patches<What, T, Touching>, patches_, pass_threads, pass_shared_, call_,
-                    k);
-    launcher_.run_early(stream_shared<What, T, Touching>, call_.step.batch * call_.shared_blocks(),
-                        shared_threads, 0, call_, k, piped ? round : 0u);
+      launcher_.run(stream_patches<What, T, HasContacts>, patches_, pass_threads, pass_shared_,
+                    call_, k);
+    launcher_.run_overlapped(stream_shared<What, T, HasContacts>,
+                             call_.step.batch * call_.shared_blocks(), shared_threads, 0, call_, k,
+                             piped ? round : 0u);
   }
 
   // The patches of an iteration as a pipeline, where a multiprocessor has room for two at once. How many patches there are
@@ -191,7 +192,7 @@ class StreamRunner {
   template <Visit What>
   bool pipe(int k, unsigned round) {
     constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
-    if constexpr (updates && !Touching && sizeof(T) == 4) {
+    if constexpr (updates && !HasContacts && sizeof(T) == 4) {
       const auto kernel = stream_pipeline<What, T>;
       // whose places 32 bits count; slots are the most of what an environment has
       constexpr std::int64_t most = std::numeric_limits<std::uint32_t>::max();
@@ -200,8 +201,8 @@ class StreamRunner {
           2 * pipeline_half_bytes(sizeof(T), plan_.most_slots, plan_.most_entries);
       const std::int64_t blocks =
           resident_blocks(reinterpret_cast<const void*>(kernel), pipeline_threads, shared);
-      launcher_.run_early(kernel, std::min(blocks, patches_), pipeline_threads, shared, call_, k,
-                          round);
+      launcher_.run_overlapped(kernel, std::min(blocks, patches_), pipeline_threads, shared, call_,
+                               k, round);
       return blocks > 0;
     }
     return false;
@@ -212,14 +213,14 @@ class StreamRunner {
     // a thread a row of sums
     const int rows = What == Decision::start ? 1 : std::min(call_.sum_rows(), decide_threads);
     const int threads = (rows + warp_size - 1) / warp_size * warp_size;
-    launcher_.run_early(stream_decide<What, T>, call_.step.batch, threads, 0, call_, k);
+    launcher_.run_overlapped(stream_decide<What, T>, call_.step.batch, threads, 0, call_, k);
   }
 
   template <VertexTask What>
   void vertices(int record) {
     const std::int64_t blocks = (plan_.vertices + vertex_threads - 1) / vertex_threads;
-    launcher_.run(stream_vertices<What, T, Touching>, call_.step.batch * blocks, vertex_threads, 0,
-                  call_, record);
+    launcher_.run(stream_vertices<What, T, HasContacts>, call_.step.batch * blocks, vertex_threads,
+                  0, call_, record);
   }
 
   template <EnvironmentTask What>
@@ -229,7 +230,7 @@ class StreamRunner {
   }
 
   static const void* rounds_kernel() {
-    return reinterpret_cast<const void*>(stream_rounds<T, Touching>);
+    return reinterpret_cast<const void*>(stream_rounds<T, HasContacts>);
   }
 
   static std::int64_t blocks_for(std::int64_t threads) {
@@ -257,21 +258,21 @@ std::int64_t stream_bytes(const DeviceStep<T>& step) {
 }
 
 // lets the kernels of a pass have more shared memory than the usual 48 KB
-template <class T, bool Touching>
+template <class T, bool HasContacts>
 void allow_shared_memory(std::size_t bytes) {
-  for (const auto kernel :
-       {stream_patches<Visit::weigh, T, Touching>, stream_patches<Visit::update, T, Touching>,
-        stream_patches<Visit::update_guarded, T, Touching>}) {
+  for (const auto kernel : {stream_patches<Visit::diagonal, T, HasContacts>,
+                            stream_patches<Visit::update, T, HasContacts>,
+                            stream_patches<Visit::update_guarded, T, HasContacts>}) {
     if (resident_blocks(reinterpret_cast<const void*>(kernel), pass_threads, bytes) == 0)
       refuse_shared_memory(bytes);
   }
 }
 
-template <class T, bool Touching>
+template <class T, bool HasContacts>
 void run_stream_with(const StreamCall<T>& call, void* outer, cudaStream_t stream) {
-  allow_shared_memory<T, Touching>(
+  allow_shared_memory<T, HasContacts>(
       pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 2));
-  StreamRunner<T, Touching>(call, outer, stream).roll();
+  StreamRunner<T, HasContacts>(call, outer, stream).rollout();
 }
 
 template <class T>
@@ -281,7 +282,7 @@ void run_stream(const DeviceStep<T>& step, void* memory, Stream to) {
   Arena arena(memory);
   call.memory = arrange(arena, call);
   void* outer = static_cast<std::byte*>(memory) + arena.size();
-  if (touches(step)) {
+  if (has_contacts(step)) {
     run_stream_with<T, true>(call, outer, stream);
   } else {
     run_stream_with<T, false>(call, outer, stream);

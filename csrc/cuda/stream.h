@@ -29,7 +29,7 @@ struct StreamMemory {
   double* part_sum;       // [batch, parts, PartSums::count]
   unsigned* counter;      // [batch] of teams that move pieces
   Plane<T>* planes;       // [batch, planes]
-  Ball<T>* balls;         // [batch, balls]
+  Ball<T>* spheres;       // [batch, balls]
 };
 
 template <class T>
@@ -48,12 +48,12 @@ struct StreamCall {
 };
 
 // One environment of a call.
-template <class T, bool Touching>
+template <class T, bool HasContacts>
 struct StreamWork {
   const StreamCall<T>& call;
   const DevicePlan<T>& plan;
   std::int64_t environment;
-  Vertices<T, Touching> v;
+  Vertices<T, HasContacts> v;
   Quad<T>*origin, *shared_force;
   T *weights, *patch_weight;
   Progress& progress;
@@ -76,7 +76,7 @@ struct StreamWork {
                      (c.step.material.stiffness.stride ? e * plan.patches : 0)),
         progress(c.memory.progress[e]),
         contacts{c.memory.planes + e * c.step.material.planes_count,
-                 c.memory.balls + e * c.step.material.spheres_count, c.step.material.planes_count,
+                 c.memory.spheres + e * c.step.material.spheres_count, c.step.material.planes_count,
                  c.step.material.spheres_count},
         in{&c.step, e},
         h(T(c.step.settings.time_step)) {}
@@ -87,11 +87,11 @@ struct StreamWork {
     // for stream_shared, see handoff.h
     return __ldcg(call.memory.omega + environment * guard_period + k % guard_period);
   }
-  PD_DEVICE Word* letters() const { return reinterpret_cast<Word*>(shared_force); }
+  PD_DEVICE TaggedWord* messages() const { return reinterpret_cast<TaggedWord*>(shared_force); }
   // What a patch has of the force on a vertex that it shares; 0 is the `round` of a pass for which nobody waits.
-  PD_DEVICE void leave_force(unsigned place, const Vec3<T>& force, unsigned round) const {
+  PD_DEVICE void store_force(unsigned place, const Vec3<T>& force, unsigned round) const {
     if constexpr (sizeof(T) == 4) {
-      Letter<T>::post(letters() + place, force, round);
+      HaloMessage<T>::send(messages() + place, force, round);
     } else {
       shared_force[place] = quad(force);
     }
@@ -112,14 +112,14 @@ struct StreamWork {
 PD_HD bool alternates(const Settings& settings) { return !(settings.tolerance > 0); }
 
 // What a pass does with a vertex once the force of the elements on it is known.
-enum class Visit { weigh, update, update_guarded };
+enum class Visit { diagonal, update, update_guarded };
 
 template <Visit What>
 struct ElementOf {
   using type = SolidGradient<What == Visit::update_guarded>;
 };
 template <>
-struct ElementOf<Visit::weigh> {
+struct ElementOf<Visit::diagonal> {
   using type = SolidDiagonal;
 };
 
@@ -128,34 +128,35 @@ struct ThreadSums {
 };
 
 // What a visit goes by beside the force; nothing before there is a state.
-template <Visit What, class T, bool Touching>
-PD_DEVICE typename Vertices<T, Touching>::Seen see(const StreamWork<T, Touching>& w, unsigned i) {
-  if constexpr (What == Visit::weigh) return {};
-  return w.v.see(i);
+template <Visit What, class T, bool HasContacts>
+PD_DEVICE typename Vertices<T, HasContacts>::LoadedVertex load_vertex(
+    const StreamWork<T, HasContacts>& w, unsigned i) {
+  if constexpr (What == Visit::diagonal) return {};
+  return w.v.load(i);
 }
 
-template <Visit What, class T, bool Touching>
-PD_DEVICE double omega_of_pass(const StreamWork<T, Touching>& w, int k) {
+template <Visit What, class T, bool HasContacts>
+PD_DEVICE double omega_of_pass(const StreamWork<T, HasContacts>& w, int k) {
   return What == Visit::update || What == Visit::update_guarded ? w.omega(k) : 0;
 }
 
-template <Visit What, class T, bool Touching>
-PD_DEVICE void visit(const StreamWork<T, Touching>& w, unsigned i,
-                     const typename Vertices<T, Touching>::Seen& seen, const Vec3<T>& force,
-                     T omega, ThreadSums& sums) {
+template <Visit What, class T, bool HasContacts>
+PD_DEVICE void visit(const StreamWork<T, HasContacts>& w, unsigned i,
+                     const typename Vertices<T, HasContacts>::LoadedVertex& loaded,
+                     const Vec3<T>& force, T omega, ThreadSums& sums) {
   double (&sum)[sums_count] = sums.value;
-  if constexpr (What == Visit::weigh) {
-    sum[0] = Least{}(sum[0], w.v.weigh(i, force.x));
+  if constexpr (What == Visit::diagonal) {
+    sum[0] = Min{}(sum[0], w.v.set_diagonal(i, force.x));
   } else {
-    if constexpr (What == Visit::update_guarded) sum[0] += seen.energy();
-    if (!alternates(w.settings())) sum[2] += seen.square_of_way();
-    const Vec3<T> next = seen.next(w.contacts, force, T(w.settings().relaxation), omega);
+    if constexpr (What == Visit::update_guarded) sum[0] += loaded.energy();
+    if (!alternates(w.settings())) sum[2] += loaded.square_of_displacement();
+    const Vec3<T> next = loaded.next(w.contacts, force, T(w.settings().relaxation), omega);
     if (alternates(w.settings())) {
-      w.v.set_in_place_of_before(i, seen, next);
+      w.v.set_in_place_of_before(i, loaded, next);
     } else {
-      const Vec3<T> change = next - seen.u;
+      const Vec3<T> change = next - loaded.u;
       sum[1] += double(dot(change, change));
-      w.v.set_before(i, seen.u);
+      w.v.set_before(i, loaded.u);
       w.v.set(i, next);
     }
   }
@@ -163,48 +164,48 @@ PD_DEVICE void visit(const StreamWork<T, Touching>& w, unsigned i,
 
 template <Visit What>
 PD_DEVICE ThreadSums no_sums() {
-  if constexpr (What == Visit::weigh) return {{HUGE_VAL, HUGE_VAL, HUGE_VAL}};
+  if constexpr (What == Visit::diagonal) return {{HUGE_VAL, HUGE_VAL, HUGE_VAL}};
   return {{0, 0, 0}};
 }
 
 // The sums of a block, to its row.
 template <Visit What>
 PD_DEVICE void write_sums(const ThreadSums& sums, double* row) {
-  using Op = std::conditional_t<What == Visit::weigh, Least, Add>;
+  using Op = std::conditional_t<What == Visit::diagonal, Min, Add>;
   __shared__ double warp_sum[sums_count][warp_size];
   static_assert(sizeof(warp_sum) == pass_static_bytes);
   const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
   for (int n = 0; n < sums_count; ++n) {
-    const double sum = across_warp(sums.value[n], Op{});
+    const double sum = warp_reduce(sums.value[n], Op{});
     if (lane == 0) warp_sum[n][warp] = sum;
   }
   __syncthreads();
   if (warp != 0) return;
   for (int n = 0; n < sums_count; ++n) {
     const bool used = lane < int(blockDim.x) / warp_size;
-    const double sum = across_warp(used ? warp_sum[n][lane] : Op::none, Op{});
+    const double sum = warp_reduce(used ? warp_sum[n][lane] : Op::identity, Op{});
     if (lane == 0) row[n] = sum;
   }
 }
 
-template <Visit What, class T, bool Touching>
-PD_DEVICE bool wants_sums(const StreamWork<T, Touching>& w) {
+template <Visit What, class T, bool HasContacts>
+PD_DEVICE bool wants_sums(const StreamWork<T, HasContacts>& w) {
   return What != Visit::update || w.settings().tolerance > 0;
 }
 
-template <Visit What, class T, bool Touching>
-PD_DEVICE bool skips(const StreamWork<T, Touching>& w) {
+template <Visit What, class T, bool HasContacts>
+PD_DEVICE bool skips(const StreamWork<T, HasContacts>& w) {
   constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
   return updates && w.settings().tolerance > 0 && w.progress.done;
 }
 
 // Elements of a patch: here(vertex, see(vertex), force) for every vertex inside it; the forces on those that it shares stay
 // behind. Returns what this thread has met of their energy. `shared`: pass_shared_bytes.
-template <class T, bool Touching, class Element, class See, class Here>
-PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, std::byte* shared,
-                                 const Element& element, const See& see, const Here& here) {
+template <class T, bool HasContacts, class Element, class Load, class Here>
+PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number, std::byte* shared,
+                                 const Element& element, const Load& load, const Here& here) {
   const Patch<T> patch(w.plan, number);
-  const HalfNumbers<T> first = read_half<true>(patch, w.weights, int(threadIdx.x));
+  const TetInputs<T> first = load_tet<true>(patch, w.weights, int(threadIdx.x));
   const Slots<T> slots(shared, w.plan.most_slots);
   const ComputedRest<T> rest = rest_of<true>(patch);
   const T per_unit = T(1) / rest.unit;
@@ -214,89 +215,90 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, Touching>& w, int number, s
     slots.set(s, position, rest.position[s].bits());
   }
   __syncthreads();
-  const auto shape_of = [&](int, const HalfNumbers<T>& numbers, const Quad<T>(&seen)[4]) {
-    return half_rest(numbers, per_unit, slots, seen);
+  const auto shape_of = [&](int, const TetInputs<T>& numbers, const Quad<T>(&loaded)[4]) {
+    return tet_rest(numbers, per_unit, slots, loaded);
   };
-  const double energy = double(each_half<false, true>(
+  const double energy = double(each_tet<false, true>(
       patch, slots, shape_of, [](int, T) { return true; }, w.weights, entries, element, first));
   // on the way while the block meets
   int s = threadIdx.x, row = 0;
-  decltype(see(0)) seen{};
-  const auto look_at_slot = [&] {
+  decltype(load(0)) loaded{};
+  const auto load_slot = [&] {
     if (s < patch.slots) row = patch.row(s);
-    if (s < patch.interior) seen = see(patch.first_vertex + s);
+    if (s < patch.interior) loaded = load(patch.first_vertex + s);
   };
-  look_at_slot();
+  load_slot();
   __syncthreads();
 #pragma unroll 1
   while (s < patch.slots) {
     const Vec3<T> force = sum_entries(entries, row);
     if (s < patch.interior) {
-      here(patch.first_vertex + s, seen, force);
+      here(patch.first_vertex + s, loaded, force);
     } else {
       const int end_vertex = patch.first_vertex + patch.interior;
-      w.leave_force(place_of_force(w.plan, patch.first_slot, end_vertex, s), force, 0);
+      w.store_force(place_of_force(w.plan, patch.first_slot, end_vertex, s), force, 0);
     }
     s += blockDim.x;
-    look_at_slot();
+    load_slot();
   }
   return energy;
 }
 
 // Elements of every patch, and the vertices inside it.
-template <Visit What, class T, bool Touching>
+template <Visit What, class T, bool HasContacts>
 __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
     stream_patches(const __grid_constant__ StreamCall<T> call, int k) {
   extern __shared__ __align__(16) std::byte shared[];
   const int number = int(blockIdx.x % call.step.plan.patches);
-  const StreamWork<T, Touching> w(call, blockIdx.x / call.step.plan.patches);
+  const StreamWork<T, HasContacts> w(call, blockIdx.x / call.step.plan.patches);
   if (skips<What>(w)) return;
   // what is read once the elements are done
   const Patch<T> patch(w.plan, number);
-  if constexpr (What != Visit::weigh) {
-    bring_near(w.v.before + patch.first_vertex, patch.interior);
-    bring_near(w.v.target + patch.first_vertex, patch.interior);
+  if constexpr (What != Visit::diagonal) {
+    prefetch_to_l2(w.v.before + patch.first_vertex, patch.interior);
+    prefetch_to_l2(w.v.target + patch.first_vertex, patch.interior);
   }
-  bring_near(w.plan.slot_row + patch.first_slot, patch.slots);
+  prefetch_to_l2(w.plan.slot_row + patch.first_slot, patch.slots);
   ThreadSums sums = no_sums<What>();
   const double omega = omega_of_pass<What>(w, k);
   const double energy = pass_over_patch(
-      w, number, shared, typename ElementOf<What>::type{}, [&](int i) { return see<What>(w, i); },
-      [&](int i, const auto& seen, const Vec3<T>& force) {
-        visit<What>(w, i, seen, force, T(omega), sums);
+      w, number, shared, typename ElementOf<What>::type{},
+      [&](int i) { return load_vertex<What>(w, i); },
+      [&](int i, const auto& loaded, const Vec3<T>& force) {
+        visit<What>(w, i, loaded, force, T(omega), sums);
       });
-  if constexpr (What != Visit::weigh) sums.value[0] += energy;
+  if constexpr (What != Visit::diagonal) sums.value[0] += energy;
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));
 }
 
 // What follows from the sums of a pass, an environment a block.
-enum class Decision { start, weigh, iterate };
+enum class Decision { start, diagonal, iterate };
 
 template <Decision What, class T>
 __global__ void __launch_bounds__(decide_threads)
     stream_decide(const __grid_constant__ StreamCall<T> call, int k) {
-  using Op = std::conditional_t<What == Decision::weigh, Least, Add>;
+  using Op = std::conditional_t<What == Decision::diagonal, Min, Add>;
   const StreamWork<T, false> w(call, blockIdx.x);
   __shared__ double total[sums_count];
-  await_kernel_before();
-  if (threadIdx.x == 0) let_next_kernel_start();
+  wait_for_previous_kernel();
+  if (threadIdx.x == 0) launch_dependents();
   if constexpr (What != Decision::start) {
-    ThreadSums sums = {{Op::none, Op::none, Op::none}};
+    ThreadSums sums = {{Op::identity, Op::identity, Op::identity}};
     for (int row = threadIdx.x; row < call.sum_rows(); row += blockDim.x) {
       for (int n = 0; n < sums_count; ++n) sums.value[n] = Op{}(sums.value[n], w.sum_row(row)[n]);
     }
-    write_sums<What == Decision::weigh ? Visit::weigh : Visit::update>(sums, total);
+    write_sums<What == Decision::diagonal ? Visit::diagonal : Visit::update>(sums, total);
   }
   if (threadIdx.x != 0) return;
   const Settings& set = call.step.settings;
   Progress& p = w.progress;
   double* omega = call.memory.omega + w.environment * guard_period;
-  if constexpr (What == Decision::weigh) {
-    p.least = total[0];
+  if constexpr (What == Decision::diagonal) {
+    p.min_share = total[0];
   } else if constexpr (What == Decision::start) {
-    p.schedule = Schedule(set, p.least, w.contacts.friction() > T(0));
+    p.schedule = Schedule(set, p.min_share, w.contacts.friction() > T(0));
     p.used = set.tolerance > 0 ? 0 : set.iterations;
-    if (set.tolerance > 0) p.stop = {w.in.fall()};
+    if (set.tolerance > 0) p.stop = {w.in.free_fall_squared()};
     p.done = false;
     omega[0] = p.schedule.next(0);
   } else {
@@ -318,7 +320,7 @@ __global__ void __launch_bounds__(vertex_threads)
   const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
   const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
   const T* stiffness = call.step.material.stiffness.of(w.environment);
-  weigh_pairs(patch, rest_of<true>(patch), stiffness, bounded, w.weights);
+  compute_patch_weights(patch, rest_of<true>(patch), stiffness, bounded, w.weights);
   const T one = one_stiffness(patch, stiffness);
   if (threadIdx.x == 0)
     w.patch_weight[patch.index] =
@@ -334,19 +336,19 @@ __global__ void __launch_bounds__(vertex_threads)
 
 enum class VertexTask { load, predict, start, finish, store };
 
-template <VertexTask What, class T, bool Touching>
+template <VertexTask What, class T, bool HasContacts>
 __global__ void __launch_bounds__(vertex_threads)
     stream_vertices(const __grid_constant__ StreamCall<T> call, int record) {
   const int blocks = (call.step.plan.vertices + vertex_threads - 1) / vertex_threads;
-  const StreamWork<T, Touching> w(call, blockIdx.x / blocks);
+  const StreamWork<T, HasContacts> w(call, blockIdx.x / blocks);
   const int i = int(blockIdx.x % blocks) * vertex_threads + int(threadIdx.x);
-  if constexpr (What == VertexTask::load && Touching) {
+  if constexpr (What == VertexTask::load && HasContacts) {
     if (i == 0)
       w.in.read_contacts(const_cast<Plane<T>*>(w.contacts.planes),
                          const_cast<Ball<T>*>(w.contacts.balls));
   }
   if (i >= w.plan.vertices) return;
-  if constexpr (What == VertexTask::load) w.v.load(i, w.in, i, w.h);
+  if constexpr (What == VertexTask::load) w.v.init(i, w.in, i, w.h);
   if constexpr (What == VertexTask::predict) w.v.predict(i, w.in, i, w.h);
   if constexpr (What == VertexTask::start) {
     const Vec3<T> u = w.v.first(i, w.in, i, w.contacts);
@@ -376,7 +378,7 @@ PD_DEVICE std::int64_t thread_number() {
 
 // ---- environment by environment
 
-enum class EnvironmentTask { move_balls, store };
+enum class EnvironmentTask { move_spheres, store };
 
 template <EnvironmentTask What, class T>
 __global__ void __launch_bounds__(vertex_threads)
@@ -385,10 +387,10 @@ __global__ void __launch_bounds__(vertex_threads)
   if (e >= call.step.batch) return;
   const StreamWork<T, true> w(call, e);
   if constexpr (What == EnvironmentTask::store) w.in.write_info(record, w.progress);
-  if constexpr (What == EnvironmentTask::move_balls) {
-    Ball<T>* balls = const_cast<Ball<T>*>(w.contacts.balls);
+  if constexpr (What == EnvironmentTask::move_spheres) {
+    Ball<T>* spheres = const_cast<Ball<T>*>(w.contacts.balls);
     for (int b = 0; b < w.contacts.ball_count; ++b)
-      balls[b].center = balls[b].center + balls[b].motion;
+      spheres[b].center = spheres[b].center + spheres[b].motion;
   }
 }
 

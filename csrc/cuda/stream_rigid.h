@@ -16,14 +16,15 @@ struct RoundsCall {
 };
 
 // A warp has the same parts in every round, and a lane the same of their vertices: it reads what it has moved itself, without waiting.
-template <class T, bool Touching>
+template <class T, bool HasContacts>
 class StreamRounds {
  public:
-  PD_DEVICE StreamRounds(const StreamWork<T, Touching>& w, BlockTeam& team) : w_(w), team_(team) {}
+  PD_DEVICE StreamRounds(const StreamWork<T, HasContacts>& w, BlockTeam& team)
+      : w_(w), team_(team) {}
 
   PD_DEVICE void run(Aligning how) {
     do {
-      find_in_rounds<Touching>(*this, how, w_.contacts.has_several());
+      find_in_rounds<HasContacts>(*this, how, w_.contacts.has_several());
       each_vertex([&](int i, const Piece<T>& piece) {
         if (!(w_.v.u[i].w > 0)) return;  // pinned
         const Vec3<T> u = w_.v.moved(i, piece.motion);
@@ -31,7 +32,7 @@ class StreamRounds {
         if (how.first) w_.v.set_before(i, u);
       });
       how.go_on();
-    } while (Touching && some_piece([&](const Piece<T>& p) { return p.leg == how.leg; }));
+    } while (HasContacts && some_piece([&](const Piece<T>& p) { return p.leg == how.leg; }));
     team_.barrier();  // blocks begin an environment together
   }
 
@@ -78,18 +79,18 @@ class StreamRounds {
     });
   }
 
-  const StreamWork<T, Touching>& w_;
+  const StreamWork<T, HasContacts>& w_;
   BlockTeam& team_;
 };
 
-template <class T, bool Touching>
+template <class T, bool HasContacts>
 __global__ void __launch_bounds__(rounds_threads)
     stream_rounds(const __grid_constant__ RoundsCall<T> call) {
   const int number = int(blockIdx.x) / call.blocks;
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.counter + number);
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
-    const StreamWork<T, Touching> w(call.stream, e);
-    StreamRounds<T, Touching>(w, team).run(call.how);
+    const StreamWork<T, HasContacts> w(call.stream, e);
+    StreamRounds<T, HasContacts>(w, team).run(call.how);
   }
 }
 

@@ -16,7 +16,7 @@ struct TeamTotals {
 };
 
 // The last warp leads: it is the one that a last round of pairs leaves idle, where there are several.
-PD_DEVICE bool leads() { return threadIdx.x + warp_size >= blockDim.x; }
+PD_DEVICE bool in_leading_warp() { return threadIdx.x + warp_size >= blockDim.x; }
 PD_DEVICE bool is_leader() { return threadIdx.x + warp_size == blockDim.x; }
 PD_DEVICE int lane() { return int(threadIdx.x) % warp_size; }
 
@@ -27,44 +27,45 @@ class TeamSums {
 
  public:
   // `box` [2, patches, sums_count], of a grid, starts with tags of zero; `cluster`: of a cluster
-  PD_DEVICE TeamSums(TeamTotals& totals, Word* box, ClusterSums cluster, int patch, int patches)
-      : totals_(&totals), box_(box), cluster_(cluster), patch_(patch), patches_(patches) {}
+  PD_DEVICE TeamSums(TeamTotals& totals, TaggedWord* mailbox, ClusterSums cluster, int patch,
+                     int patches)
+      : totals_(&totals), mailbox_(mailbox), cluster_(cluster), patch_(patch), patches_(patches) {}
 
   PD_DEVICE double total(int n) const { return totals_->total[n]; }
 
   // Every thread, before a barrier: its first `wanted` values.
   template <class Op>
-  PD_DEVICE void leave(const double (&value)[sums_count], int wanted, Op op) {
-    wanted_ = wanted;
-    left_ = blockDim.x / warp_size;
+  PD_DEVICE void store_partial(const double (&value)[sums_count], int count, Op op) {
+    count_ = count;
+    partials_ = blockDim.x / warp_size;
 #pragma unroll
     for (int n = 0; n < sums_count; ++n) {
-      if (n >= wanted) break;
-      const double sum = across_warp(value[n], op);
+      if (n >= count) break;
+      const double sum = warp_reduce(value[n], op);
       if (lane() == 0) totals_->warp_sum[n][threadIdx.x / warp_size] = sum;
     }
   }
 
   // The same, for the leading warp to send before that barrier.
   template <class Op>
-  PD_DEVICE void leave_early(const double (&value)[sums_count], int wanted, Op op) {
-    leave(value, wanted, op);
+  PD_DEVICE void store_partial_early(const double (&value)[sums_count], int count, Op op) {
+    store_partial(value, count, op);
     __syncwarp();
-    if (!leads())
+    if (!in_leading_warp())
       asm volatile("bar.arrive %0, %1;" ::"n"(early_barrier), "r"(blockDim.x) : "memory");
   }
   // Leading warp, in place of all: one value, of which every thread has left a part in `values` [threads] before a barrier.
   template <class Op>
   PD_DEVICE void gather(const double* values, Op op) {
-    double sum = Op::none;
+    double sum = Op::identity;
     for (int i = lane(); i < int(blockDim.x); i += warp_size) sum = op(sum, values[i]);
     totals_->warp_sum[0][lane()] = sum;
-    wanted_ = 1;
-    left_ = warp_size;
+    count_ = 1;
+    partials_ = warp_size;
     __syncwarp();
   }
   // Leading warp: until all have left theirs early.
-  PD_DEVICE void await_early() const {
+  PD_DEVICE void wait_for_early() const {
     __syncwarp();
     asm volatile("bar.sync %0, %1;" ::"n"(early_barrier), "r"(blockDim.x) : "memory");
   }
@@ -74,15 +75,16 @@ class TeamSums {
   PD_DEVICE void send(Op op) {
     ++round_;
 #pragma unroll 1
-    for (int n = 0; n < wanted_; ++n) {
-      const double sum = across_warp(lane() < left_ ? totals_->warp_sum[n][lane()] : Op::none, op);
+    for (int n = 0; n < count_; ++n) {
+      const double sum =
+          warp_reduce(lane() < partials_ ? totals_->warp_sum[n][lane()] : Op::identity, op);
       if constexpr (Kind == Blocks::cluster) {
-        if (n == 0 && lane() == 0) cluster_.expect(round_, wanted_ * patches_);
+        if (n == 0 && lane() == 0) cluster_.expect(round_, count_ * patches_);
         if (lane() < patches_) cluster_.send(lane(), patch_, n, sum, round_);
       }
       if (lane() != 0) continue;
       if constexpr (Kind == Blocks::grid) {
-        post(box(patch_, n), {std::uint64_t(__double_as_longlong(sum)), round_});
+        store_tagged(mailbox(patch_, n), {std::uint64_t(__double_as_longlong(sum)), round_});
       } else if constexpr (Kind == Blocks::one) {
         totals_->total[n] = sum;
       }
@@ -95,15 +97,15 @@ class TeamSums {
   PD_DEVICE void receive(Op op) {
     if constexpr (Many) {
 #pragma unroll 1
-      for (int n = 0; n < wanted_; ++n) {
-        double mine = Op::none;
+      for (int n = 0; n < count_; ++n) {
+        double mine = Op::identity;
         if constexpr (Kind == Blocks::grid) {
-          mine = over_patches<Op>(box(0, n), patches_, round_);
+          mine = reduce_over_patches<Op>(mailbox(0, n), patches_, round_);
         } else if (lane() < patches_) {
           mine = cluster_.receive(lane(), n, round_);
         }
         __syncwarp();
-        const double sum = across_warp(mine, op);
+        const double sum = warp_reduce(mine, op);
         if (lane() == 0) totals_->total[n] = sum;
       }
     }
@@ -111,21 +113,21 @@ class TeamSums {
   }
 
   // All threads; the totals are there when it returns. `Meets`: what any wrote before can be read by all after.
-  template <bool Meets = false, class Op>
-  PD_DEVICE void all_reduce(const double (&value)[sums_count], int wanted, Op op) {
-    leave(value, wanted, op);
+  template <bool Syncs = false, class Op>
+  PD_DEVICE void all_reduce(const double (&value)[sums_count], int count, Op op) {
+    store_partial(value, count, op);
     __syncthreads();
-    if (leads()) {
-      if constexpr (Meets) __threadfence();
+    if (in_leading_warp()) {
+      if constexpr (Syncs) __threadfence();
       send(op);
       receive(op);
-      if constexpr (Meets) __threadfence();
+      if constexpr (Syncs) __threadfence();
     }
     __syncthreads();
   }
 
   // Waits for all blocks of the environment; what they wrote before can be read after.
-  PD_DEVICE void meet() {
+  PD_DEVICE void sync() {
     if constexpr (!Many) {
       __syncthreads();
     } else {
@@ -134,16 +136,16 @@ class TeamSums {
   }
 
  private:
-  PD_DEVICE Word* box(int patch, int n) const {
-    return box_ + ((round_ & 1) * patches_ + patch) * sums_count + n;
+  PD_DEVICE TaggedWord* mailbox(int patch, int n) const {
+    return mailbox_ + ((round_ & 1) * patches_ + patch) * sums_count + n;
   }
 
   TeamTotals* totals_;
-  Word* box_;
+  TaggedWord* mailbox_;
   ClusterSums cluster_;
   int patch_, patches_;
-  int wanted_ = 0;      // sums that were left,
-  int left_ = 0;        // in so many parts
+  int count_ = 0;       // sums that were left,
+  int partials_ = 0;    // in so many parts
   unsigned round_ = 0;  // exchanges so far
 };
 

@@ -20,7 +20,7 @@ PD_DEVICE void spread_sums(T (&value)[36]) {
     for (int n = 0; n < half; ++n) {
       const T other = half + n < size ? value[min(half + n, 35)] : T(0);
       const T keep = select(upper, other, value[n]), give = select(upper, value[n], other);
-      value[n] = keep + __shfl_xor_sync(whole_warp, give, distance);
+      value[n] = keep + __shfl_xor_sync(full_warp, give, distance);
     }
     size = half;
   }

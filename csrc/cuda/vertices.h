@@ -5,14 +5,14 @@
 
 namespace pd::inline PD_TARGET {
 
-template <class T, bool Touching>
+template <class T, bool HasContacts>
 struct Vertices {
   Quad<T>*x, *velocity, *target;  // at the start of the step [m], [m/s], s [m] and as its w: a
   Quad<T>*u, *before;             // iterate and the one before [m]; w: 1 / D
 
   // What a pass knows of a vertex before the force on it.
-  struct Seen {
-    Vertex<Thread<T>, Touching> vertex;
+  struct LoadedVertex {
+    Vertex<Thread<T>, HasContacts> vertex;
     Vec3<T> u, before;
 
     PD_DEVICE double energy() const {
@@ -21,9 +21,9 @@ struct Vertices {
     }
 
     // |u - s|^2, with which a soft stop compares
-    PD_DEVICE double square_of_way() const {
-      const Vec3<T> way = u - vertex.target;
-      return double(dot(way, way));
+    PD_DEVICE double square_of_displacement() const {
+      const Vec3<T> displacement = u - vertex.target;
+      return double(dot(displacement, displacement));
     }
 
     PD_DEVICE Vec3<T> next(const Contacts<T>& contacts, const Vec3<T>& force, T theta,
@@ -32,15 +32,15 @@ struct Vertices {
     }
   };
 
-  PD_DEVICE Seen see(unsigned i) const { return {at(i), vec3(u[i]), vec3(before[i])}; }
+  PD_DEVICE LoadedVertex load(unsigned i) const { return {at(i), vec3(u[i]), vec3(before[i])}; }
 
-  PD_DEVICE Vertex<Thread<T>, Touching> at(unsigned i) const {
+  PD_DEVICE Vertex<Thread<T>, HasContacts> at(unsigned i) const {
     return {vec3(x[i]), vec3(target[i]), inertia(i), u[i].w};
   }
 
   PD_DEVICE T inertia(unsigned i) const { return target[i].w; }
 
-  PD_DEVICE void load(int i, const Inputs<T>& in, int vertex, T h) const {
+  PD_DEVICE void init(int i, const Inputs<T>& in, int vertex, T h) const {
     x[i] = quad(in.at_vertex(in.call->positions, vertex));
     velocity[i] = quad(in.at_vertex(in.call->velocities, vertex));
     target[i] = {T(0), T(0), T(0), in.inertia(vertex, h)};
@@ -48,7 +48,7 @@ struct Vertices {
   }
 
   // 1 / D; returns share_of_inertia
-  PD_DEVICE double weigh(int i, T elastic) const {
+  PD_DEVICE double set_diagonal(int i, T elastic) const {
     const T a = inertia(i), inverse = inverse_diagonal(a, elastic);
     u[i].w = before[i].w = inverse;
     return double(share_of_inertia(a, elastic, inverse));
@@ -58,12 +58,12 @@ struct Vertices {
     target[i] = quad(in.target(vertex, vec3(x[i]), vec3(velocity[i]), h), inertia(i));
   }
 
-  PD_DEVICE Vec3<T> straight(int i, T h) const { return h * vec3(velocity[i]); }
+  PD_DEVICE Vec3<T> at_constant_velocity(int i, T h) const { return h * vec3(velocity[i]); }
 
   // What the first iterate is made of, if it is not given.
-  PD_DEVICE Vec3<T> guess(int i, const Settings& settings) const {
+  PD_DEVICE Vec3<T> predicted(int i, const Settings& settings) const {
     if (settings.start() == StartKind::inertial) return vec3(target[i]);
-    return straight(i, T(settings.time_step));
+    return at_constant_velocity(i, T(settings.time_step));
   }
 
   PD_DEVICE Vec3<T> first(int i, const Inputs<T>& in, int vertex,
@@ -71,7 +71,7 @@ struct Vertices {
     const Settings& settings = in.call->settings;
     const bool given = settings.start() == StartKind::given;
     return at(i).first(contacts,
-                       given ? in.first_iterate(vertex) - vec3(x[i]) : guess(i, settings));
+                       given ? in.first_iterate(vertex) - vec3(x[i]) : predicted(i, settings));
   }
 
   PD_DEVICE Vec3<T> moved(int i, const RigidMotion<T>& motion) const {
@@ -83,8 +83,9 @@ struct Vertices {
     before[i] = quad(value, before[i].w);
   }
   // In place of the iterate before, for whoever then lets the two change places.
-  PD_DEVICE void set_in_place_of_before(unsigned i, const Seen& seen, const Vec3<T>& value) const {
-    before[i] = quad(value, seen.vertex.inverse);
+  PD_DEVICE void set_in_place_of_before(unsigned i, const LoadedVertex& loaded,
+                                        const Vec3<T>& value) const {
+    before[i] = quad(value, loaded.vertex.inverse);
   }
 
   PD_DEVICE void finish(int i, T h) const {
