@@ -1,27 +1,28 @@
-// Pairs of a patch whose numbers lie far away, in memory that answers late: each thread asks for its next pair while it works on
-// one, in a pass's last round for the first of the next pass.
+// Prefetched pairs for patches whose data is in global memory. Each thread loads its next pair
+// while it processes one. The last round of a pass prefetches the first pair of the next pass.
 #pragma once
 #include "cuda/patch.h"
 
 namespace pd::inline PD_TARGET {
 
-// All that the plan and an environment say of a pair.
+// All data of a pair: corners, weights and rest shape.
 template <class T>
 struct PrefetchedPair {
   PairInputs<T> numbers;
   typename StoredRest<T>::Numbers rest;
 };
 
-// `number`: of the pair; past the end the last one, which nobody works on.
+// `number` counts pairs; past the end it repeats the last pair, whose result is unused.
 template <class T>
 PD_DEVICE PrefetchedPair<T> prefetch_pair(const Patch<T>& patch, const T* weights, int number) {
   const PairPlace place = place_of(patch, min(number, patch.pairs - 1));
   return {load_pair(patch.plan, weights, place), rest_of<false>(patch).read(place)};
 }
 
-// Runs an effect on the pairs [begin, end); returns the sum of energies that this thread has met. `begin` and an `end` before the
-// last are multiples of the threads. `now`: this thread's first pair from `begin` on; after it that from `end` on, or its first of
-// all where there is none.
+// Applies an element functor to the pairs [begin, end); returns this thread's energy sum. `begin`
+// is a multiple of the number of threads, as is `end` unless it is the last. `now` is this thread's
+// first pair from `begin` on. On return it is the first pair from `end` on, or the thread's very
+// first pair if none is left.
 template <class T, class Element>
 PD_DEVICE T each_prefetched_pair(const Patch<T>& patch, const Quad<T>* position, const T* weights,
                                  Quad<T>* entries, const Element& element, PrefetchedPair<T>& now,

@@ -1,4 +1,4 @@
-// Arrays one after another in a block of memory.
+// Allocates arrays one after another in a block of memory.
 #pragma once
 #include "math/device.h"
 
@@ -7,7 +7,7 @@
 
 namespace pd {
 
-// Without a base it only adds up their size.
+// With a null base, the arena only computes the total size.
 class Arena {
  public:
   PD_HD explicit Arena(void* base) : base_(static_cast<std::byte*>(base)) {}

@@ -1,13 +1,13 @@
-// Blocks that work on one environment together, phase by phase, in memory that all of them see.
+// Blocks that work on one environment together in global memory, with a barrier between phases.
 #pragma once
 #include "cuda/collect.h"
 
 namespace pd::inline PD_TARGET {
 
-// How work is shared out never decides in which order something is added up, so the bits do not depend on `blocks`.
+// The distribution of work never affects the order of a sum, so the bits do not depend on `blocks`.
 class BlockTeam {
  public:
-  // `counter` starts as zero and belongs to the team; all blocks of the launch have to be resident
+  // `counter` starts at zero and belongs to the team; all blocks of the launch must be resident
   PD_DEVICE BlockTeam(int rank, int blocks, unsigned* counter)
       : rank_(rank), blocks_(blocks), counter_(counter) {}
 
@@ -15,11 +15,11 @@ class BlockTeam {
   PD_DEVICE int blocks() const { return blocks_; }
   PD_DEVICE int thread() const { return warp() * warp_size + int(threadIdx.x) % warp_size; }
   PD_DEVICE int threads() const { return blocks_ * int(blockDim.x); }
-  // neighbouring warps in different blocks: few pieces of work are spread over all multiprocessors
+  // consecutive warps lie in different blocks, so a few tasks spread over all multiprocessors
   PD_DEVICE int warp() const { return int(threadIdx.x) / warp_size * blocks_ + rank_; }
   PD_DEVICE int warps() const { return threads() / warp_size; }
 
-  // What any thread of the team wrote before can be read after.
+  // Team barrier: earlier writes of all its threads are visible after it.
   PD_DEVICE void barrier() {
     __syncthreads();
     if (blocks_ == 1) return;
@@ -40,7 +40,7 @@ class BlockTeam {
  private:
   int rank_, blocks_;
   unsigned* counter_;
-  unsigned expected_arrivals_ = 0;  // arrivals that the next barrier waits for
+  unsigned expected_arrivals_ = 0;  // count at which the next barrier opens
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -1,5 +1,5 @@
-// Blocks that reach each other's shared memory: a cluster of them, from compute capability 9.0 on. Elsewhere nobody launches
-// what calls these.
+// Thread block clusters, whose blocks access each other's shared memory (compute capability 9.0 and
+// newer). On older devices the host never launches a kernel that calls these functions.
 #pragma once
 #include "cuda/memory.h"
 #include "plan/shared_memory.h"
@@ -12,7 +12,7 @@
 #define PD_HAS_CLUSTERS 0
 #endif
 
-// What waits for other blocks, see ByteBarrier::wait.
+// Memory order of ByteBarrier::wait. PTX ISA 8.6 can acquire shared memory alone.
 #if __CUDACC_VER_MAJOR__ * 100 + __CUDACC_VER_MINOR__ >= 1208
 #define PD_SHARED_WAIT "relaxed"
 #define PD_SHARED_FENCE "fence.acquire.sync_restrict::shared::cluster.cluster;"
@@ -23,7 +23,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// What any thread of the cluster wrote before can be read after.
+// Cluster barrier: earlier writes of all its threads are visible after it.
 PD_DEVICE void cluster_barrier() {
 #if PD_HAS_CLUSTERS
   asm volatile(
@@ -33,13 +33,13 @@ PD_DEVICE void cluster_barrier() {
 #endif
 }
 
-using SharedAddress = std::uint32_t;  // in the shared memory of this block, or of the cluster
+using SharedAddress = std::uint32_t;  // in this block's shared memory or in the cluster's
 
 PD_DEVICE SharedAddress shared_address(const void* in_shared) {
   return SharedAddress(__cvta_generic_to_shared(in_shared));
 }
 
-// The same place in the shared memory of another block of the cluster.
+// Maps an address in shared memory to the same place in another block of the cluster.
 PD_DEVICE SharedAddress at_block(SharedAddress here, int rank) {
   SharedAddress there = here;
 #if PD_HAS_CLUSTERS
@@ -48,14 +48,15 @@ PD_DEVICE SharedAddress at_block(SharedAddress here, int rank) {
   return there;
 }
 
-// A barrier in shared memory that one arrival and a number of bytes from other blocks let through, round after round.
+// A transaction barrier (mbarrier). A phase completes after one arrival and the expected number of
+// bytes from other blocks.
 class ByteBarrier {
  public:
   PD_DEVICE explicit ByteBarrier(std::uint64_t* word) : at_(shared_address(word)) {}
 
   PD_DEVICE SharedAddress address() const { return at_; }
 
-  // one thread, before a barrier of the cluster
+  // called by one thread, before a cluster barrier
   PD_DEVICE void init() const {
 #if PD_HAS_CLUSTERS
     asm volatile("mbarrier.init.shared::cta.b64 [%0], 1;" ::"r"(at_) : "memory");
@@ -63,7 +64,7 @@ class ByteBarrier {
 #endif
   }
 
-  // one thread, once a round
+  // called by one thread, once per round
   PD_DEVICE void expect(int bytes) const {
 #if PD_HAS_CLUSTERS
     asm volatile("mbarrier.arrive.expect_tx.shared::cta.b64 _, [%0], %1;" ::"r"(at_), "r"(bytes)
@@ -71,8 +72,8 @@ class ByteBarrier {
 #endif
   }
 
-  // `parity`: of the number of rounds before this one. What other blocks sent to shared memory can be read after; the first
-  // level of cache stays, which an acquire of all memory would empty (PTX ISA 8.6 can tell them apart).
+  // `parity`: that of the number of earlier rounds. Data that other blocks stored in shared memory
+  // is visible after the wait. An acquire of all memory would also invalidate the L1 cache.
   PD_DEVICE void wait(unsigned parity) const {
 #if PD_HAS_CLUSTERS
     unsigned through;
@@ -91,7 +92,7 @@ class ByteBarrier {
   SharedAddress at_;
 };
 
-// From another block's shared memory.
+// Loads from another block's shared memory.
 PD_DEVICE float read_shared(SharedAddress from, float) {
   float number = 0;
 #if PD_HAS_CLUSTERS
@@ -107,7 +108,7 @@ PD_DEVICE double read_shared(SharedAddress from, double) {
   return number;
 }
 
-// To another block's shared memory, whose barrier counts the bytes.
+// Stores to another block's shared memory, whose barrier counts the bytes.
 PD_DEVICE void send(SharedAddress to, SharedAddress barrier, double a) {
 #if PD_HAS_CLUSTERS
   asm volatile(
@@ -117,7 +118,7 @@ PD_DEVICE void send(SharedAddress to, SharedAddress barrier, double a) {
 #endif
 }
 
-// The same where it is `wanted`, without a branch.
+// The same stores, predicated by `wanted` without a branch.
 PD_DEVICE void send(SharedAddress to, SharedAddress barrier, const Quad<float>& a, bool wanted) {
 #if PD_HAS_CLUSTERS
   asm volatile(

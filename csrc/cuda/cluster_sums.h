@@ -1,25 +1,26 @@
-// Sums that the blocks of a cluster tell each other: each sends its own to all, itself among them.
+// Exchange of sums in a cluster: each block sends its own sums to all blocks, itself included.
 #pragma once
 #include "cuda/cluster.h"
 #include "cuda/collect.h"
 
 namespace pd::inline PD_TARGET {
 
-static_assert(sums_count == 3);  // cluster_sums_bytes
+static_assert(sums_count == 3);  // size of cluster_sums_bytes
 
-// In shared memory, cluster_sums_bytes: two barriers, then numbers [2, blocks, sums_count].
+// Layout in shared memory (cluster_sums_bytes): two barriers, then numbers [2, blocks, sums_count].
 class ClusterSums {
  public:
   PD_DEVICE explicit ClusterSums(std::byte* shared)
       : barrier_(reinterpret_cast<std::uint64_t*>(shared)),
         numbers_(reinterpret_cast<double*>(barrier_ + 2)) {}
 
-  // one thread, before a barrier of the cluster
+  // called by one thread, before a cluster barrier
   PD_DEVICE void init() const {
     for (int round = 0; round < 2; ++round) barrier(round).init();
   }
 
-  // one thread, once a round: numbers that all blocks together will send; rounds count from 1
+  // called by one thread, once per round: the count that all blocks together will send; rounds
+  // start at 1
   PD_DEVICE void expect(unsigned round, int count) const {
     barrier(round).expect(count * int(sizeof(double)));
   }

@@ -1,4 +1,5 @@
-// Sums over a thread block and over the blocks of an environment, in a fixed order.
+// Reductions over a warp, a block and the blocks of an environment, in a fixed order, and tagged
+// messages.
 #pragma once
 #include "cuda/memory.h"
 
@@ -8,7 +9,7 @@ namespace pd::inline PD_TARGET {
 
 constexpr unsigned full_warp = 0xffffffff;
 constexpr int warp_size = 32;
-constexpr int sums_count = 3;  // numbers that are added up together
+constexpr int sums_count = 3;  // values per reduction
 
 struct Add {
   static constexpr double identity = 0;
@@ -19,7 +20,8 @@ struct Min {
   PD_HD double operator()(double a, double b) const { return b < a ? b : a; }
 };
 
-// The same bits in all lanes, since both partners of an exchange combine the same two numbers.
+// Butterfly reduction. All lanes get the same bits: both partners of an exchange combine the same
+// two numbers.
 template <class Op>
 PD_DEVICE double warp_reduce(double value, Op op) {
 #pragma unroll
@@ -29,7 +31,7 @@ PD_DEVICE double warp_reduce(double value, Op op) {
   return value;
 }
 
-// Several sums at once, whose chains overlap.
+// Several sums in one butterfly; their dependency chains overlap.
 template <int Count>
 PD_DEVICE void warp_reduce_sums(double (&value)[Count]) {
 #pragma unroll
@@ -39,8 +41,8 @@ PD_DEVICE void warp_reduce_sums(double (&value)[Count]) {
   }
 }
 
-// The sums of many values over a warp, written by one lane each. Two steps leave a lane one of four values, so that this takes a
-// third of the exchanges.
+// Warp sums of many values, each written by one lane. The first two exchanges leave each lane one
+// value of four, which takes a third of the exchanges of separate butterflies.
 template <int Count, class T>
 PD_DEVICE void write_warp_sums(const T (&value)[Count], double* to) {
   const int lane = int(threadIdx.x) % warp_size;
@@ -64,7 +66,8 @@ PD_DEVICE void write_warp_sums(const T (&value)[Count], double* to) {
   }
 }
 
-// Sixteen bytes that are written and read at once, so that a tag in them vouches for the rest.
+// Sixteen bytes that one instruction stores or loads: a matching tag guarantees that the value
+// belongs to the same round.
 struct alignas(16) TaggedWord {
   std::uint64_t value, tag;
 };
@@ -76,7 +79,8 @@ PD_DEVICE void store_tagged(TaggedWord* to, TaggedWord word) {
       : "memory");
 }
 
-// The word, where that is `wanted`, else zeros. There is no branch, so several that follow each other are under way at once.
+// Loads the word if `wanted`, else returns zeros. The load is predicated without a branch, so
+// consecutive loads overlap.
 PD_DEVICE TaggedWord load_tagged(const TaggedWord* from, bool wanted) {
   TaggedWord word;
   asm volatile(
@@ -88,7 +92,7 @@ PD_DEVICE TaggedWord load_tagged(const TaggedWord* from, bool wanted) {
   return word;
 }
 
-// A vector with a tag: one word in float32, three in float64.
+// A tagged halo message, a vector with a tag: one word in float32, three words in float64.
 template <class T>
 struct HaloMessage;
 

@@ -1,4 +1,4 @@
-// How a patch waits for what the other patches of its environment send.
+// How a patch waits for the halo messages of the other patches of its environment.
 #pragma once
 #include "cuda/collect.h"
 #include "plan/views.h"
@@ -11,12 +11,14 @@ struct alignas(16) Senders {
   int32 slot[in_flight], more;
 };
 
-// Warps wait as one: lanes that went on as soon as their own words came would do everything after it one by one.
+// Sums the forces that all patches of a shared vertex sent, in patch order; returns zero for lanes
+// that are not `here`.
 //
-// Both inline: nvcc 13.0 loses sums when two functions that hold 128-bit words are out of line (seen on an H100; with either
-// one inline the bits are right).
+// A warp waits as one. If lanes continued as soon as their own words arrived, the warp would run
+// all later code lane by lane.
 //
-// The parts of a shared vertex that its patches sent, in their order; zero for lanes that are not `here`.
+// Both functions are inline: nvcc 13.0 loses sums when two out-of-line functions hold 128-bit
+// words. An H100 showed this error; with either function inline the bits are right.
 template <class T>
 PD_DEVICE Vec3<T> receive_forces(const TaggedWord* mailbox, const Senders* rows, int row, bool here,
                                  unsigned round) {
@@ -25,7 +27,8 @@ PD_DEVICE Vec3<T> receive_forces(const TaggedWord* mailbox, const Senders* rows,
   do {
     Senders senders = {{-1, -1, -1, -1, -1, -1, -1}, 0};
     if (goes_on) senders = rows[row];
-    // all letters again where one is missing: kept ones would have to be waited for one by one
+    // reload all messages when one is missing: to keep the others, the warp would have to wait for
+    // them one by one
     HaloMessage<T> message[Senders::in_flight];
     bool missing;
     do {
@@ -45,7 +48,7 @@ PD_DEVICE Vec3<T> receive_forces(const TaggedWord* mailbox, const Senders* rows,
   return sum;
 }
 
-// This lane's share of what the patches sent; several requests are under way at once.
+// Reduces this lane's share of the patches' messages; several loads are in flight at once.
 template <class Op>
 PD_DEVICE double reduce_over_patches(const TaggedWord* mailbox, int patches, unsigned round) {
   constexpr int in_flight = 5;

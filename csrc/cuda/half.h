@@ -1,5 +1,6 @@
-// A patch as each_pair works on it, but with a lane for each of a pair's tetrahedra: half the work in a row, where patches are
-// so small that its length counts. Both lanes add up the forces on the corners that they share, to the same bits.
+// Processes a patch like each_pair, with one lane per tetrahedron of a pair. The serial work
+// halves, which helps patches small enough that latency dominates. Both lanes sum the forces on
+// their shared corners, to the same bits.
 #pragma once
 #include "cuda/collect.h"
 #include "cuda/patch.h"
@@ -7,22 +8,23 @@
 
 namespace pd::inline PD_TARGET {
 
-// What the plan and an environment say of a lane's tetrahedron: the even lane has the first of the pair.
+// Corners and weight of a lane's tetrahedron; even lanes hold the first tetrahedron of a pair.
 template <class T>
 struct TetInputs {
   unsigned corner[4];  // 8 times the slot, plus 65536 times the entry
-  T weight, factor;    // w V, pair_factor where rest shapes are computed
+  T weight, factor;    // w V; pair_factor where rest shapes are computed
 
   PD_HD unsigned slot_times_8(int c) const { return corner[c] & 0xffff; }
 };
 
-// `number`: of the tetrahedron; `Computed`: see rest_of. Without `Weighed` the weight is not known yet.
+// `number` counts tetrahedra; `Computed`: see rest_of. Without `WithWeights`, the weight is not
+// computed yet.
 template <bool Computed, bool WithWeights = true, class T>
 PD_DEVICE TetInputs<T> load_tet(const Patch<T>& patch, const T* weights, int number) {
   TetInputs<T> numbers;
   // lanes past the end repeat the last pair
   const unsigned pair = unsigned(min(number / 2, patch.pairs - 1)), which = unsigned(number) & 1;
-  // as of PairPlace, but by what the block of the patch knows
+  // indices as in PairPlace, from the patch's block offsets
   const unsigned before = pair & ~unsigned(pair_lanes - 1);
   const unsigned of_five = unsigned(patch.first_block) * (5 * pair_lanes) + pair + 4 * before;
   const unsigned of_two = unsigned(patch.first_block) * (2 * pair_lanes) + pair + before;
@@ -39,14 +41,14 @@ PD_DEVICE TetInputs<T> load_tet(const Patch<T>& patch, const T* weights, int num
   return numbers;
 }
 
-// Rest shape of a lane's tetrahedron, as the plan has it.
+// Stored rest shape of a lane's tetrahedron.
 template <class T>
 PD_DEVICE FaceRest<T, 1> tet_rest(const Patch<T>& patch, int number) {
   const PairPlace place = place_of(patch, min(number / 2, patch.pairs - 1));
   return rest_of<false>(patch).read_one(place, number % 2);
 }
 
-// The same worked out from the rest positions of its slots, which were looked at.
+// Rest shape computed from the rest positions in the loaded slots.
 template <class T>
 PD_DEVICE FaceRest<T, 1> tet_rest(const TetInputs<T>& numbers, T per_unit, const Slots<T>& slots,
                                   const Quad<T> (&loaded)[4]) {
@@ -56,7 +58,7 @@ PD_DEVICE FaceRest<T, 1> tet_rest(const TetInputs<T>& numbers, T per_unit, const
   return ComputedRest<T>::between(point, per_unit, {numbers.factor});
 }
 
-// The same from the rest positions themselves.
+// Rest shape computed from the rest positions in global memory.
 template <class T>
 PD_DEVICE FaceRest<T, 1> tet_rest(const TetInputs<T>& numbers, T per_unit,
                                   const RestPoint<T>* rest) {
@@ -70,7 +72,8 @@ PD_DEVICE void load_corners(const TetInputs<T>& numbers, const Slots& slots, Qua
   for (int c = 0; c < 4; ++c) loaded[c] = slots.load(numbers.slot_times_8(c));
 }
 
-// A tetrahedron as effects see elements that work on rest shapes and weights alone.
+// Adapts a tetrahedron to the element interface, for functors that read only rest shapes and
+// weights.
 template <class T>
 struct TetElement {
   using R = T;
@@ -91,9 +94,10 @@ PD_DEVICE Vec3<T> add_partner(const Vec3<T>& a) {
           a.z + __shfl_xor_sync(full_warp, a.z, 1)};
 }
 
-// Runs an effect on the tetrahedra of all pairs; returns the sum of energies that this thread has met. `slots`: where positions
-// are. `now`: what `read_half` gave for this thread's first tetrahedron. `shape_of(number, numbers, seen)`: rest shape of a
-// tetrahedron, given what was seen of its slots; `counts(number, met)`: whether its energy does. `Once`: no thread has a second.
+// Applies an element functor to the tetrahedra of all pairs; returns this thread's energy sum.
+// `slots` holds positions. `now` is this thread's first tetrahedron, from load_tet.
+// `shape_of(number, inputs, loaded)` returns a rest shape, given the loaded slots. `counts(number,
+// energy)` decides whether an energy counts. `OnePerThread`: no thread has a second tetrahedron.
 template <bool OnePerThread, bool Computed, class T, class Slots, class Element, class ShapeOf,
           class Counts>
 PD_DEVICE T each_tet(const Patch<T>& patch, const Slots& slots, const ShapeOf& shape_of,
@@ -118,7 +122,7 @@ PD_DEVICE T each_tet(const Patch<T>& patch, const Slots& slots, const ShapeOf& s
     }
     for (int c = 0; c < 3; ++c) force[c] = add_partner(force[c]);
     const bool here = first + lane < all, second = lane & 1;
-    // the first writes corners 0 and 1, the second corner 2, each its own apex
+    // the first lane writes corners 0 and 1, the second corner 2, each its own apex
     const Vec3<T> own = {select(second, force[2].x, force[0].x),
                          select(second, force[2].y, force[0].y),
                          select(second, force[2].z, force[0].z)};

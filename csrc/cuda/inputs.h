@@ -1,4 +1,4 @@
-// What the user gave, for one environment, by internal vertex.
+// User inputs of one environment, by internal vertex.
 #pragma once
 #include "cuda/memory.h"
 #include "effects/contact.h"
@@ -9,7 +9,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// What decides how an environment goes on.
+// The state of an environment's solve: schedule, stopping rule and counters.
 struct Progress {
   Schedule schedule;
   double min_share;  // smallest a / D
@@ -17,7 +17,7 @@ struct Progress {
   int used;  // iterations
   bool done;
 
-  // the soft stop, by sums of an iteration of weight omega
+  // Whether the tolerance is met, from the sums of an iteration with weight omega.
   PD_HD bool ends(double tolerance, double omega, double change, double displacement) {
     return stop.ends(tolerance, schedule.share_of(omega), change, displacement);
   }
@@ -51,13 +51,13 @@ struct Inputs {
 
   PD_DEVICE T damping() const { return *call->material.damping.of(environment); }
 
-  // a, zero where a pin holds the vertex exactly
+  // The inertial weight a; zero where a hard pin prescribes the vertex.
   PD_DEVICE T inertia(int vertex, T h) const {
     const T stiffness = pin_stiffness(pin(vertex));
     return held_inertia(inertia_weight(mass(vertex), damping(), stiffness, h), stiffness);
   }
 
-  // s, the displacement that everything but elasticity wants
+  // The target displacement s of all forces but elasticity.
   PD_DEVICE Vec3<T> target(int vertex, const Vec3<T>& x, const Vec3<T>& velocity, T h) const {
     const int index = pin(vertex);
     const T stiffness = pin_stiffness(index);

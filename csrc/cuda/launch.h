@@ -1,4 +1,5 @@
-// The kernels as functions: no torch, no CUDA headers. Memory is the caller's; work goes to a stream and nobody waits.
+// Entry points of the kernels, without torch or CUDA headers. The caller owns the memory; calls
+// enqueue work on a stream and return.
 #pragma once
 #include "plan/vertex_sum.h"
 #include "plan/views.h"
@@ -7,16 +8,18 @@
 
 namespace pd {
 
-// How a plan is run, in DevicePlan::kernel.
+// Kernel of a plan, stored in DevicePlan::kernel.
 enum class DeviceKernel : int {
-  block = 0,  // one block an environment, or several small ones, all iterations in one launch
+  block =
+      0,  // one block per environment, or several small environments per block; one launch for all iterations
   cluster =
-      1,  // one block a patch, which reach each other's shared memory, all iterations in one launch
-  grid = 2,    // one block a patch, all iterations in one launch
-  stream = 3,  // kernels for every iteration
+      1,       // one block per patch, with distributed shared memory; one launch for all iterations
+  grid = 2,    // one block per patch; one launch for all iterations
+  stream = 3,  // several launches per iteration
 };
 
-// Whether a plan has positions to work rest shapes out from, and not these themselves; see rest_of.
+// Whether rest shapes are computed from stored rest positions instead of being stored themselves;
+// see rest_of.
 template <class T>
 bool computes_rests(const DevicePlan<T>& plan) {
   return plan.kernel == int(DeviceKernel::stream);
@@ -24,7 +27,7 @@ bool computes_rests(const DevicePlan<T>& plan) {
 
 using Stream = void*;  // cudaStream_t
 
-// What a scene asks of the kernels beside elements and vertices: contacts; pieces that pins leave to move.
+// Optional parts of a scene: contacts, and connected pieces that pins leave free to move.
 template <class T>
 bool has_contacts(const DeviceStep<T>& call) {
   return call.material.planes_count + call.material.spheres_count > 0;
@@ -34,12 +37,13 @@ bool has_free_pieces(const DeviceStep<T>& call) {
   return call.plan.pieces > 0;
 }
 
-// Bytes of device memory that a run wants, aligned to 256. Fused: kernels block, cluster and grid.
+// Device memory in bytes, aligned to 256. Fused covers the kernels block, cluster and grid.
 template <class T>
 std::int64_t fused_bytes(const DeviceStep<T>& call);
 template <class T>
 void run_fused(const DeviceStep<T>& call, void* memory, Stream stream);
-// The same of kernel block for meshes so small that a block may have several environments, in float32.
+// The small-batch variant of kernel block, in float32: meshes so small that a block may hold
+// several environments.
 template <class T>
 bool takes_small_batch(const DeviceStep<T>& call);
 template <class T>
@@ -47,7 +51,8 @@ std::int64_t small_batch_bytes(const DeviceStep<T>& call);
 template <class T>
 void run_small_batch(const DeviceStep<T>& call, void* memory, Stream stream);
 
-// Blocks of the largest cluster that the current device runs; 1: it has none, or this build no code for them.
+// Blocks of the largest cluster that the current device runs; 1 when the device or this build
+// supports none.
 int largest_cluster();
 
 template <class T>
@@ -55,7 +60,7 @@ std::int64_t stream_bytes(const DeviceStep<T>& call);
 template <class T>
 void run_stream(const DeviceStep<T>& call, void* memory, Stream stream);
 
-// The same of any kernel.
+// Device memory for a step of any kernel.
 template <class T>
 std::int64_t step_bytes(const DeviceStep<T>& call) {
   return call.plan.kernel == int(DeviceKernel::stream) ? stream_bytes(call) : fused_bytes(call);

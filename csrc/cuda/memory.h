@@ -1,17 +1,19 @@
-// Vectors as they lie in the memory of a GPU, and how one thread works on them.
+// Vector types in GPU memory, and cache and register hints for one thread.
 #pragma once
 #include "math/vec.h"
 
 #include <cstdint>
 
-// Nearly everything in a kernel: what is called out of line wants its objects in memory, not in registers.
+// Kernels inline nearly everything: an out-of-line call keeps its objects in memory, not in
+// registers.
 #define PD_DEVICE __device__ __forceinline__
-// What a kernel seldom does, of values or of what lies in memory anyway: inlined, it would take registers from its iterations.
+// For code that a kernel runs rarely on values or on data in memory. Inlined, it would take
+// registers from the iterations.
 #define PD_DEVICE_COLD __device__ __noinline__
 
 namespace pd::inline PD_TARGET {
 
-// Three numbers and a fourth that belongs to them: one vertex, 16-byte loads and stores.
+// A vertex: three components and a fourth value stored with them, for 16-byte loads and stores.
 template <class T>
 struct alignas(4 * sizeof(T) > 16 ? 16 : 4 * sizeof(T)) Quad {
   T x, y, z, w;
@@ -27,7 +29,8 @@ PD_HD Quad<T> quad(const Vec3<T>& a, T w = T(0)) {
   return {a.x, a.y, a.z, w};
 }
 
-// What the compiler would rather work out again than keep.
+// Hides a value from the optimiser, which would otherwise recompute it instead of keeping it in a
+// register.
 PD_DEVICE int in_register(int value) {
   asm volatile("" : "+r"(value));
   return value;
@@ -50,7 +53,7 @@ PD_DEVICE double in_register(double value) {
   return value;
 }
 
-// Any number, for no instruction.
+// An arbitrary number that costs no instruction.
 template <class T>
 PD_DEVICE T undefined_number() {
   T any;
@@ -62,7 +65,7 @@ PD_DEVICE T undefined_number() {
   return any;
 }
 
-// Has some threads, by default those of the block, bring items into the L2 cache, for whoever reads them later.
+// The given threads, by default all of the block, prefetch items into the L2 cache.
 template <class Item>
 PD_DEVICE void prefetch_to_l2(const Item* items, int count, int thread, int threads) {
   constexpr int line = 128 / sizeof(Item);
@@ -75,7 +78,8 @@ PD_DEVICE void prefetch_to_l2(const Item* items, int count) {
   prefetch_to_l2(items, count, int(threadIdx.x), int(blockDim.x));
 }
 
-// The same by one thread in one instruction where there is one, from compute capability 9.0 on; else by `threads` of them.
+// The same prefetch as one bulk instruction of one thread (compute capability 9.0 and newer); older
+// devices use `threads` threads.
 template <class Item>
 PD_DEVICE void bulk_prefetch_to_l2(const Item* items, int count, int thread, int threads) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900

@@ -1,7 +1,9 @@
-// One patch of the mesh as a thread block works on it: pairs of tetrahedra in, one force for every slot out.
+// One patch of the mesh in a thread block: reads pairs of tetrahedra and computes one force per
+// slot.
 //
-// A pair leaves the force on each of its five corners in an entry of its own in shared memory; then every slot adds up its
-// entries, in their order. So nothing is added atomically, and the bits are the same in every run.
+// A pair writes the force on each of its five corners to an entry of its own in shared memory.
+// Every slot then sums its entries in a fixed order. There are no atomics, so every run gives the
+// same bits.
 #pragma once
 #include "cuda/memory.h"
 #include "effects/solid.h"
@@ -11,9 +13,9 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr int pair_lanes = 32;   // pairs of a block of the plan
-constexpr int no_entry = 65535;  // a corner that repeats another one leaves no force
-constexpr int entry_stride = 8;  // entries of a slot lie 8 apart
+constexpr int pair_lanes = 32;   // pairs per block of the plan
+constexpr int no_entry = 65535;  // marks a corner that repeats another one and receives no force
+constexpr int entry_stride = 8;  // consecutive entries of a slot are 8 apart
 
 template <class T>
 struct Patch {
@@ -40,8 +42,9 @@ struct Patch {
   PD_DEVICE bool owns(int slot) const { return row(slot) >= 0; }
 };
 
-// Of kernel stream: where the force on a slot goes that is not inside the patch. `end_vertex`: that of its interior vertices, of
-// which earlier patches and it have as many slots.
+// Kernel stream: index of the force on a slot outside the interior. `end_vertex`: the end of the
+// patch's interior vertices, which equals the number of interior slots up to and including this
+// patch.
 template <class T>
 PD_DEVICE int place_of_force(const DevicePlan<T>& plan, int first_slot, int end_vertex, int slot) {
   return plan.shared_place[first_slot - end_vertex + slot];
@@ -54,7 +57,7 @@ struct Pair {
   Vec3<T> force[5];
 };
 
-// One tetrahedron of a pair.
+// Selects one tetrahedron of a pair.
 template <class T, int Which>
 struct PairSide {
   using R = T;
@@ -63,7 +66,7 @@ struct PairSide {
   PD_HD static Vec3<T> pick(const Vec3<T>& first, const Vec3<T>& second) {
     return Which ? second : first;
   }
-  // the second adds to what the first has left
+  // the second tetrahedron adds to the forces of the first
   template <int Fields>
   PD_HD static void add(Pair<T, Fields>& pair, const Vec3<T> (&g)[4]) {
     for (int c = 0; c < 3; ++c) pair.force[c] = Which ? pair.force[c] + g[c] : g[c];
@@ -71,17 +74,21 @@ struct PairSide {
   }
 };
 
-// Where a pair's numbers lie in the plan and in the weights of an environment. 32 bits count them: a plan has at most
-// most_blocks.
+// Index of a pair's data in the plan and in an environment's weights. 32 bits suffice, since a plan
+// has at most most_blocks blocks.
 struct PairPlace {
-  unsigned pair;  // of all patches, the last block of each filled up
+  unsigned pair;  // counted over all patches, with the last block of each patch padded
 
-  PD_HD unsigned before() const { return pair & ~unsigned(pair_lanes - 1); }  // in earlier blocks
-  // The first of its numbers in an array that has `width` of every pair; the others follow pair_lanes apart.
+  PD_HD unsigned before() const {
+    return pair & ~unsigned(pair_lanes - 1);
+  }  // pairs in earlier blocks
+  // Index of the pair's first number in an array with `width` numbers per pair; the others follow
+  // at distance pair_lanes.
   PD_HD unsigned in(unsigned width) const { return pair + (width - 1) * before(); }
 };
 
-// A pair's tetrahedron by the user's number, -1: none; where several patches have it, all say so.
+// The user's number of one tetrahedron of a pair, -1 if absent. Every patch that holds the
+// tetrahedron returns it.
 template <class T>
 PD_DEVICE int tet_of(const DevicePlan<T>& plan, PairPlace place, int which) {
   const int tet = plan.pair_tet[place.in(2) + which * pair_lanes];
@@ -93,7 +100,7 @@ PD_DEVICE PairPlace place_of(const Patch<T>& patch, int pair) {
   return {unsigned(patch.first_block) * pair_lanes + unsigned(pair)};
 }
 
-// What the plan and an environment say of a pair, but for its rest shape.
+// Corners and weights of a pair; its rest shape is loaded separately.
 template <class T>
 struct PairInputs {
   unsigned corner[5];
@@ -103,7 +110,7 @@ struct PairInputs {
   PD_HD int entry(int c) const { return int(corner[c] >> 16); }
 };
 
-// Without `Weighed` the weights are not known yet.
+// Without `WithWeights`, the weights are not computed yet.
 template <bool WithWeights = true, class T>
 PD_DEVICE PairInputs<T> load_pair(const DevicePlan<T>& plan, const T* weights, PairPlace place) {
   PairInputs<T> numbers;
@@ -116,7 +123,8 @@ PD_DEVICE PairInputs<T> load_pair(const DevicePlan<T>& plan, const T* weights, P
   return numbers;
 }
 
-// Of an array in shared memory of a vector a slot: that of a corner as pair_corner has it.
+// Loads a corner's vector from an array in shared memory with one vector per slot; `corner` is
+// encoded as in pair_corner.
 template <class T>
 PD_DEVICE Vec3<T> at_corner(const Quad<T>* vectors, unsigned corner) {
   const auto* bytes = reinterpret_cast<const std::byte*>(vectors);
@@ -124,7 +132,7 @@ PD_DEVICE Vec3<T> at_corner(const Quad<T>* vectors, unsigned corner) {
   return vec3(*reinterpret_cast<const Quad<T>*>(bytes + slot_times_8 * (sizeof(Quad<T>) / 8)));
 }
 
-// Rest shapes as the plan has them, each pair's in the frame of its face.
+// Rest shapes stored in the plan, in the frame of the pair's face.
 template <class T>
 struct StoredRest {
   const T* rests;  // pair_rest
@@ -154,13 +162,14 @@ struct StoredRest {
   }
 
  private:
-  // those of neighbouring lanes side by side
+  // neighbouring lanes read neighbouring quads
   PD_DEVICE const Quad<T>* quads(PairPlace place) const {
     return reinterpret_cast<const Quad<T>*>(rests) + place.in(pair_rest_numbers / 4);
   }
 };
 
-// A rest position: units of the patch in float32, whose differences are exact; metres in float64.
+// A rest position. In float32 it is an integer multiple of the patch's unit, so that differences
+// are exact; in float64 it is in metres.
 template <class T>
 struct RestPoint;
 
@@ -172,7 +181,7 @@ struct alignas(16) RestPoint<float> {
     return {float(a.x - b.x), float(a.y - b.y), float(a.z - b.z)};
   }
 
-  // the same bits where numbers are kept
+  // the same bits, stored as floating-point numbers
   PD_DEVICE Vec3<float> bits() const {
     return {__int_as_float(x), __int_as_float(y), __int_as_float(z)};
   }
@@ -193,8 +202,8 @@ struct alignas(16) RestPoint<double> {
   PD_DEVICE static RestPoint of(const Vec3<double>& bits) { return {bits.x, bits.y, bits.z, 0}; }
 };
 
-// w V is what a patch and a stiffness say, over what pair_factor does: w unit^2 / 6 |pair_factor|. Whoever works it out does so
-// here, to the same bits.
+// w V = w unit^2 / (6 |pair_factor|), split into a part per patch and a part per tetrahedron. All
+// callers use these functions, so all get the same bits.
 template <class T>
 PD_HD T patch_weight(T unit, T stiffness) {
   return stiffness * (unit * unit / T(6));
@@ -204,7 +213,8 @@ PD_HD T tet_weight(T patch_weight, T factor) {
   return patch_weight * rough_reciprocal(absolute(factor));
 }
 
-// Rest shapes worked out from rest positions, which with pair_factor take half of the bytes: where memory is what binds.
+// Rest shapes computed from rest positions and pair_factor, which take half the bytes of stored
+// ones: for kernels bound by memory bandwidth.
 template <class T>
 struct ComputedRest {
   const RestPoint<T>* position;  // of every slot
@@ -240,7 +250,7 @@ struct ComputedRest {
   }
 };
 
-// Rest positions from some slot on, where the plan has them.
+// Rest positions from a slot on, where the plan stores them.
 template <class T>
 PD_DEVICE const RestPoint<T>* rest_positions(const DevicePlan<T>& plan, int first_slot) {
   const void* positions = plan.slot_rest;
@@ -248,7 +258,7 @@ PD_DEVICE const RestPoint<T>* rest_positions(const DevicePlan<T>& plan, int firs
   return static_cast<const RestPoint<T>*>(positions) + first_slot;
 }
 
-// What the plan knows of a patch's rest shapes: `Computed` where it holds positions, which kernel stream alone wants.
+// Rest shapes of a patch. `Computed`: the plan stores positions, which only kernel stream uses.
 template <bool Computed, class T>
 PD_DEVICE auto rest_of(const Patch<T>& patch) {
   if constexpr (!Computed) {
@@ -259,7 +269,7 @@ PD_DEVICE auto rest_of(const Patch<T>& patch) {
   }
 }
 
-// A pair as effects see elements.
+// Adapts one tetrahedron of a pair to the element interface of csrc/effects.
 template <class T, int Fields, class Side>
 struct PairElement {
   using R = typename Side::R;
@@ -278,14 +288,15 @@ struct PairElement {
   PD_HD void add(int, const Vec3<R> (&g)[4]) const { Side::add(pair, g); }
 };
 
-// A force in its entry, whose fourth number nobody reads: whatever stands in the register.
+// Writes a force to its entry. The fourth component is never read, so it takes whatever the
+// register holds.
 template <class T>
 PD_DEVICE void write_entry(const Vec3<T>& force, Quad<T>& entry) {
   entry = quad(force, undefined_number<T>());
 }
 
-// Runs an effect on one pair, adds what it meets of energy, and leaves the forces. `read(corner, vectors)`: those that elements
-// want of the slot of a corner, as pair_corner has it.
+// Applies an element functor to a pair, adds its energy and writes its forces. `read(corner,
+// vectors)` loads the vectors of a corner's slot, encoded as in pair_corner.
 template <int Fields, class T, class Read, class Shape, class Element>
 PD_DEVICE void process_pair(const Read& read, const Shape& shape, const PairInputs<T>& numbers,
                             Quad<T>* entries, const Element& element, T& energy) {
@@ -309,7 +320,7 @@ PD_DEVICE void process_pair(const Read& read, const Shape& shape, const PairInpu
   if (numbers.entry(4) != no_entry) write_entry(pair.force[4], entries[numbers.entry(4)]);
 }
 
-// The same for every pair of a patch, a thread a pair; returns the sum of energies that this thread has met.
+// Processes all pairs of a patch, one pair per thread; returns this thread's energy sum.
 template <int Fields, class T, class Read, class Rest, class Element>
 PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest, const T* weights,
                       Quad<T>* entries, const Element& element) {
@@ -322,13 +333,13 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const typename Rest::Numbers shape = rest.read(place_of(patch, number), now);
     process_pair<Fields>(read, shape, now, entries, element, energy);
-    // here rather than at the top: fewer registers are spilled
+    // loading here instead of at the top of the loop spills fewer registers
     now = read_numbers(number + int(blockDim.x));
   }
   return energy;
 }
 
-// w V of a pair, times l_e when `bounded`.
+// w V of both tetrahedra of a pair, times l_e if `bounded`.
 template <class T, class Rest>
 PD_DEVICE void compute_pair_weights(const DevicePlan<T>& plan, const Rest& rest, PairPlace place,
                                     const T* stiffness, bool bounded, T* weights) {
@@ -345,7 +356,7 @@ PD_DEVICE void compute_pair_weights(const DevicePlan<T>& plan, const Rest& rest,
   compute(PairSide<T, 1>{});
 }
 
-// of every pair of a patch
+// The same for all pairs of a patch.
 template <class T, class Rest>
 PD_DEVICE void compute_patch_weights(const Patch<T>& patch, const Rest& rest, const T* stiffness,
                                      bool bounded, T* weights) {
@@ -353,7 +364,8 @@ PD_DEVICE void compute_patch_weights(const Patch<T>& patch, const Rest& rest, co
     compute_pair_weights(patch.plan, rest, place_of(patch, number), stiffness, bounded, weights);
 }
 
-// The stiffness of all of a patch, which all threads of the block ask for, or -1 where there are several.
+// The common stiffness of a patch's tetrahedra, or -1 if they differ. All threads of the block must
+// call it.
 template <class T>
 PD_DEVICE T one_stiffness(const Patch<T>& patch, const T* stiffness) {
   const T first = stiffness[tet_of(patch.plan, place_of(patch, 0), 0)];
@@ -377,7 +389,7 @@ PD_DEVICE Vec3<T> sum_entries(const Quad<T>* entries, int row) {
   return sum;
 }
 
-// The same where somebody waits for it: eight entries are asked for at once.
+// The same sum where latency matters: eight loads are in flight at once.
 template <class T>
 PD_DEVICE Vec3<T> sum_entries_by_8(const Quad<T>* entries, int row) {
   constexpr int in_flight = 8;
@@ -398,8 +410,8 @@ PD_DEVICE Vec3<T> sum_entries_by_8(const Quad<T>* entries, int row) {
   return sum;
 }
 
-// The same by few instructions, where a multiprocessor has no room for more. `Entries`: like a pointer; so many are asked for at
-// once, each of which takes registers.
+// The same sum in few instructions, for kernels bound by instruction issue. `Entries` acts like a
+// pointer. `in_flight` loads are outstanding at once, each of which takes registers.
 template <class T, int in_flight = 4, class Entries>
 PD_DEVICE Vec3<T> sum_entries_compact(const Entries& entries, int row) {
   Entries entry = entries + (unsigned(row) & 0xffff);

@@ -8,7 +8,7 @@
 
 namespace pd {
 
-// What to do where none of the code of this build is for the current device.
+// The fix, when this build has no code for the current device.
 static std::string remedy(cudaError_t status) {
   if (status != cudaErrorNoKernelImageForDevice && status != cudaErrorInvalidDeviceFunction &&
       status != cudaErrorUnsupportedPtxVersion)
@@ -51,7 +51,7 @@ static int query_resident_blocks(const void* kernel, int device, int threads,
   return blocks * multiprocessors;
 }
 
-// What a kernel, launched so, gets, asked for once; every `Ask` has answers of its own.
+// Caches a query by device and launch configuration; every `Query` type has a cache of its own.
 template <class Query>
 static int cached(const void* kernel, int threads, std::size_t shared_bytes, int cluster,
                   const Query& query) {
@@ -71,7 +71,8 @@ int resident_blocks(const void* kernel, int threads, std::size_t shared_bytes) {
   });
 }
 
-// A launch of blocks that meet, with the attribute that it points at: in clusters, or with `cluster` 0 all at once.
+// A launch whose blocks synchronise, with the attribute that its configuration points to: clusters,
+// or with `cluster` 0 a cooperative launch.
 struct GroupLaunch {
   cudaLaunchAttribute attribute = {};
   cudaLaunchConfig_t config = {};

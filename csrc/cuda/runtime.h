@@ -1,4 +1,4 @@
-// What the launches ask of the CUDA runtime.
+// Queries and launches through the CUDA runtime.
 #pragma once
 #include <cuda_runtime.h>
 
@@ -7,30 +7,33 @@
 
 namespace pd {
 
-// Throws what went wrong; the error of a launch does not stay behind to surprise others.
+// Throws on an error and clears it, so that a failed launch does not surface in a later call.
 void check(cudaError_t status);
 
-// Blocks of a kernel that the current device runs at once; also lets it have that much shared memory. 0: too much for it.
+// Resident blocks of a kernel on the current device; also raises the kernel's shared memory limit.
+// Returns 0 when `shared_bytes` exceeds the limit of the device.
 int resident_blocks(const void* kernel, int threads, std::size_t shared_bytes);
 
-// Throws that a patch wants too much, and what to do; the plan is for a device that has more.
+// Throws an error that names the shared memory wanted, the limit and the fix.
 [[noreturn]] void refuse_shared_memory(std::size_t shared_bytes);
 
-// Clusters of so many blocks that the current device runs at once, after resident_blocks; 0: it has none, or none so large.
+// Resident clusters of `blocks` blocks on the current device; call resident_blocks first. Returns 0
+// when the device supports none, or none so large.
 int resident_clusters(const void* kernel, int threads, std::size_t shared_bytes, int blocks);
 
-// Whether the current device runs a kernel's code for compute capability 9.0: older code, translated for it, lacks what is new.
+// Whether the current device runs the kernel's code for compute capability 9.0. Code compiled for
+// older targets lacks clusters and overlap.
 bool runs_code_for_90(const void* kernel);
 
-// Launches clusters of `cluster` blocks; with 0 instead blocks that are all there at once.
+// Launches clusters of `cluster` blocks; 0 launches cooperatively, with all blocks resident.
 void launch(const void* kernel, unsigned blocks, int threads, void** arguments,
             std::size_t shared_bytes, int cluster, cudaStream_t stream);
 
 int multiprocessors();  // of the current device
 std::size_t shared_memory_per_multiprocessor();
-std::size_t shared_memory_per_block();  // the most that one may ask for
+std::size_t shared_memory_per_block();  // the opt-in limit of one block
 
-// A number of blocks, refused when one launch cannot have so many.
+// Converts a number of blocks; throws when one launch cannot hold it.
 unsigned blocks_of(std::int64_t count);
 
 }  // namespace pd

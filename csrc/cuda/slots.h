@@ -1,5 +1,5 @@
-// Two vectors of every slot of a patch in shared memory, six numbers a slot: the second's first number lies behind the first
-// vector, where 16-byte loads bring it along.
+// Two vectors per slot of a patch in shared memory. The first component of the second vector is
+// stored behind the first vector, so that one 16-byte load reads both.
 #pragma once
 #include "cuda/memory.h"
 #include "plan/shared_memory.h"
@@ -16,20 +16,20 @@ class Slots {
 
  public:
   Slots() = default;
-  // `memory`: slots_bytes of two vectors
+  // `memory`: slots_bytes for two vectors
   PD_DEVICE Slots(std::byte* memory, int count)
       : first_(reinterpret_cast<Quad<T>*>(memory)),
         behind_(reinterpret_cast<Two*>(first_ + count)) {}
 
-  // As much of a slot as one load brings.
+  // The first four of the six components, in one load.
   PD_DEVICE Quad<T> load(unsigned slot_times_8) const { return *at(first_, slot_times_8); }
-  // the second vector of a slot that was looked at
+  // the second vector of a slot that load() has read
   PD_DEVICE Vec3<T> second(unsigned slot_times_8, const Quad<T>& loaded) const {
     const Two two = *at(behind_, slot_times_8);
     return {loaded.w, two.a, two.b};
   }
 
-  // both, of the slot of a corner as pair_corner has it, for elements
+  // both vectors of a corner's slot, given as in pair_corner; the element kernels call this
   PD_DEVICE void operator()(unsigned corner, Vec3<T> (&vectors)[2]) const {
     const unsigned slot_times_8 = corner & 0xffff;
     const Quad<T> loaded = load(slot_times_8);
@@ -41,14 +41,14 @@ class Slots {
     first_[slot] = quad(first, second.x);
     behind_[slot] = {second.y, second.z};
   }
-  // the first vector stays
+  // keeps the first vector
   PD_DEVICE void set_second(int slot, const Vec3<T>& second) const {
     first_[slot].w = second.x;
     behind_[slot] = {second.y, second.z};
   }
 
  private:
-  // as pair_corner has slots, for the fewest instructions
+  // takes slots as pair_corner encodes them, which needs the fewest instructions
   template <class Item>
   PD_DEVICE static const Item* at(const Item* array, unsigned slot_times_8) {
     const auto* bytes = reinterpret_cast<const std::byte*>(array);

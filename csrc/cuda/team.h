@@ -1,39 +1,42 @@
-// Sums over all threads that work on an environment: every thread leaves its part, the leading warp adds up after a barrier and
-// exchanges with the leading warps of the other blocks.
+// Reductions over all threads that work on an environment. Each thread contributes a partial value.
+// After a barrier, the leading warp reduces the block and exchanges the result with the leading
+// warps of the other blocks.
 #pragma once
 #include "cuda/cluster_sums.h"
 #include "cuda/exchange.h"
 
 namespace pd::inline PD_TARGET {
 
-// The blocks that have an environment together: one; several whose shared memory they have in common; several without.
+// How blocks share an environment: one block each; a cluster with distributed shared memory; or a
+// grid of blocks.
 enum class Blocks { one, cluster, grid };
 
-// In shared memory.
+// The block's partial and total sums, in shared memory.
 struct TeamTotals {
   double warp_sum[sums_count][warp_size];
   double total[sums_count];
 };
 
-// The last warp leads: it is the one that a last round of pairs leaves idle, where there are several.
+// The last warp leads: it is idle in the last round of pairs when there are several rounds.
 PD_DEVICE bool in_leading_warp() { return threadIdx.x + warp_size >= blockDim.x; }
 PD_DEVICE bool is_leader() { return threadIdx.x + warp_size == blockDim.x; }
 PD_DEVICE int lane() { return int(threadIdx.x) % warp_size; }
 
 template <Blocks Kind>
 class TeamSums {
-  static constexpr bool Many = Kind != Blocks::one;  // blocks, patch by patch
-  static constexpr int early_barrier = 1;            // that of __syncthreads is 0
+  static constexpr bool Many = Kind != Blocks::one;  // several blocks, one per patch
+  static constexpr int early_barrier = 1;            // hardware barrier 0 is __syncthreads
 
  public:
-  // `box` [2, patches, sums_count], of a grid, starts with tags of zero; `cluster`: of a cluster
+  // `mailbox` [2, patches, sums_count] starts with zero tags (grid only); `cluster` is for clusters
+  // only
   PD_DEVICE TeamSums(TeamTotals& totals, TaggedWord* mailbox, ClusterSums cluster, int patch,
                      int patches)
       : totals_(&totals), mailbox_(mailbox), cluster_(cluster), patch_(patch), patches_(patches) {}
 
   PD_DEVICE double total(int n) const { return totals_->total[n]; }
 
-  // Every thread, before a barrier: its first `wanted` values.
+  // Called by all threads before a barrier: contributes the first `count` values.
   template <class Op>
   PD_DEVICE void store_partial(const double (&value)[sums_count], int count, Op op) {
     count_ = count;
@@ -46,7 +49,7 @@ class TeamSums {
     }
   }
 
-  // The same, for the leading warp to send before that barrier.
+  // The same contribution, which the leading warp may send before that barrier.
   template <class Op>
   PD_DEVICE void store_partial_early(const double (&value)[sums_count], int count, Op op) {
     store_partial(value, count, op);
@@ -54,7 +57,8 @@ class TeamSums {
     if (!in_leading_warp())
       asm volatile("bar.arrive %0, %1;" ::"n"(early_barrier), "r"(blockDim.x) : "memory");
   }
-  // Leading warp, in place of all: one value, of which every thread has left a part in `values` [threads] before a barrier.
+  // Leading warp, in place of store_partial: reduces `values` [threads], which all threads wrote
+  // before a barrier.
   template <class Op>
   PD_DEVICE void gather(const double* values, Op op) {
     double sum = Op::identity;
@@ -64,13 +68,13 @@ class TeamSums {
     partials_ = warp_size;
     __syncwarp();
   }
-  // Leading warp: until all have left theirs early.
+  // Leading warp: waits until all warps have called store_partial_early.
   PD_DEVICE void wait_for_early() const {
     __syncwarp();
     asm volatile("bar.sync %0, %1;" ::"n"(early_barrier), "r"(blockDim.x) : "memory");
   }
 
-  // Leading warp: the sums of the block, to the other blocks.
+  // Leading warp: sends the block's sums to the other blocks.
   template <class Op>
   PD_DEVICE void send(Op op) {
     ++round_;
@@ -92,7 +96,7 @@ class TeamSums {
     __syncwarp();
   }
 
-  // Leading warp: the sums of all blocks, the same in each.
+  // Leading warp: receives the sums of all blocks; every block gets the same bits.
   template <class Op>
   PD_DEVICE void receive(Op op) {
     if constexpr (Many) {
@@ -112,7 +116,8 @@ class TeamSums {
     __syncwarp();
   }
 
-  // All threads; the totals are there when it returns. `Meets`: what any wrote before can be read by all after.
+  // Called by all threads; the totals are valid on return. `Syncs`: also makes all earlier writes
+  // of the team visible to all its threads.
   template <bool Syncs = false, class Op>
   PD_DEVICE void all_reduce(const double (&value)[sums_count], int count, Op op) {
     store_partial(value, count, op);
@@ -126,7 +131,7 @@ class TeamSums {
     __syncthreads();
   }
 
-  // Waits for all blocks of the environment; what they wrote before can be read after.
+  // Barrier over all blocks of the environment; earlier writes are visible after it.
   PD_DEVICE void sync() {
     if constexpr (!Many) {
       __syncthreads();
@@ -144,8 +149,8 @@ class TeamSums {
   TaggedWord* mailbox_;
   ClusterSums cluster_;
   int patch_, patches_;
-  int count_ = 0;       // sums that were left,
-  int partials_ = 0;    // in so many parts
+  int count_ = 0;       // values per reduction
+  int partials_ = 0;    // partial values per sum
   unsigned round_ = 0;  // exchanges so far
 };
 

@@ -1,4 +1,5 @@
-// Launches of teams of blocks, each of which has an environment at a time, and what such a team keeps of the preconditioner.
+// Launches of block teams, each with one environment at a time, and the team's preconditioner
+// memory.
 #pragma once
 #include "cuda/arena.h"
 #include "cuda/cycle.h"
@@ -23,7 +24,7 @@ PD_HD void arrange(Arena& arena, const Levels<T>& levels, int teams, CycleMemory
   for (Quad<T>** array : {&m.coarse_in, &m.coarse_out}) arena.place(*array, teams * coarse * below);
 }
 
-// How many blocks an environment gets, and how many environments run at once. No bits depend on it.
+// Blocks per environment and concurrent environments. The bits do not depend on either.
 struct Teams {
   int count, blocks;
 
@@ -32,16 +33,16 @@ struct Teams {
         blocks(std::clamp(resident / count, 1, useful)) {}
 };
 
-// for the preconditioner, of blocks of so many threads
+// The number of blocks that speeds up the preconditioner, for blocks of `threads` threads.
 template <class T>
 int useful_blocks(const Levels<T>& levels, int threads) {
   const auto blocks = [&](int each) { return (levels.vertices + each - 1) / each; };
   if (levels.direct) return blocks(threads / warp_size);
-  // with fewer vertices one block is done before several have met
+  // for fewer vertices, one block finishes before several blocks could synchronise
   return levels.vertices <= 4 * threads ? 1 : blocks(threads);
 }
 
-// All blocks at once, since they wait for each other.
+// A cooperative launch: the blocks wait for each other, so all must be resident.
 template <class Call>
 void launch_teams(const void* kernel, Call& call, unsigned* counter, int threads,
                   std::size_t shared, cudaStream_t stream) {

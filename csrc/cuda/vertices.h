@@ -1,4 +1,4 @@
-// The state of vertices in memory, and what a step does with one of them.
+// Vertex state in device memory, and the update of one vertex.
 #pragma once
 #include "cuda/inputs.h"
 #include "solver/rigid.h"
@@ -7,10 +7,10 @@ namespace pd::inline PD_TARGET {
 
 template <class T, bool HasContacts>
 struct Vertices {
-  Quad<T>*x, *velocity, *target;  // at the start of the step [m], [m/s], s [m] and as its w: a
-  Quad<T>*u, *before;             // iterate and the one before [m]; w: 1 / D
+  Quad<T>*x, *velocity, *target;  // at the start of the step: [m], [m/s]; s [m] with w = a
+  Quad<T>*u, *before;             // iterate and previous iterate [m]; w = 1 / D
 
-  // What a pass knows of a vertex before the force on it.
+  // The state of a vertex, loaded before its elastic force is known.
   struct LoadedVertex {
     Vertex<Thread<T>, HasContacts> vertex;
     Vec3<T> u, before;
@@ -20,7 +20,7 @@ struct Vertices {
       return 0.5 * double((twice.x + twice.y) + twice.z);
     }
 
-    // |u - s|^2, with which a soft stop compares
+    // |u - s|^2, the squared displacement that the tolerance is relative to
     PD_DEVICE double square_of_displacement() const {
       const Vec3<T> displacement = u - vertex.target;
       return double(dot(displacement, displacement));
@@ -47,7 +47,7 @@ struct Vertices {
     u[i] = before[i] = {T(0), T(0), T(0), T(0)};
   }
 
-  // 1 / D; returns share_of_inertia
+  // Stores 1 / D and returns share_of_inertia.
   PD_DEVICE double set_diagonal(int i, T elastic) const {
     const T a = inertia(i), inverse = inverse_diagonal(a, elastic);
     u[i].w = before[i].w = inverse;
@@ -60,7 +60,7 @@ struct Vertices {
 
   PD_DEVICE Vec3<T> at_constant_velocity(int i, T h) const { return h * vec3(velocity[i]); }
 
-  // What the first iterate is made of, if it is not given.
+  // The predicted first iterate, used unless the caller gives one.
   PD_DEVICE Vec3<T> predicted(int i, const Settings& settings) const {
     if (settings.start() == StartKind::inertial) return vec3(target[i]);
     return at_constant_velocity(i, T(settings.time_step));
@@ -82,7 +82,7 @@ struct Vertices {
   PD_DEVICE void set_before(unsigned i, const Vec3<T>& value) const {
     before[i] = quad(value, before[i].w);
   }
-  // In place of the iterate before, for whoever then lets the two change places.
+  // Overwrites the previous iterate; the caller then swaps the two arrays.
   PD_DEVICE void set_in_place_of_before(unsigned i, const LoadedVertex& loaded,
                                         const Vec3<T>& value) const {
     before[i] = quad(value, loaded.vertex.inverse);
