@@ -1,4 +1,4 @@
-// The launch of the fused kernel, for one precision.
+// Launch of the fused kernel in one precision.
 #pragma once
 #include "cuda/arena.h"
 #include "cuda/fused_kernels.cuh"
@@ -17,10 +17,10 @@ static_assert(sizeof(Control<double>) <= fused_control_bytes);
 static_assert(sizeof(Plane<float>) == planes_numbers * sizeof(float) &&
               sizeof(Ball<float>) == spheres_numbers * sizeof(float));
 
-// Shared memory that the device keeps of every block.
+// Shared memory that the device reserves per block.
 constexpr std::size_t reserved_shared_bytes = 1024;
 
-// of fused_touching_float.cu and fused_touching_double.cu
+// instantiated in fused_touching_float.cu and fused_touching_double.cu
 extern template FusedKernel<float> fused_kernel_for<float, true, true>(Blocks, bool, int);
 extern template FusedKernel<double> fused_kernel_for<double, true, true>(Blocks, bool, int);
 
@@ -31,7 +31,7 @@ FusedKernel<T> fused_kernel(const DeviceStep<T>& step, Blocks kind, bool in_shar
                                : fused_kernel_for<T, false, false>(kind, in_shared, threads);
 }
 
-// How a call is launched.
+// Launch configuration of a call.
 template <class T>
 struct FusedLaunch {
   Blocks kind;
@@ -50,15 +50,15 @@ struct FusedLaunch {
   void keep_vertices(const DeviceStep<T>& step);
 };
 
-// A block that has an environment to itself: its threads, and how many such blocks a multiprocessor runs.
+// Shape of a block with one environment: threads, and resident blocks per multiprocessor.
 struct BlockShape {
   int threads = warp_size, per_multiprocessor = 0;
-  double pairs = 0;        // that the multiprocessor works on at a time
-  double cost = HUGE_VAL;  // of the environments that it is for, where they are known
+  double pairs = 0;        // pairs in progress per multiprocessor
+  double cost = HUGE_VAL;  // for the plan's number of environments, where it is known
 
   int resident() const { return threads * per_multiprocessor; }
-  // Threads hide the time that memory takes; then few of them should be idle in the last round of pairs, and few wait for each
-  // other.
+  // Resident threads hide memory latency. Second, few threads should idle in the last round of
+  // pairs; third, few should wait for each other.
   auto rank() const { return std::tuple(resident(), pairs, per_multiprocessor); }
   bool is_worse_than(const BlockShape& other) const {
     if (cost != other.cost) return cost > other.cost;
@@ -66,19 +66,22 @@ struct BlockShape {
   }
 };
 
-// Time that a multiprocessor takes for so many environments at a time, in units of what a round of a warp takes to issue. Up to
-// two rounds a thread has its pairs at hand, and what a block waits for is the rest of an iteration; with three it waits in
-// each. Fitted to an H100, 64 to 400 vertices in batches that it has at a time, where the shape that this chooses was up to 6 %
-// slower than the best; blocks of more rounds were not. In float32 64 vertices are for cuda/several_shape.h now.
+// Time of an iteration on a multiprocessor with several environments; the unit is the issue time of
+// one warp round. Up to two rounds per thread, pairs are prefetched and the latency is that of the
+// rest of an iteration. Three rounds each add latency.
+//
+// Fitted on an H100 to 64 to 400 vertices with all environments resident; the chosen shape was at
+// most 6 % slower than the best. Shapes with more rounds were not fitted. In float32,
+// cuda/several_shape.h now covers 64 vertices.
 inline double shape_cost(int environments, int warps, int rounds) {
   const int wait = rounds <= 2 ? 26 : 15 * rounds;
   return wait + 0.25 * warps + double(warps * rounds) * environments;
 }
 constexpr int most_fitted_rounds = 3;
 
-// The best one for a mesh, given the shared memory that it wants: for as many environments as a multiprocessor has room for, or
-// for those of the plan where they are fewer. The batch of a call does not enter, so that an environment gives the same bits
-// alone and in any batch.
+// The best shape for a mesh and its shared memory: for as many environments as fit on a
+// multiprocessor, or for those of the plan if they are fewer. The batch of a call has no influence,
+// so an environment gives the same bits alone and in any batch.
 template <class T>
 BlockShape block_shape(const DevicePlan<T>& plan, std::size_t shared) {
   BlockShape best, cheapest;
@@ -98,7 +101,8 @@ BlockShape block_shape(const DevicePlan<T>& plan, std::size_t shared) {
   return cheapest.per_multiprocessor > 0 ? cheapest : best;
 }
 
-// One patch a block: a thread for every tetrahedron and slot, as far as there are, and a warp without any to lead.
+// Threads of a block with one patch: one per tetrahedron and slot, up to a limit, plus a leading
+// warp without pairs.
 template <class T>
 int patch_threads(const DevicePlan<T>& plan) {
   const int wanted = std::max(2 * plan.most_pairs + warp_size, plan.most_slots);
@@ -139,7 +143,7 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
   teams = int(std::min<std::int64_t>(step.batch, resident / patches));
 }
 
-// As many arrays in shared memory as leave a multiprocessor no less busy, or its environments no later.
+// Keeps as many arrays in shared memory as possible without lower occupancy or higher cost.
 template <class T>
 void FusedLaunch<T>::form_block(const DeviceStep<T>& step) {
   const std::size_t each = sizeof(Quad<T>) * step.plan.most_slots;
@@ -158,7 +162,7 @@ void FusedLaunch<T>::form_block(const DeviceStep<T>& step) {
   kernel = fused_kernel(step, kind, kept == block_arrays, threads);
 }
 
-// Few patches, whose blocks reach each other's shared memory. The batch does not enter here either.
+// Few patches with distributed shared memory. The batch has no influence here either.
 template <class T>
 void FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
   shared = cluster_shared_bytes(step);
@@ -177,8 +181,8 @@ void FusedLaunch<T>::form_clusters(const DeviceStep<T>& step) {
   teams = int(std::min<std::int64_t>(step.batch, clusters));
 }
 
-// The most blocks of a cluster that this device runs, however much shared memory they want, and that this build has code for; 1:
-// none.
+// Blocks of the largest cluster that this device runs with any amount of shared memory, if this
+// build has code for it; otherwise 1.
 template <class T>
 int largest_cluster_with() {
   constexpr int threads = most_grid_threads<T>;
@@ -191,7 +195,7 @@ int largest_cluster_with() {
   return blocks;
 }
 
-// As many as fit a block that has a multiprocessor to itself.
+// As many arrays as fit in a block that has a multiprocessor to itself.
 template <class T>
 void FusedLaunch<T>::keep_vertices(const DeviceStep<T>& step) {
   const std::size_t each = sizeof(Quad<T>) * step.plan.most_slots;
@@ -207,13 +211,13 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaun
   const bool grid = launch.kind == Blocks::grid;
   const std::int64_t teams = launch.teams;
   FusedScratch<T> s;
-  // what must start as zero comes first
+  // zero-initialised arrays come first
   arena.place(s.messages, grid ? teams * 2 * plan.slots * HaloMessage<T>::words : 0);
   arena.place(s.sums, grid ? teams * 2 * plan.patches * sums_count : 0);
   for (int a = 0; a < vertex_arrays; ++a) {
     arena.place(s.vertex[a], a < launch.kept ? 0 : teams * plan.slots);
   }
-  // with one tetrahedron a thread has its weight itself
+  // with one tetrahedron per thread, its weight stays in a register
   const bool own = launch.kind == Blocks::cluster && near_once(sizeof(T));
   arena.place(s.weights, own ? 0 : teams * plan.blocks * 2 * pair_lanes);
   arena.place(s.pieces, teams * launch.patches * plan.pieces);

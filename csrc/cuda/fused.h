@@ -1,9 +1,14 @@
-// Runner of solver/step.h inside a kernel: all iterations, and all steps of a rollout, in one launch.
+// Runs solver/step.h inside a kernel: one launch covers all iterations and all steps of a rollout.
 //
-// A team of blocks has one environment at a time, each block one patch of the mesh. The iterate lives in shared memory. With
-// one patch nothing leaves the block; with several, one exchange an iteration is all. Patches of a grid send each other the forces
-// on the vertices that they share, and each adds them up in the same order and moves its own copy. Those of a cluster share no
-// vertices: each works out all tetrahedra that touch its own, and sends where these are now.
+// A team of blocks works on one environment at a time, with one patch of the mesh per block. The
+// iterate stays in shared memory. A single patch needs no communication; several patches exchange
+// once per iteration.
+//
+// Patches of a grid exchange the forces on their shared vertices. Each patch sums them in the same
+// order and updates its own copy of the vertex.
+//
+// Patches of a cluster share no vertices. Each patch computes all tetrahedra that touch its own
+// vertices, and sends the new positions of these vertices.
 #pragma once
 #include "cuda/ahead.h"
 #include "cuda/fused_call.h"
@@ -16,25 +21,29 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: the scene has contacts. `Loose`: it may have pieces that pins leave to move, always so with contacts; elsewhere their
-// sums and motions would only take registers from the iterations. `Near`: of one patch, whose vertex arrays fit shared memory, as far as iterations ask for
-// them; of several, which are so small that theirs fit and that no thread has more than one slot, nor in float32 more than one
-// tetrahedron; of a cluster, where all are as small, with so few own vertices that each has eight lanes and not four.
+// `HasContacts`: the scene has contacts. `HasFreePieces`: pins may leave a piece free to move;
+// always true with contacts. Elsewhere the sums and motions of pieces would only take registers
+// from the iterations.
+//
+// `InShared`, one patch: the arrays that iterations read fit in shared memory. Several patches: all
+// arrays fit, and each thread has at most one slot and, in float32, one tetrahedron. Cluster: in
+// addition, a patch has so few vertices of its own that each gets eight lanes instead of four.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 class FusedRunner {
-  static constexpr bool Many = Kind != Blocks::one;  // patches an environment
+  static constexpr bool Many = Kind != Blocks::one;  // several patches per environment
   static constexpr bool Clustered = Kind == Blocks::cluster;
   static constexpr bool OnePerThread = (InShared || Clustered) && near_once(sizeof(T));
-  // whether each thread keeps its first tetrahedron, or else of a grid its first pair
+  // each thread keeps its first tetrahedron in registers; without it, a grid's thread keeps its
+  // first pair
   static constexpr bool TetPerLane = Clustered || (Kind == Blocks::grid && InShared);
-  // near patches have their vertices at hand
+  // loads from global memory are prefetched; arrays in shared memory need no prefetch
   static constexpr bool prefetches = Kind == Blocks::grid && !InShared;
   using Lanes = Thread<T>;
   using HaloMessage = pd::HaloMessage<T>;
   using OwnHalo = Halo<T, InShared ? 8 : 4>;
   using LoadedVertex = typename Vertices<T, HasContacts>::LoadedVertex;
 
-  // A slot as a pass visits it.
+  // A slot, as one thread updates it in a pass.
   struct WorkItem {
     int slot, row;
     Vec3<T> origin;
@@ -43,7 +52,7 @@ class FusedRunner {
   };
 
  public:
-  // `shared`: as many bytes as FusedLaunch says
+  // `shared`: size from FusedLaunch
   PD_DEVICE FusedRunner(const FusedCall<T>& call, std::byte* shared)
       : call_(call.step),
         plan_(call.step.plan),
@@ -64,7 +73,7 @@ class FusedRunner {
     init(shared);
   }
 
-  // All steps of one environment, with a record every `every`.
+  // Runs all steps of one environment; stores a record every `every` steps.
   PD_DEVICE void rollout(std::int64_t environment) {
     in_ = {&call_, environment};
     load();
@@ -74,7 +83,7 @@ class FusedRunner {
       if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
       move_spheres();
     }
-    // nothing is under way to a block when it ends
+    // no message may be in flight to a block that ends
     if constexpr (Clustered) wait_for_positions();
     __syncthreads();
   }
@@ -108,15 +117,16 @@ class FusedRunner {
     __syncthreads();
   }
 
-  // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
+  // Minimises E exactly over the rigid motions of every piece that pins and contacts leave free.
   PD_DEVICE void align() {
     if constexpr (Clustered) store_iterate();
     apply_last_sums();
     if constexpr (HasFreePieces) align_pieces();
   }
 
-  // When the sums of an iteration are sent and concluded: with one block, or where they may stop it, in the next one before
-  // its vertices. Near patches send them at its end, far ones at the start of the next; both conclude at the end of that.
+  // When the sums of an iteration are sent and applied. With one block, or with a tolerance: in the
+  // next iteration, before its vertices. Otherwise InShared patches send them at the end of the
+  // iteration, others at the start of the next. Both apply them at the end of the next iteration.
   PD_DEVICE void iterate(int k) {
     if constexpr (Clustered) return stops_ ? iterate_own<true>(k) : iterate_own<false>(k);
     const bool guard = set_.schedule == ScheduleKind::guarded && k % guard_period == 0;
@@ -132,7 +142,7 @@ class FusedRunner {
       if (is_leader() && !control_.progress.done) ++control_.progress.used;
     };
     if constexpr (Many) {
-      // one copy of the code, which several patches have to hold in the cache
+      // one copy of the code, which must stay in the instruction cache with several patches
       pass<true>(SolidGradient<true>{guard}, lead, early,
                  [&](const WorkItem& at, const LoadedVertex& loaded, const Vec3<T>& force) {
                    if (guard && !early && at.owned()) energy_ += loaded.energy();
@@ -157,7 +167,7 @@ class FusedRunner {
     if ((guard && !early) || stops)
       sums_.store_partial({energy_, first_, second_}, stops ? sums_count : 1, Add{});
     if constexpr (Many) {
-      // while others are still busy
+      // overlaps with warps that are still busy
       if (in_leading_warp()) {
         if (early) {
           sums_.wait_for_early();
@@ -181,7 +191,8 @@ class FusedRunner {
   }
 
  private:
-  // Where this team's memory lies: worked out when it is wanted, to leave the registers to the elements.
+  // Offsets of this team's memory are computed on demand, which leaves the registers to the
+  // elements.
   PD_DEVICE std::int64_t first_slot() const {
     return std::int64_t(team_) * plan_.slots + patch_.first_slot;
   }
@@ -198,14 +209,14 @@ class FusedRunner {
     return memory_.messages +
            (std::int64_t(team_) * 2 + (round_ & 1)) * plan_.slots * HaloMessage::words;
   }
-  // Of a cluster its own vertices.
+  // In a cluster, the patch's own vertices.
   PD_DEVICE int own_slots() const { return Clustered ? patch_.interior : patch_.slots; }
   template <class Visit>
   PD_DEVICE void each_slot(const Visit& visit) {
     for (int s = threadIdx.x; s < own_slots(); s += blockDim.x) visit(s);
   }
 
-  // for elements to see; of a cluster that happens when it is sent
+  // Writes the position that elements read; in a cluster, sending it does this.
   PD_DEVICE void place(int s, const Vec3<T>& position) {
     if constexpr (Clustered) {
       return;
@@ -266,9 +277,9 @@ class FusedRunner {
     }
   }
 
-  // Elements, then every slot once with the force on its vertex. `lead` is for the leading warp, before the slots; where it
-  // `MayStop`, an environment that is done is not visited any more. `early`: energies are left before
-  // the wait for letters.
+  // Computes the elements, then visits every slot once with the force on its vertex. The leading
+  // warp calls `lead` before the slots. `MayStop`: skips the vertices of a converged environment.
+  // `early`: energies are contributed before the wait for messages.
   template <bool MayStop, class Element, class Lead, class Visit>
   PD_DEVICE void pass(const Element& element, const Lead& lead, bool early, const Visit& visit) {
     if constexpr (Clustered) return pass_own(element, visit);
@@ -283,7 +294,7 @@ class FusedRunner {
     } else if (in_leading_warp()) {
       lead();
     }
-    // of several patches only late, when what others wait for has been sent
+    // with several patches, only after this patch has sent what others wait for
     if (finished_) return;
     if constexpr (Many && InShared) {
       visit_one_item<MayStop>(early, visit);
@@ -298,13 +309,13 @@ class FusedRunner {
     }
   }
 
-  // What the leading warp has decided.
+  // Reads the decisions of the leading warp.
   template <bool MayStop>
   PD_DEVICE void read_control() {
     finished_ = MayStop && control_.progress.done;
     omega_ = control_.omega;
   }
-  // With several patches it may have waited for the sums of the others meanwhile.
+  // With several patches, the leading warp may have waited for the sums of the others first.
   template <bool MayStop>
   PD_DEVICE void read_control_late() {
     if (!late_) return;
@@ -312,7 +323,7 @@ class FusedRunner {
     read_control<MayStop>();
   }
 
-  // ---- visits: cuda/fused_visit.h
+  // ---- vertex updates: cuda/fused_visit.h
 
   PD_DEVICE int slot_of_item(int item) const;
   PD_DEVICE int row_of_item(int item) const;
@@ -333,9 +344,9 @@ class FusedRunner {
   PD_DEVICE void visit_one_item(bool early, const Visit& visit);
   PD_DEVICE void store_energy(bool owned);
 
-  // ---- what is different in a cluster: cuda/fused_halo.h
+  // ---- cluster variant: cuda/fused_halo.h
 
-  // whether this warp has any own vertices, and whether this thread is the first of the lanes of one
+  // whether this warp has own vertices, and whether this thread is the first lane of one
   PD_DEVICE bool has_own() const { return OwnHalo::first_vertex() < patch_.interior; }
   PD_DEVICE bool is_first() const {
     return OwnHalo::part() == 0 && OwnHalo::vertex() < patch_.interior;
@@ -355,18 +366,18 @@ class FusedRunner {
   template <class Element, class Visit>
   PD_DEVICE void pass_own(const Element& element, const Visit& visit);
 
-  // Whether nobody waits for the sums of the last iteration but the leading warp: energies are left before the wait for letters,
-  // and sent once it has made its own visits.
+  // Whether only the leading warp needs the sums of the last iteration. Then energies are
+  // contributed before the wait for messages, and sent after the leading warp's own visits.
   PD_DEVICE bool stores_early() const {
     return Many && (InShared || Clustered) && !(set_.tolerance > 0);
   }
 
-  // The weight of the last iteration that was counted, whose sums are concluded.
+  // The weight omega of the last counted iteration, to which the sums belong.
   PD_DEVICE double omega_of_sums() const {
     return double(control_.omega_by_parity[(control_.progress.used - 1) & 1]);
   }
 
-  // Leading warp: what follows from the sums of the last iteration.
+  // Leading warp: receives the last iteration's sums and updates schedule and stopping rule.
   PD_DEVICE void apply_sums() {
     sums_.receive(Add{});
     if (lane() == 0) {
@@ -379,7 +390,7 @@ class FusedRunner {
     __syncwarp();
   }
 
-  // The last iteration's sums, which no iteration follows.
+  // The same for the final iteration.
   PD_DEVICE void apply_last_sums() {
     if (!pending_) return;
     if (in_leading_warp()) {
@@ -390,7 +401,7 @@ class FusedRunner {
     __syncthreads();
   }
 
-  // ---- start of a call: cuda/fused_start.h
+  // ---- initialisation: cuda/fused_start.h
 
   PD_DEVICE void lay_out(const FusedCall<T>& call, std::byte* shared);
   PD_DEVICE void init(std::byte* shared);
@@ -418,39 +429,43 @@ class FusedRunner {
   const DeviceStep<T>& call_;
   const DevicePlan<T>& plan_;
   const Settings& set_;
-  int index_;  // of the patch
+  int index_;  // patch
   Patch<T> patch_;
-  int outer_pairs_;  // of a far grid: pairs after which forces on shared vertices are complete, a multiple of the threads, or all
+  // grid without InShared: pairs after which forces on shared vertices are complete, a multiple of
+  // the threads or all
+  int outer_pairs_;
   int team_;
   const FusedScratch<T>& memory_;
   Control<T>& control_;
   TeamSums<Kind> sums_;
-  // where elements read vertices, from the patch's first; of a cluster halo_ has them
+  // positions that elements read, relative to the patch's first vertex; a cluster uses halo_
+  // instead
   Quad<T>* position_;
-  Quad<T>* entries_;  // forces of elements
-  double* energies_;  // of a cluster: what each thread has met of them
+  Quad<T>* entries_;  // element forces
+  double* energies_;  // cluster: energy sum of each thread
   Vertices<T, HasContacts> v_;
-  Quad<T>* origin_;  // start of the step, from the patch's first vertex, of a cluster the mesh's
+  // position at the start of the step, relative to the patch's first vertex (cluster: the mesh's)
+  Quad<T>* origin_;
   Plane<T>* planes_;
   Ball<T>* spheres_;
   Inputs<T> in_;
   Contacts<T> contacts_;
-  OwnHalo halo_;            // of a cluster
-  TetInputs<T> tet_;        // with Halves: this thread's first tetrahedron,
+  OwnHalo halo_;            // cluster
+  TetInputs<T> tet_;        // TetPerLane: this thread's first tetrahedron
   FaceRest<T, 1> rest_;     // and its rest shape
-  PrefetchedPair<T> pair_;  // of a grid without: this thread's first pair, between passes
-  int row_ =
-      0;  // slot_row of a grid's first seat of this thread, of the vertex that it has in a cluster
-  WorkItem item_;        // the seat that comes next,
-  LoadedVertex loaded_;  // with what a pass knows of its vertex
+  PrefetchedPair<T> pair_;  // grid without TetPerLane: this thread's first pair, between passes
+  int row_ = 0;    // slot_row of this thread's first item (grid) or of its own vertex (cluster)
+  WorkItem item_;  // next item
+  LoadedVertex loaded_;  // and its loaded vertex
   T h_, theta_, omega_ = T(1);
-  double energy_ = 0, first_ = 0, second_ = 0;  // this thread's part of the sums
+  double energy_ = 0, first_ = 0, second_ = 0;  // this thread's partial sums
   unsigned round_ = 0;                          // exchanges so far
-  unsigned waited_ = 0;                         // of a cluster: those that were waited for
+  unsigned waited_ = 0;  // cluster: exchanges that this thread has waited for
   bool finished_ = false, pending_ = false, guarding_ = false, started_ = false, late_ = false;
-  T next_omega_ = T(1);  // of the leader: the next omega
-  // of a cluster: whether vertices have moved since they were sent, whether seen_ is newer than their arrays, whether the environment
-  // has just been loaded, whether the energy of this thread's first tetrahedron counts; whether a tolerance may stop it
+  T next_omega_ = T(1);  // leader: the next omega
+  // Cluster only: vertices moved since they were last sent; loaded_ is newer than the arrays; the
+  // environment was just loaded; this patch counts the energy of this thread's first tetrahedron.
+  // stops_: a tolerance may end the solve.
   bool moved_ = false, in_registers_ = false, just_loaded_ = false, counts_ = false;
   int stops_ = in_register(int(set_.tolerance > 0));
 };

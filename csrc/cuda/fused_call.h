@@ -1,4 +1,4 @@
-// What the fused kernel is given, and what it keeps where.
+// Arguments and memory layout of the fused kernel.
 #pragma once
 #include "cuda/halo.h"
 #include "cuda/inputs.h"
@@ -9,22 +9,24 @@
 
 namespace pd::inline PD_TARGET {
 
-// What a team knows of every slot and elements do not need, in the order of how often iterations ask for it. A block of a grid
-// keeps as many as fit in its shared memory, a cluster's those of its own vertices.
+// Per-slot arrays that elements do not read, ordered by how often iterations read them. A grid's
+// block keeps as many as fit in shared memory; a cluster's block keeps those of its own vertices.
 enum VertexArray { array_u, array_before, array_target, array_origin, array_x, array_velocity };
 constexpr int vertex_arrays = 6;
-// Those that a block without others keeps at most: what iterations ask for, but for x where there are contacts.
+// Arrays that a single block keeps at most: all that iterations read, except x, which only contacts
+// need.
 constexpr int block_arrays = 4;
 
 // Device memory of the teams.
 template <class T>
 struct FusedScratch {
-  Quad<T>* vertex[vertex_arrays];  // [teams, slots] those that are not in shared memory
+  Quad<T>* vertex[vertex_arrays];  // [teams, slots]; arrays outside shared memory
   T* weights;                      // [teams, blocks, 2, 32] w V
   Piece<T>* pieces;                // [teams, patches, pieces]
-  double* part_sum;  // [teams, parts, PartSums::count] of the vertices that a patch owns of a piece
-  TaggedWord* messages;  // of a grid: [teams, 2, slots, words] forces on shared vertices
-  TaggedWord* sums;      // of a grid: [teams, 2, patches, sums_count]
+  double*
+      part_sum;  // [teams, parts, PartSums::count]; a part holds the vertices of a piece that a patch owns
+  TaggedWord* messages;  // grid: [teams, 2, slots, words] forces on shared vertices
+  TaggedWord* sums;      // grid: [teams, 2, patches, sums_count]
 };
 
 template <class T>
@@ -35,7 +37,7 @@ struct FusedCall {
   int kept;  // vertex arrays in shared memory
 };
 
-// Shared memory of a block that is in no cluster.
+// Shared memory of a block outside a cluster.
 template <class T>
 PD_HD std::size_t fused_shared_bytes(const DeviceStep<T>& step) {
   const bool many = step.plan.kernel == int(DeviceKernel::grid);
@@ -43,8 +45,8 @@ PD_HD std::size_t fused_shared_bytes(const DeviceStep<T>& step) {
                                 step.material.planes_count, step.material.spheres_count);
 }
 
-// Where the parts of a block's shared memory lie behind what it decides: of a cluster sums, energies and positions, then entries, planes and
-// balls, then vertex arrays; else positions first.
+// Layout of a block's shared memory behind Control. Cluster: sums, energies, positions, entries,
+// spheres, planes, vertex arrays. Others: positions, entries, spheres, planes, vertex arrays.
 constexpr std::size_t cluster_sums_begin = fused_control_bytes;
 constexpr std::size_t cluster_energy_begin = cluster_sums_begin + cluster_sums_bytes;
 constexpr std::size_t halo_begin = cluster_energy_begin + cluster_energy_bytes;
@@ -62,14 +64,14 @@ PD_HD std::size_t cluster_shared_bytes(const DeviceStep<T>& step) {
                                   step.material.spheres_count);
 }
 
-// What the leading warp of a block decides for it.
+// Decisions of the leading warp for its block.
 template <class T>
 struct Control {
   Progress progress;
   T omega;
-  // of even and of odd iterations, of a cluster and where they may stop
+  // of even and odd iterations, in a cluster and with a tolerance
   T omega_by_parity[2];
-  // of a cluster: where the first vertex of the mesh is when a call begins
+  // cluster: position of the mesh's first vertex when a call begins
   Vec3<T> anchor;
   TeamTotals totals;
 };

@@ -1,10 +1,11 @@
-// Members of FusedRunner for a patch of a cluster, which owns its interior vertices and is told where the others are.
+// Members of FusedRunner for a patch of a cluster. The patch owns its interior vertices and
+// receives the positions of the others.
 #pragma once
 #include "cuda/fused.h"
 
 namespace pd::inline PD_TARGET {
 
-// Of the patches that work out a tetrahedron one counts its energy.
+// Of all patches that compute a tetrahedron, one counts its energy.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE bool FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::counts(
     int number, T tet_energy) const {
@@ -18,7 +19,7 @@ PD_DEVICE bool FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::count
   return plan_.pair_tet[place.in(2) + number % 2 * pair_lanes] >= 0;
 }
 
-// What positions are relative to: for all patches of a cluster the same, since they tell each other their own.
+// Origin of the positions: the same for all patches of a cluster, since they exchange positions.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE Vec3<T> FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::anchor_of_step() {
   if constexpr (!Clustered) return vec3(v_.x[0]);
@@ -30,7 +31,7 @@ PD_DEVICE Vec3<T> FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::an
   const SharedAddress first = at_block(shared_address(v_.x), 0);
   T anchor[3];
   for (int c = 0; c < 3; ++c) anchor[c] = read_shared(first + c * int(sizeof(T)), T(0));
-  cluster_barrier();  // the vertex moves on afterwards
+  cluster_barrier();  // the vertex moves after this barrier
   return read3(anchor);
 }
 
@@ -40,7 +41,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::wait_
   waited_ = round_;
 }
 
-// What iterations go by and change: in registers from the first to the last.
+// Loads the iterate into registers, where it stays during the iterations.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_iterate() {
   const int own = OwnHalo::vertex();
@@ -59,7 +60,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::store
   in_registers_ = false;
 }
 
-// Own vertices that were moved by something else than an iteration.
+// Sends own vertices that something other than an iteration has moved.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::send_positions() {
   __syncthreads();
@@ -72,8 +73,9 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::send_
   }
 }
 
-// As iterate(). Nobody waits at its end but for the positions, with which the next begins: what warps write before its barrier
-// and read after it has two places, for even and for odd iterations.
+// Cluster variant of iterate(). It ends without a barrier; the next iteration begins by waiting for
+// positions. Data that warps write before the barrier and read after it is double-buffered by the
+// parity of the iteration.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 template <bool Stops>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::iterate_own(int k) {
@@ -92,7 +94,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::itera
     if (Stops && pending_) apply_sums();
     if (is_leader()) {
       control_.omega_by_parity[k % 2] = k == 0 ? control_.omega : next_omega_;
-      // before the energy that might change it is known: while others are busy
+      // computed early, while other warps are busy, although the energy may still change it
       next_omega_ = T(control_.progress.schedule.next(k + 1));
       if (!control_.progress.done) ++control_.progress.used;
     }
@@ -127,7 +129,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::itera
       const Schedule& schedule = control_.progress.schedule;
       const int before = schedule.restarts;
       apply_sums();
-      // after a restart an omega hangs on nothing that came before it
+      // after a restart, omega is independent of earlier iterations, so it is computed again
       if (is_leader() && schedule.restarts > before)
         next_omega_ = T(control_.progress.schedule.next(k + 1));
     }
@@ -137,7 +139,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::itera
   if (Stops) __syncthreads();
 }
 
-// As pass(), of which nobody moves anything.
+// Cluster variant of pass(), for visits that move no vertex.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 template <class Element, class Visit>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::pass_own(

@@ -1,4 +1,5 @@
-// The fused kernel, for one precision. What touches has sources of its own, so that two compilers share the work.
+// The fused kernel in one precision. Kernels with contacts are compiled in separate sources, to
+// parallelise the build.
 #pragma once
 #include "cuda/fused_halo.h"
 #include "cuda/fused_rigid.h"
@@ -8,13 +9,14 @@
 
 namespace pd {
 
-// Threads of a block that has a multiprocessor to itself: the most, and those that have registers to look ahead.
+// Threads of a block that has a multiprocessor to itself: the maximum, and the number that leaves
+// registers for prefetched data.
 template <class T>
 constexpr int most_grid_threads = int(most_patch_threads(sizeof(T)));
 template <class T>
 constexpr int global_memory_threads = sizeof(T) == 4 ? 384 : 192;
 
-// Threads that a multiprocessor has registers for, of blocks that have an environment each.
+// Threads that fit in a multiprocessor's registers, for blocks with one environment each.
 template <class T>
 constexpr int resident_threads = sizeof(T) == 4 ? 640 : 256;
 
@@ -25,7 +27,7 @@ __global__ void __launch_bounds__(Threads, 1)
   FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared> runner(call, shared);
   const int team = Kind != Blocks::one ? int(blockIdx.x) / call.step.plan.patches : int(blockIdx.x);
   for (std::int64_t e = team; e < call.step.batch; e += call.teams) runner.rollout(e);
-  // nobody leaves while others may still write to its shared memory
+  // no block may exit while others can still write to its shared memory
   if constexpr (Kind == Blocks::cluster) cluster_barrier();
 }
 
@@ -36,7 +38,7 @@ template <class T, bool HasContacts, bool HasFreePieces>
 FusedKernel<T> fused_kernel_for(Blocks kind, bool in_shared, int threads) {
   constexpr int most = most_grid_threads<T>;
   if (kind == Blocks::cluster) {
-    constexpr int few = most * 5 / 8;  // have more registers each
+    constexpr int few = most * 5 / 8;  // leaves more registers per thread
     if (threads <= few) {
       if (in_shared) return fused_step<T, HasContacts, HasFreePieces, Blocks::cluster, true, few>;
       return fused_step<T, HasContacts, HasFreePieces, Blocks::cluster, false, few>;

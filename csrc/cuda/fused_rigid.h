@@ -5,7 +5,8 @@
 
 namespace pd::inline PD_TARGET {
 
-// What finds the motions: by itself, so that what lives across its calls is spilled here, and not in the iterations.
+// Finds the motions, out of line: registers live across its calls are spilled here and not in the
+// iterations.
 template <class T, bool HasContacts, Blocks Kind>
 struct MotionFinder {
   const DevicePlan<T>& plan;
@@ -19,7 +20,7 @@ struct MotionFinder {
 
   template <Rigid What>
   PD_DEVICE void find(const Aligning& how) {
-    if constexpr (Kind != Blocks::one) sums.sync();  // everyone has read the sums of the last time
+    if constexpr (Kind != Blocks::one) sums.sync();  // all blocks have read the previous sums
     const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
     for (int n = first_part + warp; n < end_part; n += warps) {
       const Part part(plan, n, nullptr, -first_slot);
@@ -32,7 +33,7 @@ struct MotionFinder {
     __syncthreads();
   }
 
-  // In every patch that has the vertices, not only where their parts are.
+  // Covers every patch that holds the vertices, not only the patch of their part.
   PD_DEVICE void begin_still() {
     for (int s = threadIdx.x; s < slots; s += blockDim.x) {
       const int number = plan.slot_piece[first_slot + s];
@@ -41,13 +42,13 @@ struct MotionFinder {
     __syncthreads();
   }
 
-  // The same in every block of the team, since all of them work out all motions.
+  // The same in every block of the team, since each block computes all motions.
   PD_DEVICE bool some_tip() const {
     return some_of(plan.pieces, [&](int n) { return pieces[n].tipping.goes_on(); });
   }
 };
 
-// Returns where the team stands.
+// Returns the team's state.
 template <class T, bool HasContacts, Blocks Kind>
 PD_DEVICE_COLD TeamSums<Kind> find_motions(MotionFinder<T, HasContacts, Kind> finder,
                                            Aligning how) {
@@ -68,7 +69,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::align
         how);
     each_slot([&](int s) {
       const int number = plan_.slot_piece[patch_.first_slot + s];
-      if (number < 0 || !(v_.u[s].w > 0)) return;  // of no piece, or pinned
+      if (number < 0 || !(v_.u[s].w > 0)) return;  // of no free piece, or pinned
       const Vec3<T> u = v_.moved(s, piece(number).motion);
       move(s, u);
       if (first) v_.set_before(s, u);
@@ -77,7 +78,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::align
     __syncthreads();
     how.go_on();
   } while (HasContacts && some_of(plan_.pieces, [&](int n) { return piece(n).leg == how.leg; }));
-  // again, since registers that live across calls would be spilled in the iterations too
+  // reloads the prefetched data: registers live across calls would be spilled in the iterations too
   if constexpr (Many) load_own();
 }
 

@@ -1,10 +1,11 @@
-// Members of FusedRunner that prepare a call and an environment: its state in the memory of the block, its weights.
+// Members of FusedRunner that initialise a call and an environment: memory layout, state and
+// weights.
 #pragma once
 #include "cuda/fused.h"
 
 namespace pd::inline PD_TARGET {
 
-// Where everything lies in the memory of the block, and what does not fit there.
+// Sets the pointers to shared memory, and to global memory for arrays that do not fit.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::lay_out(
     const FusedCall<T>& call, std::byte* shared) {
@@ -36,7 +37,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::lay_o
   planes_ = reinterpret_cast<Plane<T>*>(spheres_ + call_.material.spheres_count);
 }
 
-// What a thread knows of its patch.
+// Per-thread data of the patch, constant for the call.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::init(std::byte* shared) {
   if constexpr (!InShared) {
@@ -66,7 +67,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load(
       position_[s] = quad(none);
     }
   });
-  // before the other blocks may write a step's result to the same place
+  // before other blocks may store a step's result to the same place
   if (Clustered && threadIdx.x == 0) control_.anchor = in_.at_vertex(call_.positions, 0);
   just_loaded_ = true;
   moved_ = false;
@@ -82,7 +83,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::move_
   __syncthreads();
 }
 
-// a and 1 / D of every vertex, w V of every element, and the smallest a / D
+// Computes a and 1 / D of every vertex, w V of every element, and the smallest a / D.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::assemble_diagonal() {
   const T* stiffness = call_.material.stiffness.of(in_.environment);
@@ -116,11 +117,11 @@ template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InSha
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::compute_weights(
     const T* stiffness, bool bounded) {
   compute_patch_weights(patch_, rest_of<false>(patch_), stiffness, bounded, weights());
-  __syncthreads();  // one lane has left the weights of two
+  __syncthreads();  // one lane has written the weights of two
   if constexpr (Many) load_own();
 }
 
-// What a thread keeps of its first tetrahedron, or its first pair.
+// Loads this thread's first tetrahedron or pair.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_own() {
   if constexpr (!TetPerLane) {
@@ -138,7 +139,8 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_
   if constexpr (Clustered) counts_ = counts_energy(threadIdx.x);
 }
 
-// The same without memory where no thread has more than one tetrahedron. Returns its weight without the bound.
+// The same without global memory, for one tetrahedron per thread; returns its weight without the
+// bound l_e.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE T FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::compute_own_weight(
     const T* stiffness, bool bounded) {

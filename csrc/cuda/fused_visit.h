@@ -1,10 +1,10 @@
-// Members of FusedRunner that visit the slots of a patch of a grid, and exchange forces meanwhile.
+// Members of FusedRunner that update the slots of a grid's patch while halo messages are in flight.
 #pragma once
 #include "cuda/fused.h"
 
 namespace pd::inline PD_TARGET {
 
-// Shared slots have the first seats.
+// Items are numbered with shared slots first.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::slot_of_item(
     int item) const {
@@ -18,14 +18,14 @@ PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::row_of
   return item == int(threadIdx.x) ? row_ : patch_.row(slot_of_item(item));
 }
 
-// rounds of this warp's threads for so many seats
+// Rounds that this warp needs for `items` items.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::rounds(int items) const {
   const int threads = blockDim.x;
   return max(0, (items - (int(threadIdx.x) - lane()) + threads - 1) / threads);
 }
 
-// In a visit the rounds without shared seats come first: letters are on the way meanwhile.
+// Rounds without shared slots come first, while messages are in flight.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::item_of_visit(
     int visit) const {
@@ -42,7 +42,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_
   item_ = {slot, row_of_item(item), vec3(origin_[slot])};
 }
 
-// Of a grid: the force on a shared vertex goes to the other patches.
+// Grid: sends the force on a shared vertex to the other patches.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::send_force(
     int item, const Vec3<T>& force) const {
@@ -66,13 +66,15 @@ PD_DEVICE Vec3<T> FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::re
                            round_);
 }
 
-// Of a far grid: what the first visited vertex knows of itself, asked for before the barrier, as the next one's before a visit.
+// Grid without InShared: loads the first item before the barrier; each later item is loaded during
+// the visit before it.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::prefetch_first() {
   load_item(item_of_visit(0));
 }
 
-// What the guard wants to know of this iterate, before it is moved.
+// Contributes the energy of the current iterate, which the schedule's guard needs before the
+// update.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::store_energy(
     bool owned) {
@@ -80,7 +82,8 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::store
   sums_.store_partial_early({energy_, 0, 0}, 1, Add{});
 }
 
-// A warp's rounds of seats without shared ones, then those whose letters have come meanwhile.
+// Visits the interior rounds of a warp, then the shared ones, whose messages have arrived
+// meanwhile.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 template <bool MayStop, class Visit>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::visit_items(
@@ -106,14 +109,15 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::visit
   }
 }
 
-// The same where each thread has the one seat of its number. Warps wait as one, else lanes would go on one after another.
+// The same with one item per thread. A warp waits as one, since its lanes would otherwise continue
+// one after another.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
 template <bool MayStop, class Visit>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::visit_one_item(
     bool early, const Visit& visit) {
   ++round_;
   const int item = threadIdx.x, shared = patch_.shared();
-  // of the warp: any slots, any shared ones
+  // whether the warp has any slots, and any shared slots
   const bool here = item - lane() < patch_.slots, waits = item - lane() < shared;
   const bool sends = item < shared;
   Vec3<T> force = {T(0), T(0), T(0)};

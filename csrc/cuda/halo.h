@@ -1,6 +1,6 @@
-// How the patches of a cluster know each other's vertices: every vertex has one owner, which sends its new position straight into
-// the shared memory of all patches whose tetrahedra touch it. Elements read it where it came, so that one exchange an iteration is
-// all, and nobody adds up what others send.
+// Halo exchange of a cluster. Every vertex has one owner, which stores its new position in the
+// shared memory of all patches whose tetrahedra touch it. Elements read the position there, so one
+// exchange per iteration suffices and no forces are exchanged.
 #pragma once
 #include "cuda/cluster.h"
 #include "cuda/collect.h"
@@ -8,24 +8,26 @@
 
 namespace pd::inline PD_TARGET {
 
-// Where elements read positions of slots.
+// The positions of slots, as elements read them.
 template <class T>
 struct SlotPositions {
   const Quad<T>* first;
 
-  // as pair_corner has slots
+  // takes slots as pair_corner encodes them
   PD_DEVICE Quad<T> load(unsigned slot_times_8) const {
     const auto* bytes = reinterpret_cast<const std::byte*>(first);
     return *reinterpret_cast<const Quad<T>*>(bytes + slot_times_8 * (unsigned(sizeof(*first)) / 8));
   }
 };
 
-// Every own vertex has some lanes of a warp: with four vertices a warp lane, lane + 4, lane + 8, ..., which add up forces and send
-// by turns. All of them know the vertex and move it alike. In shared memory, halo_bytes: two barriers, positions [2, slots].
+// Several lanes of a warp share an own vertex: with four vertices per warp, they are lane, lane +
+// 4, lane + 8, ... Each sums some of the forces and sends to some of the patches; all hold the same
+// vertex and apply the same update. Layout in shared memory (halo_bytes): two barriers, positions
+// [2, slots].
 template <class T, int Lanes>
 class Halo {
-  static constexpr int vertices = warp_size / Lanes;               // of a warp
-  static constexpr int most_places = most_cluster_blocks / Lanes;  // that a lane sends to
+  static constexpr int vertices = warp_size / Lanes;               // per warp
+  static constexpr int most_places = most_cluster_blocks / Lanes;  // targets per lane
 
  public:
   PD_DEVICE Halo(std::byte* shared, int slots)
@@ -33,18 +35,19 @@ class Halo {
         position_(reinterpret_cast<Quad<T>*>(shared + barriers_bytes)),
         slots_(slots) {}
 
-  // The own vertex of this lane, and of the first lane of its warp; the number of the lane among those of its vertex.
+  // The own vertex of this lane, that of its warp's first lane, and the lane's rank among those of
+  // its vertex.
   PD_DEVICE static int vertex() { return first_vertex() + int(threadIdx.x) % vertices; }
   PD_DEVICE static int first_vertex() { return int(threadIdx.x) / warp_size * vertices; }
   PD_DEVICE static int part() { return int(threadIdx.x) % warp_size / vertices; }
 
-  // All threads, before a barrier of the cluster.
+  // Called by all threads, before a cluster barrier.
   PD_DEVICE void init(const Patch<T>& patch) {
     if (vertex() < patch.interior) {
       const int32* copies =
           patch.plan.slot_copy + (patch.first_vertex + vertex()) * int(most_cluster_blocks);
       for (int j = 0; j < most_places; ++j) {
-        // the owner's own place is the first; those that there are come before those that there are not
+        // the owner's own slot comes first; valid targets come before missing ones
         const int n = j * Lanes + part();
         const int place = n == 0 ? patch.index << 16 | vertex() : copies[max(n - 1, 0)];
         place_[j] = max(place, 0);
@@ -60,7 +63,8 @@ class Halo {
 
   PD_DEVICE SlotPositions<T> positions(unsigned round) const { return {place(round)}; }
 
-  // Whole warps that have own vertices, once a round, numbered from 1, after the wait for the one before.
+  // Called by whole warps with own vertices, once per round (from 1), after the wait for the
+  // previous round.
   PD_DEVICE void send(const Vec3<T>& position, unsigned round) const {
     const Quad<T> payload = quad(position);
     const Quad<T>* const row = place(round);
@@ -76,10 +80,11 @@ class Halo {
     __syncwarp();
   }
 
-  // until the positions of all slots are there
+  // Waits until the positions of all slots have arrived.
   PD_DEVICE void wait(unsigned round) const { barrier(round).wait((round - 1) >> 1 & 1); }
 
-  // Whole warps: the force on the vertex of this lane, whose entries its lanes take by turns, four at a time.
+  // Called by whole warps: the force on this lane's vertex. Its lanes take the entries in turn,
+  // four loads at a time.
   PD_DEVICE static Vec3<T> sum_entries(const Quad<T>* entries, int row) {
     constexpr int in_flight = 4, step = Lanes * entry_stride;
     const int count = row >> 16 & 0x7fff;
@@ -117,9 +122,9 @@ class Halo {
   std::uint64_t* barrier_;
   Quad<T>* position_;
   int slots_;
-  int place_[most_places] = {};  // where patches have the vertex, see slot_copy
-  int places_ = 0, most_ = 0;    // how many there are of them, and of any lane of the warp
-  int expected_ = 0;             // bytes a round
+  int place_[most_places] = {};  // targets of the vertex, see slot_copy
+  int places_ = 0, most_ = 0;    // number of targets, and its maximum over the warp
+  int expected_ = 0;             // bytes per round
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -1,4 +1,5 @@
-// The rigid motions of solver/rigid.h: sums over every patch's part of a piece, a warp a part, then over the parts, a warp a piece.
+// The rigid motions of solver/rigid.h: reductions over a patch's part of a piece (one warp per
+// part), then over the parts (one warp per piece).
 #pragma once
 #include "cuda/collect.h"
 #include "cuda/vertices.h"
@@ -6,34 +7,36 @@
 
 namespace pd::inline PD_TARGET {
 
-// Rounds: where a piece is, and before any iteration on contacts whether it starts from where it was; its motion if it touches nothing,
-// what contacts leave of that, several where it tips, and nothing where that leads into further contacts.
+// Rounds. start: centroid, and whether a piece starts from its current position (before iterations
+// on contacts only). mean: centroid. free: motion without contacts. touching: motion that contacts
+// leave. tipping: rolling, in several rounds. beside: cancels a motion that would lead into further
+// contacts.
 enum class Rigid { start, mean, free, touching, tipping, beside };
 
-// The numbers of a part, see RigidSums and Touch, and the least gap of the last round. What a search finds, and what the start goes by,
-// comes where those of Touch are in their round.
+// Offsets of a part's values: RigidSums, Touch, and the least gap of the last round. The rounds
+// tipping and start reuse the place of Touch.
 struct PartSums {
   static constexpr int rigid = 0, touch = RigidSums::count, bounds = touch + Touch::sums;
   static constexpr int touched = bounds + Touch::bounds, least_gap = touched + 1;
   static constexpr int count = least_gap + 1, found = touch, start = touch;
-  // after those of StartSums: of a (v - u), by which the mean moves with a piece that stays
+  // behind StartSums: sum of a (v - u), which shifts the centroid of a piece that starts at rest
   static constexpr int back = StartSums::count, starts = back + 3;
   static_assert(Found::count <= Touch::sums && starts <= Touch::sums);
 };
 
 template <class T>
 struct Piece {
-  double sum[RigidSums::count], touch[Touch::sums], bounds[Touch::bounds];  // of all its parts
+  double sum[RigidSums::count], touch[Touch::sums], bounds[Touch::bounds];  // over all its parts
   double start[PartSums::starts];
-  double touched, least_gap;  // a bit for each of the first planes; see PartSums
-  bool still;                 // starts from where it is
-  int leg;                    // in which it goes on, 0: in none
+  double touched, least_gap;  // one bit per plane; see PartSums
+  bool still;                 // starts from its current position
+  int leg;                    // the leg that it continues in, 0: none
   Vec3<double> center;
   RigidMotion<T> motion;
   Tipping tipping;
 };
 
-// Slots of a part, and where the arrays have the vertex of one: at the slot itself, or where `vertex` says, from `first` on.
+// Slots of a part. A vertex lies at its slot, or at `vertex[slot]` if given, with offset `first`.
 struct Part {
   const int *slot, *vertex;
   int begin, end, first;
@@ -51,7 +54,7 @@ struct Part {
     return plan.slot_piece[slot[begin]];
   }
 
-  // visit(i), each by one lane
+  // calls visit(i) on one lane each
   template <class Visit>
   PD_DEVICE void each(const Visit& visit) const {
     for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size)
@@ -59,7 +62,8 @@ struct Part {
   }
 };
 
-// Lane n gets value n of all lanes together. Each exchange halves how many values a lane is left with.
+// Reduces `value` over a warp; lane n gets value n. Each exchange halves the number of values per
+// lane.
 template <int Count, class Op>
 PD_DEVICE double share_out(const double (&value)[Count], Op op) {
   static_assert(Count <= warp_size);
@@ -71,7 +75,7 @@ PD_DEVICE double share_out(const double (&value)[Count], Op op) {
     const bool upper = int(threadIdx.x) & half;
 #pragma unroll
     for (int n = 0; n < half; ++n) {
-      if (n >= Count) break;  // nothing but `none` in both halves
+      if (n >= Count) break;  // both halves hold only `identity`
       const double give = upper ? left[n] : left[n + half];
       left[n] = op(upper ? left[n + half] : left[n], __shfl_xor_sync(full_warp, give, half));
     }
@@ -79,7 +83,7 @@ PD_DEVICE double share_out(const double (&value)[Count], Op op) {
   return left[0];
 }
 
-// Returns what share_out does.
+// The same, also written to `to`; returns the lane's value.
 template <int Count, class Op>
 PD_DEVICE double write_shares(const double (&value)[Count], Op op, double* to) {
   const double own = share_out(value, op);
@@ -87,8 +91,9 @@ PD_DEVICE double write_shares(const double (&value)[Count], Op op, double* to) {
   return own;
 }
 
-// What all rounds go by: whether this is before any iteration; there are pins; every part is a whole piece, which then needs no round for
-// its mean; pieces may start from where they are; and the leg of the motion.
+// Settings of all rounds. first: before any iteration. pins: the plan has pins. whole: every part
+// is a whole piece, so no round for the centroid is needed. starts: pieces may start from their
+// current position. leg: leg of the motion.
 struct Aligning {
   bool first, pins, whole, starts;
   int leg = 0;
@@ -108,7 +113,7 @@ struct Aligning {
   }
 };
 
-// Whether that is so of one of `count`, for all threads of a block, which wait for each other here.
+// Whether `is` holds for any of `count`. All threads of the block must call it.
 template <class Is>
 PD_DEVICE bool some_of(int count, const Is& is) {
   bool some = false;
@@ -116,7 +121,8 @@ PD_DEVICE bool some_of(int count, const Is& is) {
   return __syncthreads_or(some);
 }
 
-// The rounds of a leg. `run` finds what each is for, sets pieces to where they start, and knows whether some tip.
+// The rounds of a leg. `run` finds the values of a round, resets pieces to their start, and knows
+// whether some roll.
 template <bool HasContacts, class Run>
 PD_DEVICE void find_in_rounds(Run& run, const Aligning& how, bool several_contacts) {
   if constexpr (HasContacts) {
@@ -134,7 +140,7 @@ PD_DEVICE void find_in_rounds(Run& run, const Aligning& how, bool several_contac
   }
 }
 
-// The lane of a warp that has the least number, the first of them.
+// The first lane of a warp that holds the least number.
 PD_DEVICE int lane_of_least(double number) {
   const double least = warp_reduce(number, Min{});
   const unsigned have = __ballot_sync(full_warp, number == least);
@@ -151,7 +157,7 @@ PD_HD Plane<To> plane_in(const Plane<From>& p) {
   return {vector_in<To>(p.normal), To(p.height), To(p.friction)};
 }
 
-// Whether a piece does not go on in this leg. After the round for contacts it has no motion that others could change.
+// Whether a piece takes no part in this leg. After round `touching` no other round can change it.
 template <Rigid What, class T>
 PD_DEVICE bool stands(const Aligning& how, const Piece<T>& piece) {
   return What <= Rigid::touching && how.leg > 0 && piece.leg != how.leg;
@@ -256,13 +262,14 @@ PD_DEVICE_COLD void sum_part(Vertices<T, HasContacts> v, Contacts<T> contacts,
   }
 }
 
-// Number n of `from`, [parts, PartSums::count], of a part, past the first level of cache, which does not see what other blocks wrote.
+// Value n of a part from `from` [parts, PartSums::count]. It bypasses the L1 cache, which may not
+// hold the writes of other blocks.
 template <class T>
 PD_DEVICE double read_part(const DevicePlan<T>& plan, const double* from, int at, int n) {
   return __ldcg(from + PartSums::count * plan.piece_part[at] + n);
 }
 
-// Lane n gets number n of many parts together: a lane adds up all numbers of every 32nd of them.
+// Lane n gets value n reduced over many parts; each lane reads every 32nd part.
 template <int Count, class T, class Op>
 PD_DEVICE_COLD double reduce_over_many_parts(const DevicePlan<T>& plan, int begin, int end,
                                              const double* from, Op op) {
@@ -274,8 +281,9 @@ PD_DEVICE_COLD double reduce_over_many_parts(const DevicePlan<T>& plan, int begi
   return share_out(part, op);
 }
 
-// Combines Count numbers, from the `first` on, of the parts of a piece, in memory that all lanes can read then: to broadcast them one by
-// one takes longer. With few parts a lane adds up one number of all of them.
+// Reduces Count values from `first` on over the parts of a piece, into memory that all lanes can
+// read. Broadcasts one by one would take longer. With few parts, each lane reduces one value over
+// all of them.
 template <int Count, class T, class Op>
 PD_DEVICE void reduce_over_parts(const DevicePlan<T>& plan, int piece, const double* part_sum,
                                  Op op, int first, double* total) {
@@ -301,7 +309,7 @@ PD_DEVICE RigidMotion<T> motion_in(const RigidMotion<double>& m) {
           vector_in<T>(m.shift)};
 }
 
-// Of bits in numbers.
+// Bitwise or of integers stored as doubles.
 struct Or {
   static constexpr double identity = 0;
   PD_DEVICE double operator()(double a, double b) const {
@@ -309,7 +317,7 @@ struct Or {
   }
 };
 
-// What the parts of a piece have found, for all lanes.
+// The best result over the parts of a piece, for all lanes.
 template <class T>
 PD_DEVICE void find_over_parts(const DevicePlan<T>& plan, int piece, const double* part_sum,
                                double (&found)[Found::count]) {
@@ -337,7 +345,7 @@ PD_DEVICE void stand_still(Piece<T>& to) {
   to.leg = 0;
 }
 
-// What contacts leave to a piece that does not tip, by one lane.
+// The motion that contacts leave to a piece that does not roll, by one lane.
 template <class T>
 PD_DEVICE_COLD void move_on_contacts(const Contacts<T>& contacts, Aligning how, Piece<T>& to) {
   const auto plane = [&](int k) { return plane_in<double>(contacts.planes[k]); };

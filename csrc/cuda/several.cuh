@@ -1,4 +1,4 @@
-// The kernel for several environments a block and its launch.
+// The small-batch kernel and its launch.
 #pragma once
 #include "cuda/arena.h"
 #include "cuda/launch.h"
@@ -18,7 +18,7 @@ __global__ void __launch_bounds__(FewRegisters ? few_registers_threads : small_b
   const auto begin = [&](std::int64_t block, std::int64_t each, std::int64_t before) {
     return min(before + block * each, call.step.batch);
   };
-  // so many to every block, as often as there are as many, then what is left in equal parts
+  // full waves of `per_block` environments per block, then the rest in equal shares
   const std::int64_t blocks = gridDim.x, wave = blocks * call.per_block;
   for (std::int64_t before = 0; before < call.step.batch; before += wave) {
     const std::int64_t left = min(call.step.batch - before, wave);
@@ -35,7 +35,7 @@ struct SmallBatchLaunch {
   void (*kernel)(SmallBatchCall<T>);
   int blocks;
   std::size_t shared;
-  // that device memory is for: with any batch no more than a large one has at work
+  // environments with device memory; no batch needs more than a large one keeps resident
   std::int64_t environments;
 
   explicit SmallBatchLaunch(const DeviceStep<T>& step) {
@@ -76,7 +76,8 @@ struct SmallBatchLaunch {
   }
 };
 
-// Few pairs, whose vertices all fit the shared memory of a block. The batch does not enter: the bits are those of this kernel.
+// For few pairs, whose vertices all fit in a block's shared memory. The batch has no influence,
+// since it would change the bits.
 template <class T>
 bool takes_small_batch(const DeviceStep<T>& step) {
   return step.plan.kernel == int(DeviceKernel::block) &&

@@ -1,8 +1,9 @@
-// Runner of solver/step.h inside a kernel, for meshes so small that a block has several environments: their pairs of tetrahedra
-// fill its warps, one environment after the other, where the pairs of one would leave lanes idle.
+// Runs solver/step.h inside a kernel, with several environments per block, for meshes so small that
+// one environment leaves lanes idle. The pairs of all environments fill the warps one after
+// another.
 //
-// Which threads work on an environment, and which others there are in its block, never decides in which order something is
-// added up, so neither decides the bits: whoever launches it may choose both by the batch.
+// The assignment of threads, and the other environments of a block, never affect the order of a
+// sum, so the bits do not depend on them. The launch may choose both by the batch.
 #pragma once
 #include "cuda/patch.h"
 #include "cuda/rigid.h"
@@ -13,13 +14,14 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`, `Loose`: see cuda/fused.h. `Once`: no thread has a second pair, so that each keeps what the plan says of its own.
-// `Lean`: there are too few registers to ask for all forces on a vertex at once.
+// `HasContacts`, `HasFreePieces`: see cuda/fused.h. `OnePerThread`: no thread has a second pair, so
+// each keeps its pair's data in registers. `FewRegisters`: too few registers to load all forces on
+// a vertex at once.
 template <class T, bool HasContacts, bool HasFreePieces, bool OnePerThread, bool FewRegisters>
 class SmallBatchRunner {
   using LoadedVertex = typename Vertices<T, HasContacts>::LoadedVertex;
 
-  // A pair or a vertex of one of the environments.
+  // A pair or a vertex of one environment.
   struct WorkItem {
     int environment, at;
   };
@@ -56,7 +58,7 @@ class SmallBatchRunner {
     first_slot_ = item_of(threadIdx.x, slots());
   }
 
-  // All steps of environments `first` to `first + here - 1`.
+  // Runs all steps of environments `first` to `first + here - 1`.
   PD_DEVICE void rollout(std::int64_t first, int here) {
     first_ = first;
     here_ = here;
@@ -97,7 +99,7 @@ class SmallBatchRunner {
     __syncthreads();
   }
 
-  // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
+  // Minimises E exactly over the rigid motions of every piece that pins and contacts leave free.
   PD_DEVICE void align() {
     apply_last_sums();
     if constexpr (HasFreePieces) align_pieces();
@@ -118,11 +120,11 @@ class SmallBatchRunner {
   }
 
  private:
-  // What vertices leave of themselves for the sums of their environment.
+  // The per-vertex values that are summed over an environment.
   enum VertexSum { energy_sum, change_sum, displacement_sum };
 
   PD_DEVICE bool stops() const { return stops_; }
-  // of the plan's one patch
+  // of the plan's only patch
   PD_DEVICE int pairs() const { return plan_.most_pairs; }
   PD_DEVICE int slots() const { return plan_.most_slots; }
   PD_DEVICE Inputs<T> inputs(int environment) const { return {&call_, first_ + environment}; }
@@ -142,24 +144,24 @@ class SmallBatchRunner {
            std::int64_t(first_of_block_ + environment) * plan_.parts * PartSums::count;
   }
 
-  // ---- who works on what
+  // ---- assignment of work
 
   PD_DEVICE static WorkItem item_of(int number, int each) { return {number / each, number % each}; }
-  // the one of this thread after it
+  // this thread's next item
   PD_DEVICE static WorkItem after(const WorkItem& item, int each, const Stride& stride) {
     const int at = item.at + stride.rest;
     const bool next = at >= each;
     return {item.environment + stride.whole + next, next ? at - each : at};
   }
 
-  // visit(seat, number in arrays of all)
+  // visit(item, index in the arrays of all environments)
   template <class Visit>
   PD_DEVICE void each_slot(const Visit& visit) {
     for (WorkItem item = first_slot_; item.environment < here_;
          item = after(item, slots(), slot_stride_))
       visit(item, item.environment * slots() + item.at);
   }
-  // A warp for each; the last ones, whose pairs are the fewest.
+  // One warp per environment, from the last warp on, which has the fewest pairs.
   template <class Visit>
   PD_DEVICE void each_environment(const Visit& visit) {
     const int warps = blockDim.x / warp_size;
@@ -179,14 +181,14 @@ class SmallBatchRunner {
     return FewRegisters ? sum_entries(entries, row) : sum_entries_by_8<T>(entries, row);
   }
 
-  // of this thread's next one, or again of its first
+  // Loads the data of this thread's next pair, or of its first pair again.
   PD_DEVICE void prefetch_pair(const WorkItem& next) {
     if (first_pair_.environment >= here_) return;
     const WorkItem& item = next.environment < here_ ? next : first_pair_;
     pair_ = load_pair(plan_, weights(item.environment), PairPlace{unsigned(item.at)});
   }
 
-  // Runs an effect on all pairs, a thread a pair.
+  // Applies an element functor to all pairs, one pair per thread.
   template <bool Energies, class Element>
   PD_DEVICE void each_pair(const Element& element) {
     const StoredRest<T> rest{plan_.pair_rest};
@@ -233,7 +235,7 @@ class SmallBatchRunner {
       v_.set(i, next);
       position_[i] = quad(vec3(origin_[i]) + next);
     });
-    // by those who have the fewest vertices, while others move theirs
+    // by the warps with the fewest vertices, while others update theirs
     const auto compute_omega = [&](int e) { control_[e].compute_omega(k + 1); };
     if (!stops() && pending_) {
       apply_sums(k, compute_omega);
@@ -252,7 +254,7 @@ class SmallBatchRunner {
 
   // ---- sums
 
-  // a number of T, kept as such
+  // stored in the precision T
   PD_DEVICE void store_sum(VertexSum which, int i, double value) {
     vertex_sum_[int(which) * vertex_sums_ + i] = T(value);
   }
@@ -271,7 +273,7 @@ class SmallBatchRunner {
     return warp_reduce(sum, Add{}) + reduce_over_vertices(energy_sum, environment, Add{});
   }
 
-  // What follows from the sums of iteration k - 1, and then for one thread of each environment.
+  // Applies the sums of iteration k - 1; then one thread of each environment calls `then`.
   template <class Then>
   PD_DEVICE void apply_sums(int k, const Then& then) {
     const bool guarded = (k - 1) % guard_period == 0 && set_.schedule == ScheduleKind::guarded;
@@ -295,7 +297,7 @@ class SmallBatchRunner {
     __syncwarp();
   }
 
-  // The last iteration's sums, which no iteration follows.
+  // Applies the sums of the final iteration.
   PD_DEVICE void apply_last_sums() {
     if (!pending_) return;
     apply_sums(set_.iterations, [](int) {});
@@ -303,7 +305,7 @@ class SmallBatchRunner {
     __syncthreads();
   }
 
-  // ---- start of a call
+  // ---- initialisation
 
   PD_DEVICE void load() {
     for (int e = threadIdx.x; e < here_; e += blockDim.x)
@@ -324,7 +326,7 @@ class SmallBatchRunner {
     __syncthreads();
   }
 
-  // a and 1 / D of every vertex, w V of every element, and the smallest a / D
+  // Computes a and 1 / D of every vertex, w V of every element, and the smallest a / D.
   PD_DEVICE void assemble_diagonal() {
     compute_weights(set_.weighted);
     for (int e = threadIdx.x; e < here_; e += blockDim.x) control_[e].progress.done = false;
@@ -350,7 +352,7 @@ class SmallBatchRunner {
       compute_pair_weights(plan_, rest, PairPlace{unsigned(item.at)},
                            call_.material.stiffness.of(first_ + item.environment), bounded,
                            weights(item.environment));
-    // each thread reads what it has written itself
+    // each thread reads only weights that it wrote itself
     prefetch_pair(first_pair_);
   }
 
@@ -363,11 +365,12 @@ class SmallBatchRunner {
     started_ = true;
     if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
     align_out_of_line(whole_, shared_, first_, here_, first);
-    // again, since what lives in registers across a call would be spilled in the iterations too
+    // reloads the pair: registers live across the call would be spilled in the iterations too
     prefetch_pair(first_pair_);
   }
 
-  // By a runner of its own, so that this one stays in registers. `first`: there is no iterate before this one.
+  // Uses a runner of its own, so that this runner stays in registers. `first`: no iterate precedes
+  // this one.
   PD_DEVICE_COLD static void align_out_of_line(const SmallBatchCall<T>& call, std::byte* shared,
                                                std::int64_t first_environment, int here,
                                                bool first) {
@@ -396,20 +399,20 @@ class SmallBatchRunner {
   const Settings& set_;
   const SmallBatchScratch<T>& memory_;
   const Stride &pair_stride_, &slot_stride_;
-  unsigned first_of_block_;         // in the scratch memory
-  std::int64_t first_ = 0;          // environment,
-  int here_ = 0;                    // and how many
-  EnvironmentControl<T>* control_;  // of each
-  Quad<T>* position_;               // where elements read vertices
-  Quad<T>* origin_;                 // start of the step, from the first vertex
-  Quad<T>* entries_;                // forces of elements
+  unsigned first_of_block_;         // in scratch memory
+  std::int64_t first_ = 0;          // first environment
+  int here_ = 0;                    // and their number
+  EnvironmentControl<T>* control_;  // of each environment
+  Quad<T>* position_;               // positions that elements read
+  Quad<T>* origin_;   // positions at the start of the step, relative to the first vertex
+  Quad<T>* entries_;  // element forces
   Vertices<T, HasContacts> v_;
-  T *pair_energy_, *vertex_sum_;  // of all environments, for sums; the latter for each of VertexSum
+  T *pair_energy_, *vertex_sum_;  // of all environments; the latter once per VertexSum
   int vertex_sums_;
   Ball<T>* spheres_;
   Plane<T>* planes_;
   WorkItem first_pair_, first_slot_;  // of this thread
-  PairInputs<T> pair_;                // of its next pair
+  PairInputs<T> pair_;                // its next pair
   T h_;
   const T& theta_;
   int stops_ = in_register(int(set_.tolerance > 0));

@@ -1,4 +1,4 @@
-// What the kernel for several environments a block is given, and what it keeps where.
+// Arguments and memory layout of the small-batch kernel.
 #pragma once
 #include "cuda/collect.h"
 #include "cuda/inputs.h"
@@ -7,11 +7,11 @@
 
 namespace pd::inline PD_TARGET {
 
-// How an environment goes on, in shared memory.
+// State of an environment's solve, in shared memory.
 template <class T>
 struct EnvironmentControl {
   Progress progress;
-  T omega[2];  // of even and of odd iterations
+  T omega[2];  // of even and odd iterations
 
   PD_DEVICE void compute_omega(int k) { omega[k & 1] = T(progress.schedule.next(k)); }
 };
@@ -19,13 +19,13 @@ struct EnvironmentControl {
 // Device memory of the blocks.
 template <class T>
 struct SmallBatchScratch {
-  Quad<T>*x, *velocity;  // [blocks, together, slots]
-  T* weights;            // [blocks, together, blocks of pairs, 2, 32] w V
-  Piece<T>* pieces;      // [blocks, together, pieces]
-  double* part_sum;      // [blocks, together, parts, PartSums::count]
+  Quad<T>*x, *velocity;  // [blocks, per_block, slots]
+  T* weights;            // [blocks, per_block, blocks of pairs, 2, 32] w V
+  Piece<T>* pieces;      // [blocks, per_block, pieces]
+  double* part_sum;      // [blocks, per_block, parts, PartSums::count]
 };
 
-// From one pair or vertex of a thread to its next one: environments, and what is left.
+// Step from one item of a thread to its next: whole environments, and the remainder.
 struct Stride {
   int whole, rest;
 
@@ -37,13 +37,13 @@ template <class T>
 struct SmallBatchCall {
   DeviceStep<T> step;
   SmallBatchScratch<T> scratch;
-  int per_block;  // environments of a block
+  int per_block;  // environments per block
   Stride pair_stride, slot_stride;
-  T relaxation;  // of the settings, in T
+  T relaxation;  // from the settings, in T
 };
 
-// Where the parts of a block's shared memory lie: courses; position, target, u, before and origin of every slot; entries;
-// energies of pairs, then three numbers of every slot; balls and planes.
+// Layout of a block's shared memory: EnvironmentControl; position, target, u, before and origin of
+// every slot; entries; energies of pairs; three numbers of every slot; spheres and planes.
 template <class T>
 struct SmallBatchLayout {
   std::size_t vectors, entries, energies, contacts, bytes;

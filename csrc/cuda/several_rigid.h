@@ -64,7 +64,7 @@ PD_DEVICE void SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread,
     find_in_rounds<HasContacts>(rounds, how, contacts(0).has_several());
     each_slot([&](const WorkItem& item, int i) {
       const int number = plan_.slot_piece[item.at];
-      if (number < 0 || !(v_.u[i].w > 0)) return;  // of no piece, or pinned
+      if (number < 0 || !(v_.u[i].w > 0)) return;  // of no free piece, or pinned
       const Vec3<T> u = v_.moved(i, piece(item.environment, number).motion);
       move(i, u);
       if (first) v_.set_before(i, u);

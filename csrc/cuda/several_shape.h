@@ -1,4 +1,4 @@
-// How many environments of a small mesh a block has, and with how many threads: known without a GPU.
+// Environments and threads per block for a small mesh, without CUDA.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -7,17 +7,18 @@
 
 namespace pd {
 
-// Threads that a multiprocessor has registers for: usually, and with so few each that some are spilled.
+// Threads that fit in a multiprocessor's registers: by default, and with so few registers each that
+// some spill.
 constexpr int small_batch_threads = 640, few_registers_threads = 768;
 
 constexpr int lanes_of_warp = 32;
 
-// A mesh as the shape of a block is chosen for it.
+// The sizes of a mesh that determine the shape of a block.
 struct SmallMesh {
   int pairs, slots;
 };
 
-// A block: how many environments it has, and with how many threads.
+// Shape of a block: its environments and threads.
 struct SmallBatchShape {
   int per_block, threads;
   bool few_registers;
@@ -26,9 +27,9 @@ struct SmallBatchShape {
   int rounds(int each) const { return (per_block * each + threads - 1) / threads; }
   bool once(const SmallMesh& mesh) const { return rounds(mesh.pairs) == 1; }
 
-  // Time of an iteration of so many blocks on a multiprocessor, in units of what its warps' rounds of pairs take to issue: what a
-  // block waits for, and what all of them issue. In a kernel for one pair a thread (`single`) they issue a sixth less; with few
-  // registers all takes a twelfth more.
+  // Time of an iteration of `blocks` blocks on a multiprocessor: a block's latency plus the issue
+  // time of all blocks. The unit is the issue time of a warp's round of pairs. A kernel with one
+  // pair per thread (`single`) issues a sixth less; `few_registers` adds a twelfth.
   double time(const SmallMesh& mesh, int blocks, bool single) const {
     const double many = per_block;
     const double latency = 6 + 8 * rounds(mesh.pairs) + 3.5 * rounds(mesh.slots) +
@@ -39,21 +40,22 @@ struct SmallBatchShape {
   }
 };
 
-// What a device has for blocks.
+// Limits of a device.
 struct DeviceLimits {
   int multiprocessors;
-  std::size_t shared;        // memory of a multiprocessor,
-  std::size_t block_shared;  // and the most of a block
+  std::size_t shared;        // per multiprocessor
+  std::size_t block_shared;  // maximum per block
 };
 
 constexpr int most_per_block = 4;
 
-// visit(shape, blocks that a multiprocessor runs), for every shape that a device has room for; `bytes(together)`: of shared memory.
+// Calls visit(shape, resident blocks per multiprocessor) for every shape that fits on the device.
+// `bytes(per_block)`: shared memory.
 template <class Bytes, class Visit>
 void each_shape(const SmallMesh& mesh, const DeviceLimits& limits, const Bytes& bytes,
                 const Visit& visit) {
   constexpr int most_threads = 224, most_rounds = 2, most_blocks = 32;
-  constexpr std::size_t reserved = 1024;  // of shared memory, that the device keeps of every block
+  constexpr std::size_t reserved = 1024;  // shared memory that the device reserves per block
   for (int per_block = 1; per_block <= most_per_block; ++per_block) {
     const std::size_t shared = bytes(per_block);
     if (shared > limits.block_shared) return;
@@ -70,8 +72,8 @@ void each_shape(const SmallMesh& mesh, const DeviceLimits& limits, const Bytes& 
   }
 }
 
-// The shape for a batch. `time` is fitted to 1800 runs on an H100, of 3 to 192 pairs in batches of 1 to 8192; what this chooses
-// took 0.6 % more than the best shape on average and 6 % at most.
+// The shape for a batch. `time` is fitted to 1800 runs on an H100, with 3 to 192 pairs and batches
+// of 1 to 8192. The chosen shape took 0.6 % longer than the best on average, and 6 % at most.
 template <class Bytes>
 SmallBatchShape small_batch_shape(const SmallMesh& mesh, std::int64_t batch,
                                   const DeviceLimits& limits, const Bytes& bytes) {
@@ -81,7 +83,7 @@ SmallBatchShape small_batch_shape(const SmallMesh& mesh, std::int64_t batch,
   each_shape(mesh, limits, bytes, [&](const SmallBatchShape& shape, int fit) {
     if (shape.per_block > batch) return;
     const bool single = shape.once(mesh);
-    // the last of what blocks do together they share out equally
+    // blocks share the last partial wave equally
     const std::int64_t blocks = std::int64_t(fit) * limits.multiprocessors;
     const std::int64_t waves = batch / (blocks * shape.per_block);
     const std::int64_t left = batch - waves * blocks * shape.per_block, each = whole(left, blocks);
@@ -90,7 +92,7 @@ SmallBatchShape small_batch_shape(const SmallMesh& mesh, std::int64_t batch,
       const SmallBatchShape last{int(each), shape.threads, shape.few_registers};
       time += last.time(mesh, int(whole(whole(left, each), limits.multiprocessors)), single);
     }
-    // of as good ones the one that shares the least: the others would leave blocks without any
+    // among equal times, the first and smallest `per_block`: larger ones would leave blocks idle
     if (time < least) {
       least = time;
       best = shape;
@@ -99,7 +101,7 @@ SmallBatchShape small_batch_shape(const SmallMesh& mesh, std::int64_t batch,
   return best;
 }
 
-// Environments that a device works on at a time, at most, whatever the batch and so the shape.
+// The most environments resident on a device, over all batches and shapes.
 template <class Bytes>
 std::int64_t most_at_work(const SmallMesh& mesh, const DeviceLimits& limits, const Bytes& bytes) {
   std::int64_t most = 0;
