@@ -1,4 +1,4 @@
-// Runner of solver/adjoint.h and solver/contact_gradients.h.
+// Kernels of solver/adjoint.h and solver/contact_gradients.h.
 #pragma once
 #include "cuda/conjugate_sums.cuh"
 #include "solver/adjoint.h"
@@ -6,7 +6,7 @@
 
 namespace pd {
 
-// visit(vertex), by a thread each.
+// Calls visit(vertex), one thread per vertex.
 template <class T, class Visit>
 PD_DEVICE void visit_adjoint_vertex(const DeviceAdjointSystem<T>& call, const Visit& visit) {
   const DevicePlan<T>& plan = call.plan;
@@ -39,7 +39,7 @@ __global__ void __launch_bounds__(field_threads)
   AdjointAnswer<T>{call, number / call.vertices, number % call.vertices}.give();
 }
 
-// A block for every number of every environment.
+// One block per component and environment.
 template <class T>
 __global__ void __launch_bounds__(field_threads)
     vertex_sum(const __grid_constant__ VertexSumCall<T> call) {

@@ -1,4 +1,4 @@
-// Runner of solver/conjugate.h: one launch, whatever it takes, behind that of the weights.
+// Runs solver/conjugate.h after the launch that computes the weights.
 #pragma once
 #include "cuda/conjugate_alone.cuh"
 #include "cuda/conjugate_launch.cuh"

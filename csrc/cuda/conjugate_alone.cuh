@@ -1,4 +1,5 @@
-// Iterations of solver/conjugate.h where a block has the mesh of an environment in its shared memory.
+// Conjugate gradients of solver/conjugate.h, with an environment's whole mesh in the shared memory
+// of one block.
 #pragma once
 #include "cuda/conjugate_sums.cuh"
 #include "cuda/friction_alone.cuh"
@@ -11,14 +12,14 @@ namespace pd {
 template <class T>
 struct ConjugateBlock {
   DeviceConjugate<T> call;
-  FieldWork<T> product;  // of the direction
+  FieldWork<T> product;  // with the search direction
   T* image;              // [batch, vertices, 3], the product
   FrictionVectors<T> friction;
 };
 
-// All iterations of an environment, until it is done: no other one enters, and nobody asks in between. A thread has the same
-// vertices from the first loop to the last, so what it writes of them in device memory it finds there.
-// `Slides`: with friction.
+// All iterations of one environment, independent of the others and without host synchronisation. A
+// thread keeps its vertices in all loops, so it reads its own writes to global memory.
+// `WithFriction`: adds the solve with friction.
 template <class T, bool WithFriction>
 __global__ void __launch_bounds__(conjugate_threads<T>)
     conjugate_block(const __grid_constant__ ConjugateBlock<T> work) {
@@ -31,7 +32,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
   Conjugate numbers(progress);
   if (!numbers.active) return;
   const T *inertia = call.inertia.of(environment), *inverse = call.inverse.of(environment);
-  // visit(slot, vertex, where its vectors are)
+  // visit(slot, vertex, offset of its vectors)
   const auto each_slot = [&](const auto& visit) {
     for (int s = threadIdx.x; s < plan.slots; s += blockDim.x) {
       const int i = plan.vertex_order[s];
@@ -39,7 +40,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     }
   };
 
-  // the largest number, and whether any vertex slides
+  // the largest component, and whether any vertex slides
   double largest[2] = {0, 0};
   each_slot([&](int, int, std::int64_t at) {
     largest[0] = Max()(largest[0], largest_of(read3(call.residual + at)));
@@ -130,7 +131,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     write3(call.direction + at, unit * direction_of(s));
   });
   numbers.scale_by(double(unit));
-  // all have read what there was
+  // all threads have read the old progress
   if (threadIdx.x == 0) numbers.write(progress);
 }
 
@@ -153,8 +154,9 @@ void run_conjugate_block(const DeviceConjugate<T>& call, void* memory, cudaStrea
   compute_field_weights<false>(work.product, stream);
   const auto kernel = call.friction ? conjugate_block<T, true> : conjugate_block<T, false>;
   const std::size_t bytes = pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, 2);
-  // Half as many threads where two blocks then share a multiprocessor, which is for many environments. How many there are in
-  // this call does not enter, since the threads decide the order of sums.
+  // Half as many threads if two blocks then share a multiprocessor, unless the plan is for one
+  // environment. The batch of this call has no influence, since the number of threads sets the
+  // order of sums.
   const void* function = reinterpret_cast<const void*>(kernel);
   const bool share = plan.environments != 1 && resident_blocks(function, conjugate_threads<T> / 2,
                                                                bytes) >= 2 * multiprocessors();

@@ -1,4 +1,4 @@
-// Launches of conjugate_team.cuh and friction_team.cuh: teams of as many blocks as are of use.
+// Launches of conjugate_team.cuh and friction_team.cuh, with as many blocks per team as are useful.
 #pragma once
 #include "cuda/friction_team.cuh"
 
@@ -6,7 +6,7 @@
 
 namespace pd {
 
-// The arrays of one of several teams, but for those of environments.
+// Arrays of one team; arrays per environment are not offset.
 template <class T>
 __device__ ConjugateMemory<T> memory_of_team(const ConjugateTeams<T>& work, int team) {
   ConjugateMemory<T> m = work.memory;
@@ -22,7 +22,7 @@ __device__ ConjugateMemory<T> memory_of_team(const ConjugateTeams<T>& work, int 
   return m;
 }
 
-// `Slides`: with friction.
+// `WithFriction`: adds the solve with friction.
 template <class T, bool WithLevels, bool Computed, bool WithFriction>
 __global__ void __launch_bounds__(conjugate_threads<T>)
     conjugate_teams(const __grid_constant__ ConjugateTeams<T> work) {
@@ -46,10 +46,11 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
 
 template <class T>
 struct ConjugateLaunch {
-  // Vertices of all teams: with more of them fewer teams of more blocks do as well, in less memory.
+  // Vertices of all teams together. Beyond it, fewer teams of more blocks are as fast and take less
+  // memory.
   static constexpr std::int64_t most_vertices = std::int64_t(1) << 21;
-  // Vertices times iterations of a launch, some tenths of a second on an H100: a device that draws as well must not be kept
-  // longer. Those that follow go on where it has ended.
+  // Vertices times iterations of a launch, which bound it to some tenths of a second on an H100, so
+  // that a GPU that also drives a display stays responsive. The next launch continues the solve.
   static constexpr std::int64_t most_work = std::int64_t(1) << 30;
 
   const void* kernel;
@@ -85,8 +86,9 @@ struct ConjugateLaunch {
     if (blocks == 0) refuse_shared_memory(shared);
     return blocks;
   }
-  // The plan alone decides, since they set the order of sums: no more than there are pairs for, so that patches of a small
-  // mesh are worked on side by side; but the preconditioner wants few blocks that meet, of many threads.
+  // Only the plan decides, since the number of threads sets the order of sums. More threads than
+  // pairs would keep the patches of a small mesh from running in parallel. The preconditioner is
+  // faster with few blocks of many threads.
   static int threads_of(const DevicePlan<T>& plan) {
     constexpr int most = conjugate_threads<T>, least = 64;
     return plan.levels.there() ? most : std::clamp(int(whole_warps(plan.most_pairs)), least, most);

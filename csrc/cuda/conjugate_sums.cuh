@@ -1,5 +1,5 @@
-// What the runners of solver/conjugate.h share: sums of a block and of a team, in float64, and the product that an iteration
-// begins with.
+// Shared parts of the runners of solver/conjugate.h: float64 sums over a block and a team, and the
+// elastic product of an iteration.
 #pragma once
 #include "cuda/block_team.h"
 #include "cuda/fields.cuh"
@@ -7,7 +7,7 @@
 
 namespace pd {
 
-// Threads of a block that has a multiprocessor to itself: as many as there are registers for.
+// Threads of a block that has a multiprocessor to itself, limited by registers.
 template <class T>
 constexpr int conjugate_threads = sizeof(T) == 4 ? 512 : 256;
 
@@ -15,11 +15,12 @@ using WarpSums = double[conjugate_threads<float> / warp_size][2];
 
 struct Max {
   static constexpr double identity = 0;
-  // of no number and another one that
+  // ignores b if it is NaN
   __device__ double operator()(double a, double b) const { return b > a ? b : a; }
 };
 
-// Of all threads of a block, the same in each of them. `warp_sums` is free again when it returns.
+// Reduces over all threads of a block; all threads get the result. `warp_sums` may be reused on
+// return.
 template <class Op, int Count>
 __device__ void block_reduce(double (&value)[Count], WarpSums& warp_sums) {
   const Op op;
@@ -36,7 +37,8 @@ __device__ void block_reduce(double (&value)[Count], WarpSums& warp_sums) {
   __syncthreads();
 }
 
-// Of the parts of an environment: blocks of a team leave them and, once they have met, all put them together in one order.
+// Partial sums of an environment: blocks store them, and after a team barrier every block reduces
+// them in the same order.
 template <class Op, int Count>
 struct PartialSums {
   double* values;  // [count, Count]
@@ -69,7 +71,8 @@ __device__ double largest_of(const Vec3<T>& a) {
   return larger(larger(double(absolute(a.x)), double(absolute(a.y))), double(absolute(a.z)));
 }
 
-// |b|^2, and zero besides, which is no number where a right side b or a position is infinite or none.
+// |b|^2; the added zero terms make it NaN if the right-hand side b or the position is infinite or
+// NaN.
 template <class T>
 __device__ double square_of_right(const Vec3<T>& right, const Vec3<T>& position) {
   const T none(0);
@@ -77,13 +80,13 @@ __device__ double square_of_right(const Vec3<T>& right, const Vec3<T>& position)
   return wide_dot(right, right) + double(lost.x + lost.y + lost.z);
 }
 
-// slide_across of a vertex, whose vectors stand at `at`
+// slide_across of a vertex, whose vectors start at `at`
 template <class T>
 __device__ const T* across_of(const DeviceConjugate<T>& call, std::int64_t at) {
   return call.sliding ? call.sliding + slide_count * at + 3 * slide_across : nullptr;
 }
 
-// the field whose product with the direction an iteration begins with
+// The elastic Hessian product with the search direction.
 template <class T>
 DeviceField<T> conjugate_field(const DeviceConjugate<T>& call) {
   DeviceField<T> field;

@@ -1,5 +1,6 @@
-// Iterations of solver/conjugate.h on a plan of any size: a team of blocks has an environment, whose vectors are in device
-// memory, in the order of the plan, and meets between the phases of an iteration. Nobody asks in between.
+// Conjugate gradients of solver/conjugate.h for a plan of any size. A team of blocks works on one
+// environment, with vectors in global memory in plan order, and has barriers between the phases of
+// an iteration. There is no host synchronisation.
 #pragma once
 #include "cuda/conjugate_sums.cuh"
 #include "cuda/cycle_triangle.h"
@@ -7,18 +8,19 @@
 
 namespace pd {
 
-// What a team keeps.
+// Global memory of a team.
 template <class T>
 struct ConjugateMemory {
   Quad<T>*x, *solution, *image;  // [vertices]; image: H times the direction
   Quad<T>* residual;             // [vertices], w: 1 / D
-  Quad<T>*direction, *other;     // [vertices], w: inertia; iterations alternate
-  Quad<T>* shared_force;         // [slots], as FieldWork has it
-  // of BiCGStab, where friction follows: the second product of an iteration [vertices], and of every environment, from launch to
-  // launch, the first residual of the cycle and the correction of y
+  Quad<T>*direction, *other;     // [vertices], w: inertia; swapped every iteration
+  Quad<T>* shared_force;         // [slots], as in FieldWork
+  // BiCGStab for friction. smoothed [vertices]: second product of an iteration. Per environment,
+  // kept between launches: shadow, the first residual of the cycle; correction, that of y.
   Quad<T>*smoothed, *shadow, *correction;
-  // of parts: d . H d, or two numbers of a product with friction; |r|^2 and r . r / D, two again; r . M r, and before whether
-  // any vertex slides, and the largest number
+  // Partial sums. products: d . H d, or two values with friction. squares: |r|^2 and r . r / D, or
+  // two values with friction. weighted: r . M r; before that, whether any vertex slides, and the
+  // largest component.
   double *products, *squares, *weighted;
   CycleMemory<T> cycle;  // with levels
 };
@@ -26,19 +28,19 @@ struct ConjugateMemory {
 template <class T>
 struct ConjugateTeams {
   DeviceConjugate<T> call;
-  FieldWork<T> product;  // its weights
+  FieldWork<T> product;  // for its weights
   ConjugateMemory<T> memory;
   unsigned* counter;  // [teams], zero at the launch
   int teams, blocks;  // blocks of a team
 
-  int threads;  // of a block, and vertices of a part
+  int threads;  // of a block; also vertices of a partial sum
 
   PD_HD int parts_of(int vertices) const { return (vertices + threads - 1) / threads; }
   PD_HD int vertex_parts() const { return parts_of(call.plan.vertices); }
   PD_HD int product_parts() const { return call.plan.patches + parts_of(call.plan.shared); }
 };
 
-// `Leveled`: with a preconditioner; `Computed`: see rest_of.
+// `WithLevels`: with the multilevel preconditioner. `Computed`: see rest_of.
 template <class T, bool WithLevels, bool Computed>
 class ConjugateTeam {
   static_assert(conjugate_threads<T> % (most_parts * warp_size) == 0);
@@ -67,19 +69,19 @@ class ConjugateTeam {
   __device__ void run() {
     double* progress = call_.progress + environment_ * progress_count;
     Conjugate numbers(progress);
-    // all of the team alike
+    // the same decision in all threads of the team
     if (!numbers.active) return;
     load(numbers.begins);
     numbers.scale_by(1 / double(unit_));
     iterate_all(numbers);
     store();
     numbers.scale_by(double(unit_));
-    team_.barrier();  // before sums of the next environment stand where this one's were
+    team_.barrier();  // the next environment overwrites the partial sums
     if (team_.thread() == 0) numbers.write(progress);
   }
 
  protected:
-  // As many as there may be; returns how many they were.
+  // Runs at most call_.iterations iterations; returns their number.
   __device__ int iterate_all(Conjugate& numbers) {
     if (numbers.begins) begin(numbers);
     int k = 0;
@@ -87,7 +89,7 @@ class ConjugateTeam {
     return k;
   }
 
-  // visit(vertex) of every part of this block, after which leave(part)
+  // Calls visit(vertex) for every part of this block, then store(part).
   template <class Visit, class Store>
   __device__ void each_part(int first, int count, const Visit& visit, const Store& store) {
 #pragma unroll 1
@@ -98,7 +100,7 @@ class ConjugateTeam {
     }
   }
 
-  // a vertex in the arrays of the user
+  // index of a vertex in the user's arrays
   __device__ std::int64_t row(int i) const {
     return environment_ * plan_.vertices + plan_.vertex_order[i];
   }
@@ -191,7 +193,8 @@ class ConjugateTeam {
     direction_pending_ = true;
   }
 
-  // The next direction, by the last one: nobody has it before it is used. Without `turns_` the last one is in use still.
+  // The next search direction, computed on demand from the last one. Without `direction_pending_`,
+  // the last one is still current.
   __device__ Vec3<T> direction(int i) const {
     const Vec3<T> last_one = vec3(last_[i]);
     if (!direction_pending_) return last_one;
@@ -200,7 +203,7 @@ class ConjugateTeam {
     return multiply_add(keep_, last_one, residual.w * vec3(residual));
   }
 
-  // H times the next direction, which then is the last one, and the curvature along it
+  // Computes H times the next direction, which becomes the last one, and the curvature along it.
   __device__ void multiply() {
     double sum[1] = {0};
     const auto next = [&](int i) { return direction(i); };
@@ -222,7 +225,8 @@ class ConjugateTeam {
     direction_pending_ = false;
   }
 
-  // Of a field, what(vertex): look(vertex, elastic product, field) at all vertices of this block, after whose parts leave(part)
+  // Computes the elastic product with a field what(vertex). Calls visit(vertex, product, field) for
+  // all vertices of this block, and store(part) after each part.
   template <class What, class Visit, class Store>
   __device__ void multiply(const What& what, const Visit& visit, const Store& store) {
 #pragma unroll 1
@@ -247,7 +251,7 @@ class ConjugateTeam {
     }
   }
 
-  // of a patch: look at the vertices that it has alone
+  // of a patch: visits its interior vertices
   template <class What, class Visit>
   __device__ void multiply_patch(const Patch<T>& patch, const What& what, const Visit& visit) {
     const Vec3<T> anchor = vec3(m_.x[patch.vertex(0)]);
@@ -264,14 +268,13 @@ class ConjugateTeam {
         Vec3<T> vectors[2];
         slots_(unsigned(8 * s), vectors);
         visit(patch.first_vertex + s, sum_entries(entries_, plan_.slot_row[slot]), vectors[1]);
-      } else if (plan_.shared >
-                 0) {  // of a cluster none are, and their owners have all of the force
+      } else if (plan_.shared > 0) {  // a cluster has none: owners hold the complete force
         m_.shared_force[slot] = quad(sum_entries(entries_, plan_.slot_row[slot]));
       }
     }
   }
 
-  // M of the residual that was set, for `direction`; returns r . M r
+  // Applies M to the residual that was set; `direction` uses the result. Returns r . M r.
   __device__ double apply_levels() {
     cycle_.run();
     double sum[1] = {0};

@@ -1,4 +1,4 @@
-// Elastic energy and its derivatives at given positions: one pass over the patches of any plan.
+// Elastic energy and its derivatives at given positions, in one pass over the patches of any plan.
 #pragma once
 #include "cuda/arena.h"
 #include "cuda/collect.h"
@@ -24,7 +24,7 @@ struct FieldWork {
   }
 };
 
-// Where the result of one vertex goes.
+// Writes the result of one vertex.
 template <int Numbers, class T>
 __device__ void write_vertex(const DeviceField<T>& field, std::int64_t environment, int vertex,
                              const Vec3<T>& force) {
@@ -47,14 +47,14 @@ __global__ void __launch_bounds__(field_threads)
                         work.field.weighted, work.weights + set * plan.blocks * 2 * pair_lanes);
 }
 
-// What a block works on, a patch of one environment: its positions, relative to its first vertex, and with two Fields also
-// its directions, read into shared memory.
+// A patch of one environment in shared memory: positions relative to its first vertex and, with two
+// Fields, directions.
 template <int Fields, class T>
 struct PatchFields {
   std::int64_t environment;
   Patch<T> patch;
-  Quad<T>* position;  // by slot, without directions
-  Slots<T> both;      // else
+  Quad<T>* position;  // by slot, with one field
+  Slots<T> both;      // with two fields
   Quad<T>* entries;   // behind them
 
   __device__ PatchFields(const DeviceField<T>& field, std::byte* shared)
@@ -82,7 +82,7 @@ struct PatchFields {
     __syncthreads();
   }
 
-  // of the slot of a corner, as pair_corner has it, for elements
+  // the vectors of a corner's slot, encoded as in pair_corner; element functors call this
   __device__ void operator()(unsigned corner, Vec3<T> (&vectors)[Fields]) const {
     if constexpr (Fields == 2) {
       both(corner, vectors);
@@ -92,7 +92,7 @@ struct PatchFields {
   }
 };
 
-// Fields: how many vectors of a vertex an element reads; Numbers: how many a vertex gets.
+// Fields: vectors that an element reads per vertex. Numbers: values that a vertex gets.
 template <bool Computed, class Element, int Fields, int Numbers, class T>
 __global__ void __launch_bounds__(field_threads)
     field_vertices(const __grid_constant__ FieldWork<T> work) {
@@ -109,7 +109,7 @@ __global__ void __launch_bounds__(field_threads)
     const Vec3<T> force = sum_entries(fields.entries, plan.slot_row[slot]);
     if (s < patch.interior) {
       write_vertex<Numbers>(work.field, environment, patch.first_vertex + s, force);
-    } else if (plan.shared > 0) {  // of a cluster none are, and their owners have all of the force
+    } else if (plan.shared > 0) {  // a cluster has none: owners hold the complete force
       work.shared_force[environment * plan.slots + slot] = quad(force);
     }
   }
@@ -129,7 +129,7 @@ __global__ void __launch_bounds__(field_threads)
   write_vertex<Numbers>(work.field, environment, plan.patch_vertex[plan.patches] + i, force);
 }
 
-// Product: the derivative of the energy along the direction, else the energy.
+// Product: the derivative of the energy along the direction; otherwise the energy.
 template <bool Computed, bool Product, class T>
 __global__ void __launch_bounds__(field_threads)
     field_elements(const __grid_constant__ FieldWork<T> work) {
@@ -147,7 +147,7 @@ __global__ void __launch_bounds__(field_threads)
     const Mat3<T> rest[2] = {numbers.face.inverse(0), numbers.face.inverse(1)};
     for (int e = 0; e < 2; ++e) {
       const int tet = plan.pair_tet[place.in(2) + e * pair_lanes];
-      if (tet < 0) continue;  // none, or written by another patch
+      if (tet < 0) continue;  // no tetrahedron, or another patch writes it
       Vec3<T> x[4], dx[4];
       for (int c = 0; c < 4; ++c) {
         Vec3<T> vectors[wanted];
@@ -167,7 +167,7 @@ __global__ void __launch_bounds__(field_threads)
   }
 }
 
-// `teams`: environments that are worked on at a time.
+// `teams`: environments in progress at a time.
 template <class T>
 FieldWork<T> arrange(Arena& arena, const DeviceField<T>& field, std::int64_t teams) {
   const DevicePlan<T>& plan = field.plan;

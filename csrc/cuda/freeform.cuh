@@ -1,4 +1,4 @@
-// One thread an item.
+// Runs a task of freeform patches with one thread per item.
 #pragma once
 #include "cuda/freeform.h"
 #include "cuda/runtime.h"

@@ -1,4 +1,5 @@
-// The tasks of free-form patches as functions: no torch, no CUDA headers. Work goes to a stream and nobody waits.
+// Tasks of freeform patches as functions, without torch or CUDA headers. Calls enqueue work on a
+// stream and return.
 #pragma once
 #include "patches/tasks.h"
 

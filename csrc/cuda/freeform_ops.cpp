@@ -1,4 +1,4 @@
-// The ops of free-form patches on CUDA: memory, stream and device come from torch.
+// The ops of freeform patches on CUDA. Torch provides memory, stream and device.
 #include "freeform_ops.h"
 
 #include "cuda/freeform.h"

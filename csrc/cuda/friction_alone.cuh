@@ -1,17 +1,18 @@
-// Products of solver/friction_adjoint.h where a block has the mesh of an environment in its shared memory.
+// BiCGStab of solver/friction_adjoint.h, with an environment's whole mesh in the shared memory of
+// one block.
 #pragma once
 #include "cuda/conjugate_sums.cuh"
 #include "solver/friction_adjoint.h"
 
 namespace pd {
 
-// Vectors of BiCGStab, [batch, vertices, 3]; its p is where directions are.
+// Vectors of BiCGStab, [batch, vertices, 3]; its p is stored in the direction.
 template <class T>
 struct FrictionVectors {
   T *shadow, *correction, *smoothed;  // smoothed: the second product of an iteration
 };
 
-// One environment, whose fields are in shared memory. A thread has the same vertices in every loop.
+// One environment, with its fields in shared memory. A thread keeps its vertices in all loops.
 template <class T>
 class FrictionBlock {
  public:
@@ -28,7 +29,7 @@ class FrictionBlock {
         inertia_(call.inertia.of(blockIdx.x)),
         inverse_(call.inverse.of(blockIdx.x)) {}
 
-  // Leaves the multiplier in the solution: G^T of what was solved for.
+  // Replaces the solution y by the multiplier G^T y.
   __device__ void run(FrictionSolve& friction) const {
     each_slot([&](int, int, std::int64_t at) { write3(v_.correction + at, {T(0), T(0), T(0)}); });
     while (friction.active()) advance(friction);
@@ -39,7 +40,7 @@ class FrictionBlock {
   }
 
  private:
-  // visit(slot, vertex, where its vectors are)
+  // visit(slot, vertex, offset of its vectors)
   template <class Visit>
   __device__ void each_slot(const Visit& visit) const {
     const DevicePlan<T>& plan = call_.plan;
@@ -111,7 +112,7 @@ class FrictionBlock {
     });
   }
 
-  // With the true residual of y and its correction, by its |r|^2: begins a cycle, or ends.
+  // Begins a cycle or ends the solve, by the true |r|^2 of y plus its correction.
   __device__ void correct(FrictionSolve& friction, double square) const {
     const bool enters = friction.accept(square, call_.tolerance);
     each_slot([&](int, int, std::int64_t at) {

@@ -1,4 +1,4 @@
-// Products of solver/friction_adjoint.h by a team of blocks, after the solve of the symmetric part.
+// BiCGStab of solver/friction_adjoint.h by a team of blocks, after the solve of the symmetric part.
 #pragma once
 #include "cuda/conjugate_team.cuh"
 #include "solver/friction_adjoint.h"
@@ -31,7 +31,7 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
     double* const of_friction = call_.friction + environment_ * friction_count;
     Conjugate numbers(progress);
     FrictionSolve friction(of_friction, numbers.scale);
-    // all of the team alike
+    // the same decision in all threads of the team
     if (!numbers.active && !friction.active()) return;
     const bool slides = any_slides();
     Base::load(numbers.begins);
@@ -56,7 +56,7 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
     Base::store();
     numbers.scale_by(double(unit_));
     friction.scale_by(double(unit_));
-    team_.barrier();  // before sums of the next environment stand where this one's were
+    team_.barrier();  // the next environment overwrites the partial sums
     if (team_.thread() != 0) return;
     numbers.write(progress);
     friction.write(of_friction);
@@ -80,11 +80,11 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
         });
     team_.barrier();
     Base::largest_.reduce(any, warp_sums_);
-    team_.barrier();  // before others stand there
+    team_.barrier();  // others overwrite the partial sums
     return any[0] > 0;
   }
 
-  // what a cycle keeps from launch to launch
+  // Scales the vectors that a cycle keeps between launches.
   __device__ void scale_cycle(T factor) {
     each_vertex([&](int i) {
       m_.shadow[i] = quad(factor * vec3(m_.shadow[i]));
@@ -92,12 +92,12 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
     });
   }
 
-  // the multiplier is G^T of what was solved for
+  // Replaces the solution y by the multiplier G^T y.
   __device__ void press_solution() {
     each_vertex([&](int i) { m_.solution[i] = quad(press(vec3(m_.solution[i]), sliding(i))); });
   }
 
-  // after the solve of the symmetric part
+  // Called after the solve of the symmetric part.
   __device__ void begin(FrictionSolve& friction) {
     friction.begin(friction.left, adjoint_iterations);
     direction_pending_ = false;
@@ -114,7 +114,7 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
     return residual.w * vec3(stage == FrictionStage::first ? last_[i] : residual);
   }
 
-  // A z, and its products with vectors
+  // Computes A z and its dot products.
   __device__ void multiply(FrictionStage stage) {
     const T per_unit = T(1) / unit_;
     double sum[2] = {0, 0};
@@ -153,7 +153,7 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
     products_.reduce(sum, warp_sums_);
     if (stage == FrictionStage::residual) return correct(friction, sum[0]);
     const T step = T(first ? friction.go(sum[0]) : friction.smooth(sum[0], sum[1]));
-    // before the next product leaves its sums
+    // before the next product overwrites the partial sums
     if (first && friction.stage == FrictionStage::residual) return team_.barrier();
     const Quad<T>* const product = first ? m_.image : m_.smoothed;
     double left[2] = {0, 0};
@@ -186,7 +186,7 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
     team_.barrier();
   }
 
-  // With the true residual of y and its correction, by its |r|^2: begins a cycle, or ends.
+  // Begins a cycle or ends the solve, by the true |r|^2 of y plus its correction.
   __device__ void correct(FrictionSolve& friction, double square) {
     const bool enters = friction.accept(square, call_.tolerance);
     each_part(
@@ -202,7 +202,7 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
     team_.barrier();
   }
 
-  // M of a field, for the result of the cycle
+  // Applies M to a field; cycle_ holds the result.
   __device__ void precondition(const Quad<T>* field) {
     each_part(0, plan_.vertices, [&](int i) { cycle_.set(i, vec3(field[i])); }, [](int) {});
     team_.barrier();

@@ -23,8 +23,8 @@ struct FusedScratch {
   Quad<T>* vertex[vertex_arrays];  // [teams, slots]; arrays outside shared memory
   T* weights;                      // [teams, blocks, 2, 32] w V
   Piece<T>* pieces;                // [teams, patches, pieces]
-  double*
-      part_sum;  // [teams, parts, PartSums::count]; a part holds the vertices of a piece that a patch owns
+  // [teams, parts, PartSums::count]; a part holds the vertices of a piece that a patch owns
+  double* part_sum;
   TaggedWord* messages;  // grid: [teams, 2, slots, words] forces on shared vertices
   TaggedWord* sums;      // grid: [teams, 2, patches, sums_count]
 };

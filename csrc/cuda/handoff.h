@@ -1,8 +1,8 @@
-// What some warps of a block wait for while others go on, and what a kernel that starts early waits for.
+// Signals between warps of a block, and overlap of consecutive kernels.
 #pragma once
 #include "cuda/cluster.h"
 
-// from compute capability 9.0 on the hardware waits for a while
+// try_wait suspends the thread in hardware (compute capability 9.0 and newer)
 #if PD_HAS_CLUSTERS
 #define PD_SIGNAL_WAIT "try_wait"
 #else
@@ -11,13 +11,14 @@
 
 namespace pd::inline PD_TARGET {
 
-// Turn after turn: a barrier in shared memory (mbarrier of PTX) which those who wait do not come to. Every thread gives its
-// part: one for its whole warp would take as long, and compute-sanitizer would not see what the others have done before.
+// A reusable signal (PTX mbarrier): some threads arrive, others wait without arriving. Every thread
+// arrives for itself. One arrival per warp would take as long, and compute-sanitizer would not see
+// the writes of its other lanes.
 class Signal {
  public:
   PD_DEVICE explicit Signal(std::uint64_t* word) : at_(shared_address(word)) {}
 
-  // one thread, before __syncthreads
+  // called by one thread, before __syncthreads
   PD_DEVICE void init(int threads) const {
     asm volatile("mbarrier.init.shared.b64 [%0], %1;" ::"r"(at_), "r"(threads) : "memory");
   }
@@ -26,7 +27,7 @@ class Signal {
     asm volatile("{.reg .b64 turn; mbarrier.arrive.shared.b64 turn, [%0];}" ::"r"(at_) : "memory");
   }
 
-  // what they did before they gave it can be read after
+  // writes before the arrivals are visible after the wait
   PD_DEVICE void wait(unsigned turn) const {
     unsigned complete;
     while (true) {
@@ -46,21 +47,27 @@ class Signal {
   SharedAddress at_;
 };
 
-// Kernels that Launcher::run_overlapped launches start before the one before them has ended. Two things hold of each of them:
-// some block ends only after it has waited (wait_for_previous_kernel), so that the end of a kernel is the end of all before it; and
-// some block lets the next one start only after it has waited, so that a kernel starts when all but the one before it have
-// ended. So what a kernel reads without waiting has to be of kernels before the one before it, by the L2 cache, which sees all
-// writes; or letters of the one before it; or a plan or weights, of pairs and of patches, as long as kernels that nobody starts
-// early stand between those that write them and the first that is. All but stream_shared wait for everything else.
+// A kernel launched by Launcher::run_overlapped starts before the previous kernel has ended. Two
+// rules hold for each such kernel. First, at least one block ends only after
+// wait_for_previous_kernel, so the end of a kernel implies the end of all earlier ones. Second, at
+// least one block triggers the next kernel only after that wait, so a kernel starts when all but
+// the previous one have ended.
+//
+// Before the wait, a kernel may therefore read three kinds of data. Results of kernels before the
+// previous one, through the L2 cache, which sees all writes. Halo messages of the previous kernel.
+// The plan and the weights, provided that kernels launched without overlap separate their writer
+// from the first overlapped kernel. All kernels but stream_shared wait before they read anything
+// else.
 
-// Until the kernel before has ended and what it wrote is there.
+// Waits until the previous kernel has ended and its writes are visible.
 PD_DEVICE void wait_for_previous_kernel() {
 #if PD_HAS_CLUSTERS
   asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
 }
 
-// One thread of every block, see above: the next kernel may start wherever there is room.
+// Called by one thread of every block, by the rules above: the next kernel may start where
+// resources are free.
 PD_DEVICE void launch_dependents() {
 #if PD_HAS_CLUSTERS
   asm volatile("griddepcontrol.launch_dependents;" ::: "memory");

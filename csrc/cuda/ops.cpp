@@ -1,4 +1,4 @@
-// The ops on CUDA: memory, stream and device come from torch, everything else from the kernels.
+// The ops on CUDA. Torch provides memory, stream and device.
 #include "rollout_adjoint.h"
 
 #include "cuda/launch.h"
@@ -83,7 +83,7 @@ struct Cuda {
   }
 
  private:
-  // Memory goes back to torch's allocator at once; it hands it out again on the same stream only.
+  // The memory returns to torch's allocator at once, which reuses it only on the same stream.
   template <class Call>
   static void run(const Tensor& like, const Call& call, std::int64_t (*bytes)(const Call&),
                   void (*launch)(const Call&, void*, Stream)) {

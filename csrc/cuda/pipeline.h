@@ -1,36 +1,44 @@
-// Iterations over many patches as a pipeline, in float32, one block on each multiprocessor. Its warps have three tasks: some
-// work on the elements of a patch, while others add up the forces of the patch before and move its vertices, and others bring
-// the slots of the next and help with the forces. Two patches take turns in shared memory. So arithmetic and memory need not
-// wait for each other, as they do where every warp of a block goes through all of it; and a thread has both tetrahedra of a
-// pair, which share loads, the edges of their face and the sums of forces on it. It pays where a multiprocessor has many
-// patches one after another, to fill it but once.
+// Iterations over many patches as a pipeline in float32, with one block per multiprocessor. Its
+// warps have three tasks. Element warps compute the elements of a patch. Updaters sum the forces of
+// the previous patch and update its vertices. Loaders load the slots of the next patch and help to
+// sum forces.
+//
+// Two patches are in shared memory at a time, so arithmetic overlaps with memory access. A thread
+// computes both tetrahedra of a pair, which share loads, face edges and force sums. The pipeline
+// pays off when a multiprocessor processes many patches, since it fills only once.
 #pragma once
 #include "cuda/handoff.h"
 #include "cuda/stream.h"
 
 namespace pd::inline PD_TARGET {
 
-// In this order: movers, bringers, elements (producer and consumer warps). So many that each thread may have 96 registers,
-// which elements want, and that a block of stream_shared has room beside: 640 x 96 + 128 x 32 registers are all 65,536. Hardly
-// any cache is left for registers that spill: ten of elements outweigh a seventh of their instructions.
+// Warp roles, in this order: updaters, loaders, elements. The sizes leave 96 registers per thread,
+// which elements need, and room for a block of stream_shared: 640 x 96 + 128 x 32 = 65,536
+// registers. The cache has little room for spilled registers: ten spills in the element code cost
+// more than a seventh of its instructions saves.
 //
-// Movers and bringers take about as long for a patch as elements do, so anything more that they do costs: one more row for
-// movers to add up 9 us, one more for bringers in its place 4 us, of an iteration of a million vertices on an H100. So a warp
-// tells 32 stops at once, in words of 16 bytes; entries are added up by few instructions, though movers and bringers spill some
-// registers for it; what is read from memory is asked for before anything that waits; and vertices that patches share have a kernel
-// of their own. Entries that meet in banks cost, too (plan/phases.h). Patches are dealt out beforehand: blocks end up to 9 us
-// apart, but tickets would cost more.
+// Updaters and loaders take about as long per patch as elements, so any extra work in them costs
+// time. On an H100 with a million vertices, one more row of forces costs 9 us per iteration in the
+// updaters, or 4 us in the loaders.
 //
-// By clocks inside the kernel elements wait for 13 % of their time, movers for 9 % and bringers for 30 %: what is left to gain is
-// in the instructions of elements, and in warps for which there are no registers.
+// Therefore one warp schedules 32 patches at once, in 16-byte words. Sums of entries use few
+// instructions, although updaters and loaders spill some registers. Loads are issued before any
+// wait. Shared vertices have a kernel of their own. Bank conflicts between entries also cost time
+// (plan/phases.h). Patches are assigned in advance: blocks end up to 9 us apart, but a work queue
+// would cost more.
 //
-// A register that is written under a condition is kept from before, all around a loop: so where a thread has no slot, it
-// reads what is the first one's. And whoever writes to a register waits for a load that is on its way there, the fourth number of
-// 16 bytes included, which nobody reads.
+// By clocks inside the kernel, elements wait for 13 % of their time, updaters for 9 % and loaders
+// for 30 %. Further gains need fewer element instructions, or more warps, for which there are no
+// registers.
+//
+// A register written under a condition stays live around the loop. So a thread without a slot reads
+// the first slot instead. A write to a register also waits for a load into it that is in flight,
+// which includes the unused fourth component of a 16-byte load.
 constexpr int updater_threads = 128, loader_threads = 128, element_threads = 384;
 constexpr int pipeline_threads = updater_threads + loader_threads + element_threads;
 
-// The patches of a block, of all environments: item after item, from its own number on as far apart as there are blocks.
+// The patches of a block over all environments: from the block's own index on, with the number of
+// blocks as stride.
 template <class T, Visit What>
 class Pipeline {
   static_assert(
@@ -41,7 +49,7 @@ class Pipeline {
   PD_DEVICE Pipeline(const StreamCall<T>& call, int k, unsigned round, std::byte* shared)
       : call_(call), k_(k), round_(round), shared_(shared) {}
 
-  // All threads of the block, each its own task.
+  // Called by all threads of the block; each warp runs its task.
   PD_DEVICE void run() const {
     const bool updates = updater() < updater_threads, loads = !updates && loader() < loader_threads;
     if (threadIdx.x == 0) init_signals();
@@ -66,12 +74,13 @@ class Pipeline {
   using LoadedVertex = typename Vertices<T, false>::LoadedVertex;
 
   static constexpr int element_warps = element_threads / warp_size;
-  // Slots that bringers have in registers at once; those of larger patches follow one by one.
+  // slots that loaders hold in registers at once; larger patches load the rest one by one
   static constexpr int usual_slots = 640;
   static constexpr int loaded_slots = usual_slots / loader_threads;
-  // From left_slots on bringers add up the forces of slots that are not inside the patch.
+  // from updated_slots on, loaders sum the forces on slots outside the interior
   static constexpr int updated = 3, updated_slots = updated * updater_threads;
-  // Of moved, what visits of so many want is asked for before forces are awaited, that of the others after.
+  // of the `updated` slots, so many load their vertex before the wait for forces, the others after
+  // it
   static constexpr int prefetched = 2;
 
   PD_DEVICE static int updater() { return int(threadIdx.x); }
@@ -82,9 +91,10 @@ class Pipeline {
 
   PD_DEVICE const DevicePlan<T>& plan() const { return call_.step.plan; }
 
-  // ---- who waits for whom, for either half of shared memory
+  // ---- signals, for either half of shared memory
 
-  // Slots are there and entries are free (elements wait); forces are there and slots are free (movers and bringers wait).
+  // slots_ready: slots are loaded and entries are free (elements wait). forces_ready: forces are
+  // written and slots are free (updaters and loaders wait).
   enum Event { slots_ready, forces_ready, events };
 
   PD_DEVICE Signal signal(Event event, unsigned n) const {
@@ -100,33 +110,34 @@ class Pipeline {
   PD_DEVICE void arrive(Event event, unsigned n) const { signal(event, n).arrive(); }
   PD_DEVICE void wait(Event event, unsigned n) const { signal(event, n).wait(n / 2); }
 
-  // ---- stops of the block
+  // ---- schedule of the block
 
-  // Where a patch lies in the arrays. Those that have numbers for every environment are read as one array of all of them, from
-  // that of the first on, which takes one instruction; 32 bits count them (StreamRunner::pipe).
+  // Offsets of a patch in the arrays. Arrays with data per environment are indexed from the first
+  // environment, which takes one instruction. 32 bits suffice (StreamRunner::pipe).
   struct alignas(16) ScheduledPatch {
-    unsigned vertex, slot, place;  // the first of those before the environment's
-    int first_vertex, interior;    // of the plan, as are the next three
+    unsigned vertex, slot, place;  // offset of the environment
+    int first_vertex, interior;    // in the plan, as are the next three
     int first_slot, slots, first_place;
     int environment, patch;
-    int first_block, blocks;  // of pairs; blocks 0: there is no such patch
-    int first_warp;           // of the elements' warps, which has the first of them
+    int first_block, blocks;  // of pairs; blocks = 0 ends the schedule
+    int first_warp;           // element warp that takes the first block
     T patch_weight;           // StreamMemory::patch_weight
-    unsigned weights;         // blocks of them before those of its environment
+    unsigned weights;         // offset of the environment's weights, in blocks
     T unit;                   // of rest positions [m]
   };
 
   PD_DEVICE Work work(int environment = 0) const { return Work(call_, environment); }
 
-  // Stop `n` of the block. Whoever wants to know reads it there, since registers for it would be too many. A warp tells as many
-  // at once as it has lanes, in turn n of bringers those from n + 16 on, in place of n - 48 to n - 17: nobody is so far behind,
-  // since movers are past n - 4 and elements past n - 2 by then.
+  // Entry `n` of the block's schedule, in shared memory, since it would take too many registers.
+  // One warp adds as many entries as it has lanes. In round n of the loaders it writes entries n +
+  // 16 to n + 47, over the entries n - 48 to n - 17. No warp still reads those: by then updaters
+  // have passed n - 4 and elements n - 2.
   static constexpr unsigned schedule_chunk = warp_size;
   PD_DEVICE ScheduledPatch& scheduled(unsigned n) const {
     __shared__ ScheduledPatch table[2 * schedule_chunk];
     return table[n % (2 * schedule_chunk)];
   }
-  // what comes after the stops that are told
+  // where the schedule continues
   struct ScheduleCursor {
     int item, first_warp;
   };
@@ -143,7 +154,7 @@ class Pipeline {
   }
   PD_DEVICE Slots<T> slots_of(unsigned n) const { return Slots<T>(half(n), plan().most_slots); }
 
-  // Two numbers of every entry, then the third of every entry.
+  // Two components of every entry, then the third component of every entry.
   struct Entries {
     struct alignas(2 * sizeof(T)) Two {
       T x, y;
@@ -163,7 +174,7 @@ class Pipeline {
     const auto* first = reinterpret_cast<const typename Entries::Two*>(entries);
     return {first, reinterpret_cast<const T*>(first + plan().most_entries)};
   }
-  // what each warp has met of the elements' energy
+  // energy sum of each element warp
   PD_DEVICE double* energies_of(unsigned n) const {
     __shared__ double energies[2][element_warps];
     return energies[n & 1];
@@ -173,7 +184,7 @@ class Pipeline {
     return at.place + unsigned(plan().shared_place[at.first_place + s]);
   }
 
-  // ---- slots: cuda/pipeline_bring.h
+  // ---- loaders: cuda/pipeline_bring.h
 
   struct SlotData;
   struct RemainingForce;
@@ -202,7 +213,7 @@ class Pipeline {
   PD_DEVICE void process_pair(const PairData& now, const SharedSlots& slots, T unit, T& energy,
                               const ReadNext& read_next) const;
 
-  // ---- vertices: cuda/pipeline_move.h
+  // ---- updaters: cuda/pipeline_move.h
 
   PD_DEVICE void update_vertices() const;
   PD_DEVICE void update_patch(unsigned n) const;

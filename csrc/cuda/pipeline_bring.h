@@ -1,24 +1,26 @@
-// Members of Pipeline that bring the slots of a patch into shared memory, and add up the forces that movers leave to them.
+// Members of Pipeline that load the slots of a patch into shared memory, and sum the forces that
+// updaters leave to loaders.
 #pragma once
 #include "cuda/pipeline.h"
 
 namespace pd::inline PD_TARGET {
 
-// What is on its way to the slots.
+// Slot data in flight.
 template <class T, Visit What>
 struct Pipeline<T, What>::SlotData {
   Vec3<T> u[loaded_slots], origin[loaded_slots];
   RestPoint<T> rest[loaded_slots];
 };
 
-// The forces that movers leave to bringers, who have the time.
+// A force that loaders sum, since they wait more than updaters.
 template <class T, Visit What>
 struct Pipeline<T, What>::RemainingForce {
   int row;
   unsigned place;
 };
 
-// Past the last stop, too: nothing is brought, but the forces of the two before are there.
+// Continues for two entries past the end of the schedule: it loads nothing there, but sums the
+// forces of the last two patches.
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::load_slots() const {
   unsigned vertex[loaded_slots];
@@ -35,7 +37,7 @@ PD_DEVICE void Pipeline<T, What>::load_slots() const {
       remaining = remaining_at(at, first_remaining(at));
       wait(forces_ready, n - 2);
     }
-    // first the forces, while slots are on their way
+    // sums forces first, while the slot loads are in flight
     if (n >= 2) sum_remaining(n - 2, remaining);
     store_slots(scheduled(n).slots, n, data);
     arrive(slots_ready, n);

@@ -1,4 +1,4 @@
-// Members of Pipeline that work on the elements of a patch, a thread a pair of tetrahedra.
+// Members of Pipeline that compute the elements of a patch, one pair of tetrahedra per thread.
 #pragma once
 #include "cuda/pipeline.h"
 
@@ -9,17 +9,18 @@ struct Pipeline<T, What>::PairData : PairInputs<T> {
   T factor[2];  // pair_factor
 };
 
-// What a warp has of a stop: blocks of pairs, as far apart as there are warps. They go on with the next stop's where the
-// last one's end, so that none of them has more to do than others.
+// A warp's blocks of pairs in a scheduled patch, with the number of warps as stride. The next patch
+// continues with the warp after the last one, so that all warps get equal work.
 template <class T, Visit What>
 struct Pipeline<T, What>::Share {
-  unsigned block, end;  // none left: block >= end
-  unsigned weights;     // as of its stop
+  unsigned block, end;  // none left if block >= end
+  unsigned weights;     // of its scheduled patch
   T patch_weight;
 };
 
-// Slots and entries of a half by 32-bit addresses, which stay in registers; by pointers they would be worked out again for
-// each of them. Three instructions find a slot, and two an entry, since pipeline_slots leaves bits 13 to 15 of a corner 0.
+// 32-bit shared addresses of a half's slots and entries, which stay in registers; with pointers,
+// the compiler would recompute the addresses. A slot takes three instructions and an entry two,
+// since pipeline_slots leaves bits 13 to 15 of a corner zero.
 template <class T, Visit What>
 class Pipeline<T, What>::SharedSlots {
  public:
@@ -31,7 +32,8 @@ class Pipeline<T, What>::SharedSlots {
     third_ = in_register(entry_ + 8 * entries);
   }
 
-  // `corner`: of PairNumbers. What is volatile keeps its order, so nothing is looked at before it is awaited.
+  // `corner`: of PairInputs. The asm is volatile to keep its order, so no load moves before the
+  // wait.
   PD_DEVICE void load(unsigned corner, Vec3<T>& position, RestPoint<T>& rest) const {
     const SharedAddress slot_times_8 = in_register(corner & 0xffff);
     Quad<T> loaded;
@@ -45,7 +47,7 @@ class Pipeline<T, What>::SharedSlots {
     position = vec3(loaded);
     rest = RestPoint<T>::of(bits);
   }
-  // Unless the corner has no entry.
+  // Writes nothing if the corner has no entry.
   PD_DEVICE void write_entry(unsigned corner, const Vec3<T>& force) const {
     asm volatile(
         "{.reg .pred p; setp.lt.u32 p, %0, 0xffff0000; @p st.shared.v2.f32 [%1], {%3, %4}; "
@@ -72,7 +74,7 @@ PD_DEVICE void Pipeline<T, What>::process_elements() const {
     T energy = T(0);
     const T unit = scheduled(n).unit;
     bool more = share.block < share.end;
-    // else the last turn has read the first pairs of the next stop
+    // otherwise the last round has already loaded the first pairs of the next patch
     if (!more) {
       share = share_of(n + 1);
       finish_load(now, read(share), share.patch_weight);
@@ -108,14 +110,15 @@ PD_DEVICE typename Pipeline<T, What>::Share Pipeline<T, What>::share_of(unsigned
           in.patch_weight};
 }
 
-// A lane a pair, of the next block; where none is left, some of the stop's that nobody wants.
+// Loads one pair per lane of the next block. If no block is left, it loads valid data that is
+// unused.
 template <class T, Visit What>
 PD_DEVICE typename Pipeline<T, What>::PairData Pipeline<T, What>::read(const Share& share) const {
   const unsigned lane = threadIdx.x % warp_size, block = share.block;
   const int32* corner = plan().pair_corner + (block * (5 * pair_lanes) + lane);
   const T* factor = plan().pair_factor + (block * (2 * pair_lanes) + lane);
   PairData pair;
-  // once a patch: the caches had better keep something else
+  // streaming loads, since each pair is read once per pass
   for (int c = 0; c < 5; ++c) pair.corner[c] = unsigned(__ldcs(corner + c * pair_lanes));
   for (int e = 0; e < 2; ++e) pair.factor[e] = __ldcs(factor + e * pair_lanes);
   for (int e = 0; e < 2; ++e) pair.weight[e] = T(0);
@@ -132,7 +135,8 @@ PD_DEVICE const T* Pipeline<T, What>::weights_of(unsigned block, unsigned weight
   return call_.memory.weights + std::size_t(block + weights) * (2 * pair_lanes);
 }
 
-// Not before its end is what was read looked at, since whoever moves a number waits for it. `patch_weight`: of its stop.
+// Uses the loaded data only at the end of a round, since moving a register waits for its load.
+// `patch_weight`: of the scheduled patch.
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::finish_load(PairData& now, const PairData& read, T patch_weight) {
   for (int c = 0; c < 5; ++c) now.corner[c] = in_register(read.corner[c]);
@@ -144,7 +148,7 @@ PD_DEVICE void Pipeline<T, What>::finish_load(PairData& now, const PairData& rea
   }
 }
 
-// Has all pairs of a stop brought into the L2 cache.
+// Prefetches all pairs of a scheduled patch into the L2 cache.
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::prefetch_pairs(unsigned n) const {
   const ScheduledPatch in = scheduled(n);
@@ -159,7 +163,8 @@ PD_DEVICE void Pipeline<T, What>::prefetch_pairs(unsigned n) const {
     prefetch(weights_of(unsigned(in.first_block), in.weights), in.blocks * two);
 }
 
-// `read_next`: between its tetrahedra. Lanes past the last pair leave no force, and what they strain weighs nothing.
+// Calls `read_next` between the two tetrahedra. Lanes past the last pair write no force and have
+// weight zero.
 template <class T, Visit What>
 template <class ReadNext>
 PD_DEVICE void Pipeline<T, What>::process_pair(const PairData& now, const SharedSlots& slots,

@@ -1,4 +1,4 @@
-// Members of Pipeline that move the vertices of a patch.
+// Members of Pipeline that update the vertices of a patch.
 #pragma once
 #include "cuda/pipeline.h"
 
@@ -6,11 +6,11 @@ namespace pd::inline PD_TARGET {
 
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::update_vertices() const {
-  // the entries of both halves are free
+  // the entries of both halves start free
   for (unsigned n = 0; n < 2; ++n) arrive(slots_ready, n);
   prefetch_patch(0);
   wait_for_previous_kernel();
-  // not before, see handoff.h
+  // only after the wait, see handoff.h
   if (updater() == 0) launch_dependents();
 #pragma unroll 1
   for (unsigned n = 0; scheduled(n).blocks > 0; ++n) update_patch(n);
@@ -41,7 +41,7 @@ PD_DEVICE void Pipeline<T, What>::update_patch(unsigned n) const {
   wait(forces_ready, n);
   if (What == Visit::update_guarded && updater() < element_warps)
     sums.value[0] += energies_of(n)[updater()];
-  // first what frees the half
+  // first everything that frees this half of shared memory
 #pragma unroll
   for (int r = 0; r < updated; ++r) force[r] = sum_entries_compact<T>(entries, row[r]);
   const T omega = T(loaded_omega);
@@ -50,7 +50,7 @@ PD_DEVICE void Pipeline<T, What>::update_patch(unsigned n) const {
     visit<What>(all, first_vertex + unsigned(s), load_vertex<What>(all, first_vertex + unsigned(s)),
                 sum_entries_compact<T>(entries, plan().slot_row[at.first_slot + s]), omega, sums);
   arrive(slots_ready, n);
-  // on the way during the first visits
+  // loads overlap with the first visits
   unsigned place[updated];
 #pragma unroll
   for (int r = 0; r < updated; ++r) {
@@ -68,7 +68,8 @@ PD_DEVICE void Pipeline<T, What>::update_patch(unsigned n) const {
   if (wants_sums<What>(all)) write_updater_sums(sums, n, work(at.environment).sum_row(at.patch));
 }
 
-// Has what movers read of a patch brought into the L2 cache, by one thread of each of three warps.
+// Prefetches an updater's inputs of a patch into the L2 cache, by one thread of each of three
+// warps.
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::prefetch_patch(unsigned n) const {
   const ScheduledPatch at = scheduled(n);
@@ -88,7 +89,7 @@ template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::write_updater_sums(const ThreadSums& sums, unsigned n,
                                                      double* row) const {
   constexpr int warps = updater_threads / warp_size;
-  // those who are ahead write the others while somebody still reads
+  // double buffer: warps that are ahead write one half while others still read the other
   __shared__ double by_parity[2][sums_count][warps];
   double (&warp_sum)[sums_count][warps] = by_parity[n & 1];
   for (int i = 0; i < sums_count; ++i) {

@@ -1,10 +1,10 @@
-// Members of Pipeline that find out which patches its block has.
+// Members of Pipeline that build the schedule of a block.
 #pragma once
 #include "cuda/pipeline.h"
 
 namespace pd::inline PD_TARGET {
 
-// Stops from `first` on, by a warp: items of environments that go on.
+// Adds schedule entries from `first` on, by one warp; converged environments are skipped.
 template <class T, Visit What>
 PD_DEVICE void Pipeline<T, What>::extend_schedule(unsigned first) const {
   __syncwarp();
@@ -38,7 +38,8 @@ PD_DEVICE void Pipeline<T, What>::extend_schedule(unsigned first) const {
       s.unit = plan().patch_unit[patch];
       s.patch_weight = work(environment).patch_weight[patch];
     }
-    // the guard's energies are summed alike in any batch
+    // guarded passes keep first_warp at zero, so that energies are summed in the same order in any
+    // batch
     if (What == Visit::update) {
       int until = s.blocks;
 #pragma unroll

@@ -1,4 +1,4 @@
-// Runner of solver/report.h: a block a chunk of vertices, then one an environment.
+// Kernels of solver/report.h: one block per chunk of vertices, then one block per environment.
 #pragma once
 #include "cuda/collect.h"
 #include "cuda/launch.h"
@@ -7,7 +7,7 @@
 
 namespace pd {
 
-// The sums of a block's threads, in thread 0.
+// Sums over a block's threads; thread 0 gets the result.
 PD_DEVICE void block_reduce_sums(double (&sum)[report_sums]) {
   constexpr int warps = report_chunk / warp_size;
   __shared__ double warp_sum[warps][report_sums];

@@ -1,11 +1,12 @@
-// Vertices that patches share, of the kernels for meshes of any size: their forces are what all these patches have of them.
+// Update of vertices shared by several patches, for kernel stream. The force on a vertex is the sum
+// over its patches.
 #pragma once
 #include "cuda/collect.h"
 #include "cuda/stream.h"
 
 namespace pd::inline PD_TARGET {
 
-// Where the forces of patches on a vertex that they share lie, in the order of patches.
+// Range of a shared vertex's forces, in patch order.
 struct SharedPlaces {
   int at, end;
 
@@ -14,7 +15,8 @@ struct SharedPlaces {
       : at(plan.shared_start[shared]), end(plan.shared_start[shared + 1]) {}
 };
 
-// Their sum: two at once, since few have more, and more would keep other threads out for want of registers.
+// Sums the forces, two loads at a time: few vertices have more, and more registers would lower
+// occupancy.
 template <class T, bool HasContacts>
 PD_DEVICE Vec3<T> shared_force(const StreamWork<T, HasContacts>& w, SharedPlaces place) {
   constexpr int in_flight = 2;
@@ -32,7 +34,7 @@ PD_DEVICE Vec3<T> shared_force(const StreamWork<T, HasContacts>& w, SharedPlaces
   return force;
 }
 
-// The same by whole warps, which wait for letters of a round where there are any.
+// The same sum by whole warps, which wait for the messages of `round` in float32.
 template <bool HasContacts>
 PD_DEVICE Vec3<double> wait_for_force(const StreamWork<double, HasContacts>& w, SharedPlaces place,
                                       unsigned) {
@@ -64,7 +66,8 @@ PD_DEVICE Vec3<float> wait_for_force(const StreamWork<float, HasContacts>& w, Sh
   return force;
 }
 
-// Vertices are in the order of the last patch that has them, so this letter of a block's should come last.
+// Vertices are ordered by the last patch that holds them, so this message of a block should arrive
+// last.
 template <bool HasContacts>
 PD_DEVICE void wait_for_last_message(const StreamWork<float, HasContacts>& w, int place,
                                      unsigned round) {
@@ -76,7 +79,7 @@ PD_DEVICE void wait_for_last_message(const StreamWork<float, HasContacts>& w, in
   }
 }
 
-// From the L2 cache, see handoff.h; x, which contacts alone want, is of the step's start.
+// Loads through the L2 cache, see handoff.h. Only contacts read x, which is constant during a step.
 PD_DEVICE Quad<float> load_from_l2(const Quad<float>& item) {
   const float4 f = __ldcg(reinterpret_cast<const float4*>(&item));
   return {f.x, f.y, f.z, f.w};
@@ -92,12 +95,14 @@ PD_DEVICE typename Vertices<T, HasContacts>::LoadedVertex load_vertex_from_l2(
   return {{vec3(w.v.x[i]), vec3(target), target.w, u.w}, vec3(u), vec3(before)};
 }
 
-// Vertices that patches share. As many threads as there can be where 32 registers are enough, since they wait for memory.
+// Updates vertices that patches share. With 32 registers per thread, occupancy is highest, which
+// hides the memory latency.
 //
-// With a `round` above 0 it works beside the pipeline of its pass, a block on each multiprocessor, for which that leaves
-// registers: it moves its vertices as soon as the letters on them have come. What else it reads is of kernels that had ended
-// before any block of the pipeline let it start; what it writes nobody makes use of before it has ended. Its last block waits for
-// the pipeline, so that whoever waits for it waits for both.
+// With `round` above 0 the kernel runs beside the pipeline of its pass, which leaves registers for
+// one block on each multiprocessor. It updates a vertex as soon as its messages have arrived. Its
+// other inputs come from kernels that ended before the pipeline triggered it. No kernel reads its
+// results before it ends. Its last block waits for the pipeline, so waiting for this kernel is
+// waiting for both.
 template <Visit What, class T, bool HasContacts>
 __global__ void __launch_bounds__(shared_threads, sizeof(T) == 4 && !HasContacts ? 16 : 1)
     stream_shared(const __grid_constant__ StreamCall<T> call, int k, unsigned round) {

@@ -1,4 +1,5 @@
-// Runner of solver/step.h on the host: every part of a step is a launch. Covers every mesh, effect and batch.
+// Runs solver/step.h on the host: every part of a step is a launch. It supports every mesh, effect
+// and batch.
 #pragma once
 #include "cuda/arena.h"
 #include "cuda/launch.h"
@@ -47,12 +48,12 @@ StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
   return m;
 }
 
-// Launches on one stream, which runs them in order.
+// Launches on one stream, in order.
 class Launcher {
  public:
   explicit Launcher(cudaStream_t stream) : stream_(stream) {}
 
-  // one block of `threads` for each of `count` pieces of work
+  // one block of `threads` threads per task, `count` tasks
   template <class Call, class... Arguments>
   void run(void (*kernel)(Call, Arguments...), std::int64_t count, int threads, std::size_t shared,
            const Call& call, Arguments... arguments) const {
@@ -61,7 +62,8 @@ class Launcher {
     check(cudaGetLastError());
   }
 
-  // The same for a kernel that waits by itself (cuda/handoff.h), so that it may start before the one before has ended.
+  // The same for a kernel that waits itself (cuda/handoff.h), so that it may start before the
+  // previous kernel has ended.
   template <class Call, class... Arguments>
   void run_overlapped(void (*kernel)(Call, Arguments...), std::int64_t count, int threads,
                       std::size_t shared, const Call& call, Arguments... arguments) const {
@@ -86,7 +88,7 @@ class Launcher {
 template <class T, bool HasContacts>
 class StreamRunner {
  public:
-  // `outer`: memory of outer_bytes, for the multilevel solver alone
+  // `outer`: memory of outer_bytes, for the multilevel solver only
   StreamRunner(const StreamCall<T>& call, void* outer, cudaStream_t stream)
       : call_(call),
         set_(call_.step.settings),
@@ -150,7 +152,7 @@ class StreamRunner {
 
   void descend() { run_outer(call_, outer_, stream_); }
 
-  // environments that are done skip what is still launched: asking would mean waiting
+  // always false, since a query would synchronise; converged environments skip the kernels instead
   bool finished() const { return false; }
 
   void finish() { vertices<VertexTask::finish>(0); }
@@ -160,7 +162,7 @@ class StreamRunner {
     const bool own = call_.step.material.stiffness.stride != 0;
     const std::int64_t sets = own ? patches_ : plan_.patches;
     launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, set_.weighted);
-    // the pass starts from u = 0 at no particular place
+    // the pass starts from u = 0 at the current positions
     launcher_.run(stream_origins<T>, patches_, vertex_threads, 0, call_);
     pass<Visit::diagonal>(0);
     decide<Decision::diagonal>(0);
@@ -174,9 +176,9 @@ class StreamRunner {
 
   template <Visit What>
   void pass(int k) {
-    // Letters of a pipeline's pass have a number of their own, which none has from before: the first pass of a call, weigh,
-    // leaves 0 at every place. With a tolerance it is 0 too, and stream_shared waits for the whole pass, since environments that
-    // are done send nothing.
+    // Messages of each pipeline pass carry a new number. The first pass of a call writes 0 to every
+    // place, so no old message matches. With a tolerance the number is 0 too, and stream_shared
+    // waits for the whole pass, since converged environments send nothing.
     const unsigned round = set_.tolerance > 0 ? 0 : ++round_;
     const bool piped = pipe<What>(k, round);
     if (!piped)
@@ -187,14 +189,15 @@ class StreamRunner {
                              piped ? round : 0u);
   }
 
-  // The patches of an iteration as a pipeline, where a multiprocessor has room for two at once. How many patches there are
-  // does not enter, since sums come in another order: an environment has the same bits in any batch.
+  // Runs an iteration's patches as a pipeline if shared memory holds two of them. The number of
+  // patches has no influence: the pipeline sums in another order, and an environment must have the
+  // same bits in any batch.
   template <Visit What>
   bool pipe(int k, unsigned round) {
     constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
     if constexpr (updates && !HasContacts && sizeof(T) == 4) {
       const auto kernel = stream_pipeline<What, T>;
-      // whose places 32 bits count; slots are the most of what an environment has
+      // the pipeline uses 32-bit indices; slots are the largest array of an environment
       constexpr std::int64_t most = std::numeric_limits<std::uint32_t>::max();
       if (plan_.most_slots > pipeline_slots || call_.step.batch * plan_.slots > most) return false;
       const std::size_t shared =
@@ -210,7 +213,7 @@ class StreamRunner {
 
   template <Decision What>
   void decide(int k) {
-    // a thread a row of sums
+    // one thread per row of sums
     const int rows = What == Decision::start ? 1 : std::min(call_.sum_rows(), decide_threads);
     const int threads = (rows + warp_size - 1) / warp_size * warp_size;
     launcher_.run_overlapped(stream_decide<What, T>, call_.step.batch, threads, 0, call_, k);
@@ -257,7 +260,7 @@ std::int64_t stream_bytes(const DeviceStep<T>& step) {
   return arena.size() + (step.settings.multilevel() ? outer_bytes(step) : 0);
 }
 
-// lets the kernels of a pass have more shared memory than the usual 48 KB
+// Raises the shared memory limit of the pass kernels above the default of 48 KB.
 template <class T, bool HasContacts>
 void allow_shared_memory(std::size_t bytes) {
   for (const auto kernel : {stream_patches<Visit::diagonal, T, HasContacts>,

@@ -1,4 +1,5 @@
-// Kernels of one pass each, for meshes of any size: what a step does, patch by patch and vertex by vertex, in global memory.
+// Kernels for meshes of any size, one pass of a step each. They work patch by patch or vertex by
+// vertex, with the state in global memory.
 #pragma once
 #include "cuda/collect.h"
 #include "cuda/half.h"
@@ -9,27 +10,27 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr int vertex_threads = 256;  // of a block of the kernels over vertices
-constexpr int shared_threads = 128;  // over shared vertices: so many have room beside a pipeline's
-constexpr int pass_threads =
-    384;  // of a block of the kernels over patches, two on a multiprocessor
-constexpr int decide_threads = 1024;  // at most, of the block that adds up an environment's sums
+constexpr int vertex_threads = 256;  // per block of kernels over vertices
+// of kernels over shared vertices; such a block fits beside a pipeline's block
+constexpr int shared_threads = 128;
+constexpr int pass_threads = 384;     // per block of kernels over patches, two on a multiprocessor
+constexpr int decide_threads = 1024;  // maximum for the block that reduces an environment's sums
 
 template <class T>
 struct StreamMemory {
   Quad<T>*x, *velocity, *target, *u, *before;  // [batch, vertices]
   Quad<T>* origin;                             // [batch, slots]
-  Quad<T>* shared_force;  // [batch, places]; letters in float32 (cuda/collect.h)
+  Quad<T>* shared_force;  // [batch, places]; halo messages in float32 (cuda/collect.h)
   T* weights;             // [batch or 1, blocks, 2, 32] w V
-  T* patch_weight;        // [batch or 1, patches] of patches with one stiffness above 0, else -1
+  T* patch_weight;        // [batch or 1, patches]; -1 unless the patch has one positive stiffness
   double* sums;           // [batch, patches + blocks of shared vertices, sums_count]
   Progress* progress;     // [batch]
   double* omega;          // [batch, guard_period] of the next iterations
   Piece<T>* pieces;       // [batch, pieces]
   double* part_sum;       // [batch, parts, PartSums::count]
-  unsigned* counter;      // [batch] of teams that move pieces
+  unsigned* counter;      // [batch] barrier counters of the teams that move pieces
   Plane<T>* planes;       // [batch, planes]
-  Ball<T>* spheres;       // [batch, balls]
+  Ball<T>* spheres;       // [batch, spheres]
 };
 
 template <class T>
@@ -40,14 +41,14 @@ struct StreamCall {
   PD_HD int shared_blocks() const {
     return (step.plan.shared + shared_threads - 1) / shared_threads;
   }
-  // of forces on shared vertices
+  // number of forces on shared vertices
   PD_HD std::int64_t places() const {
     return step.plan.slots - (step.plan.vertices - step.plan.shared);
   }
   PD_HD int sum_rows() const { return step.plan.patches + shared_blocks(); }
 };
 
-// One environment of a call.
+// Pointers of one environment of a call.
 template <class T, bool HasContacts>
 struct StreamWork {
   const StreamCall<T>& call;
@@ -82,13 +83,15 @@ struct StreamWork {
         h(T(c.step.settings.time_step)) {}
 
   PD_DEVICE const Settings& settings() const { return call.step.settings; }
-  // Of iteration k; whoever asks long before it is wanted converts it then, since that waits.
+  // The weight omega of iteration k, in float64. A caller that loads it early converts it late,
+  // since the conversion waits for the load.
   PD_DEVICE double omega(int k) const {
-    // for stream_shared, see handoff.h
+    // stream_shared needs the L2 cache, see handoff.h
     return __ldcg(call.memory.omega + environment * guard_period + k % guard_period);
   }
   PD_DEVICE TaggedWord* messages() const { return reinterpret_cast<TaggedWord*>(shared_force); }
-  // What a patch has of the force on a vertex that it shares; 0 is the `round` of a pass for which nobody waits.
+  // Stores a patch's force on a shared vertex. `round` is the message tag; 0 marks a pass that no
+  // kernel waits for.
   PD_DEVICE void store_force(unsigned place, const Vec3<T>& force, unsigned round) const {
     if constexpr (sizeof(T) == 4) {
       HaloMessage<T>::send(messages() + place, force, round);
@@ -107,11 +110,11 @@ struct StreamWork {
   }
 };
 
-// Whether u and the iterate before change places with every iteration, which writes less. Not where environments may stop, each
-// at its own.
+// Whether u and the previous iterate swap roles every iteration, which writes less memory. With a
+// tolerance they do not, since environments stop at different iterations.
 PD_HD bool alternates(const Settings& settings) { return !(settings.tolerance > 0); }
 
-// What a pass does with a vertex once the force of the elements on it is known.
+// The update of a vertex once its elastic force is known.
 enum class Visit { diagonal, update, update_guarded };
 
 template <Visit What>
@@ -127,7 +130,7 @@ struct ThreadSums {
   double value[sums_count];
 };
 
-// What a visit goes by beside the force; nothing before there is a state.
+// Loads a vertex for a visit; the first pass (diagonal) runs before there is a state.
 template <Visit What, class T, bool HasContacts>
 PD_DEVICE typename Vertices<T, HasContacts>::LoadedVertex load_vertex(
     const StreamWork<T, HasContacts>& w, unsigned i) {
@@ -168,7 +171,7 @@ PD_DEVICE ThreadSums no_sums() {
   return {{0, 0, 0}};
 }
 
-// The sums of a block, to its row.
+// Writes the sums of a block to its row.
 template <Visit What>
 PD_DEVICE void write_sums(const ThreadSums& sums, double* row) {
   using Op = std::conditional_t<What == Visit::diagonal, Min, Add>;
@@ -199,8 +202,9 @@ PD_DEVICE bool skips(const StreamWork<T, HasContacts>& w) {
   return updates && w.settings().tolerance > 0 && w.progress.done;
 }
 
-// Elements of a patch: here(vertex, see(vertex), force) for every vertex inside it; the forces on those that it shares stay
-// behind. Returns what this thread has met of their energy. `shared`: pass_shared_bytes.
+// Computes the elements of a patch. Calls here(vertex, load(vertex), force) for every interior
+// vertex and stores the forces on shared vertices. Returns this thread's energy sum. `shared`:
+// pass_shared_bytes.
 template <class T, bool HasContacts, class Element, class Load, class Here>
 PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number, std::byte* shared,
                                  const Element& element, const Load& load, const Here& here) {
@@ -220,7 +224,7 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number
   };
   const double energy = double(each_tet<false, true>(
       patch, slots, shape_of, [](int, T) { return true; }, w.weights, entries, element, first));
-  // on the way while the block meets
+  // loads overlap with the barrier
   int s = threadIdx.x, row = 0;
   decltype(load(0)) loaded{};
   const auto load_slot = [&] {
@@ -244,7 +248,7 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number
   return energy;
 }
 
-// Elements of every patch, and the vertices inside it.
+// Updates the elements and interior vertices of every patch.
 template <Visit What, class T, bool HasContacts>
 __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
     stream_patches(const __grid_constant__ StreamCall<T> call, int k) {
@@ -252,7 +256,7 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   const int number = int(blockIdx.x % call.step.plan.patches);
   const StreamWork<T, HasContacts> w(call, blockIdx.x / call.step.plan.patches);
   if (skips<What>(w)) return;
-  // what is read once the elements are done
+  // prefetches data that is read after the elements
   const Patch<T> patch(w.plan, number);
   if constexpr (What != Visit::diagonal) {
     prefetch_to_l2(w.v.before + patch.first_vertex, patch.interior);
@@ -271,7 +275,7 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));
 }
 
-// What follows from the sums of a pass, an environment a block.
+// Decisions from the sums of a pass, one environment per block.
 enum class Decision { start, diagonal, iterate };
 
 template <Decision What, class T>
@@ -309,7 +313,7 @@ __global__ void __launch_bounds__(decide_threads)
     const auto set_omega = [&](int next) { omega[next % guard_period] = p.schedule.next(next); };
     set_omega(k + 1);
     if (p.schedule.wants_energy(k)) p.schedule.check(total[0]);
-    // where nothing is asked in between, until the next look at the energy
+    // without a tolerance, all iterations until the next energy check
     for (int next = k + 2; !soft && next <= k + guard_period; ++next) set_omega(next);
   }
 }
@@ -325,14 +329,14 @@ __global__ void __launch_bounds__(vertex_threads)
   if (threadIdx.x == 0)
     w.patch_weight[patch.index] =
         one > T(0) ? patch_weight(w.plan.patch_unit[patch.index], one) : T(-1);
-  // the padding of the last block, which the pipeline reads
+  // clears the padding of the last block, which the pipeline reads
   const int end = (patch.pairs + pair_lanes - 1) / pair_lanes * pair_lanes;
   const int padding = patch.pairs + int(threadIdx.x);
   for (int e = 0; e < 2 && padding < end; ++e)
     (w.weights + place_of(patch, padding).in(2))[e * pair_lanes] = T(0);
 }
 
-// ---- vertex by vertex
+// ---- kernels over vertices
 
 enum class VertexTask { load, predict, start, finish, store };
 
@@ -360,7 +364,7 @@ __global__ void __launch_bounds__(vertex_threads)
     w.in.write(record, i, vec3(w.v.x[i]), vec3(w.v.velocity[i]));
 }
 
-// Positions relative to the first vertex of each patch, which keep their last bits however far from the origin.
+// Positions relative to each patch's first vertex, which stay accurate far from the origin.
 template <class T>
 __global__ void __launch_bounds__(vertex_threads)
     stream_origins(const __grid_constant__ StreamCall<T> call) {
@@ -371,12 +375,12 @@ __global__ void __launch_bounds__(vertex_threads)
     w.origin[patch.first_slot + s] = quad(vec3(w.v.x[patch.vertex(s)]) - anchor);
 }
 
-// Of this thread in the grid.
+// This thread's index in the grid.
 PD_DEVICE std::int64_t thread_number() {
   return std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
 }
 
-// ---- environment by environment
+// ---- kernels over environments
 
 enum class EnvironmentTask { move_spheres, store };
 

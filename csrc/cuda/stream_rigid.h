@@ -1,4 +1,5 @@
-// The rigid motions of cuda/rigid.h for kernel `stream`, in one launch: a team of blocks has an environment at a time.
+// The rigid motions of cuda/rigid.h for kernel `stream`, in one launch; a team of blocks works on
+// one environment at a time.
 #pragma once
 #include "cuda/block_team.h"
 #include "cuda/stream.h"
@@ -11,11 +12,12 @@ template <class T>
 struct RoundsCall {
   StreamCall<T> stream;
   Aligning how;
-  int teams, blocks;  // of a team
-  unsigned* counter;  // [teams] zero
+  int teams, blocks;  // blocks of a team
+  unsigned* counter;  // [teams], zero at the launch
 };
 
-// A warp has the same parts in every round, and a lane the same of their vertices: it reads what it has moved itself, without waiting.
+// A warp keeps its parts over all rounds, and a lane its vertices, so each lane reads its own
+// writes without a barrier.
 template <class T, bool HasContacts>
 class StreamRounds {
  public:
@@ -33,7 +35,7 @@ class StreamRounds {
       });
       how.go_on();
     } while (HasContacts && some_piece([&](const Piece<T>& p) { return p.leg == how.leg; }));
-    team_.barrier();  // blocks begin an environment together
+    team_.barrier();  // blocks start an environment together
   }
 
   template <Rigid What>
@@ -59,7 +61,7 @@ class StreamRounds {
   }
 
  private:
-  // The same in every block of the team: pieces change only once all blocks have met again.
+  // The same in every block of the team: pieces change only after the next team barrier.
   template <class Is>
   PD_DEVICE bool some_piece(const Is& is) const {
     return some_of(w_.plan.pieces, [&](int n) { return is(w_.piece(n)); });
