@@ -29,7 +29,7 @@ struct SolidTensors {
   }
 
   template <class T>
-  Solid<T> view(double thickness, bool clip) const {
+  PaperField<T> view(double thickness, bool clip) const {
     return {lists,
             read<T>(points),
             read<T>(positions),
@@ -56,7 +56,7 @@ Tensor solid_field(const Tensor& points, const Tensor& positions, const Tensor& 
   const Tensor out = in.empty({in.batch, in.lists.samples});
   for_precision(points, [&](auto real) {
     using T = decltype(real);
-    const SolidField<T> task{in.view<T>(thickness, clip), write<T>(out)};
+    const PaperFieldValues<T> task{in.view<T>(thickness, clip), write<T>(out)};
     Backend::run(task, out.numel(), points);
   });
   return out;
@@ -76,12 +76,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> solid_field_vjp(
   const Tensor partial = in.empty({in.sets, in.lists.entries, 17});
   for_precision(points, [&](auto real) {
     using T = decltype(real);
-    const Solid<T> solid = in.view<T>(thickness, clip);
-    const SolidSamples<T> samples{solid, read<T>(g), write<T>(gx), write<T>(corners)};
-    const SolidVertices<T> sums{in.lists, read<T>(corners), write<T>(gv)};
-    const SolidEntries<T> entries{solid, read<T>(g), in.batch, in.sets, write<T>(partial)};
-    const SolidQuadrics<T> quadrics{in.lists, read<T>(partial), in.sets, write<T>(ga),
-                                    write<T>(gw)};
+    const PaperField<T> solid = in.view<T>(thickness, clip);
+    const PaperFieldSamples<T> samples{solid, read<T>(g), write<T>(gx), write<T>(corners)};
+    const PaperFieldVertices<T> sums{in.lists, read<T>(corners), write<T>(gv)};
+    const PaperFieldEntries<T> entries{solid, read<T>(g), in.batch, in.sets, write<T>(partial)};
+    const PaperFieldQuadrics<T> quadrics{in.lists, read<T>(partial), in.sets, write<T>(ga),
+                                         write<T>(gw)};
     Backend::run(samples, in.batch * n, points);
     Backend::run(sums, in.batch * v, points);
     Backend::run(entries, in.sets * in.lists.entries, points);

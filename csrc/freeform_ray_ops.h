@@ -51,20 +51,20 @@ inline void check_cells(const Tensor& cells, const Tensor& like, std::int64_t sa
                         std::int64_t patches, std::int64_t level) {
   TORCH_CHECK_VALUE(level >= 1, "level must be at least 1, got ", level);
   TORCH_CHECK_VALUE(cells.dim() == 2 && cells.size(0) >= 1, "cells must be int32 [count > 0, ",
-                    cell_numbers, "], got ", describe(cells));
-  check_array(cells, at::kInt, cells.size(0), cell_numbers, {like.device(), "positions"}, "cells",
+                    cell_size, "], got ", describe(cells));
+  check_array(cells, at::kInt, cells.size(0), cell_size, {like.device(), "positions"}, "cells",
               "corners, checks, patch and place of each", ray_arrays);
   // on a GPU, where no op may wait, the kernels leave out a cell that is none
   if (!cells.is_cpu()) return;
   const std::int64_t places = level * level;
   const int32* first = cells.const_data_ptr<int32>();
   for (std::int64_t n = 0; n < cells.size(0); ++n) {
-    const int32* cell = first + cell_numbers * n;
+    const int32* cell = first + cell_size * n;
     TORCH_CHECK_INDEX(is_cell(cell, samples, patches, places),
                       "cells must hold corners and checks in 0..", samples - 1, ", patches in 0..",
                       patches - 1, " and places in 0..", places - 1, ", got ",
-                      at::IntArrayRef(std::vector<std::int64_t>(cell, cell + cell_numbers)), " at ",
-                      n, "; ", ray_arrays);
+                      at::IntArrayRef(std::vector<std::int64_t>(cell, cell + cell_size)), " at ", n,
+                      "; ", ray_arrays);
   }
 }
 
@@ -134,10 +134,10 @@ Five surface_rays(const Tensor& origins, const Tensor& directions, const Tensor&
   real(rays.origins, rays.origins.sizes(), "origins", "m");
   const int levels = levels_of(cells.size(0), 2);  // at most four cells a leaf, side by side
   const auto empty = [&](at::IntArrayRef sizes) { return at::empty(sizes, positions.options()); };
-  const Tensor sheets = empty({batch, lists.patches, sheet_numbers});
-  const Tensor bumps = empty({lists.entries / 4 + lists.patches + 1, bump_numbers});
+  const Tensor sheets = empty({batch, lists.patches, posed_patch_size});
+  const Tensor bumps = empty({lists.entries / 4 + lists.patches + 1, bump_simd4_size});
   const Tensor heights = empty({lists.samples}), points = empty({batch, lists.samples, 3});
-  const Tensor fours = empty({batch, std::int64_t(1) << levels, cell_four_numbers});
+  const Tensor fours = empty({batch, std::int64_t(1) << levels, cell_simd4_size});
   const Tensor boxes = empty_boxes(batch, levels, positions);
   const Tensor depth = empty({batch, rays.count}), b = empty({batch, rays.count, 3});
   const Tensor patch = at::empty({batch, rays.count}, positions.options().dtype(at::kInt));
@@ -148,10 +148,10 @@ Five surface_rays(const Tensor& origins, const Tensor& directions, const Tensor&
     using T = decltype(number);
     const Base<T> base{read<T>(at_rest), read<T>(n), phong ? phong_lift<T> : T(0)};
     const Ellipsoids<T> ellipsoids{read<T>(a), read<T>(c), read<T>(m)};
-    Backend::run(PosedSheets<T>{lists, base, read<T>(posed), read<T>(turned), write<T>(sheets)},
+    Backend::run(PosedPatches<T>{lists, base, read<T>(posed), read<T>(turned), write<T>(sheets)},
                  batch * lists.patches, positions);
     Backend::run(GatheredBumps<T>{lists, ellipsoids, write<T>(bumps)}, lists.patches, positions);
-    const Sheets<T> surface{lists, read<T>(sheets), read<T>(bumps), base.lift, on_surface};
+    const PosedSurface<T> surface{lists, read<T>(sheets), read<T>(bumps), base.lift, on_surface};
     Backend::run(GridHeights<T>{surface, read<T>(grid), write<T>(heights)}, lists.samples,
                  positions);
     Backend::run(GridPoints<T>{surface, read<T>(grid), read<T>(heights), write<T>(points)},
@@ -198,7 +198,7 @@ std::tuple<Tensor, Tensor> field_rays(const Tensor& origins, const Tensor& direc
   for_precision(positions, [&](auto real) {
     using T = decltype(real);
     const Tree<T> tree{write<T>(boxes), in.lists.patches, levels};
-    const Solid<T> solid = in.view<T>(thickness, clip);
+    const PaperField<T> solid = in.view<T>(thickness, clip);
     if (!exhaustive) {
       Backend::run(FieldBoxes<T>{solid, tree, read<int32>(order)}, in.batch << levels, positions);
       join_boxes<Backend>(tree, in.batch, positions);

@@ -83,7 +83,7 @@ Six height_vjp(const Tensor& grad_heights, const Tensor& grad_slopes, const Tens
   const Tensor gv = rest.empty({rest.lists.vertices, 3}), gd = rest.empty({rest.lists.vertices, 3});
   const Tensor ga = rest.empty({q}), gc = rest.empty({q, 3}), gm = rest.empty({q, 6});
   const Tensor gb = rest.empty({n, 3}), corners = rest.empty({n, corner_numbers});
-  const Tensor probes = rest.empty({n, probe_numbers});
+  const Tensor probes = rest.empty({n, probe_size});
   const Tensor partial = rest.empty({rest.lists.entries, 10});
   for_precision(vertices, [&](auto real) {
     using T = decltype(real);

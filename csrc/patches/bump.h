@@ -90,37 +90,37 @@ PD_HD void bounds_of(const PatchBumps<T>& b, T& low, T& high) {
 
 // The same by fours, number by number, so that a processor takes four at once; what is missing lies far away.
 template <class T>
-struct BumpFours {
+struct BumpSimd4 {
   const T* numbers;  // [count, 10, 4]
   int32 count;
 };
 
-constexpr int bump_numbers = 40;
+constexpr int bump_simd4_size = 40;
 
 // Where the fours of a patch begin: they fit in before those of the next, with less than one to spare for each patch.
-PD_HD Index first_four(const Lists& lists, Index patch) {
+PD_HD Index first_simd4(const Lists& lists, Index patch) {
   return lists.patch_start[patch] / 4 + patch;
 }
 
-PD_HD int32 fours_of(const Lists& lists, Index patch) {
+PD_HD int32 simd4_count(const Lists& lists, Index patch) {
   return (lists.patch_start[patch + 1] - lists.patch_start[patch] + 3) / 4;
 }
 
 template <class T>
-PD_HD void store_fours(T* fours, const Ellipsoids<T>& of, const Lists& lists, Index patch) {
-  T* to = fours + bump_numbers * first_four(lists, patch);
+PD_HD void store_simd4(T* simd4, const Ellipsoids<T>& of, const Lists& lists, Index patch) {
+  T* to = simd4 + bump_simd4_size * first_simd4(lists, patch);
   const int32 begin = lists.patch_start[patch], end = lists.patch_start[patch + 1];
-  for (int32 n = 0; n < 4 * fours_of(lists, patch); ++n) {
+  for (int32 n = 0; n < 4 * simd4_count(lists, patch); ++n) {
     Bump<T> r = {T(0), {T(1e15), T(0), T(0)}, {T(1), T(1), T(1), T(0), T(0), T(0)}};
     if (begin + n < end) r = load_bump(of, lists.entry_quadric[begin + n]);
     const T numbers[10] = {r.a,    r.c.x,  r.c.y,  r.c.z,  r.m.xx,
                            r.m.yy, r.m.zz, r.m.yx, r.m.zx, r.m.zy};
-    for (int k = 0; k < 10; ++k) to[bump_numbers * (n / 4) + 4 * k + n % 4] = numbers[k];
+    for (int k = 0; k < 10; ++k) to[bump_simd4_size * (n / 4) + 4 * k + n % 4] = numbers[k];
   }
 }
 
 template <class T>
-PD_HD Field<T> bumps_at(const BumpFours<T>& b, const Vec3<T>& x) {
+PD_HD Field<T> bumps_at(const BumpSimd4<T>& b, const Vec3<T>& x) {
   using L = Lanes<T>;
   using R = Number<T>;
   const Vec3<R> at = {R(x.x), R(x.y), R(x.z)};
@@ -128,7 +128,7 @@ PD_HD Field<T> bumps_at(const BumpFours<T>& b, const Vec3<T>& x) {
   Vec3<R> gradient = {R(T(0)), R(T(0)), R(T(0))};
   for (int32 n = 0; n < b.count; ++n) {
     for (int lane = 0; lane < 4; lane += L::width) {
-      const T* m = b.numbers + bump_numbers * Index(n) + lane;
+      const T* m = b.numbers + bump_simd4_size * Index(n) + lane;
       const Vec3<R> c = {L::load(m + 4), L::load(m + 8), L::load(m + 12)};
       const Factor<R> factor = {L::load(m + 16), L::load(m + 20), L::load(m + 24),
                                 L::load(m + 28), L::load(m + 32), L::load(m + 36)};
@@ -149,9 +149,9 @@ PD_HD Field<T> bumps_at(const BumpFours<T>& b, const Vec3<T>& x) {
 }
 
 template <class T>
-PD_HD void bounds_of(const BumpFours<T>& b, T& low, T& high) {
+PD_HD void bounds_of(const BumpSimd4<T>& b, T& low, T& high) {
   for (int n = 0; n < 4 * b.count; ++n) {
-    const T a = b.numbers[bump_numbers * (n / 4) + n % 4];
+    const T a = b.numbers[bump_simd4_size * (n / 4) + n % 4];
     (a > T(0) ? high : low) = (a > T(0) ? high : low) + a;
   }
 }

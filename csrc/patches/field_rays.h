@@ -13,14 +13,14 @@ namespace pd::freeform {
 
 template <class T>
 struct FieldBoxes {
-  Solid<T> solid;  // without points
+  PaperField<T> solid;  // without points
   Tree<T> tree;
   const int32* order;  // [P] patches, in the order of the leaves
 };
 
 template <class T>
 struct FieldRays {
-  Solid<T> solid;  // without points
+  PaperField<T> solid;  // without points
   Tree<T> tree;
   const int32* order;
   bool exhaustive;  // tries every patch
@@ -37,12 +37,12 @@ constexpr int degree = 6;
 
 // f(t) = c_0 + c_1 t + c_2 t^2
 template <class T>
-struct Parabola {
+struct Quadratic {
   T c0, c1, c2;
 };
 
 template <class T>
-PD_HD T value_at(const Parabola<T>& f, const T& t) {
+PD_HD T value_at(const Quadratic<T>& f, const T& t) {
   return multiply_add(t, multiply_add(t, f.c2, f.c1), f.c0);
 }
 
@@ -55,7 +55,7 @@ struct Profile {
 };
 
 template <class T>
-PD_HD Profile<T> profile_of(const Solid<T>& s, Index pose, Index patch, const Vec3<T>& o,
+PD_HD Profile<T> profile_of(const PaperField<T>& s, Index pose, Index patch, const Vec3<T>& o,
                             const Vec3<T>& d) {
   Profile<T> p = {o, d, pose, patch, {}};
   const Planes<T> here = planes_at(s, pose, patch, o), there = planes_at(s, pose, patch, o + d);
@@ -67,7 +67,7 @@ PD_HD Profile<T> profile_of(const Solid<T>& s, Index pose, Index patch, const Ve
 }
 
 template <class T>
-PD_HD Parabola<T> quadric_along(const Solid<T>& s, const Profile<T>& p, Index entry) {
+PD_HD Quadratic<T> quadric_along(const PaperField<T>& s, const Profile<T>& p, Index entry) {
   const T* w = matrices_of(s, p.pose, entry);
   const T x[4] = {p.o.x, p.o.y, p.o.z, T(1)}, d[4] = {p.d.x, p.d.y, p.d.z, T(0)};
   T mixed = T(0);
@@ -79,32 +79,33 @@ PD_HD Parabola<T> quadric_along(const Solid<T>& s, const Profile<T>& p, Index en
 
 // `next`, or t if it lies between `after` and `next`. Not for NaN.
 template <class T>
-PD_HD T earlier(const T& t, const T& after, const T& next) {
+PD_HD T earlier_root(const T& t, const T& after, const T& next) {
   return t > after && t < next ? t : next;
 }
 
 // Where the polynomial that F' is now ends.
 template <class T>
-PD_HD T next_break(const Solid<T>& s, const Profile<T>& p, const T& after, const T& last) {
+PD_HD T next_break(const PaperField<T>& s, const Profile<T>& p, const T& after, const T& last) {
   T next = last;
   for (int32 e = s.lists.patch_start[p.patch]; e < s.lists.patch_start[p.patch + 1]; ++e) {
-    const Parabola<T> q = quadric_along(s, p, e);
+    const Quadratic<T> q = quadric_along(s, p, e);
     const T square = multiply_subtract(q.c1, q.c1, T(4) * q.c2 * q.c0);
     if (!(square >= T(0))) continue;
     const T root = square_root(square), half = T(-0.5) * (q.c1 < T(0) ? q.c1 - root : q.c1 + root);
-    next = earlier(half / q.c2, after, next);
-    next = earlier(q.c0 / half, after, next);
+    next = earlier_root(half / q.c2, after, next);
+    next = earlier_root(q.c0 / half, after, next);
   }
   if (s.clip) return next;
   for (int k = 0; k < 5; ++k)
     for (int j = 0; j < k; ++j)
-      next = earlier((p.line[j][0] - p.line[k][0]) / (p.line[k][1] - p.line[j][1]), after, next);
+      next =
+          earlier_root((p.line[j][0] - p.line[k][0]) / (p.line[k][1] - p.line[j][1]), after, next);
   return next;
 }
 
 // Narrows [from, to] to where the line is not negative; whether anything is left.
 template <class T>
-PD_HD bool narrow(const T (&line)[2], T& from, T& to) {
+PD_HD bool clip_to_line(const T (&line)[2], T& from, T& to) {
   if (line[1] == T(0)) return line[0] >= T(0);
   const T root = -line[0] / line[1];
   if (line[1] > T(0)) {
@@ -117,8 +118,8 @@ PD_HD bool narrow(const T (&line)[2], T& from, T& to) {
 
 // Bernstein coefficients over [from, to] of the parabola's cube, times a.
 template <class T>
-PD_HD void add_cube(const Parabola<T>& q, const T& from, const T& to, const T& a,
-                    T (&sum)[degree + 1]) {
+PD_HD void add_cubed_quadratic(const Quadratic<T>& q, const T& from, const T& to, const T& a,
+                               T (&sum)[degree + 1]) {
   const T x = value_at(q, from), z = value_at(q, to);
   const T y =
       T(2) * x + multiply_add(T(2) * from, q.c2, q.c1) * (to - from);  // twice the middle one
@@ -134,7 +135,8 @@ PD_HD void add_cube(const Parabola<T>& q, const T& from, const T& to, const T& a
 
 // Coefficients over the part [from, to] of [0, 1].
 template <class T>
-PD_HD void part_of(const T (&whole)[degree + 1], const T& from, const T& to, T (&c)[degree + 1]) {
+PD_HD void restrict_bernstein(const T (&whole)[degree + 1], const T& from, const T& to,
+                              T (&c)[degree + 1]) {
   for (int n = 0; n <= degree; ++n) c[n] = whole[n];
   for (int round = degree; round > 0; --round)  // keeps [0, to]
     for (int n = degree; n > degree - round; --n)
@@ -146,7 +148,7 @@ PD_HD void part_of(const T (&whole)[degree + 1], const T& from, const T& to, T (
 
 // The least s in [0, 1] where the polynomial is not negative.
 template <class T>
-PD_HD bool first_not_negative(const T (&whole)[degree + 1], T& s) {
+PD_HD bool first_nonnegative(const T (&whole)[degree + 1], T& s) {
   constexpr int deepest = sizeof(T) == 4 ? 22 : 48;
   Index place = 0;
   int depth = 0;
@@ -154,7 +156,7 @@ PD_HD bool first_not_negative(const T (&whole)[degree + 1], T& s) {
   while (true) {
     const T from = T(place) * size, to = T(place + 1) * size;
     T c[degree + 1];
-    part_of(whole, from, to, c);
+    restrict_bernstein(whole, from, to, c);
     bool possible = false;
     for (int n = 0; n <= degree; ++n) possible = possible || c[n] >= T(0);
     if (c[0] >= T(0) || (possible && depth == deepest)) {
@@ -179,9 +181,9 @@ PD_HD bool first_not_negative(const T (&whole)[degree + 1], T& s) {
 
 // The least t in [from, to] with F' >= 0.
 template <class T>
-PD_HD bool enter_patch(const Solid<T>& s, const Profile<T>& p, T from, T to, T& at) {
+PD_HD bool first_entry(const PaperField<T>& s, const Profile<T>& p, T from, T to, T& at) {
   for (int k = 0; s.clip && k < 4; ++k)
-    if (!narrow(p.line[k], from, to)) return false;
+    if (!clip_to_line(p.line[k], from, to)) return false;
   while (true) {
     const T next = next_break(s, p, from, to), middle = T(0.5) * (from + next);
     int least = 4;
@@ -195,20 +197,20 @@ PD_HD bool enter_patch(const Solid<T>& s, const Profile<T>& p, T from, T to, T& 
       c[n] = line[0] + line[1] * (from + (next - from) * (T(n) / T(degree)));
     bool active = false;
     for (int32 e = s.lists.patch_start[p.patch]; e < s.lists.patch_start[p.patch + 1]; ++e) {
-      const Parabola<T> q = quadric_along(s, p, e);
+      const Quadratic<T> q = quadric_along(s, p, e);
       if (!(value_at(q, middle) > T(0))) continue;
       active = true;
-      add_cube(q, from, next, s.amplitudes[s.lists.entry_quadric[e]], c);
+      add_cubed_quadratic(q, from, next, s.amplitudes[s.lists.entry_quadric[e]], c);
     }
     if (active) {
       T place;
-      if (first_not_negative(c, place)) {
+      if (first_nonnegative(c, place)) {
         at = multiply_add(place, next - from, from);
         return true;
       }
     } else {
       T begin = from, end = next;
-      if (narrow(line, begin, end)) {
+      if (clip_to_line(line, begin, end)) {
         at = begin;
         return true;
       }
@@ -219,7 +221,7 @@ PD_HD bool enter_patch(const Solid<T>& s, const Profile<T>& p, T from, T to, T& 
 }
 
 // Where Q may be positive for all its rounding, and the most that it may be; nothing where it is positive nowhere.
-struct Extent {
+struct QuadricExtent {
   bool bounded;
   double most;
   Vec3<double> centre, half;
@@ -227,7 +229,7 @@ struct Extent {
 
 // Q = most - (x - c)^T A (x - c) for an ellipsoid, which reaches sqrt(most A^-1_ii) from c along axis i.
 template <class T>
-PD_HD Extent extent_of(const T* w) {
+PD_HD QuadricExtent extent_of(const T* w) {
   const auto mean = [&](int r, int c) {
     return 0.5 * (double(w[4 * r + c]) + double(w[4 * c + r]));
   };
@@ -238,7 +240,7 @@ PD_HD Extent extent_of(const T* w) {
   const Mat3<double> cofactor = {
       {cross(a.row[1], a.row[2]), cross(a.row[2], a.row[0]), cross(a.row[0], a.row[1])}};
   const double minor = cofactor.row[2].z, det = dot(a.row[0], cofactor.row[0]);
-  Extent e = {false, 0.0, zero3<double>(), zero3<double>()};
+  QuadricExtent e = {false, 0.0, zero3<double>(), zero3<double>()};
   // a cone, a hyperboloid, or too nearly a cylinder
   if (!(a.row[0].x > 0.0 && minor > 0.0 && det > 1e-9 * a.row[0].x * a.row[1].y * a.row[2].z))
     return e;
@@ -264,7 +266,7 @@ PD_HD Extent extent_of(const T* w) {
 // Where the field of a patch may not be negative. With R <= r, the sum of what the positive quadrics are at most: clipped, the
 // prism over the triangle from -tau to tau + r; literal, that from -tau to tau, and wherever a positive quadric is.
 template <class T>
-PD_HD Box<double> field_box(const Solid<T>& s, Index pose, Index patch) {
+PD_HD Box<double> field_box(const PaperField<T>& s, Index pose, Index patch) {
   Vec3<double> v[3];
   for (int k = 0; k < 3; ++k) {
     const Vec3<T> p =
@@ -281,7 +283,7 @@ PD_HD Box<double> field_box(const Solid<T>& s, Index pose, Index patch) {
   for (int32 e = s.lists.patch_start[patch]; e < s.lists.patch_start[patch + 1]; ++e) {
     const double a = double(s.amplitudes[s.lists.entry_quadric[e]]);
     if (a <= 0.0) continue;
-    const Extent q = extent_of(matrices_of(s, pose, e));
+    const QuadricExtent q = extent_of(matrices_of(s, pose, e));
     bounded = bounded && q.bounded;
     if (!(q.most > 0.0)) continue;
     risen += a * (q.most * q.most * q.most);
@@ -326,12 +328,12 @@ template <class T>
 struct EnterPatch {
   const FieldRays<T>& task;
   Index pose;
-  const Sight<T>& ray;
+  const RayFrame<T>& ray;
   T& depth;
   int32& found;
 
   PD_HD void operator()(Index number) const {
-    const Solid<T>& s = task.solid;
+    const PaperField<T>& s = task.solid;
     const int32 patch = task.order[number];
     if (!is_below(patch, task.tree.count)) return;
     const Index corner = pose * s.lists.vertices + s.lists.triangles[3 * patch];
@@ -341,7 +343,7 @@ struct EnterPatch {
     for (int k = 0; k < 5; ++k) reach = reach + absolute(p.line[k][0]) + absolute(p.line[k][1]);
     if (!(reach <= biggest<T>())) return;  // collapsed, or not finite
     T at;
-    if (!enter_patch(s, p, task.rays.near - foot, task.rays.far - foot, at)) return;
+    if (!first_entry(s, p, task.rays.near - foot, task.rays.far - foot, at)) return;
     const T t = at + foot;
     if (!(t < depth || (t == depth && patch > found))) return;
     depth = t;
@@ -363,16 +365,16 @@ struct EnterLeaf {
 template <class T>
 PD_HD void item(const FieldRays<T>& t, Index i) {
   const Index pose = i / t.rays.count, ray = i % t.rays.count;
-  const Sight<T> sight = sight_along(load3(t.rays.origins + pose * t.rays.origin_step, ray),
-                                     load3(t.rays.directions + pose * t.rays.direction_step, ray));
+  const RayFrame<T> frame = ray_frame(load3(t.rays.origins + pose * t.rays.origin_step, ray),
+                                      load3(t.rays.directions + pose * t.rays.direction_step, ray));
   T depth = t.rays.far;
   int32 found = -1;
-  if (dot(sight.o, sight.o) + dot(sight.d, sight.d) <= biggest<T>()) {
-    const EnterPatch<T> enter = {t, pose, sight, depth, found};
+  if (dot(frame.o, frame.o) + dot(frame.d, frame.d) <= biggest<T>()) {
+    const EnterPatch<T> enter = {t, pose, frame, depth, found};
     if (t.exhaustive) {
       for (Index n = 0; n < t.tree.count; ++n) enter(n);
     } else {
-      visit(t.tree, pose, sight, t.rays.near, depth, T(64) * epsilon<T>() * largest(sight.o),
+      visit(t.tree, pose, frame, t.rays.near, depth, T(64) * epsilon<T>() * largest(frame.o),
             EnterLeaf<T>{enter});
     }
   }

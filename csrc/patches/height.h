@@ -22,7 +22,7 @@ struct Height {
   T* slopes;   // [S, 2] m
 };
 
-constexpr int probe_numbers = 7;
+constexpr int probe_size = 7;
 
 // Gradients of each sample for its barycentric coordinates and corners, and what its quadrics need: x, w and mu, where the
 // loss changes with a quadric as mu R(x) + grad R(x) . w does.
@@ -140,7 +140,7 @@ PD_HD void item(const HeightSamples<T>& t, Index sample) {
   shell_vjp(s, g);
   for (int k = 0; k < 3; ++k) t.grad_barycentrics[3 * sample + k] = g.b[k];
   store_corners(t.corners, sample, g);
-  T* probe = t.probes + probe_numbers * sample;
+  T* probe = t.probes + probe_size * sample;
   store3(probe, 0, x);
   store3(probe, 1, w);
   probe[6] = mu;
@@ -152,7 +152,7 @@ PD_HD void item(const HeightEntries<T>& t, Index entry) {
   const Bump<T> r = load_bump(t.quadrics, t.lists.entry_quadric[entry]);
   BumpAdjoint<T> g = {T(0), zero3<T>(), {T(0), T(0), T(0), T(0), T(0), T(0)}};
   for (int32 i = t.lists.sample_start[patch]; i < t.lists.sample_start[patch + 1]; ++i) {
-    const T* probe = t.probes + probe_numbers * Index(t.lists.sample_order[i]);
+    const T* probe = t.probes + probe_size * Index(t.lists.sample_order[i]);
     bump_vjp(r, load3(probe, 0), load3(probe, 1), probe[6], g);
   }
   T* to = t.partial + 10 * entry;

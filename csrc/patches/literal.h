@@ -10,7 +10,7 @@
 namespace pd::freeform {
 
 template <class T>
-struct Solid {
+struct PaperField {
   Lists lists;
   const T* points;      // [B, S, 3] m
   const T* positions;   // [B, V, 3] m
@@ -22,21 +22,21 @@ struct Solid {
 };
 
 template <class T>
-struct SolidField {
-  Solid<T> solid;
+struct PaperFieldValues {
+  PaperField<T> solid;
   T* out;  // [B, S] m
 };
 
 // Gradients of each sample for its point and its three corners.
 template <class T>
-struct SolidSamples {
-  Solid<T> solid;
+struct PaperFieldSamples {
+  PaperField<T> solid;
   const T* grad;        // [B, S]
   T *points, *corners;  // [B, S, 3], [B, S, 9]
 };
 
 template <class T>
-struct SolidVertices {
+struct PaperFieldVertices {
   Lists lists;
   const T* corners;
   T* positions;  // [B, V, 3]
@@ -44,15 +44,15 @@ struct SolidVertices {
 
 // Gradients of each entry for its quadric, over the samples of its patch and over all poses that share the quadric.
 template <class T>
-struct SolidEntries {
-  Solid<T> solid;
+struct PaperFieldEntries {
+  PaperField<T> solid;
   const T* grad;
   Index batch, sets;  // poses, and how many sets of matrices they have
   T* partial;         // [sets, entries, 17]
 };
 
 template <class T>
-struct SolidQuadrics {
+struct PaperFieldQuadrics {
   Lists lists;
   const T* partial;
   Index sets;
@@ -86,12 +86,12 @@ PD_HD T quadric_value(const T* w, const T (&x)[4]) {
 }
 
 template <class T>
-PD_HD const T* matrices_of(const Solid<T>& t, Index pose, Index entry) {
+PD_HD const T* matrices_of(const PaperField<T>& t, Index pose, Index entry) {
   return t.matrices + pose * t.stride + 16 * Index(t.lists.entry_quadric[entry]);
 }
 
 template <class T>
-PD_HD T perturbation(const Solid<T>& t, Index pose, Index patch, const T (&x)[4]) {
+PD_HD T perturbation(const PaperField<T>& t, Index pose, Index patch, const T (&x)[4]) {
   T sum = T(0);
   for (int32 e = t.lists.patch_start[patch]; e < t.lists.patch_start[patch + 1]; ++e) {
     const T q = quadric_value(matrices_of(t, pose, e), x);
@@ -108,7 +108,7 @@ struct Planes {
 };
 
 template <class T>
-PD_HD Planes<T> planes_at(const Solid<T>& t, Index pose, Index patch, const Vec3<T>& x) {
+PD_HD Planes<T> planes_at(const PaperField<T>& t, Index pose, Index patch, const Vec3<T>& x) {
   Planes<T> p;
   for (int k = 0; k < 3; ++k)
     p.v[k] = load3(t.positions, pose * t.lists.vertices + t.lists.triangles[3 * patch + k]);
@@ -133,8 +133,8 @@ PD_HD int smallest_of(const T (&value)[5]) {
 }
 
 template <class T>
-PD_HD void item(const SolidField<T>& t, Index i) {
-  const Solid<T>& s = t.solid;
+PD_HD void item(const PaperFieldValues<T>& t, Index i) {
+  const PaperField<T>& s = t.solid;
   const Index pose = i / s.lists.samples, patch = s.lists.sample_patch[i % s.lists.samples];
   T x[4];
   load_homogeneous(s.points, i, x);
@@ -177,8 +177,8 @@ PD_HD void plane_vjp(const Planes<T>& p, int k, const Vec3<T>& x, const T& grad,
 }
 
 template <class T>
-PD_HD void item(const SolidSamples<T>& t, Index i) {
-  const Solid<T>& s = t.solid;
+PD_HD void item(const PaperFieldSamples<T>& t, Index i) {
+  const PaperField<T>& s = t.solid;
   const Index pose = i / s.lists.samples, patch = s.lists.sample_patch[i % s.lists.samples];
   T x[4];
   load_homogeneous(s.points, i, x);
@@ -206,7 +206,7 @@ PD_HD void item(const SolidSamples<T>& t, Index i) {
 }
 
 template <class T>
-PD_HD void item(const SolidVertices<T>& t, Index i) {
+PD_HD void item(const PaperFieldVertices<T>& t, Index i) {
   const Index pose = i / t.lists.vertices, vertex = i % t.lists.vertices;
   Vec3<T> sum = zero3<T>();
   for (int32 c = t.lists.corner_start[vertex]; c < t.lists.corner_start[vertex + 1]; ++c) {
@@ -218,8 +218,8 @@ PD_HD void item(const SolidVertices<T>& t, Index i) {
 }
 
 template <class T>
-PD_HD void item(const SolidEntries<T>& t, Index i) {
-  const Solid<T>& s = t.solid;
+PD_HD void item(const PaperFieldEntries<T>& t, Index i) {
+  const PaperField<T>& s = t.solid;
   const Index set = i / s.lists.entries, entry = i % s.lists.entries;
   const Index patch = s.lists.entry_patch[entry];
   const T a = s.amplitudes[s.lists.entry_quadric[entry]];
@@ -247,7 +247,7 @@ PD_HD void item(const SolidEntries<T>& t, Index i) {
 }
 
 template <class T>
-PD_HD void item(const SolidQuadrics<T>& t, Index quadric) {
+PD_HD void item(const PaperFieldQuadrics<T>& t, Index quadric) {
   T amplitude = T(0);
   for (Index set = 0; set < t.sets; ++set) {
     T sum[16] = {};

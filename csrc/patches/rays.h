@@ -15,8 +15,8 @@
 namespace pd::freeform {
 
 constexpr int check_points = 12;
-constexpr int cell_numbers = 3 + check_points + 2;  // corners and checks in `points`, patch, place
-constexpr int cell_four_numbers = 4 * (9 + 1);      // corners and slack
+constexpr int cell_size = 3 + check_points + 2;  // corners and checks in `points`, patch, place
+constexpr int cell_simd4_size = 4 * (9 + 1);     // corners and slack
 
 // Where the surface is, cell by cell.
 template <class T>
@@ -26,7 +26,7 @@ struct Cells {
   const T* weights;    // [12, 3] barycentric coordinates of the checks in their cell
   const T* places;     // [m^2, 9] barycentric coordinates of the corners of a cell in its patch
   const T* points;     // [B, N, 3] m
-  T* fours;  // [B, leaves, 10, 4] of up to four cells, number by number: corners and slack, NaN for none, m
+  T* simd4;  // [B, leaves, 10, 4] of up to four cells, number by number: corners and slack, NaN for none, m
   Index samples, patches, cells_of_patch;
   T size;  // edge of a cell in barycentric coordinates, 1 / m
 };
@@ -38,7 +38,7 @@ struct CellBoxes {
 
 template <class T>
 struct SurfaceRays {
-  Sheets<T> sheets;
+  PosedSurface<T> surface;
   Cells<T> cells;
   Rays<T> rays;
   T* depth;             // [B, R] m, infinite without a hit
@@ -53,7 +53,7 @@ namespace pd::freeform::inline PD_TARGET {
 
 // Whether the numbers of a cell point into the arrays.
 PD_HD bool is_cell(const int32* cell, Index samples, Index patches, Index places) {
-  bool is = is_below(cell[cell_numbers - 2], patches) && is_below(cell[cell_numbers - 1], places);
+  bool is = is_below(cell[cell_size - 2], patches) && is_below(cell[cell_size - 1], places);
   for (int k = 0; k < 3 + check_points; ++k) is = is && is_below(cell[k], samples);
   return is;
 }
@@ -66,10 +66,10 @@ PD_HD void item(const CellBoxes<T>& t, Index i) {
   const T* points = c.points + 3 * pose * c.samples;
   const T most = biggest<T>();
   Box<T> box = {{most, most, most}, {-most, -most, -most}};
-  T* four = c.fours + cell_four_numbers * i;
-  for (int k = 0; k < cell_four_numbers; ++k) four[k] = T(NAN);
+  T* simd4 = c.simd4 + cell_simd4_size * i;
+  for (int k = 0; k < cell_simd4_size; ++k) simd4[k] = T(NAN);
   for (Index n = first_of(c.tree, leaf); n < first_of(c.tree, leaf + 1); ++n) {
-    const int32* cell = c.cells + cell_numbers * n;
+    const int32* cell = c.cells + cell_size * n;
     if (!is_cell(cell, c.samples, c.patches, c.cells_of_patch)) continue;  // left out, like none
     const Vec3<T> p[3] = {load3(points, cell[0]), load3(points, cell[1]), load3(points, cell[2])};
     T apart = T(0);
@@ -83,7 +83,7 @@ PD_HD void item(const CellBoxes<T>& t, Index i) {
     const T rounding = T(16) * epsilon<T>() * greater(largest(own.low), largest(own.high));
     // between the checks it is little more
     const T slack = T(1.5) * square_root(apart) + rounding;
-    T* to = four + n - first_of(c.tree, leaf);
+    T* to = simd4 + n - first_of(c.tree, leaf);
     const T numbers[10] = {p[0].x, p[0].y, p[0].z, p[1].x, p[1].y,
                            p[1].z, p[2].x, p[2].y, p[2].z, slack};
     for (int k = 0; k < 10; ++k) to[4 * k] = numbers[k];
@@ -106,18 +106,18 @@ PD_HD T apart(const T (&a)[3], const T* b) {
   return greater(greater(absolute(a[0] - b[0]), absolute(a[1] - b[1])), absolute(a[2] - b[2]));
 }
 
-enum class End { nowhere, beside, on_patch };
+enum class RefineResult { diverged, outside_patch, on_patch };
 
 // Newton's method from b, and where it ends. A whole step leads to the ray but for the bend of the surface, of second order in the
 // step: what it did to the last step tells what it will do to the next, and where that is nothing nobody need look.
 template <class T>
-PD_HD End refine(const SurfaceRays<T>& t, const Sheet<T>& sheet, const Sight<T>& ray,
-                 const T* known, T (&b)[3], T& depth) {
+PD_HD RefineResult refine(const SurfaceRays<T>& t, const PosedPatch<T>& posed,
+                          const RayFrame<T>& ray, const T* known, T (&b)[3], T& depth) {
   const T most = t.cells.size;
   T before = T(0);  // length of the step that led here, if it was a whole one
   Vec3<T> aimed = zero3<T>();
   for (int step = 0; step < 24; ++step) {
-    const SurfaceElement<T> s = surface_at(t.sheets, sheet, b);
+    const SurfaceElement<T> s = surface_at(t.surface, posed, b);
     const Vec3<T> r = s.point - ray.o;
     const T x = dot(r, ray.u), y = dot(r, ray.v);
     const T xx = dot(s.tangent[0], ray.u), xy = dot(s.tangent[1], ray.u);
@@ -149,33 +149,34 @@ PD_HD End refine(const SurfaceRays<T>& t, const Sheet<T>& sheet, const Sight<T>&
       // as far as positions are known, in barycentric coordinates
       const T edge = greater(largest(s.tangent[0]), largest(s.tangent[1]));
       const T margin = greater(T(512) * epsilon<T>(), lesser(rounding / edge, most));
-      return outside >= -margin ? End::on_patch : End::beside;
+      return outside >= -margin ? RefineResult::on_patch : RefineResult::outside_patch;
     }
     // on the way to the hit that is known
-    if (known != nullptr && apart(b, known) <= T(1) / T(64) * most) return End::beside;
+    if (known != nullptr && apart(b, known) <= T(1) / T(64) * most)
+      return RefineResult::outside_patch;
     if (!(outside >= T(-2) * most)) break;
     before = after;
   }
-  return End::nowhere;
+  return RefineResult::diverged;
 }
 
 // Cells as seen along a ray.
 template <class T, class R>
-struct SeenCells {
+struct ProjectedCells {
   R area[3], whole, slack, longest;
   unsigned passed;  // bits: those that the ray passes within the slack
 };
 
 // Those from `lane` on, R at a time: T or Number<T>.
 template <class R, class T, class Load>
-PD_HD SeenCells<T, R> see_cells(const T* four, const Load& load, const Sight<T>& ray, const T& near,
-                                const T& far) {
+PD_HD ProjectedCells<T, R> project_cells(const T* simd4, const Load& load, const RayFrame<T>& ray,
+                                         const T& near, const T& far) {
   const auto spread = [](const Vec3<T>& a) { return Vec3<R>{R(a.x), R(a.y), R(a.z)}; };
   const Vec3<R> o = spread(ray.o), d = spread(ray.d), u = spread(ray.u), v = spread(ray.v);
-  SeenCells<T, R> s;
+  ProjectedCells<T, R> s;
   R flat[3][2], along[3];
   for (int k = 0; k < 3; ++k) {
-    const T* p = four + 12 * k;
+    const T* p = simd4 + 12 * k;
     const Vec3<R> r = Vec3<R>{load(p), load(p + 4), load(p + 8)} - o;
     flat[k][0] = dot(r, u);
     flat[k][1] = dot(r, v);
@@ -183,7 +184,7 @@ PD_HD SeenCells<T, R> see_cells(const T* four, const Load& load, const Sight<T>&
   }
   const R nearest = lesser(lesser(along[0], along[1]), along[2]);
   const R farthest = greater(greater(along[0], along[1]), along[2]);
-  s.slack = load(four + 36) + R(T(16) * epsilon<T>()) * (R(largest(ray.o)) + absolute(farthest));
+  s.slack = load(simd4 + 36) + R(T(16) * epsilon<T>()) * (R(largest(ray.o)) + absolute(farthest));
   // so that a cell that is not finite is left at once
   s.passed = bits_of(nearest - s.slack <= R(far)) & bits_of(R(near) <= farthest + s.slack);
   for (int k = 0; k < 3; ++k) {
@@ -206,64 +207,67 @@ PD_HD SeenCells<T, R> see_cells(const T* four, const Load& load, const Sight<T>&
 
 // The nearest hit so far, after one cell more.
 template <class T>
-PD_HD void meet_cell(const SurfaceRays<T>& t, Index pose, const int32* cell,
-                     const SeenCells<T, T>& seen, const Sight<T>& ray, Hit<T>& hit) {
+PD_HD void intersect_cell(const SurfaceRays<T>& t, Index pose, const int32* cell,
+                          const ProjectedCells<T, T>& projected, const RayFrame<T>& ray,
+                          Hit<T>& hit) {
   // seen so steeply that it may be met twice
-  const bool edge_on = absolute(seen.whole) <= T(8) * seen.slack * seen.longest;
-  const int32 patch = cell[cell_numbers - 2];
-  const T* place = t.cells.places + 9 * cell[cell_numbers - 1];
+  const bool edge_on = absolute(projected.whole) <= T(8) * projected.slack * projected.longest;
+  const int32 patch = cell[cell_size - 2];
+  const T* place = t.cells.places + 9 * cell[cell_size - 1];
   // beside the hit, on the same patch and met once: that is the one
   if (!edge_on && hit.patch == patch) {
     T b[3];
     for (int k = 0; k < 3; ++k) {
-      b[k] = (seen.area[0] * place[k] + seen.area[1] * place[3 + k] + seen.area[2] * place[6 + k]) /
-             seen.whole;
+      b[k] = (projected.area[0] * place[k] + projected.area[1] * place[3 + k] +
+              projected.area[2] * place[6 + k]) /
+             projected.whole;
     }
     if (apart(b, hit.b) <= T(0.25) * t.cells.size) return;
   }
-  const Sheet<T> sheet = load_sheet(t.sheets, pose, patch);
+  const PosedPatch<T> posed = load_posed_patch(t.surface, pose, patch);
   for (int start = 0; start < 4; ++start) {
     T inner[3], total = T(0), b[3], depth;
     for (int k = 0; k < 3; ++k) {
       inner[k] = start > 0 ? T(int(k == start - 1))
                  : edge_on ? T(1)
-                           : greater(T(0), seen.area[k] / seen.whole);
+                           : greater(T(0), projected.area[k] / projected.whole);
       total = total + inner[k];
     }
     for (int k = 0; k < 3; ++k)
       b[k] = (inner[0] * place[k] + inner[1] * place[3 + k] + inner[2] * place[6 + k]) / total;
-    const End end = refine(t, sheet, ray, hit.patch == patch ? hit.b : nullptr, b, depth);
-    if (end == End::on_patch && depth >= t.rays.near && depth < hit.depth)
+    const RefineResult end = refine(t, posed, ray, hit.patch == patch ? hit.b : nullptr, b, depth);
+    if (end == RefineResult::on_patch && depth >= t.rays.near && depth < hit.depth)
       hit = {depth, patch, {b[0], b[1], b[2]}};
-    if (end != End::nowhere && !edge_on) break;
+    if (end != RefineResult::diverged && !edge_on) break;
   }
 }
 
 // Visits leaves with the cells that they hold.
 template <class T>
-struct MeetCells {
+struct IntersectCells {
   const SurfaceRays<T>& task;
   Index pose;
-  const Sight<T>& ray;
+  const RayFrame<T>& ray;
   Hit<T>& hit;
 
   PD_HD void operator()(Index leaf) const {
     const Cells<T>& c = task.cells;
-    const T* four = c.fours + cell_four_numbers * ((pose << c.tree.levels) + leaf);
+    const T* simd4 = c.simd4 + cell_simd4_size * ((pose << c.tree.levels) + leaf);
     const Index first = first_of(c.tree, leaf), count = first_of(c.tree, leaf + 1) - first;
     const auto one = [](const T* from) { return *from; };
     for (int lane = 0; lane < count; lane += Lanes<T>::width) {
-      const auto seen =
-          see_cells<Number<T>>(four + lane, Lanes<T>::load, ray, task.rays.near, hit.depth);
+      const auto projected =
+          project_cells<Number<T>>(simd4 + lane, Lanes<T>::load, ray, task.rays.near, hit.depth);
       for (int k = 0; k < Lanes<T>::width; ++k) {
-        if (!(seen.passed >> k & 1)) continue;
-        const int32* cell = c.cells + cell_numbers * (first + lane + k);
+        if (!(projected.passed >> k & 1)) continue;
+        const int32* cell = c.cells + cell_size * (first + lane + k);
         if constexpr (Lanes<T>::width == 1) {
-          meet_cell(task, pose, cell, seen, ray, hit);
+          intersect_cell(task, pose, cell, projected, ray, hit);
         } else {
           // those before it may have brought the hit nearer
-          const auto again = see_cells<T>(four + lane + k, one, ray, task.rays.near, hit.depth);
-          if (again.passed) meet_cell(task, pose, cell, again, ray, hit);
+          const auto again =
+              project_cells<T>(simd4 + lane + k, one, ray, task.rays.near, hit.depth);
+          if (again.passed) intersect_cell(task, pose, cell, again, ray, hit);
         }
       }
     }
@@ -277,13 +281,13 @@ PD_HD void item(const SurfaceRays<T>& t, Index i) {
   const Vec3<T> d = load3(t.rays.directions + pose * t.rays.direction_step, ray);
   // first by the largest component, whose square alone might be beyond all numbers
   const Vec3<T> scaled = (T(1) / largest(d)) * d;
-  const Sight<T> sight = sight_along(load3(t.rays.origins + pose * t.rays.origin_step, ray),
-                                     (T(1) / square_root(dot(scaled, scaled))) * scaled);
+  const RayFrame<T> frame = ray_frame(load3(t.rays.origins + pose * t.rays.origin_step, ray),
+                                      (T(1) / square_root(dot(scaled, scaled))) * scaled);
   Hit<T> hit = {t.rays.far, -1, {T(0), T(0), T(0)}};
   // one that is not finite meets nothing
-  if (dot(sight.o, sight.o) + dot(sight.d, sight.d) <= biggest<T>())
-    visit(t.cells.tree, pose, sight, t.rays.near, hit.depth, T(0),
-          MeetCells<T>{t, pose, sight, hit});
+  if (dot(frame.o, frame.o) + dot(frame.d, frame.d) <= biggest<T>())
+    visit(t.cells.tree, pose, frame, t.rays.near, hit.depth, T(0),
+          IntersectCells<T>{t, pose, frame, hit});
   t.depth[i] = hit.patch < 0 ? T(HUGE_VAL) : hit.depth;
   t.patch[i] = hit.patch;
   for (int k = 0; k < 3; ++k) t.barycentrics[3 * i + k] = hit.b[k];
@@ -291,7 +295,7 @@ PD_HD void item(const SurfaceRays<T>& t, Index i) {
   Vec3<T> point = zero3<T>(), normal = zero3<T>();
   if (hit.patch >= 0) {
     const SurfaceElement<T> s =
-        surface_at(t.sheets, load_sheet(t.sheets, pose, Index(hit.patch)), hit.b);
+        surface_at(t.surface, load_posed_patch(t.surface, pose, Index(hit.patch)), hit.b);
     point = s.point;
     normal = cross(s.tangent[0], s.tangent[1]);
     normal = (T(1) / square_root(dot(normal, normal))) * normal;

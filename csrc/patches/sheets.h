@@ -5,17 +5,17 @@
 
 namespace pd::freeform {
 
-constexpr int sheet_numbers = 45;
+constexpr int posed_patch_size = 45;
 
 // The posed surface patch by patch, its frames multiplied out: with A_k, v_k, e_k and u_k of patches/surface.h,
 //   sum_k b_k (v_k + A_k u_k) = sum_k b_k v_k + sum_{k<j} b_k b_j (A_k - A_j)(V_j - V_k) / 2 + sum_k b_k (h + l_k) A_k N_k,
 // which takes half of the arithmetic at every further place on the patch. V_k and N_k follow, and the bumps by fours.
 template <class T>
-struct PosedSheets {
+struct PosedPatches {
   Lists lists;
   Base<T> base;
   const T *positions, *frames;  // [B, V, 3], [B, V, 3, 3]
-  T* sheets;                    // [B, P, 45]
+  T* patches;                   // [B, P, 45]
 };
 
 // The bumps of every patch by fours.
@@ -23,29 +23,29 @@ template <class T>
 struct GatheredBumps {
   Lists lists;
   Ellipsoids<T> quadrics;
-  T* fours;  // [entries / 4 + P + 1, 10, 4]
+  T* simd4;  // [entries / 4 + P + 1, 10, 4]
 };
 
 // What the surface is evaluated from.
 template <class T>
-struct Sheets {
+struct PosedSurface {
   Lists lists;
-  const T *sheets, *fours;  // of PosedSheets and GatheredBumps
-  T lift;                   // of Base
+  const T *patches, *simd4;  // of PosedSheets and GatheredBumps
+  T lift;                    // of Base
   bool on_surface;
 };
 
 // The corners and checks of cells: heights at rest, then points in every pose.
 template <class T>
 struct GridHeights {
-  Sheets<T> sheets;
+  PosedSurface<T> surface;
   const T* barycentrics;  // [N, 3]
   T* heights;             // [N] m
 };
 
 template <class T>
 struct GridPoints {
-  Sheets<T> sheets;
+  PosedSurface<T> surface;
   const T *barycentrics, *heights;
   T* points;  // [B, N, 3] m
 };
@@ -56,11 +56,11 @@ namespace pd::freeform::inline PD_TARGET {
 
 // Item: a patch of a pose.
 template <class T>
-PD_HD void item(const PosedSheets<T>& t, Index i) {
+PD_HD void item(const PosedPatches<T>& t, Index i) {
   const Index pose = i / t.lists.patches;
   const int32* corner = t.lists.triangles + 3 * (i % t.lists.patches);
   Mat3<T> a[3];
-  T* to = t.sheets + sheet_numbers * i;
+  T* to = t.patches + posed_patch_size * i;
   for (int k = 0; k < 3; ++k) {
     const Index vertex = pose * t.lists.vertices + corner[k];
     a[k] = load9(t.frames, vertex);
@@ -82,21 +82,21 @@ PD_HD void item(const PosedSheets<T>& t, Index i) {
 // Item: a patch.
 template <class T>
 PD_HD void item(const GatheredBumps<T>& t, Index patch) {
-  store_fours(t.fours, t.quadrics, t.lists, patch);
+  store_simd4(t.simd4, t.quadrics, t.lists, patch);
 }
 
 // One patch at rest and in a pose.
 template <class T>
-struct Sheet {
+struct PosedPatch {
   Vec3<T> posed[3], pair[3], director[3];  // of PosedSheets, pair k of corners k and k + 1
   Vec3<T> v[3], n[3];                      // at rest
-  BumpFours<T> bumps;
+  BumpSimd4<T> bumps;
 };
 
 template <class T>
-PD_HD Sheet<T> load_sheet(const Sheets<T>& t, Index pose, Index patch) {
-  Sheet<T> s;
-  const T* from = t.sheets + sheet_numbers * (pose * t.lists.patches + patch);
+PD_HD PosedPatch<T> load_posed_patch(const PosedSurface<T>& t, Index pose, Index patch) {
+  PosedPatch<T> s;
+  const T* from = t.patches + posed_patch_size * (pose * t.lists.patches + patch);
   for (int k = 0; k < 3; ++k) {
     s.posed[k] = load3(from, k);
     s.pair[k] = load3(from, 3 + k);
@@ -104,36 +104,37 @@ PD_HD Sheet<T> load_sheet(const Sheets<T>& t, Index pose, Index patch) {
     s.v[k] = load3(from, 9 + k);
     s.n[k] = load3(from, 12 + k);
   }
-  s.bumps = {t.fours + bump_numbers * first_four(t.lists, patch), fours_of(t.lists, patch)};
+  s.bumps = {t.simd4 + bump_simd4_size * first_simd4(t.lists, patch), simd4_count(t.lists, patch)};
   return s;
 }
 
 template <class T>
 PD_HD void item(const GridHeights<T>& t, Index i) {
-  const Sheet<T> s = load_sheet(t.sheets, 0, t.sheets.lists.sample_patch[i]);
+  const PosedPatch<T> s = load_posed_patch(t.surface, 0, t.surface.lists.sample_patch[i]);
   const T b[3] = {t.barycentrics[3 * i], t.barycentrics[3 * i + 1], t.barycentrics[3 * i + 2]};
   const Vec3<T> flat = blend(b, s.v);
   Vec3<T> x = flat;
-  if (t.sheets.lift != T(0)) {
+  if (t.surface.lift != T(0)) {
     for (int k = 0; k < 3; ++k)
-      add(x, b[k] * (-t.sheets.lift * dot(flat - s.v[k], s.n[k])), s.n[k]);
+      add(x, b[k] * (-t.surface.lift * dot(flat - s.v[k], s.n[k])), s.n[k]);
   }
   t.heights[i] =
-      t.sheets.on_surface ? solve_height(s.bumps, x, blend(b, s.n)) : bumps_at(s.bumps, x).value;
+      t.surface.on_surface ? solve_height(s.bumps, x, blend(b, s.n)) : bumps_at(s.bumps, x).value;
 }
 
 template <class T>
 PD_HD void item(const GridPoints<T>& t, Index i) {
-  const Index pose = i / t.sheets.lists.samples, sample = i % t.sheets.lists.samples;
-  const Sheet<T> s = load_sheet(t.sheets, pose, t.sheets.lists.sample_patch[sample]);
+  const Index pose = i / t.surface.lists.samples, sample = i % t.surface.lists.samples;
+  const PosedPatch<T> s = load_posed_patch(t.surface, pose, t.surface.lists.sample_patch[sample]);
   const T* from = t.barycentrics + 3 * sample;
   const T b[3] = {from[0], from[1], from[2]}, h = t.heights[sample];
   const Vec3<T> flat = blend(b, s.v);
   Vec3<T> point = blend(b, s.posed);
   for (int k = 0; k < 3; ++k) {
     add(point, b[k] * b[(k + 1) % 3], s.pair[k]);
-    const T raised = t.sheets.lift != T(0) ? -t.sheets.lift * dot(flat - s.v[k], s.n[k]) : T(0);
-    add(point, b[k] * (h + raised), s.director[k]);
+    const T lift_height =
+        t.surface.lift != T(0) ? -t.surface.lift * dot(flat - s.v[k], s.n[k]) : T(0);
+    add(point, b[k] * (h + lift_height), s.director[k]);
   }
   store3(t.points, i, point);
 }
@@ -145,7 +146,8 @@ struct SurfaceElement {
 };
 
 template <class T>
-PD_HD SurfaceElement<T> surface_at(const Sheets<T>& t, const Sheet<T>& s, const T (&b)[3]) {
+PD_HD SurfaceElement<T> surface_at(const PosedSurface<T>& t, const PosedPatch<T>& s,
+                                   const T (&b)[3]) {
   const Vec3<T> flat = blend(b, s.v), d = blend(b, s.director);
   Vec3<T> x = flat, along[2] = {s.v[0] - s.v[2], s.v[1] - s.v[2]};
   SurfaceElement<T> e;
@@ -159,22 +161,22 @@ PD_HD SurfaceElement<T> surface_at(const Sheets<T>& t, const Sheet<T>& s, const 
     e.tangent[c] = tangent;
   }
   if (t.lift != T(0)) {
-    T raised[3];
+    T lift_height[3];
     for (int k = 0; k < 3; ++k) {
-      raised[k] = -t.lift * dot(flat - s.v[k], s.n[k]);
-      add(x, b[k] * raised[k], s.n[k]);
-      add(e.point, b[k] * raised[k], s.director[k]);
+      lift_height[k] = -t.lift * dot(flat - s.v[k], s.n[k]);
+      add(x, b[k] * lift_height[k], s.n[k]);
+      add(e.point, b[k] * lift_height[k], s.director[k]);
     }
     for (int c = 0; c < 2; ++c) {
       const Vec3<T> edge = s.v[c] - s.v[2];
-      add(along[c], raised[c], s.n[c]);
-      add(along[c], -raised[2], s.n[2]);
-      add(e.tangent[c], raised[c], s.director[c]);
-      add(e.tangent[c], -raised[2], s.director[2]);
+      add(along[c], lift_height[c], s.n[c]);
+      add(along[c], -lift_height[2], s.n[2]);
+      add(e.tangent[c], lift_height[c], s.director[c]);
+      add(e.tangent[c], -lift_height[2], s.director[2]);
       for (int k = 0; k < 3; ++k) {
-        const T raising = -t.lift * dot(edge, s.n[k]);
-        add(along[c], b[k] * raising, s.n[k]);
-        add(e.tangent[c], b[k] * raising, s.director[k]);
+        const T lift_slope = -t.lift * dot(edge, s.n[k]);
+        add(along[c], b[k] * lift_slope, s.n[k]);
+        add(e.tangent[c], b[k] * lift_slope, s.director[k]);
       }
     }
   }

@@ -15,10 +15,10 @@ struct Shell {
   Vec3<T> v[3], n[3];
   T b[3];
   T lift;
-  Vec3<T> reach[3];  // e_k
-  Vec3<T> edge[2];   // V_d - V_3
-  T raised[3];       // l_k
-  T raising[3][2];   // its derivatives
+  Vec3<T> corner_offset[3];  // e_k
+  Vec3<T> edge[2];           // V_d - V_3
+  T lift_height[3];          // l_k
+  T lift_slope[3][2];        // its derivatives
 };
 
 template <class T>
@@ -33,24 +33,25 @@ PD_HD Shell<T> shell_of(const Base<T>& base, const int32* corners, const T* bary
   for (int d = 0; d < 2; ++d) s.edge[d] = s.v[d] - s.v[2];
   for (int k = 0; k < 3; ++k) {
     const Vec3<T> away[3] = {s.v[0] - s.v[k], s.v[1] - s.v[k], s.v[2] - s.v[k]};
-    s.reach[k] = blend(s.b, away);
-    s.raised[k] = -s.lift * dot(s.reach[k], s.n[k]);
-    for (int d = 0; d < 2; ++d) s.raising[k][d] = -s.lift * dot(s.edge[d], s.n[k]);
+    s.corner_offset[k] = blend(s.b, away);
+    s.lift_height[k] = -s.lift * dot(s.corner_offset[k], s.n[k]);
+    for (int d = 0; d < 2; ++d) s.lift_slope[k][d] = -s.lift * dot(s.edge[d], s.n[k]);
   }
   return s;
 }
 
 template <class T>
 PD_HD Vec3<T> base_point(const Shell<T>& s) {
-  const Vec3<T> raised[3] = {s.v[0] + s.raised[0] * s.n[0], s.v[1] + s.raised[1] * s.n[1],
-                             s.v[2] + s.raised[2] * s.n[2]};
-  return blend(s.b, raised);
+  const Vec3<T> lift_height[3] = {s.v[0] + s.lift_height[0] * s.n[0],
+                                  s.v[1] + s.lift_height[1] * s.n[1],
+                                  s.v[2] + s.lift_height[2] * s.n[2]};
+  return blend(s.b, lift_height);
 }
 
 template <class T>
 PD_HD Vec3<T> base_tangent(const Shell<T>& s, int d) {
-  Vec3<T> p = s.edge[d] + (s.raised[d] * s.n[d] - s.raised[2] * s.n[2]);
-  for (int k = 0; k < 3; ++k) add(p, s.b[k] * s.raising[k][d], s.n[k]);
+  Vec3<T> p = s.edge[d] + (s.lift_height[d] * s.n[d] - s.lift_height[2] * s.n[2]);
+  for (int k = 0; k < 3; ++k) add(p, s.b[k] * s.lift_slope[k][d], s.n[k]);
   return p;
 }
 
@@ -69,16 +70,16 @@ template <class T>
 struct ShellAdjoint {
   Vec3<T> v[3], n[3];
   T b[3];
-  Vec3<T> reach[3], edge[2];
-  T raised[3], raising[3][2];
+  Vec3<T> corner_offset[3], edge[2];
+  T lift_height[3], lift_slope[3][2];
 };
 
 template <class T>
 PD_HD ShellAdjoint<T> no_gradient() {
   ShellAdjoint<T> g;
   for (int k = 0; k < 3; ++k) {
-    g.v[k] = g.n[k] = g.reach[k] = zero3<T>();
-    g.b[k] = g.raised[k] = g.raising[k][0] = g.raising[k][1] = T(0);
+    g.v[k] = g.n[k] = g.corner_offset[k] = zero3<T>();
+    g.b[k] = g.lift_height[k] = g.lift_slope[k][0] = g.lift_slope[k][1] = T(0);
   }
   g.edge[0] = g.edge[1] = zero3<T>();
   return g;
@@ -88,9 +89,9 @@ template <class T>
 PD_HD void base_point_vjp(const Shell<T>& s, const Vec3<T>& grad, ShellAdjoint<T>& g) {
   for (int k = 0; k < 3; ++k) {
     add(g.v[k], s.b[k], grad);
-    add(g.n[k], s.b[k] * s.raised[k], grad);
-    g.raised[k] = g.raised[k] + s.b[k] * dot(grad, s.n[k]);
-    g.b[k] = g.b[k] + dot(grad, s.v[k] + s.raised[k] * s.n[k]);
+    add(g.n[k], s.b[k] * s.lift_height[k], grad);
+    g.lift_height[k] = g.lift_height[k] + s.b[k] * dot(grad, s.n[k]);
+    g.b[k] = g.b[k] + dot(grad, s.v[k] + s.lift_height[k] * s.n[k]);
   }
 }
 
@@ -99,10 +100,10 @@ PD_HD void base_tangent_vjp(const Shell<T>& s, int d, const Vec3<T>& grad, Shell
   add(g.edge[d], grad);
   for (int k = 0; k < 3; ++k) {
     const T chart = T(int(k == d) - int(k == 2)), along = dot(grad, s.n[k]);
-    g.raised[k] = g.raised[k] + chart * along;
-    g.raising[k][d] = g.raising[k][d] + s.b[k] * along;
-    g.b[k] = g.b[k] + s.raising[k][d] * along;
-    add(g.n[k], chart * s.raised[k] + s.b[k] * s.raising[k][d], grad);
+    g.lift_height[k] = g.lift_height[k] + chart * along;
+    g.lift_slope[k][d] = g.lift_slope[k][d] + s.b[k] * along;
+    g.b[k] = g.b[k] + s.lift_slope[k][d] * along;
+    add(g.n[k], chart * s.lift_height[k] + s.b[k] * s.lift_slope[k][d], grad);
   }
 }
 
@@ -124,20 +125,20 @@ PD_HD void director_tangent_vjp(int d, const Vec3<T>& grad, ShellAdjoint<T>& g) 
 template <class T>
 PD_HD void shell_vjp(const Shell<T>& s, ShellAdjoint<T>& g) {
   for (int k = 0; k < 3; ++k) {
-    const T raised = -s.lift * g.raised[k];
-    add(g.reach[k], raised, s.n[k]);
-    add(g.n[k], raised, s.reach[k]);
+    const T lift_height = -s.lift * g.lift_height[k];
+    add(g.corner_offset[k], lift_height, s.n[k]);
+    add(g.n[k], lift_height, s.corner_offset[k]);
     for (int d = 0; d < 2; ++d) {
-      const T raising = -s.lift * g.raising[k][d];
-      add(g.edge[d], raising, s.n[k]);
-      add(g.n[k], raising, s.edge[d]);
+      const T lift_slope = -s.lift * g.lift_slope[k][d];
+      add(g.edge[d], lift_slope, s.n[k]);
+      add(g.n[k], lift_slope, s.edge[d]);
     }
   }
   for (int k = 0; k < 3; ++k) {
     for (int j = 0; j < 3; ++j) {
-      g.b[j] = g.b[j] + dot(g.reach[k], s.v[j] - s.v[k]);
-      add(g.v[j], s.b[j], g.reach[k]);
-      add(g.v[k], -s.b[j], g.reach[k]);
+      g.b[j] = g.b[j] + dot(g.corner_offset[k], s.v[j] - s.v[k]);
+      add(g.v[j], s.b[j], g.corner_offset[k]);
+      add(g.v[k], -s.b[j], g.corner_offset[k]);
     }
   }
   for (int d = 0; d < 2; ++d) {

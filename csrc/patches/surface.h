@@ -44,14 +44,14 @@ struct SurfacePose {
 namespace pd::freeform::inline PD_TARGET {
 
 template <class T>
-PD_HD Vec3<T> arm(const Shell<T>& s, int k, const T& height) {
-  return T(0.5) * s.reach[k] + (height + s.raised[k]) * s.n[k];
+PD_HD Vec3<T> frame_offset(const Shell<T>& s, int k, const T& height) {
+  return T(0.5) * s.corner_offset[k] + (height + s.lift_height[k]) * s.n[k];
 }
 
 // its derivative along the chart
 template <class T>
-PD_HD Vec3<T> arm_tangent(const Shell<T>& s, int k, int d, const T& slope) {
-  return T(0.5) * s.edge[d] + (slope + s.raising[k][d]) * s.n[k];
+PD_HD Vec3<T> frame_offset_tangent(const Shell<T>& s, int k, int d, const T& slope) {
+  return T(0.5) * s.edge[d] + (slope + s.lift_slope[k][d]) * s.n[k];
 }
 
 template <class T>
@@ -66,8 +66,8 @@ PD_HD void item(const Surface<T>& t, Index i) {
     const Index vertex = pose * t.lists.vertices + corner[k];
     const Mat3<T> a = load9(t.frames, vertex);
     v[k] = load3(t.positions, vertex);
-    carried[k] = a * arm(s, k, h);
-    for (int d = 0; d < 2; ++d) turned[d][k] = a * arm_tangent(s, k, d, slope[d]);
+    carried[k] = a * frame_offset(s, k, h);
+    for (int d = 0; d < 2; ++d) turned[d][k] = a * frame_offset_tangent(s, k, d, slope[d]);
   }
   const Vec3<T> sum[3] = {v[0] + carried[0], v[1] + carried[1], v[2] + carried[2]};
   store3(t.points, i, blend(s.b, sum));
@@ -92,8 +92,8 @@ PD_HD void item(const SurfaceSamples<T>& t, Index sample) {
   const T h = t.heights[sample];
   const T slope[2] = {t.slopes[2 * sample], t.slopes[2 * sample + 1]};
   ShellAdjoint<T> g = no_gradient<T>();
-  Vec3<T> to_arm[3], to_tangent[3][2];
-  for (int k = 0; k < 3; ++k) to_arm[k] = to_tangent[k][0] = to_tangent[k][1] = zero3<T>();
+  Vec3<T> to_offset[3], to_tangent[3][2];
+  for (int k = 0; k < 3; ++k) to_offset[k] = to_tangent[k][0] = to_tangent[k][1] = zero3<T>();
   for (Index pose = 0; pose < t.batch; ++pose) {
     const Index i = pose * t.lists.samples + sample;
     const Vec3<T> point = load3(t.grad_points, i);
@@ -101,29 +101,29 @@ PD_HD void item(const SurfaceSamples<T>& t, Index sample) {
     for (int k = 0; k < 3; ++k) {
       const Index vertex = pose * t.lists.vertices + corner[k];
       const Mat3<T> a = load9(t.frames, vertex);
-      const Vec3<T> at = load3(t.positions, vertex) + a * arm(s, k, h);
-      add(to_arm[k], corner_gradient(s.b[k], k, point, tangent[0], tangent[1]) * a);
+      const Vec3<T> at = load3(t.positions, vertex) + a * frame_offset(s, k, h);
+      add(to_offset[k], corner_gradient(s.b[k], k, point, tangent[0], tangent[1]) * a);
       g.b[k] = g.b[k] + dot(point, at);
       for (int d = 0; d < 2; ++d) {
         const Vec3<T> pulled = tangent[d] * a;
         add(to_tangent[k][d], s.b[k], pulled);
-        g.b[k] = g.b[k] + dot(pulled, arm_tangent(s, k, d, slope[d]));
+        g.b[k] = g.b[k] + dot(pulled, frame_offset_tangent(s, k, d, slope[d]));
       }
     }
   }
   T to_height = T(0), to_slope[2] = {T(0), T(0)};
   for (int k = 0; k < 3; ++k) {
-    const T along = dot(to_arm[k], s.n[k]);
+    const T along = dot(to_offset[k], s.n[k]);
     to_height = to_height + along;
-    g.raised[k] = along;
-    add(g.reach[k], T(0.5), to_arm[k]);
-    add(g.n[k], h + s.raised[k], to_arm[k]);
+    g.lift_height[k] = along;
+    add(g.corner_offset[k], T(0.5), to_offset[k]);
+    add(g.n[k], h + s.lift_height[k], to_offset[k]);
     for (int d = 0; d < 2; ++d) {
       const T steeper = dot(to_tangent[k][d], s.n[k]);
       to_slope[d] = to_slope[d] + steeper;
-      g.raising[k][d] = steeper;
+      g.lift_slope[k][d] = steeper;
       add(g.edge[d], T(0.5), to_tangent[k][d]);
-      add(g.n[k], slope[d] + s.raising[k][d], to_tangent[k][d]);
+      add(g.n[k], slope[d] + s.lift_slope[k][d], to_tangent[k][d]);
     }
   }
   shell_vjp(s, g);
@@ -150,9 +150,10 @@ PD_HD void item(const SurfacePose<T>& t, Index i) {
       const Vec3<T> g =
           corner_gradient(s.b[k], k, load3(t.grad_points, row), tangent[0], tangent[1]);
       add(position, g);
-      add_outer(frame, T(1), g, arm(s, k, t.heights[sample]));
+      add_outer(frame, T(1), g, frame_offset(s, k, t.heights[sample]));
       for (int d = 0; d < 2; ++d)
-        add_outer(frame, s.b[k], tangent[d], arm_tangent(s, k, d, t.slopes[2 * sample + d]));
+        add_outer(frame, s.b[k], tangent[d],
+                  frame_offset_tangent(s, k, d, t.slopes[2 * sample + d]));
     }
   }
   store3(t.positions, i, position);

@@ -17,11 +17,11 @@
   X(Surface)                 \
   X(SurfaceSamples)          \
   X(SurfacePose)             \
-  X(SolidField)              \
-  X(SolidSamples)            \
-  X(SolidVertices)           \
-  X(SolidEntries)            \
-  X(SolidQuadrics)           \
+  X(PaperFieldValues)        \
+  X(PaperFieldSamples)       \
+  X(PaperFieldVertices)      \
+  X(PaperFieldEntries)       \
+  X(PaperFieldQuadrics)      \
   X(Deformation)             \
   X(DeformationGradients)    \
   X(DeformationPoints)       \
@@ -31,7 +31,7 @@
   X(FramesWeights)           \
   X(CellBoxes)               \
   X(JoinedBoxes)             \
-  X(PosedSheets)             \
+  X(PosedPatches)            \
   X(GatheredBumps)           \
   X(GridHeights)             \
   X(GridPoints)              \

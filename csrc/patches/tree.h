@@ -54,34 +54,34 @@ PD_HD Index first_of(const Tree<T>& t, Index leaf) {
 // Nodes are numbered from the root, 1; below n lie 2 n and 2 n + 1, and below those 4 n up to 4 n + 3, which are kept together.
 // There is no node 0.
 template <class T>
-PD_HD Index numbers_of(const Tree<T>& t) {
+PD_HD Index tree_size(const Tree<T>& t) {
   return 24 * greater(Index(1), Index(1) << t.levels >> 1);
 }
 
-PD_HD Index place_of(Index node) { return 24 * (node / 4) + node % 4; }
+PD_HD Index node_offset(Index node) { return 24 * (node / 4) + node % 4; }
 
 template <class T>
 PD_HD Box<T> load_box(const T* boxes, Index node) {
-  const T* from = boxes + place_of(node);
+  const T* from = boxes + node_offset(node);
   return {{from[0], from[4], from[8]}, {from[12], from[16], from[20]}};
 }
 
 template <class T>
 PD_HD void store_box(T* boxes, Index node, const Box<T>& box) {
   const T numbers[6] = {box.low.x, box.low.y, box.low.z, box.high.x, box.high.y, box.high.z};
-  for (int k = 0; k < 6; ++k) boxes[place_of(node) + 4 * k] = numbers[k];
+  for (int k = 0; k < 6; ++k) boxes[node_offset(node) + 4 * k] = numbers[k];
 }
 
 template <class T>
 PD_HD void store_leaf(const Tree<T>& t, Index pose, Index leaf, const Box<T>& box) {
-  store_box(t.boxes + pose * numbers_of(t), (Index(1) << t.levels) + leaf, box);
+  store_box(t.boxes + pose * tree_size(t), (Index(1) << t.levels) + leaf, box);
 }
 
 // Item: an inner node of a pose at a level, 0 the root, from its children.
 template <class T>
 PD_HD void item(const JoinedBoxes<T>& t, Index i) {
   const Index pose = i >> t.level, node = (Index(1) << t.level) + i - (pose << t.level);
-  T* boxes = t.tree.boxes + pose * numbers_of(t.tree);
+  T* boxes = t.tree.boxes + pose * tree_size(t.tree);
   Box<T> box = load_box(boxes, 2 * node);
   const Box<T> other = load_box(boxes, 2 * node + 1);
   join(box, other.low, other.high);
@@ -98,12 +98,12 @@ PD_HD T inverse_of(const T& a) {
 
 // A ray and two directions across it (Duff et al. 2017): what meets it has no component along either.
 template <class T>
-struct Sight {
+struct RayFrame {
   Vec3<T> o, d, u, v, inverse;  // of d, component by component
 };
 
 template <class T>
-PD_HD Sight<T> sight_along(const Vec3<T>& o, const Vec3<T>& d) {
+PD_HD RayFrame<T> ray_frame(const Vec3<T>& o, const Vec3<T>& d) {
   const T sign = d.z < T(0) ? T(-1) : T(1), a = T(-1) / (sign + d.z), b = d.x * d.y * a;
   return {o,
           d,
@@ -115,8 +115,8 @@ PD_HD Sight<T> sight_along(const Vec3<T>& o, const Vec3<T>& d) {
 // Which of four boxes, larger by `margin`, a ray enters before `far`, as bits, and where: never later than that, for the rounding of
 // six products. A box around nothing has its faces the wrong way round, and no ray enters it.
 template <class T>
-PD_HD unsigned enter_four(const T* boxes, const Sight<T>& ray, const T& near, const T& far,
-                          const T& margin, T (&entry)[4]) {
+PD_HD unsigned intersect_boxes(const T* boxes, const RayFrame<T>& ray, const T& near, const T& far,
+                               const T& margin, T (&entry)[4]) {
   using L = Lanes<T>;
   using R = Number<T>;
   constexpr T rounding = T(4) * epsilon<T>();
@@ -144,14 +144,14 @@ PD_HD unsigned enter_four(const T* boxes, const Sight<T>& ray, const T& near, co
 
 // Nodes still to be looked into, the nearest on top.
 template <class T>
-struct Waiting {
+struct NodeStack {
   int32 node[64];
   T entry[64];
   int count;
 };
 
 template <class T>
-PD_HD void put(Waiting<T>& w, int base, Index node, const T& entry) {
+PD_HD void push(NodeStack<T>& w, int base, Index node, const T& entry) {
   int at = w.count++;
   for (; at > base && w.entry[at - 1] < entry; --at) {
     w.node[at] = w.node[at - 1];
@@ -164,21 +164,22 @@ PD_HD void put(Waiting<T>& w, int base, Index node, const T& entry) {
 // Calls `meet` with the leaves whose boxes, larger by `margin`, a ray enters before `far`, which may shrink meanwhile; about from
 // near to far.
 template <class T, class Meet>
-PD_HD void visit(const Tree<T>& t, Index pose, const Sight<T>& ray, const T& near, const T& far,
+PD_HD void visit(const Tree<T>& t, Index pose, const RayFrame<T>& ray, const T& near, const T& far,
                  const T& margin, const Meet& meet) {
-  const T* boxes = t.boxes + pose * numbers_of(t);
+  const T* boxes = t.boxes + pose * tree_size(t);
   const Index leaves = Index(1) << t.levels;
-  Waiting<T> w;
+  NodeStack<T> w;
   w.count = 0;
   // steps of two levels end at the leaves
   for (Index node = 1 + t.levels % 2; node <= 1 + 2 * (t.levels % 2); ++node)
-    put(w, w.count, node, near);
+    push(w, w.count, node, near);
   while (w.count > 0) {
     Index node = w.node[--w.count];
     if (w.entry[w.count] > far) continue;
     while (node < leaves) {
       T entry[4];
-      const unsigned in = enter_four(boxes + place_of(4 * node), ray, near, far, margin, entry);
+      const unsigned in =
+          intersect_boxes(boxes + node_offset(4 * node), ray, near, far, margin, entry);
       // the nearest at once; there is no node 0
       Index next = 0;
       T nearest = T(0);
@@ -190,11 +191,11 @@ PD_HD void visit(const Tree<T>& t, Index pose, const Sight<T>& ray, const T& nea
           next = found;
           nearest = entry[k];
         } else if (entry[k] < nearest) {
-          put(w, base, next, nearest);
+          push(w, base, next, nearest);
           next = found;
           nearest = entry[k];
         } else {
-          put(w, base, found, entry[k]);
+          push(w, base, found, entry[k]);
         }
       }
       node = next;
