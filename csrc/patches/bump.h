@@ -1,7 +1,9 @@
-// One perturbation R = a [Q]_+^3 with Q = 1 - |y|^2, y = M (x - c): value, derivatives and adjoint side by side.
+// One perturbation R = a [Q]_+^3 with Q = 1 - |y|^2 and y = M (x - c): value, derivatives and
+// adjoint side by side.
 //
-// R is the soft-object kernel of Wyvill et al. (1986) over an ellipsoid: a at the centre, 27/64 a at half the radius, C2 across
-// the boundary, where it ends. |dR/dr| is at most 96 / (25 sqrt 5) a over the radius.
+// R is the soft-object kernel of Wyvill et al. (1986) over an ellipsoid. It is a at the centre,
+// 27/64 a at half the radius, and C2 across the boundary, where it ends. |dR/dr| is at most 96 /
+// (25 sqrt 5) a over the radius.
 //   grad R = -6 a q^2 M^T y,   Hess R w = M^T (24 a q (y.z) y - 6 a q^2 z),   z = M w,   q = [Q]_+
 #pragma once
 #include "patches/fours.h"
@@ -51,7 +53,8 @@ struct Field {
   Vec3<T> gradient;
 };
 
-// The sum over the quadrics of a patch. Those that x lies outside of are left out, not added as zeros.
+// The sum over the quadrics of a patch. Quadrics that do not contain x are skipped instead of added
+// as zeros.
 template <class T>
 PD_HD Field<T> bumps_at(const Ellipsoids<T>& of, const Lists& lists, Index patch,
                         const Vec3<T>& x) {
@@ -88,7 +91,8 @@ PD_HD void bounds_of(const PatchBumps<T>& b, T& low, T& high) {
   }
 }
 
-// The same by fours, number by number, so that a processor takes four at once; what is missing lies far away.
+// The same bumps in groups of four, component by component, for SIMD lanes. Missing bumps of the
+// last group lie far away.
 template <class T>
 struct BumpSimd4 {
   const T* numbers;  // [count, 10, 4]
@@ -97,7 +101,8 @@ struct BumpSimd4 {
 
 constexpr int bump_simd4_size = 40;
 
-// Where the fours of a patch begin: they fit in before those of the next, with less than one to spare for each patch.
+// Index of a patch's first group. Every patch reserves room for its bumps plus at most one partial
+// group.
 PD_HD Index first_simd4(const Lists& lists, Index patch) {
   return lists.patch_start[patch] / 4 + patch;
 }
@@ -136,7 +141,7 @@ PD_HD Field<T> bumps_at(const BumpSimd4<T>& b, const Vec3<T>& x) {
       const R none = R(T(0)), q = R(T(1)) - dot(y, y);
       const auto inside = q > none;
       if (bits_of(inside) == 0) continue;
-      // what is not finite counts only where it reaches
+      // infinite or NaN values count only inside the ellipsoid
       const R steep = L::load(m) * (q * q);
       const Vec3<R> slope = steep * transposed_times(factor, y);
       value = value + select(inside, steep * q, none);
@@ -156,7 +161,7 @@ PD_HD void bounds_of(const BumpSimd4<T>& b, T& low, T& high) {
   }
 }
 
-// Hess R w of the sum over the quadrics of a patch
+// Hess R w, summed over the quadrics of a patch.
 template <class T>
 PD_HD Vec3<T> bumps_hessian_product(const Ellipsoids<T>& of, const Lists& lists, Index patch,
                                     const Vec3<T>& x, const Vec3<T>& w) {
@@ -173,7 +178,7 @@ PD_HD Vec3<T> bumps_hessian_product(const Ellipsoids<T>& of, const Lists& lists,
   return sum;
 }
 
-// Gradient of mu R(x) + grad R(x) . w for the ten numbers of a quadric.
+// Gradient of mu R(x) + grad R(x) . w with respect to the ten numbers of a quadric.
 template <class T>
 struct BumpAdjoint {
   T a;

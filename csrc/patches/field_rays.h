@@ -1,10 +1,14 @@
-// The first point of the published field (patches/literal.h) on each ray: the least t with F' >= 0 over all patches.
+// First intersection of each ray with the published field (patches/literal.h): the least t with F'
+// >= 0 over all patches.
 //
-// Along a ray each plane is a line in t and each Q_i a quadratic, positive between its roots if it is an ellipsoid. Between the
-// roots of the quadrics, and of the differences of planes in the literal reading, F' is one polynomial of degree 6. In Bernstein
-// form over such a piece it has no root where its coefficients are all negative; else the piece is halved (de Casteljau), the near
-// half first. Nothing is missed, however thin; where F' only touches 0, a hit may be reported. A tree of boxes around the solids
-// spares a ray those that it passes.
+// Along a ray, each plane is linear in t and each Q_i is quadratic; for an ellipsoid it is positive
+// between its roots. Between the roots of the quadrics, F' is one polynomial of degree 6. In the
+// literal reading, the differences of planes add breaks.
+//
+// A polynomial has no root in an interval if all its Bernstein coefficients are negative. Otherwise
+// the interval is halved (de Casteljau), the near half first. No intersection is missed, however
+// thin; where F' only touches 0, a hit may be reported. A tree of boxes around the solids skips the
+// patches that a ray misses.
 #pragma once
 #include "patches/literal.h"
 #include "patches/tree.h"
@@ -23,7 +27,7 @@ struct FieldRays {
   PaperField<T> solid;  // without points
   Tree<T> tree;
   const int32* order;
-  bool exhaustive;  // tries every patch
+  bool exhaustive;  // tests every patch
   Rays<T> rays;
   T* depth;      // [B, R] m, infinite without a hit
   int32* patch;  // [B, R], -1 without a hit
@@ -46,7 +50,7 @@ PD_HD T value_at(const Quadratic<T>& f, const T& t) {
   return multiply_add(t, multiply_add(t, f.c2, f.c1), f.c0);
 }
 
-// One patch seen along a ray, t counted from the foot of its first corner.
+// One patch along a ray; t starts at the foot of its first corner.
 template <class T>
 struct Profile {
   Vec3<T> o, d;
@@ -77,13 +81,13 @@ PD_HD Quadratic<T> quadric_along(const PaperField<T>& s, const Profile<T>& p, In
   return {quadric_value(w, x), mixed, quadric_value(w, d)};
 }
 
-// `next`, or t if it lies between `after` and `next`. Not for NaN.
+// Returns t if it lies between `after` and `next`, else `next`. Inputs must not be NaN.
 template <class T>
 PD_HD T earlier_root(const T& t, const T& after, const T& next) {
   return t > after && t < next ? t : next;
 }
 
-// Where the polynomial that F' is now ends.
+// End of the interval on which F' is one polynomial.
 template <class T>
 PD_HD T next_break(const PaperField<T>& s, const Profile<T>& p, const T& after, const T& last) {
   T next = last;
@@ -103,7 +107,7 @@ PD_HD T next_break(const PaperField<T>& s, const Profile<T>& p, const T& after, 
   return next;
 }
 
-// Narrows [from, to] to where the line is not negative; whether anything is left.
+// Clips [from, to] to where the line is not negative; returns whether anything remains.
 template <class T>
 PD_HD bool clip_to_line(const T (&line)[2], T& from, T& to) {
   if (line[1] == T(0)) return line[0] >= T(0);
@@ -116,13 +120,14 @@ PD_HD bool clip_to_line(const T (&line)[2], T& from, T& to) {
   return from <= to;
 }
 
-// Bernstein coefficients over [from, to] of the parabola's cube, times a.
+// Adds a times the Bernstein coefficients of the cubed quadratic over [from, to].
 template <class T>
 PD_HD void add_cubed_quadratic(const Quadratic<T>& q, const T& from, const T& to, const T& a,
                                T (&sum)[degree + 1]) {
   const T x = value_at(q, from), z = value_at(q, to);
   const T y =
-      T(2) * x + multiply_add(T(2) * from, q.c2, q.c1) * (to - from);  // twice the middle one
+      // twice the middle coefficient
+      T(2) * x + multiply_add(T(2) * from, q.c2, q.c1) * (to - from);
   const T cube[degree + 1] = {x * x * x,
                               T(3) * x * x * y / T(6),
                               T(3) * x * (y * y + x * z) / T(15),
@@ -133,16 +138,16 @@ PD_HD void add_cubed_quadratic(const Quadratic<T>& q, const T& from, const T& to
   for (int n = 0; n <= degree; ++n) sum[n] = multiply_add(a, cube[n], sum[n]);
 }
 
-// Coefficients over the part [from, to] of [0, 1].
+// Bernstein coefficients over the subinterval [from, to] of [0, 1].
 template <class T>
 PD_HD void restrict_bernstein(const T (&whole)[degree + 1], const T& from, const T& to,
                               T (&c)[degree + 1]) {
   for (int n = 0; n <= degree; ++n) c[n] = whole[n];
-  for (int round = degree; round > 0; --round)  // keeps [0, to]
+  for (int round = degree; round > 0; --round)  // restricts to [0, to]
     for (int n = degree; n > degree - round; --n)
       c[n] = multiply_add(to, c[n] - c[n - 1], c[n - 1]);
   const T cut = from / to;
-  for (int round = degree; round > 0; --round)  // of that, [from, to]
+  for (int round = degree; round > 0; --round)  // and then to [from, to]
     for (int n = 0; n < round; ++n) c[n] = multiply_add(cut, c[n + 1] - c[n], c[n]);
 }
 
@@ -169,7 +174,7 @@ PD_HD bool first_nonnegative(const T (&whole)[degree + 1], T& s) {
       size = T(0.5) * size;
       continue;
     }
-    ++place;  // the next interval that begins where this one ends
+    ++place;  // the next interval, which begins where this one ends
     while (depth > 0 && place % 2 == 0) {
       place /= 2;
       --depth;
@@ -220,14 +225,15 @@ PD_HD bool first_entry(const PaperField<T>& s, const Profile<T>& p, T from, T to
   }
 }
 
-// Where Q may be positive for all its rounding, and the most that it may be; nothing where it is positive nowhere.
+// Bounds of the region where Q may be positive, rounding included, and its maximum there.
 struct QuadricExtent {
   bool bounded;
   double most;
   Vec3<double> centre, half;
 };
 
-// Q = most - (x - c)^T A (x - c) for an ellipsoid, which reaches sqrt(most A^-1_ii) from c along axis i.
+// For an ellipsoid, Q = most - (x - c)^T A (x - c); it reaches sqrt(most A^-1_ii) from c along axis
+// i.
 template <class T>
 PD_HD QuadricExtent extent_of(const T* w) {
   const auto mean = [&](int r, int c) {
@@ -241,7 +247,7 @@ PD_HD QuadricExtent extent_of(const T* w) {
       {cross(a.row[1], a.row[2]), cross(a.row[2], a.row[0]), cross(a.row[0], a.row[1])}};
   const double minor = cofactor.row[2].z, det = dot(a.row[0], cofactor.row[0]);
   QuadricExtent e = {false, 0.0, zero3<double>(), zero3<double>()};
-  // a cone, a hyperboloid, or too nearly a cylinder
+  // a cone, a hyperboloid, or nearly a cylinder
   if (!(a.row[0].x > 0.0 && minor > 0.0 && det > 1e-9 * a.row[0].x * a.row[1].y * a.row[2].z))
     return e;
   const double inverse[3] = {cofactor.row[0].x / det, cofactor.row[1].y / det, minor / det};
@@ -263,8 +269,9 @@ PD_HD QuadricExtent extent_of(const T* w) {
   return e;
 }
 
-// Where the field of a patch may not be negative. With R <= r, the sum of what the positive quadrics are at most: clipped, the
-// prism over the triangle from -tau to tau + r; literal, that from -tau to tau, and wherever a positive quadric is.
+// Bounds of the region where the field of a patch may be nonnegative. Let r bound the sum of the
+// positive quadrics. Clipped: the prism over the triangle from -tau to tau + r. Literal: the prism
+// from -tau to tau, and every positive quadric.
 template <class T>
 PD_HD Box<double> field_box(const PaperField<T>& s, Index pose, Index patch) {
   Vec3<double> v[3];
@@ -277,7 +284,7 @@ PD_HD Box<double> field_box(const PaperField<T>& s, Index pose, Index patch) {
   const double most = biggest<double>();
   Box<double> box = {{most, most, most}, {-most, -most, -most}};
   double risen = 0.0;
-  // without a plane, or not finite: no ray meets it
+  // degenerate or not finite: no ray intersects it
   if (!(dot(normal, normal) > 0.5)) return box;
   bool bounded = true;
   for (int32 e = s.lists.patch_start[patch]; e < s.lists.patch_start[patch + 1]; ++e) {
@@ -309,7 +316,7 @@ PD_HD Vec3<T> rounded(const Vec3<double>& a) {
   return {T(a.x), T(a.y), T(a.z)};
 }
 
-// Item: a leaf of a pose.
+// Item: one leaf of one pose.
 template <class T>
 PD_HD void item(const FieldBoxes<T>& t, Index i) {
   const Index pose = i >> t.tree.levels, leaf = i - (pose << t.tree.levels);
@@ -323,7 +330,8 @@ PD_HD void item(const FieldBoxes<T>& t, Index i) {
   store_leaf(t.tree, pose, leaf, {rounded<T>(box.low), rounded<T>(box.high)});
 }
 
-// Of the patches that a ray enters, the first, and of those at the same depth the last: whatever their order, the same.
+// Keeps the first patch that a ray enters; at equal depth, the one with the largest number,
+// whatever their order.
 template <class T>
 struct EnterPatch {
   const FieldRays<T>& task;
@@ -341,7 +349,7 @@ struct EnterPatch {
     const Profile<T> p = profile_of(s, pose, patch, multiply_add(foot, ray.d, ray.o), ray.d);
     T reach = T(0);
     for (int k = 0; k < 5; ++k) reach = reach + absolute(p.line[k][0]) + absolute(p.line[k][1]);
-    if (!(reach <= biggest<T>())) return;  // collapsed, or not finite
+    if (!(reach <= biggest<T>())) return;  // degenerate, or not finite
     T at;
     if (!first_entry(s, p, task.rays.near - foot, task.rays.far - foot, at)) return;
     const T t = at + foot;
@@ -361,7 +369,7 @@ struct EnterLeaf {
   }
 };
 
-// Item: a ray in a pose.
+// Item: one ray in one pose.
 template <class T>
 PD_HD void item(const FieldRays<T>& t, Index i) {
   const Index pose = i / t.rays.count, ray = i % t.rays.count;

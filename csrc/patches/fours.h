@@ -1,6 +1,5 @@
-// Four numbers of each kind side by side in memory: a processor takes as many of them at once as one short vector holds, a
-// GPU, whose threads are its lanes, one after another.
-//
+// Groups of four values, stored component by component. A CPU processes as many at once as a SIMD
+// register of 16 bytes holds. A GPU, whose threads are its lanes, processes them one after another.
 //   for (int lane = 0; lane < 4; lane += Lanes<T>::width) { Number<T> a = Lanes<T>::load(from + lane); ... }
 #pragma once
 #include "patches/views.h"
@@ -57,7 +56,7 @@ struct Lanes {
   }
 };
 
-// Bit k: whether it holds in lane k.
+// Bit k is set if the mask holds in lane k.
 template <class T, int W>
 PD_HD unsigned bits_of(const Mask<T, W>& mask) {
 #if defined(__SSE2__)

@@ -1,13 +1,16 @@
-// How a pose turns and stretches the surface: a deformation gradient for each patch, a frame for each vertex.
+// Rotation and stretch of the posed surface: a deformation gradient for each patch, a frame for
+// each vertex.
 //
-// Patch p has a constraint of four vertices, its corners and an apex: G_p = Ds Dm^-1, Ds = (x_2 - x_1, x_3 - x_1, x_apex - x_1).
-// Of G = U diag(s) V^T, det U = det V = +1, the frames take
+// Patch p has a constraint of four vertices, its corners and an apex:
+//   G_p = Ds Dm^-1,   Ds = (x_2 - x_1, x_3 - x_1, x_apex - x_1).
+// With G = U diag(s) V^T and det U = det V = +1, the frames use
 //   G~ = U diag(f(s)) V^T,   f(s) = min(max(|s|, lower), upper),
-// so that nothing is turned inside out or flattened; G itself where that changes nothing. The frame of a vertex is the mean of
-// G~ over the patches around it, weighted by their area at rest.
+// which prevents inversion and flattening; where f changes nothing, they use G itself. The frame of
+// a vertex is the mean of G~ over its patches, weighted by rest area.
 //
-// With P = U^T dG V, the derivative of G~ is U K V^T, where for each pair i, j the symmetric part of P is scaled by
-// (f_i - f_j) / (s_i - s_j) and its skew part by (f_i + f_j) / (s_i + s_j): a self-adjoint map, so it serves as the adjoint.
+// With P = U^T dG V, the derivative of G~ is U K V^T. For each pair i, j, K scales the symmetric
+// part of P by (f_i - f_j) / (s_i - s_j) and its skew part by (f_i + f_j) / (s_i + s_j). The map is
+// self-adjoint, so it also serves as the adjoint.
 #pragma once
 #include "math/svd.h"
 #include "patches/views.h"
@@ -23,12 +26,12 @@ template <class T>
 struct Deformation {
   Constraints constraints;
   const T *positions, *inverse_rest;  // [B, U, 3] m, [P, 3, 3] 1/m
-  const T* fallback;  // [B, P, 3, 3] for collapsed constraints, or null: their nearest rotation
+  const T* fallback;  // [B, P, 3, 3] for collapsed constraints; null: their nearest rotation
   Clamp<T> clamp;
   T* out;  // [B, P, 3, 3]
 };
 
-// The gradient for G of each constraint, and for what stands in for it.
+// The gradients with respect to each constraint's G and to its fallback.
 template <class T>
 struct DeformationGradients {
   Constraints constraints;
@@ -36,7 +39,7 @@ struct DeformationGradients {
   bool has_fallback;
   Clamp<T> clamp;
   const T* grad;            // [B, P, 3, 3]
-  T *gradients, *fallback;  // [B, P, 3, 3]; no fallback: null
+  T *gradients, *fallback;  // [B, P, 3, 3]; fallback may be null
 };
 
 template <class T>
@@ -80,7 +83,8 @@ struct FramesWeights {
 
 namespace pd::freeform::inline PD_TARGET {
 
-// Below it the second singular value gives no direction any more: float32 knows G to 1e-7 of itself.
+// Below this value, the second singular value no longer defines a direction: float32 resolves G to
+// a relative 1e-7.
 template <class T>
 PD_HD constexpr T collapsed() {
   return T(1e-4);
@@ -119,7 +123,7 @@ PD_HD bool within(const Clamp<T>& clamp, const SignedSvd<T>& d) {
   return d.s[2] >= clamp.lower && d.s[0] <= clamp.upper;
 }
 
-// Not `<`: NaN has no direction either.
+// not `<`: NaN counts as collapsed too
 template <class T>
 PD_HD bool has_collapsed(const SignedSvd<T>& d) {
   return !(d.s[1] >= collapsed<T>());
@@ -158,7 +162,7 @@ PD_HD Mat3<T> clamped_differential(const SignedSvd<T>& d, const Clamp<T>& clamp,
   for (int i = 0; i < 3; ++i) {
     for (int j = i + 1; j < 3; ++j) {
       const T gap = d.s[i] - d.s[j];
-      // nearly equal singular values: the quotient is the slope, but for its rounding
+      // for nearly equal singular values, the quotient is the slope up to rounding
       const T even = gap > square_root(epsilon<T>()) * d.s[0] ? (f[i] - f[j]) / gap
                                                               : clamped_slope(clamp, d.s[j]);
       const T odd = (f[i] + f[j]) / (d.s[i] + d.s[j]);
@@ -180,7 +184,8 @@ PD_HD void item(const DeformationGradients<T>& t, Index i) {
   const Mat3<T> grad = load9(t.grad, i);
   Mat3<T> out = zero9<T>(), fallback = zero9<T>();
   if (has_collapsed(d)) {
-    // without a fallback the rotation of a collapsed constraint counts as constant: its derivative has no bound
+    // Without a fallback, the rotation of a collapsed constraint counts as constant, since its
+    // derivative is unbounded.
     fallback = grad;
   } else {
     out = within(t.clamp, d) ? grad : clamped_differential(d, t.clamp, grad);

@@ -1,10 +1,11 @@
 // The height of the surface over its base, h = sum_i R_i(x), and its derivatives along the chart.
 //
-// x = P(b) is a point of the base surface, or, measured on the surface itself, x = P + h D: then h is the root of
+// By default x = P(b) is a point of the base surface. Measured on the surface itself, x = P + h D,
+// and h is the root of
 //   g(h) = h - sum_i R_i(P + h D),
-// the only one where sum_i 96/(25 sqrt 5) |a_i| |M_i D| < 1. With F_d = dD/db_d,
-//   dh/db_d = grad R . (dP/db_d + h F_d) / (1 - grad R . D),
-// and without the terms in D and F where x is P.
+// which is unique if sum_i 96/(25 sqrt 5) |a_i| |M_i D| < 1. With F_d = dD/db_d,
+//   dh/db_d = grad R . (dP/db_d + h F_d) / (1 - grad R . D);
+// the terms in D and F vanish where x is P.
 #pragma once
 #include "patches/bump.h"
 #include "patches/shell.h"
@@ -24,8 +25,9 @@ struct Height {
 
 constexpr int probe_size = 7;
 
-// Gradients of each sample for its barycentric coordinates and corners, and what its quadrics need: x, w and mu, where the
-// loss changes with a quadric as mu R(x) + grad R(x) . w does.
+// Gradients of each sample with respect to its barycentric coordinates and corners. The probe (x,
+// w, mu) of a sample gives the gradients of its quadrics: the loss changes as mu R(x) + grad R(x) .
+// w.
 template <class T>
 struct HeightSamples {
   Lists lists;
@@ -38,7 +40,7 @@ struct HeightSamples {
   T* probes;             // [S, 7]
 };
 
-// Gradients of each entry for its quadric: the sum over the samples of its patch.
+// Gradients of each entry with respect to its quadric, summed over the samples of its patch.
 template <class T>
 struct HeightEntries {
   Lists lists;
@@ -47,7 +49,7 @@ struct HeightEntries {
   T* partial;  // [entries, 10]
 };
 
-// The sum over the entries of each quadric.
+// Sums over the entries of each quadric.
 template <class T>
 struct HeightQuadrics {
   Lists lists;
@@ -59,7 +61,7 @@ struct HeightQuadrics {
 
 namespace pd::freeform::inline PD_TARGET {
 
-// Newton's method between bounds that hold a root, halving them where a step leaves them.
+// Newton's method in a bracket of the root, with bisection where a step leaves the bracket.
 template <class T, class Bumps>
 PD_HD T solve_height(const Bumps& bumps, const Vec3<T>& p, const Vec3<T>& d) {
   T low = T(0), high = T(0);
@@ -112,7 +114,7 @@ PD_HD void item(const HeightSamples<T>& t, Index sample) {
   const T scale = t.on_surface ? T(1) / (T(1) - dot(r.gradient, d)) : T(1);
   const T slope_grads[2] = {t.grad_slopes[2 * sample], t.grad_slopes[2 * sample + 1]};
 
-  // w: what grad R is multiplied by in the loss
+  // w: the factor of grad R in the loss
   Vec3<T> w = zero3<T>();
   T steepness = T(0), with_height = t.grad_heights[sample];
   for (int c = 0; c < 2; ++c) {

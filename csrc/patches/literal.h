@@ -1,9 +1,12 @@
-// The field of one patch as published (Vyatkin and Dolgovesov 2023): F' = F + sum_i R_i, positive inside, where F = min(p_1 .. p_5)
-// is the solid between five planes and R_i = a_i [Q_i]_+^3 a quadric's perturbation, Q(x) = (x, 1)^T W (x, 1). Over the triangle
-// (v_1, v_2, v_3) of unit normal n, indices mod 3,
-//   p_k(x) = m_k . (x - v_{k+1}),  m_k = n x (v_{k+2} - v_{k+1}) / |.|   for k = 1..3, the clip planes, which face inwards,
-//   p_4(x) = tau + n . (x - v_1),  p_5(x) = tau - n . (x - v_1),         the base planes, tau half the thickness.
-// Literal, the sum moves all five planes out; clipped, only p_5: min(p_1 .. p_4, p_5 + R). Quadrics need not be ellipsoids here.
+// The field of one patch as published (Vyatkin and Dolgovesov 2023): F' = F + sum_i R_i, positive
+// inside. F = min(p_1 .. p_5) is the solid between five planes. R_i = a_i [Q_i]_+^3 is the
+// perturbation of a quadric, with Q(x) = (x, 1)^T W (x, 1). Over the triangle (v_1, v_2, v_3) with
+// unit normal n and indices mod 3,
+//   p_k(x) = m_k . (x - v_{k+1}),  m_k = n x (v_{k+2} - v_{k+1}) / |.|   for k = 1..3, the clip planes
+//   p_4(x) = tau + n . (x - v_1),  p_5(x) = tau - n . (x - v_1),         the base planes
+// where the clip planes face inwards and tau is half the thickness. The literal reading adds the
+// sum to all five planes. The clipped one adds it to p_5 only: min(p_1 .. p_4, p_5 + R). Here
+// quadrics need not be ellipsoids.
 #pragma once
 #include "patches/views.h"
 
@@ -16,7 +19,7 @@ struct PaperField {
   const T* positions;   // [B, V, 3] m
   const T* amplitudes;  // [Q]
   const T* matrices;    // [1 or B, Q, 4, 4]
-  Index stride;         // from the matrices of one pose to those of the next: 0 or 16 Q
+  Index stride;         // between the matrices of consecutive poses: 0 or 16 Q
   T thickness;          // tau, m
   bool clip;
 };
@@ -27,7 +30,7 @@ struct PaperFieldValues {
   T* out;  // [B, S] m
 };
 
-// Gradients of each sample for its point and its three corners.
+// Gradients of each sample with respect to its point and its three corners.
 template <class T>
 struct PaperFieldSamples {
   PaperField<T> solid;
@@ -42,12 +45,13 @@ struct PaperFieldVertices {
   T* positions;  // [B, V, 3]
 };
 
-// Gradients of each entry for its quadric, over the samples of its patch and over all poses that share the quadric.
+// Gradients of each entry with respect to its quadric, summed over the samples of its patch and all
+// poses that share the quadric.
 template <class T>
 struct PaperFieldEntries {
   PaperField<T> solid;
   const T* grad;
-  Index batch, sets;  // poses, and how many sets of matrices they have
+  Index batch, sets;  // poses, and their sets of matrices
   T* partial;         // [sets, entries, 17]
 };
 
@@ -124,7 +128,7 @@ PD_HD Planes<T> planes_at(const PaperField<T>& t, Index pose, Index patch, const
   return p;
 }
 
-// The first of the smallest: it takes the derivative where planes meet.
+// The first of the smallest planes; it takes the derivative where planes intersect.
 template <class T>
 PD_HD int smallest_of(const T (&value)[5]) {
   int least = 0;
@@ -145,7 +149,7 @@ PD_HD void item(const PaperFieldValues<T>& t, Index i) {
   t.out[i] = s.clip ? f : f + r;
 }
 
-// Gradient of plane `k` for x and the corners.
+// Gradient of plane `k` with respect to x and the corners.
 template <class T>
 PD_HD void plane_vjp(const Planes<T>& p, int k, const Vec3<T>& x, const T& grad, Vec3<T>& gx,
                      Vec3<T> (&gv)[3]) {

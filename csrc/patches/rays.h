@@ -1,13 +1,16 @@
-// The first point of the posed surface on each ray.
+// First intersection of each ray with the posed surface.
 //
-// Every patch is cut into cells, triangles of its barycentric grid. The surface over a cell lies within `slack` of the triangle
-// of its corners, which 12 points inside the cell tell; the cells lie in a tree of boxes. Seen along a ray, the triangle is
-// flat: the ray can meet the surface only if it passes within the slack of it. Then Newton's method finds S(b) = o + t d from
-// where the ray meets the triangle, and where the cell is seen edge-on, so that it may be met twice, from its corners too. A
-// patch counts as far as its edges and the rounding of positions beyond, so neighbours leave no gap between them.
+// Every patch is divided into cells, triangles of its barycentric grid, which are stored in a tree
+// of boxes. The surface over a cell lies within `slack` of the triangle of its corners; 12 check
+// points inside the cell determine the slack. A ray can intersect the surface only if it passes the
+// triangle within the slack. Newton's method then solves S(b) = o + t d, from the intersection with
+// the triangle. Where the ray sees the cell edge-on and may intersect it twice, it also starts from
+// the corners. A patch extends beyond its edges by the rounding of positions, so neighbours leave
+// no gap.
 //
-// Newton's method stops early where it closes in on the hit that is known, and a cell right beside that hit is left out unless
-// it is seen edge-on. Both rely on cells that are no longer than the quadrics are wide.
+// Newton's method stops early when it converges to the known hit. A cell right beside that hit is
+// skipped unless it is seen edge-on. Both rely on cells that are no longer than the quadrics are
+// wide.
 #pragma once
 #include "patches/sheets.h"
 #include "patches/tree.h"
@@ -18,7 +21,7 @@ constexpr int check_points = 12;
 constexpr int cell_size = 3 + check_points + 2;  // corners and checks in `points`, patch, place
 constexpr int cell_simd4_size = 4 * (9 + 1);     // corners and slack
 
-// Where the surface is, cell by cell.
+// The cells of the surface.
 template <class T>
 struct Cells {
   Tree<T> tree;
@@ -26,7 +29,9 @@ struct Cells {
   const T* weights;    // [12, 3] barycentric coordinates of the checks in their cell
   const T* places;     // [m^2, 9] barycentric coordinates of the corners of a cell in its patch
   const T* points;     // [B, N, 3] m
-  T* simd4;  // [B, leaves, 10, 4] of up to four cells, number by number: corners and slack, NaN for none, m
+  // [B, leaves, 10, 4] m; up to four cells per leaf, component by component: corners and slack, NaN
+  // if missing
+  T* simd4;
   Index samples, patches, cells_of_patch;
   T size;  // edge of a cell in barycentric coordinates, 1 / m
 };
@@ -51,14 +56,14 @@ struct SurfaceRays {
 
 namespace pd::freeform::inline PD_TARGET {
 
-// Whether the numbers of a cell point into the arrays.
+// Whether the indices of a cell are in range.
 PD_HD bool is_cell(const int32* cell, Index samples, Index patches, Index places) {
   bool is = is_below(cell[cell_size - 2], patches) && is_below(cell[cell_size - 1], places);
   for (int k = 0; k < 3 + check_points; ++k) is = is && is_below(cell[k], samples);
   return is;
 }
 
-// Item: a leaf of a pose.
+// Item: one leaf of one pose.
 template <class T>
 PD_HD void item(const CellBoxes<T>& t, Index i) {
   const Cells<T>& c = t.cells;
@@ -70,7 +75,8 @@ PD_HD void item(const CellBoxes<T>& t, Index i) {
   for (int k = 0; k < cell_simd4_size; ++k) simd4[k] = T(NAN);
   for (Index n = first_of(c.tree, leaf); n < first_of(c.tree, leaf + 1); ++n) {
     const int32* cell = c.cells + cell_size * n;
-    if (!is_cell(cell, c.samples, c.patches, c.cells_of_patch)) continue;  // left out, like none
+    // skipped, like a missing cell
+    if (!is_cell(cell, c.samples, c.patches, c.cells_of_patch)) continue;
     const Vec3<T> p[3] = {load3(points, cell[0]), load3(points, cell[1]), load3(points, cell[2])};
     T apart = T(0);
     for (int k = 0; k < check_points; ++k) {
@@ -81,7 +87,7 @@ PD_HD void item(const CellBoxes<T>& t, Index i) {
     Box<T> own = {p[0], p[0]};
     for (int k = 1; k < 3; ++k) join(own, p[k], p[k]);
     const T rounding = T(16) * epsilon<T>() * greater(largest(own.low), largest(own.high));
-    // between the checks it is little more
+    // margin for the surface between the check points
     const T slack = T(1.5) * square_root(apart) + rounding;
     T* to = simd4 + n - first_of(c.tree, leaf);
     const T numbers[10] = {p[0].x, p[0].y, p[0].z, p[1].x, p[1].y,
@@ -100,7 +106,7 @@ struct Hit {
   T b[3];
 };
 
-// The largest difference between two places on a patch.
+// The largest difference between two barycentric coordinates.
 template <class T>
 PD_HD T apart(const T (&a)[3], const T* b) {
   return greater(greater(absolute(a[0] - b[0]), absolute(a[1] - b[1])), absolute(a[2] - b[2]));
@@ -108,13 +114,14 @@ PD_HD T apart(const T (&a)[3], const T* b) {
 
 enum class RefineResult { diverged, outside_patch, on_patch };
 
-// Newton's method from b, and where it ends. A whole step leads to the ray but for the bend of the surface, of second order in the
-// step: what it did to the last step tells what it will do to the next, and where that is nothing nobody need look.
+// Newton's method from b, and how it ends. The error after a full step is of second order in the
+// step. The ratio of two steps therefore predicts the next error; where that is negligible, no
+// further evaluation is needed.
 template <class T>
 PD_HD RefineResult refine(const SurfaceRays<T>& t, const PosedPatch<T>& posed,
                           const RayFrame<T>& ray, const T* known, T (&b)[3], T& depth) {
   const T most = t.cells.size;
-  T before = T(0);  // length of the step that led here, if it was a whole one
+  T before = T(0);  // length of the previous step if it was a full one
   Vec3<T> aimed = zero3<T>();
   for (int step = 0; step < 24; ++step) {
     const SurfaceElement<T> s = surface_at(t.surface, posed, b);
@@ -126,7 +133,7 @@ PD_HD RefineResult refine(const SurfaceRays<T>& t, const PosedPatch<T>& posed,
     T p = xy * y - yy * x, q = yx * x - xx * y;
     const T rounding = T(32) * epsilon<T>() * (largest(s.point) + largest(ray.o));
     bool close = absolute(x) <= rounding && absolute(y) <= rounding;
-    // never by more than a cell
+    // a step is at most one cell
     const T bound = most * absolute(det), longest = greater(absolute(p), absolute(q));
     const bool whole = longest <= bound;
     const T scale = whole ? T(1) / det : most / longest * (det < T(0) ? T(-1) : T(1));
@@ -146,12 +153,12 @@ PD_HD RefineResult refine(const SurfaceRays<T>& t, const PosedPatch<T>& posed,
     aimed = multiply_add(p, s.tangent[0], multiply_add(q, s.tangent[1], r));
     if (close) {
       depth = dot(aimed, ray.d);
-      // as far as positions are known, in barycentric coordinates
+      // accuracy of the positions, in barycentric coordinates
       const T edge = greater(largest(s.tangent[0]), largest(s.tangent[1]));
       const T margin = greater(T(512) * epsilon<T>(), lesser(rounding / edge, most));
       return outside >= -margin ? RefineResult::on_patch : RefineResult::outside_patch;
     }
-    // on the way to the hit that is known
+    // converging to the known hit
     if (known != nullptr && apart(b, known) <= T(1) / T(64) * most)
       return RefineResult::outside_patch;
     if (!(outside >= T(-2) * most)) break;
@@ -160,14 +167,14 @@ PD_HD RefineResult refine(const SurfaceRays<T>& t, const PosedPatch<T>& posed,
   return RefineResult::diverged;
 }
 
-// Cells as seen along a ray.
+// Cells projected along a ray.
 template <class T, class R>
 struct ProjectedCells {
   R area[3], whole, slack, longest;
-  unsigned passed;  // bits: those that the ray passes within the slack
+  unsigned passed;  // bits of the cells that the ray passes within the slack
 };
 
-// Those from `lane` on, R at a time: T or Number<T>.
+// Projects the cells from `lane` on; R is T or Number<T>.
 template <class R, class T, class Load>
 PD_HD ProjectedCells<T, R> project_cells(const T* simd4, const Load& load, const RayFrame<T>& ray,
                                          const T& near, const T& far) {
@@ -185,7 +192,7 @@ PD_HD ProjectedCells<T, R> project_cells(const T* simd4, const Load& load, const
   const R nearest = lesser(lesser(along[0], along[1]), along[2]);
   const R farthest = greater(greater(along[0], along[1]), along[2]);
   s.slack = load(simd4 + 36) + R(T(16) * epsilon<T>()) * (R(largest(ray.o)) + absolute(farthest));
-  // so that a cell that is not finite is left at once
+  // rejects cells that are not finite
   s.passed = bits_of(nearest - s.slack <= R(far)) & bits_of(R(near) <= farthest + s.slack);
   for (int k = 0; k < 3; ++k) {
     const R *e = flat[(k + 1) % 3], *f = flat[(k + 2) % 3];
@@ -197,7 +204,7 @@ PD_HD ProjectedCells<T, R> project_cells(const T* simd4, const Load& load, const
   for (int k = 0; k < 3; ++k) {
     const R *e = flat[(k + 1) % 3], *f = flat[(k + 2) % 3], x = e[0] - f[0], y = e[1] - f[1];
     const R length = square_root(x * x + y * y);
-    // not beyond this edge, on either side of the cell
+    // not beyond this edge, for either orientation of the cell
     const R inside = select(s.whole < R(T(0)), -s.area[k], s.area[k]);
     s.passed &= bits_of(-(s.slack * length) <= inside);
     s.longest = greater(s.longest, length);
@@ -205,16 +212,16 @@ PD_HD ProjectedCells<T, R> project_cells(const T* simd4, const Load& load, const
   return s;
 }
 
-// The nearest hit so far, after one cell more.
+// Updates the nearest hit with one more cell.
 template <class T>
 PD_HD void intersect_cell(const SurfaceRays<T>& t, Index pose, const int32* cell,
                           const ProjectedCells<T, T>& projected, const RayFrame<T>& ray,
                           Hit<T>& hit) {
-  // seen so steeply that it may be met twice
+  // nearly edge-on: the ray may intersect the cell twice
   const bool edge_on = absolute(projected.whole) <= T(8) * projected.slack * projected.longest;
   const int32 patch = cell[cell_size - 2];
   const T* place = t.cells.places + 9 * cell[cell_size - 1];
-  // beside the hit, on the same patch and met once: that is the one
+  // beside the hit on the same patch, with one intersection: the same hit
   if (!edge_on && hit.patch == patch) {
     T b[3];
     for (int k = 0; k < 3; ++k) {
@@ -242,7 +249,7 @@ PD_HD void intersect_cell(const SurfaceRays<T>& t, Index pose, const int32* cell
   }
 }
 
-// Visits leaves with the cells that they hold.
+// Intersects the ray with the cells of a leaf.
 template <class T>
 struct IntersectCells {
   const SurfaceRays<T>& task;
@@ -264,7 +271,7 @@ struct IntersectCells {
         if constexpr (Lanes<T>::width == 1) {
           intersect_cell(task, pose, cell, projected, ray, hit);
         } else {
-          // those before it may have brought the hit nearer
+          // earlier cells may have moved the hit nearer
           const auto again =
               project_cells<T>(simd4 + lane + k, one, ray, task.rays.near, hit.depth);
           if (again.passed) intersect_cell(task, pose, cell, again, ray, hit);
@@ -274,17 +281,17 @@ struct IntersectCells {
   }
 };
 
-// Item: a ray in a pose.
+// Item: one ray in one pose.
 template <class T>
 PD_HD void item(const SurfaceRays<T>& t, Index i) {
   const Index pose = i / t.rays.count, ray = i % t.rays.count;
   const Vec3<T> d = load3(t.rays.directions + pose * t.rays.direction_step, ray);
-  // first by the largest component, whose square alone might be beyond all numbers
+  // scales by the largest component first, since its square alone could overflow
   const Vec3<T> scaled = (T(1) / largest(d)) * d;
   const RayFrame<T> frame = ray_frame(load3(t.rays.origins + pose * t.rays.origin_step, ray),
                                       (T(1) / square_root(dot(scaled, scaled))) * scaled);
   Hit<T> hit = {t.rays.far, -1, {T(0), T(0), T(0)}};
-  // one that is not finite meets nothing
+  // a ray that is not finite hits nothing
   if (dot(frame.o, frame.o) + dot(frame.d, frame.d) <= biggest<T>())
     visit(t.cells.tree, pose, frame, t.rays.near, hit.depth, T(0),
           IntersectCells<T>{t, pose, frame, hit});

@@ -1,4 +1,4 @@
-// The posed surface as rays see it: patch by patch, multiplied out so that many places on a patch are cheap to find.
+// The posed surface for rays: per-patch polynomials that make many evaluations on a patch cheap.
 #pragma once
 #include "patches/height.h"
 #include "patches/surface.h"
@@ -7,9 +7,12 @@ namespace pd::freeform {
 
 constexpr int posed_patch_size = 45;
 
-// The posed surface patch by patch, its frames multiplied out: with A_k, v_k, e_k and u_k of patches/surface.h,
-//   sum_k b_k (v_k + A_k u_k) = sum_k b_k v_k + sum_{k<j} b_k b_j (A_k - A_j)(V_j - V_k) / 2 + sum_k b_k (h + l_k) A_k N_k,
-// which takes half of the arithmetic at every further place on the patch. V_k and N_k follow, and the bumps by fours.
+// The posed surface patch by patch, with the products of its frames expanded. With A_k, v_k, e_k
+// and u_k of patches/surface.h,
+//   sum_k b_k (v_k + A_k u_k) = sum_k b_k v_k + sum_{k<j} b_k b_j (A_k - A_j)(V_j - V_k) / 2
+//   + sum_k b_k (h + l_k) A_k N_k,
+// which halves the arithmetic of every further evaluation on the patch. V_k and N_k follow, then
+// the bumps in groups of four.
 template <class T>
 struct PosedPatches {
   Lists lists;
@@ -18,7 +21,7 @@ struct PosedPatches {
   T* patches;                   // [B, P, 45]
 };
 
-// The bumps of every patch by fours.
+// The bumps of every patch in groups of four.
 template <class T>
 struct GatheredBumps {
   Lists lists;
@@ -26,16 +29,16 @@ struct GatheredBumps {
   T* simd4;  // [entries / 4 + P + 1, 10, 4]
 };
 
-// What the surface is evaluated from.
+// Inputs of an evaluation of the surface.
 template <class T>
 struct PosedSurface {
   Lists lists;
-  const T *patches, *simd4;  // of PosedSheets and GatheredBumps
-  T lift;                    // of Base
+  const T *patches, *simd4;  // from PosedPatches and GatheredBumps
+  T lift;                    // from Base
   bool on_surface;
 };
 
-// The corners and checks of cells: heights at rest, then points in every pose.
+// Corners and check points of cells: heights at rest, then points in every pose.
 template <class T>
 struct GridHeights {
   PosedSurface<T> surface;
@@ -54,7 +57,7 @@ struct GridPoints {
 
 namespace pd::freeform::inline PD_TARGET {
 
-// Item: a patch of a pose.
+// Item: one patch of one pose.
 template <class T>
 PD_HD void item(const PosedPatches<T>& t, Index i) {
   const Index pose = i / t.lists.patches;
@@ -79,7 +82,7 @@ PD_HD void item(const PosedPatches<T>& t, Index i) {
   }
 }
 
-// Item: a patch.
+// Item: one patch.
 template <class T>
 PD_HD void item(const GatheredBumps<T>& t, Index patch) {
   store_simd4(t.simd4, t.quadrics, t.lists, patch);
@@ -88,7 +91,7 @@ PD_HD void item(const GatheredBumps<T>& t, Index patch) {
 // One patch at rest and in a pose.
 template <class T>
 struct PosedPatch {
-  Vec3<T> posed[3], pair[3], director[3];  // of PosedSheets, pair k of corners k and k + 1
+  Vec3<T> posed[3], pair[3], director[3];  // from PosedPatches; pair k joins corners k and k + 1
   Vec3<T> v[3], n[3];                      // at rest
   BumpSimd4<T> bumps;
 };
@@ -139,7 +142,7 @@ PD_HD void item(const GridPoints<T>& t, Index i) {
   store3(t.points, i, point);
 }
 
-// The surface at one place: a point and its tangents along the chart.
+// A point of the surface and its tangents along the chart.
 template <class T>
 struct SurfaceElement {
   Vec3<T> point, tangent[2];
@@ -155,7 +158,7 @@ PD_HD SurfaceElement<T> surface_at(const PosedSurface<T>& t, const PosedPatch<T>
   for (int k = 0; k < 3; ++k) add(e.point, b[k] * b[(k + 1) % 3], s.pair[k]);
   for (int c = 0; c < 2; ++c) {
     Vec3<T> tangent = s.posed[c] - s.posed[2];
-    // of the pairs, that without the third corner grows, that without c shrinks, and theirs does both
+    // derivatives of b_k b_j: direction c raises b_c and lowers the third coordinate
     add(tangent, b[1 - c], s.pair[0] - s.pair[1 + c]);
     add(tangent, b[2] - b[c], s.pair[2 - c]);
     e.tangent[c] = tangent;

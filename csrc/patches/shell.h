@@ -1,10 +1,11 @@
 // Shell coordinates of a patch, value and adjoint side by side.
 //
 // With barycentric coordinates b, rest corners V_k and directors N_k, the base surface is
-//   P(b) = sum_k b_k (V_k + l_k N_k),   l_k = -lift e_k . N_k,   e_k = sum_j b_j (V_j - V_k),
-// flat for lift = 0; lift = 3/4 is Phong tessellation (Boubekeur and Alexa 2008). D(b) = sum_k b_k N_k is not normalised, and a
-// point at height h lies at P + h D. Neighbours share V, N and b along an edge, hence the sheet P + h D over it.
-// Derivatives are those along the chart (b_1, b_2), b_3 = 1 - b_1 - b_2: direction d moves weight from corner 3 to corner d.
+//   P(b) = sum_k b_k (V_k + l_k N_k),   l_k = -lift e_k . N_k,   e_k = sum_j b_j (V_j - V_k).
+// It is flat for lift = 0; lift = 3/4 is Phong tessellation (Boubekeur and Alexa 2008). D(b) =
+// sum_k b_k N_k is not normalised, and a point at height h is P + h D. Neighbours share V, N and b
+// along an edge, hence also the surface P + h D over it. Derivatives are along the chart (b_1, b_2)
+// with b_3 = 1 - b_1 - b_2: direction d moves weight from corner 3 to corner d.
 #pragma once
 #include "patches/views.h"
 
@@ -65,7 +66,7 @@ PD_HD Vec3<T> director_tangent(const Shell<T>& s, int d) {
   return s.n[d] - s.n[2];
 }
 
-// Gradients for everything in a Shell.
+// Gradients with respect to all members of a Shell.
 template <class T>
 struct ShellAdjoint {
   Vec3<T> v[3], n[3];
@@ -121,7 +122,7 @@ PD_HD void director_tangent_vjp(int d, const Vec3<T>& grad, ShellAdjoint<T>& g) 
   g.n[2] = g.n[2] - grad;
 }
 
-// Carries the gradients of what a Shell derives on to corners and barycentric coordinates.
+// Propagates the gradients of derived members to corners and barycentric coordinates.
 template <class T>
 PD_HD void shell_vjp(const Shell<T>& s, ShellAdjoint<T>& g) {
   for (int k = 0; k < 3; ++k) {
@@ -148,7 +149,7 @@ PD_HD void shell_vjp(const Shell<T>& s, ShellAdjoint<T>& g) {
 }
 
 constexpr int corner_numbers =
-    18;  // gradients of a sample for its corners: V_k then N_k of each corner
+    18;  // gradients of a sample with respect to its corners: V_k then N_k of each corner
 
 template <class T>
 PD_HD void store_corners(T* to, Index sample, const ShellAdjoint<T>& g) {
@@ -162,7 +163,8 @@ PD_HD void store_corners(T* to, Index sample, const ShellAdjoint<T>& g) {
 
 namespace pd::freeform {
 
-// Gradients for vertices and directors: the sum over the samples of the patches around each vertex.
+// Gradients with respect to vertices and directors: sums over the samples of the patches around
+// each vertex.
 template <class T>
 struct CornerSum {
   Lists lists;

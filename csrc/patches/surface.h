@@ -1,8 +1,9 @@
 // The surface in any pose. With posed corners v_k and their frames A_k,
 //   S(b) = sum_k b_k (v_k + A_k u_k),   u_k = e_k / 2 + (h + l_k) N_k,
-// where e_k, l_k and N_k are those of the shell at rest (patches/shell.h). Half of e_k blends the three affine maps of the
-// corners (James 2020, Phong deformation); the second half is in v_k already. At rest, v = V and A = 1, it is P + h D, and an
-// affine motion v = G V + t, A = G carries it along exactly. Linear in the pose, and the same numbers on both sides of an edge.
+// where e_k, l_k and N_k belong to the shell at rest (patches/shell.h). Half of e_k blends the
+// three affine maps of the corners (James 2020, Phong deformation); v_k already contains the other
+// half. At rest, with v = V and A = 1, the surface is P + h D. It follows an affine motion v = G V
+// + t, A = G exactly. It is linear in the pose, and both sides of an edge give the same numbers.
 // Tangents are the derivatives along the chart of shell.h.
 #pragma once
 #include "patches/shell.h"
@@ -29,7 +30,7 @@ struct SurfaceSamples {
   T *grad_heights, *grad_slopes, *grad_barycentrics, *corners;  // [S], [S, 2], [S, 3], [S, 18]
 };
 
-// Gradients for the pose: the sum over the samples of the patches around each vertex.
+// Gradients with respect to the pose: sums over the samples of the patches around each vertex.
 template <class T>
 struct SurfacePose {
   Lists lists;
@@ -48,7 +49,7 @@ PD_HD Vec3<T> frame_offset(const Shell<T>& s, int k, const T& height) {
   return T(0.5) * s.corner_offset[k] + (height + s.lift_height[k]) * s.n[k];
 }
 
-// its derivative along the chart
+// derivative along the chart
 template <class T>
 PD_HD Vec3<T> frame_offset_tangent(const Shell<T>& s, int k, int d, const T& slope) {
   return T(0.5) * s.edge[d] + (slope + s.lift_slope[k][d]) * s.n[k];
@@ -77,7 +78,7 @@ PD_HD void item(const Surface<T>& t, Index i) {
   }
 }
 
-// What a pose passes on to corner k: the gradient for v_k + A_k u_k.
+// The gradient with respect to v_k + A_k u_k at corner k.
 template <class T>
 PD_HD Vec3<T> corner_gradient(const T& b, int k, const Vec3<T>& point, const Vec3<T>& tangent0,
                               const Vec3<T>& tangent1) {

@@ -1,4 +1,4 @@
-// Every task of the free-form patches: what a device has to be able to run.
+// All tasks of freeform patches, which every device must run.
 #pragma once
 #include "patches/field_rays.h"
 #include "patches/frames.h"

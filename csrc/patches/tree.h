@@ -1,4 +1,4 @@
-// A complete binary tree of boxes around things that a ray may meet, refitted in every pose.
+// A complete binary tree of bounding boxes, refitted in every pose.
 #pragma once
 #include "patches/fours.h"
 
@@ -6,8 +6,8 @@ namespace pd::freeform {
 
 template <class T>
 struct Tree {
-  T* boxes;  // [B, 2^(levels + 1) / 4 or 1, 6, 4] least and greatest coordinates of four nodes, m
-  Index count;  // things, in the order of the leaves
+  T* boxes;     // [B, 2^(levels + 1) / 4 or 1, 6, 4] m; lower and upper bounds of four nodes
+  Index count;  // items, in the order of the leaves
   int levels;
 };
 
@@ -19,9 +19,9 @@ struct JoinedBoxes {
 
 template <class T>
 struct Rays {
-  const T *origins, *directions;  // [1 or B, R, 3] m, and of unit length for FieldRays
+  const T *origins, *directions;  // [1 or B, R, 3] m; directions have unit length for FieldRays
   Index count, origin_step,
-      direction_step;  // from the rays of one pose to those of the next: 0 or 3 R
+      direction_step;  // between the rays of consecutive poses: 0 or 3 R
   T near, far;         // m
 };
 
@@ -51,8 +51,8 @@ PD_HD Index first_of(const Tree<T>& t, Index leaf) {
   return (leaf * t.count) >> t.levels;
 }
 
-// Nodes are numbered from the root, 1; below n lie 2 n and 2 n + 1, and below those 4 n up to 4 n + 3, which are kept together.
-// There is no node 0.
+// Nodes are numbered from the root, 1. The children of n are 2 n and 2 n + 1; its grandchildren 4 n
+// to 4 n + 3 are stored together. Node 0 does not exist.
 template <class T>
 PD_HD Index tree_size(const Tree<T>& t) {
   return 24 * greater(Index(1), Index(1) << t.levels >> 1);
@@ -77,7 +77,7 @@ PD_HD void store_leaf(const Tree<T>& t, Index pose, Index leaf, const Box<T>& bo
   store_box(t.boxes + pose * tree_size(t), (Index(1) << t.levels) + leaf, box);
 }
 
-// Item: an inner node of a pose at a level, 0 the root, from its children.
+// Item: an inner node of one pose, at a level counted from the root, computed from its children.
 template <class T>
 PD_HD void item(const JoinedBoxes<T>& t, Index i) {
   const Index pose = i >> t.level, node = (Index(1) << t.level) + i - (pose << t.level);
@@ -88,18 +88,19 @@ PD_HD void item(const JoinedBoxes<T>& t, Index i) {
   store_box(boxes, node, box);
 }
 
-// Finite for 0 too, or 0 times it would be NaN. Only along the very face of a box is the answer then open, and the margin of the
-// boxes keeps the surface off their faces.
+// Finite for 0 too, since 0 times infinity would be NaN. The result is then wrong only for rays
+// along the face of a box, and the margin of the boxes keeps the surface off their faces.
 template <class T>
 PD_HD T inverse_of(const T& a) {
   constexpr T least = T(1) / biggest<T>() * T(4);
   return T(1) / (absolute(a) > least ? a : least);
 }
 
-// A ray and two directions across it (Duff et al. 2017): what meets it has no component along either.
+// A ray and two directions across it (Duff et al. 2017): a point on the ray has no component along
+// either.
 template <class T>
 struct RayFrame {
-  Vec3<T> o, d, u, v, inverse;  // of d, component by component
+  Vec3<T> o, d, u, v, inverse;  // 1 / d, component by component
 };
 
 template <class T>
@@ -112,8 +113,9 @@ PD_HD RayFrame<T> ray_frame(const Vec3<T>& o, const Vec3<T>& d) {
           {inverse_of(d.x), inverse_of(d.y), inverse_of(d.z)}};
 }
 
-// Which of four boxes, larger by `margin`, a ray enters before `far`, as bits, and where: never later than that, for the rounding of
-// six products. A box around nothing has its faces the wrong way round, and no ray enters it.
+// Intersects a ray with four boxes enlarged by `margin`, before `far`. Returns bits and entry
+// depths, which are never too late, with the rounding of six products included. An empty box has
+// inverted faces, so no ray enters it.
 template <class T>
 PD_HD unsigned intersect_boxes(const T* boxes, const RayFrame<T>& ray, const T& near, const T& far,
                                const T& margin, T (&entry)[4]) {
@@ -142,7 +144,7 @@ PD_HD unsigned intersect_boxes(const T* boxes, const RayFrame<T>& ray, const T& 
   return in;
 }
 
-// Nodes still to be looked into, the nearest on top.
+// Nodes still to visit, the nearest on top.
 template <class T>
 struct NodeStack {
   int32 node[64];
@@ -161,8 +163,8 @@ PD_HD void push(NodeStack<T>& w, int base, Index node, const T& entry) {
   w.entry[at] = entry;
 }
 
-// Calls `meet` with the leaves whose boxes, larger by `margin`, a ray enters before `far`, which may shrink meanwhile; about from
-// near to far.
+// Calls `meet` for the leaves whose boxes, enlarged by `margin`, a ray enters before `far`, roughly
+// from near to far. `far` may shrink meanwhile.
 template <class T, class Meet>
 PD_HD void visit(const Tree<T>& t, Index pose, const RayFrame<T>& ray, const T& near, const T& far,
                  const T& margin, const Meet& meet) {
@@ -170,7 +172,7 @@ PD_HD void visit(const Tree<T>& t, Index pose, const RayFrame<T>& ray, const T& 
   const Index leaves = Index(1) << t.levels;
   NodeStack<T> w;
   w.count = 0;
-  // steps of two levels end at the leaves
+  // steps of two levels must end at the leaves
   for (Index node = 1 + t.levels % 2; node <= 1 + 2 * (t.levels % 2); ++node)
     push(w, w.count, node, near);
   while (w.count > 0) {
@@ -180,7 +182,7 @@ PD_HD void visit(const Tree<T>& t, Index pose, const RayFrame<T>& ray, const T& 
       T entry[4];
       const unsigned in =
           intersect_boxes(boxes + node_offset(4 * node), ray, near, far, margin, entry);
-      // the nearest at once; there is no node 0
+      // visits the nearest at once; 0 means none
       Index next = 0;
       T nearest = T(0);
       const int base = w.count;

@@ -1,7 +1,8 @@
-// What the maths of free-form patches sees: pointers and counts. Knows neither torch nor a device.
+// Inputs of the maths of freeform patches: pointers and counts, without torch or CUDA.
 //
-// A task is a struct of inputs and outputs; `item(task, i)` computes what belongs to index i and writes nothing else, so the
-// items of a task run in any order, on any device, to the same bits.
+// A task is a struct of inputs and outputs. `item(task, i)` computes the outputs of index i and
+// writes nothing else. The items of a task therefore run in any order, on any device, to the same
+// bits.
 #pragma once
 #include "math/mat.h"
 #include "math/scalar.h"
@@ -32,7 +33,7 @@ template <class T>
 struct Base {
   const T* vertices = nullptr;   // [V, 3] m
   const T* directors = nullptr;  // [V, 3]
-  T lift = 0;                    // 3/4 of Phong tessellation, or 0 for flat patches
+  T lift = 0;                    // 3/4 for Phong tessellation, 0 for flat patches
 };
 
 template <class T>
@@ -104,8 +105,8 @@ PD_HD void add_outer(Mat3<T>& to, const T& s, const Vec3<T>& a, const Vec3<T>& b
   add(to.row[2], s * a.z, b);
 }
 
-// Rounded term by term and added in pairs: swapping corners keeps the bits where one weight is zero, which makes patches
-// agree on the edge that they share.
+// Each product is rounded, and products are added in pairs. If one weight is zero, swapping corners
+// keeps the bits, so patches agree on their shared edge.
 template <class T>
 PD_HD Vec3<T> blend(const T (&weight)[3], const Vec3<T> (&of)[3]) {
   return (weight[0] * of[0] + weight[1] * of[1]) + weight[2] * of[2];

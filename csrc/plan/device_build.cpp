@@ -22,7 +22,7 @@ namespace {
 
 constexpr int small_part = 64;  // vertices
 
-// The numbers that say where the arrays of each patch begin.
+// Computes the offsets of each patch's arrays.
 void number_patches(DeviceMeshPlan& plan, const std::vector<MeshPatch>& patches, bool stored,
                     bool fixed) {
   plan.patch_block = plan.patch_slot = {0};
@@ -55,7 +55,7 @@ std::int32_t packed(std::int64_t low, std::int64_t high) {
   return std::int32_t(std::uint32_t(low) | std::uint32_t(high) << 16);
 }
 
-// Rest shapes and bounds of a pair in lane `lane` of `block`.
+// Writes rest shapes and bounds of a pair in lane `lane` of `block`.
 void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, const Pair& pair,
                double unit, std::int64_t block, std::int64_t lane) {
   std::array<std::int64_t, 5> vertex;
@@ -87,7 +87,7 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch,
     const std::int64_t block = first_block + i / lanes, lane = i % lanes;
     Pair pair = patch.pairs[std::min(i, count - 1)];
     int forces = pair.corners();
-    if (i >= count) {  // padding strains like the last pair, but weighs nothing and pulls nowhere
+    if (i >= count) {  // padding repeats the last pair, with zero weight and no force
       pair.tet = {-1, -1};
       forces = 0;
     }
@@ -105,7 +105,7 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch,
   }
 }
 
-// Interior vertices are numbered anew, in the order of their slots.
+// Renumbers interior vertices in the order of their slots.
 void renumber(Numbering& numbering, const std::vector<MeshPatch>& patches) {
   for (std::size_t p = 0; p < patches.size(); ++p) {
     const std::int32_t inside = numbering.patch_vertex[p];
@@ -124,7 +124,8 @@ void fill_slots(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, 
   }
 }
 
-// Rest positions of one patch from its first vertex, in metres or in units of which its extent has up to 2^29.
+// Writes rest positions of a patch relative to its first vertex, in metres or in units of up to
+// 2^-29 of its extent.
 void fill_rest_positions(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch,
                          int number) {
   const auto offset = [&](std::size_t s, int c) {
@@ -144,7 +145,7 @@ void fill_rest_positions(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch
   }
   int exponent = 0;
   std::frexp(extent, &exponent);  // extent < 2^exponent
-  // up to 2^29, so that differences are up to 2^30 and fit
+  // up to 2^29 units, so that differences stay below 2^30
   const double unit = std::ldexp(1.0, exponent - 29);
   plan.patch_unit[number] = unit;
   for (std::size_t s = 0; s < count; ++s) {
@@ -153,7 +154,7 @@ void fill_rest_positions(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch
   }
 }
 
-// Of a cluster: where each vertex has slots beside that of its owner.
+// Cluster: lists the slots of each vertex in patches that do not own it.
 void link_copies(DeviceMeshPlan& plan) {
   plan.slot_copy.assign(plan.vertex_order.size() * most_cluster_blocks, -1);
   std::vector<std::int32_t> found(plan.vertex_order.size(), 0);
@@ -168,7 +169,7 @@ void link_copies(DeviceMeshPlan& plan) {
   }
 }
 
-// The first patch that has a shared vertex owns it.
+// The first patch that holds a shared vertex owns it.
 void mark_owners(DeviceMeshPlan& plan) {
   for (std::size_t i = 0; i + 1 < plan.shared_start.size(); ++i) {
     for (std::int32_t at = plan.shared_start[i] + 1; at < plan.shared_start[i + 1]; ++at)
@@ -176,7 +177,7 @@ void mark_owners(DeviceMeshPlan& plan) {
   }
 }
 
-// For every shared slot the slots of its vertex, in rows of seven.
+// Lists the slots of each shared vertex, in rows of seven, for every shared slot.
 void link_slots(DeviceMeshPlan& plan) {
   constexpr std::int32_t width = 8, together = width - 1;
   const std::int32_t first_shared = plan.patch_vertex.back();
@@ -197,7 +198,7 @@ void link_slots(DeviceMeshPlan& plan) {
   }
 }
 
-// Forces on shared vertices lie vertex by vertex.
+// Orders the forces on shared vertices by vertex.
 void place_forces(DeviceMeshPlan& plan) {
   const std::int32_t first_shared = plan.patch_vertex.back();
   std::vector<std::int32_t> next(plan.shared_start.begin(), plan.shared_start.end() - 1);
@@ -207,7 +208,8 @@ void place_forces(DeviceMeshPlan& plan) {
   }
 }
 
-// The vertices of each loose piece, patch by patch, in parts of `most` at most: every vertex in the first patch that has it.
+// Lists the vertices of each free piece, patch by patch, in parts of at most `most` vertices. Every
+// vertex belongs to the first patch that holds it.
 void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pieces, int most) {
   plan.patch_part = plan.part_start = {0};
   plan.piece_start.assign(pieces + 1, 0);
@@ -306,7 +308,7 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
   if (kernel == stream_kernel) place_forces(plan);
   if (kernel == cluster_kernel) link_copies(plan);
   const std::int32_t pieces = *std::max_element(piece, piece + vertices) + 1;
-  // where few blocks hold an environment all their warps are to be busy
+  // small parts keep all warps busy where few blocks hold an environment
   const bool few = kernel == block_kernel || kernel == cluster_kernel;
   if (pieces > 0) add_parts(plan, piece, pieces, few ? small_part : int(vertices));
   plan.sizes = count_sizes(plan, made, count, pieces, kernel);

@@ -1,4 +1,5 @@
-// Turns a tetrahedral mesh into the arrays of device.def: patches, pairs, gathers, rest matrices.
+// Compiles a tetrahedral mesh into the arrays of device.def: patches, pairs, gather lists and rest
+// shapes.
 #pragma once
 
 #include "plan/views.h"
@@ -9,7 +10,8 @@
 
 namespace pd {
 
-// The table as vectors. What pins decide is the caller's: pin_vertex and vertex_pin are empty, sizes says no pins.
+// The table as vectors. The caller adds pins: pin_vertex and vertex_pin are empty, and sizes counts
+// no pins.
 struct DeviceMeshPlan {
   using real = double;
 #define X(name, type, width, rows, meaning) std::vector<type> name;
@@ -17,11 +19,13 @@ struct DeviceMeshPlan {
 #undef X
 };
 
-// `positions` [vertices, 3] at rest, `tets` [count, 4] with positive volume, `piece` [vertices] without pins that a vertex
-// moves with, -1: pinned, `kernel` as in DeviceKernel, `fixed`: for float32. All checked by the caller, and that
-// 1 <= patches <= count, of a cluster also <= vertices and <= most_cluster_blocks. Throws std::invalid_argument when a patch has
-// more numbers than 16 bits can count, std::overflow_error when all of them have more than 32 bits can. `progress` hears the
-// fraction done now and then.
+// Builds the plan. `positions` [vertices, 3]: rest positions. `tets` [count, 4]: tetrahedra of
+// positive volume. `piece` [vertices]: the connected piece without pins of each vertex, or -1.
+// `kernel`: as in DeviceKernel. `fixed`: for float32. `progress` is called with the fraction done.
+//
+// The caller checks all inputs and 1 <= patches <= count; for a cluster, also patches <= vertices
+// and patches <= most_cluster_blocks. Throws std::invalid_argument when a patch exceeds a 16-bit
+// count, and std::overflow_error when the plan exceeds a 32-bit count.
 DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
                                  const std::int64_t* tets, std::int64_t count, int patches,
                                  int kernel, bool fixed, const std::int32_t* piece,

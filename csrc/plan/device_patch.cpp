@@ -25,9 +25,10 @@ constexpr int small_pairs = 512;  // of a patch
                               std::to_string(most) + "; take more patches");
 }
 
-// Slots of a patch: interior vertices first, most forces first, which leaves little padding between entries. In a small patch,
-// which has room for padding and waits for others most of the time, shared ones come as they are numbered: all their patches
-// read and write them in runs then. Padding can grow to several times the forces where a few vertices have many.
+// Orders the slots of a patch: interior vertices first, by descending number of forces, which
+// leaves little padding between entries. A small patch has room for padding and mostly waits for
+// others. Its shared vertices keep their global order, so that all patches read and write them in
+// runs. Padding can reach several times the forces if a few vertices have many.
 std::vector<std::int32_t> slots_of(const MeshPatch& patch, int number, const Numbering& numbering) {
   std::vector<std::int32_t> order(patch.vertex.size()), slot(order.size());
   for (std::size_t v = 0; v < order.size(); ++v) order[v] = std::int32_t(v);
@@ -51,7 +52,7 @@ void scatter(std::vector<T>& items, const std::vector<std::int32_t>& place) {
   items = std::move(moved);
 }
 
-// Every slice of eight slots has room for as many forces as its busiest.
+// Every slice of eight slots reserves as many entries as its slot with the most forces.
 void count_entries(MeshPatch& patch) {
   patch.first.resize(patch.forces.size());
   SliceBanks banks;
@@ -64,7 +65,8 @@ void count_entries(MeshPatch& patch) {
   }
 }
 
-// As few as can be meet in a bank. In a patch that is not small those that touch shared vertices come in the first blocks.
+// Minimises bank conflicts. In a patch that is not small, pairs that touch shared vertices come in
+// the first blocks.
 void order_pairs(MeshPatch& patch, int number, const Numbering& numbering) {
   patch.outer = std::ssize(patch.pairs);
   if (patch.outer <= small_pairs) return spread_banks(patch.pairs);
@@ -83,7 +85,7 @@ void order_pairs(MeshPatch& patch, int number, const Numbering& numbering) {
   patch.pairs.insert(patch.pairs.end(), rest.begin(), rest.end());
 }
 
-// `number` [vertices] is -1 before and after.
+// `number` [vertices] is -1 before and after the call.
 MeshPatch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& number) {
   const std::span<const std::int32_t> tets = mesh.partition.patch(index);
   MeshPatch patch;
@@ -125,7 +127,7 @@ std::vector<MeshPatch> make_patches(const Mesh& mesh, std::int64_t vertices) {
   std::int64_t most_tets = 0;
   for (int p = 0; p < partition.patches(); ++p)
     most_tets = std::max(most_tets, std::ssize(partition.patch(p)));
-  // five entries for two tetrahedra are the fewest
+  // two tetrahedra have at least five entries
   if (5 * most_tets / 2 >= none)
     refuse(partition.patches(), 5 * most_tets / 2, "entries", none - 1);
   std::vector<MeshPatch> patches(partition.patches());
