@@ -20,20 +20,20 @@ class CorotationMaker {
  public:
   PD_DEVICE CorotationMaker(const CorotationInput<T>& in, const CorotationMemory<T>& memory,
                             BlockTeam& team, std::byte* scratch, std::size_t scratch_bytes,
-                            double times, CorotationControl<T>& control)
+                            double stiffness_ratio, CorotationControl<T>& control)
       : plan_(control.plan),
         scratch_(scratch),
         scratch_bytes_(scratch_bytes),
-        times_(times),
+        stiffness_ratio_(stiffness_ratio),
         in_(in),
         m_(memory),
         team_(team),
         c_(control) {}
 
   PD_DEVICE void make() const {
-    const Vec3<T> middle = find_middle();
+    const Vec3<T> centroid = find_centroid();
     for (int i = team_.thread(); i < plan_.vertices; i += team_.threads())
-      set(i, (vec3(in_.x[i]) - middle) + vec3(in_.base[i]), in_.u[i].w > T(0));
+      set(i, (vec3(in_.x[i]) - centroid) + vec3(in_.base[i]), in_.u[i].w > T(0));
     team_.barrier();
     multiply();
     team_.barrier();
@@ -71,7 +71,7 @@ class CorotationMaker {
 
  private:
   // Any place amid the vertices will do. What is held has no part in it, be it NaN.
-  PD_DEVICE Vec3<T> find_middle() const {
+  PD_DEVICE Vec3<T> find_centroid() const {
     const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
     const int count = turning_chunk(plan_.vertices), chunks = turning_chunks(plan_.vertices);
     double* of_chunk = m_.products;  // which are not there yet
@@ -138,8 +138,8 @@ class CorotationMaker {
       // the lanes of a row keep a group each
       static_assert(threads_of_row == turning_groups);
       const bool high = lane & 2, odd = lane & 1;
-      const Quad<T> total =
-          halve(odd, halve(high, sum[0], sum[2], 2), halve(high, sum[1], sum[3], 2), 1);
+      const Quad<T> total = exchange_halves(odd, exchange_halves(high, sum[0], sum[2], 2),
+                                            exchange_halves(high, sum[1], sum[3], 2), 1);
       if (first + own < level.rows) m_.images[at(lane, row)] = total;
     }
   }
@@ -149,8 +149,8 @@ class CorotationMaker {
     constexpr int together = 64, stride = together + 1;  // vertices in shared memory at a time
     constexpr int vectors = 2 * turning_groups, sums = 2;
     static_assert(2 * turning_products <= sums * small_outer_threads);
-    Quad<T>* seen = reinterpret_cast<Quad<T>*>(scratch_);  // [vectors, stride]
-    T* inertia = reinterpret_cast<T*>(seen + vectors * stride);
+    Quad<T>* loaded = reinterpret_cast<Quad<T>*>(scratch_);  // [vectors, stride]
+    T* inertia = reinterpret_cast<T*>(loaded + vectors * stride);
     static_assert((4 * vectors * stride + together) * sizeof(double) <= turning_scratch_bytes);
     const int count = turning_chunk(plan_.vertices);
     const int end = min((chunk + 1) * count, plan_.vertices);
@@ -163,7 +163,7 @@ class CorotationMaker {
         const int group = t / together, i = t % together;
         if (i >= here) continue;
         const Quad<T>* from = group < turning_groups ? m_.numbers : m_.images;
-        seen[group * stride + i] = from[at(group % turning_groups, begin + i)];
+        loaded[group * stride + i] = from[at(group % turning_groups, begin + i)];
         if (group == 0) inertia[i] = in_.inertia[begin + i].w;
       }
       __syncthreads();
@@ -173,8 +173,8 @@ class CorotationMaker {
         if (t >= 2 * turning_products) break;
         const bool of_matrix = t >= turning_products;
         const int m = t / turning_numbers % turning_numbers, n = t % turning_numbers;
-        const T* one = &seen[m / 4 * stride].x + m % 4;
-        const T* other = &seen[(n / 4 + (of_matrix ? turning_groups : 0)) * stride].x + n % 4;
+        const T* one = &loaded[m / 4 * stride].x + m % 4;
+        const T* other = &loaded[(n / 4 + (of_matrix ? turning_groups : 0)) * stride].x + n % 4;
 #pragma unroll 4
         for (int i = 0; i < here; ++i) {
           const double a = of_matrix ? 1.0 : double(inertia[i]);
@@ -192,7 +192,7 @@ class CorotationMaker {
   // Sums of products of the strains of all modes over a patch.
   PD_DEVICE void add_strains(int number) const {
     // a warp two groups, of which k is not before l, and one of some slices; what was in their place is of no use any more
-    constexpr int meetings = turning_groups * (turning_groups + 1) / 2, slices = 3;
+    constexpr int group_pairs = turning_groups * (turning_groups + 1) / 2, slices = 3;
     double* const sum = c_.at(0);
     static_assert(slices * turning_pairs * sizeof(double) <= sizeof(c_.inverse));
     const Patch<T> patch(plan_, number);
@@ -202,11 +202,11 @@ class CorotationMaker {
 #pragma unroll 1
     for (int first = 0; first < 2 * patch.pairs; first += tile.size()) {
       __syncthreads();
-      if (int(threadIdx.x) < tile.size()) see(patch, first, tile);
+      if (int(threadIdx.x) < tile.size()) fill_tile(patch, first, tile);
       __syncthreads();
       const int count = min(tile.size(), 2 * patch.pairs - first);
 #pragma unroll 1
-      for (int task = threadIdx.x / warp_size; task < slices * meetings;
+      for (int task = threadIdx.x / warp_size; task < slices * group_pairs;
            task += int(blockDim.x) / warp_size) {
         const int b = task / slices, slice = task % slices;
         const int k = b < 1 ? 0 : b < 3 ? 1 : b < 6 ? 2 : 3, l = b - k * (k + 1) / 2;
@@ -223,7 +223,7 @@ class CorotationMaker {
   }
 
   // A tetrahedron of the patch, to place threadIdx.x of the tile.
-  PD_DEVICE void see(const Patch<T>& patch, int first, const TurningTile<T>& tile) const {
+  PD_DEVICE void fill_tile(const Patch<T>& patch, int first, const TurningTile<T>& tile) const {
     const int place = threadIdx.x, tet = first + place;
     const TetInputs<T> numbers = load_tet<true>(patch, in_.weights, tet);
     const bool there = tet < 2 * patch.pairs && numbers.weight > T(0);
@@ -356,15 +356,15 @@ class CorotationMaker {
     const Quad<T> n = m_.numbers[at(mode / 6, vertex)];
     const int a = mode % 3;
     const T w = n.x;
-    const Vec3<T> way = mode % 6 < 3
-                            ? Vec3<T>{a == 0 ? w : T(0), a == 1 ? w : T(0), a == 2 ? w : T(0)}
-                        : a == 0 ? Vec3<T>{T(0), -n.w, n.z}
-                        : a == 1 ? Vec3<T>{n.w, T(0), -n.y}
-                                 : Vec3<T>{-n.z, n.y, T(0)};
+    const Vec3<T> displacement =
+        mode % 6 < 3 ? Vec3<T>{a == 0 ? w : T(0), a == 1 ? w : T(0), a == 2 ? w : T(0)}
+        : a == 0     ? Vec3<T>{T(0), -n.w, n.z}
+        : a == 1     ? Vec3<T>{n.w, T(0), -n.y}
+                     : Vec3<T>{-n.z, n.y, T(0)};
     const auto wide = [](const Vec3<T>& v) {
       return Vec3<double>{double(v.x), double(v.y), double(v.z)};
     };
-    const Vec3<double> d = wide(way);
+    const Vec3<double> d = wide(displacement);
     return {d.x - dot(wide(free.row[0]), d), d.y - dot(wide(free.row[1]), d),
             d.z - dot(wide(free.row[2]), d)};
   }
@@ -408,7 +408,8 @@ class CorotationMaker {
   }
 
   // of two sums a lane keeps one and adds its neighbour's
-  PD_DEVICE static Quad<T> halve(bool upper, const Quad<T>& a, const Quad<T>& b, int distance) {
+  PD_DEVICE static Quad<T> exchange_halves(bool upper, const Quad<T>& a, const Quad<T>& b,
+                                           int distance) {
     const auto half = [&](T x, T y) {
       return select(upper, y, x) + __shfl_xor_sync(full_warp, select(upper, x, y), distance);
     };
@@ -431,7 +432,7 @@ class CorotationMaker {
     const double* scale = c_.scale;
     each_entry(matrices, [&](int of, int i, int j) {
       now[of].at[i][j] = scaled_entry(matrix[of], scale[i], scale[j], i, j,
-                                      of ? turning_noise : times_ * turning_noise);
+                                      of ? turning_noise : stiffness_ratio_ * turning_noise);
     });
     __syncthreads();
 #pragma unroll 1
@@ -457,7 +458,7 @@ class CorotationMaker {
   const DevicePlan<T>& plan_;
   std::byte* scratch_;  // in shared memory
   std::size_t scratch_bytes_;
-  double times_;  // the material is that of A so many times at most
+  double stiffness_ratio_;  // the material is that of A so many times at most
   const CorotationInput<T>& in_;
   const CorotationMemory<T>& m_;
   BlockTeam& team_;
@@ -469,9 +470,9 @@ class CorotationMaker {
 template <class T>
 __device__ __noinline__ BlockTeam make_corotation(CorotationInput<T> in, CorotationMemory<T> memory,
                                                   BlockTeam team, std::byte* scratch,
-                                                  std::size_t scratch_bytes, double times,
+                                                  std::size_t scratch_bytes, double stiffness_ratio,
                                                   CorotationControl<T>& control) {
-  CorotationMaker<T>(in, memory, team, scratch, scratch_bytes, times, control).make();
+  CorotationMaker<T>(in, memory, team, scratch, scratch_bytes, stiffness_ratio, control).make();
   return team;
 }
 
@@ -479,9 +480,10 @@ __device__ __noinline__ BlockTeam make_corotation(CorotationInput<T> in, Corotat
 template <class T>
 __device__ __noinline__ BlockTeam hold_corotation(CorotationInput<T> in, const Mat3<T>* free,
                                                   CorotationMemory<T> memory, BlockTeam team,
-                                                  std::byte* scratch, double times,
+                                                  std::byte* scratch, double stiffness_ratio,
                                                   CorotationControl<T>& control) {
-  CorotationMaker<T>(in, memory, team, scratch, turning_scratch_bytes, times, control).hold(free);
+  CorotationMaker<T>(in, memory, team, scratch, turning_scratch_bytes, stiffness_ratio, control)
+      .hold(free);
   return team;
 }
 

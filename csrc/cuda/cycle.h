@@ -8,7 +8,7 @@ namespace pd::inline PD_TARGET {
 // Right side, result, and two to work with that a direct solve does without.
 template <class T>
 struct LevelFields {
-  Quad<T>*in, *z, *rest, *part;
+  Quad<T>*right, *z, *residual, *initial;
 };
 
 template <class T>
@@ -21,7 +21,8 @@ struct CycleMemory {
 template <class T>
 PD_DEVICE CycleMemory<T> cycle_of_team(const Levels<T>& levels, CycleMemory<T> m, int team) {
   const auto move = [team](LevelFields<T>& f, std::int64_t size) {
-    f = {f.in + team * size, f.z + team * size, f.rest + team * size, f.part + team * size};
+    f = {f.right + team * size, f.z + team * size, f.residual + team * size,
+         f.initial + team * size};
   };
   const std::int64_t coarse = std::int64_t(levels.coarse_unknowns()) * team;
   move(m.fine, levels.vertices);
@@ -50,21 +51,21 @@ class DeviceCycle {
  public:
   // `part`: shared memory for four vectors of every warp of the block
   PD_DEVICE DeviceCycle(const Levels<T>& levels, const CycleMemory<T>& memory, BlockTeam& team,
-                        Quad<T>* part)
-      : levels_(levels), m_(memory), team_(team), part_(part) {}
+                        Quad<T>* warp_sums)
+      : levels_(levels), m_(memory), team_(team), warp_sums_(warp_sums) {}
 
   // The right side at a vertex. All are set, and met by a barrier, before a run.
   PD_DEVICE void set(int i, const Vec3<T>& right) const {
     const T inverse = levels_.fine_inverse[i];
     if (levels_.direct) {
       // what is held has no part in a product, be it NaN
-      m_.fine.in[i] = quad(inverse > T(0) ? right : Vec3<T>{T(0), T(0), T(0)});
+      m_.fine.right[i] = quad(inverse > T(0) ? right : Vec3<T>{T(0), T(0), T(0)});
       return;
     }
-    m_.fine.in[i] = quad(right);
-    m_.fine.part[i] = quad(T(Smoother::first) * inverse * right);
+    m_.fine.right[i] = quad(right);
+    m_.fine.initial[i] = quad(T(Smoother::first) * inverse * right);
   }
-  PD_DEVICE Vec3<T> right_side(int i) const { return vec3(m_.fine.in[i]); }
+  PD_DEVICE Vec3<T> right_side(int i) const { return vec3(m_.fine.right[i]); }
   PD_DEVICE Vec3<T> result(int i) const { return vec3(m_.fine.z[i]); }
   PD_DEVICE void set_result(int i, const Vec3<T>& z) const { m_.fine.z[i] = quad(z); }
 
@@ -80,27 +81,27 @@ class DeviceCycle {
     const Level<4, T> middle = middle_level(levels_);
     const bool direct = levels_.direct, three = levels_.has_middle();
     if (!direct) {
-      restrict_to(fine, m_.fine, three ? m_.middle.in : m_.coarse_in,
-                  three ? m_.middle.part : nullptr);
+      restrict_to(fine, m_.fine, three ? m_.middle.right : m_.coarse_in,
+                  three ? m_.middle.initial : nullptr);
       smooth(fine, m_.fine);
       team_.barrier();
-      find_rest(fine, m_.fine);
+      compute_residual(fine, m_.fine);
     }
     if (three) {
       restrict_to(middle, m_.middle, m_.coarse_in, nullptr);
       smooth(middle, m_.middle);
       team_.barrier();
-      find_rest(middle, m_.middle);
+      compute_residual(middle, m_.middle);
     }
     solve_rows();
     team_.barrier();
     if (direct) return;
     solve_columns();
-    smooth_rest(fine, m_.fine);
+    smooth_residual(fine, m_.fine);
     if (three) {
-      smooth_rest(middle, m_.middle);
+      smooth_residual(middle, m_.middle);
       team_.barrier();
-      lift(middle, m_.middle, m_.coarse_out);
+      prolongate(middle, m_.middle, m_.coarse_out);
     }
     team_.barrier();
   }
@@ -110,7 +111,7 @@ class DeviceCycle {
     if (levels_.direct) {
       solve_columns();
     } else {
-      lift(fine_level(levels_), m_.fine, below_fine());
+      prolongate(fine_level(levels_), m_.fine, below_fine());
     }
     team_.barrier();
   }
@@ -124,26 +125,28 @@ class DeviceCycle {
       const int warps = int(blockDim.x) / warp_size;
 #pragma unroll 1
       for (int t = int(threadIdx.x) / warp_size * together; t < count; t += warps * together) {
-        if (row(t) < levels_.vertices) dots_of<together>(columns(), row(t));
+        if (row(t) < levels_.vertices) multiply_rows<together>(columns(), row(t));
       }
       return;
     }
-    constexpr int lanes = lanes_of_lift<1>;
+    constexpr int lanes = prolongation_lanes<1>;
     const int last = levels_.vertices - 1, lane = int(threadIdx.x) % lanes;
     const Level<1, T> fine = fine_level(levels_);
 #pragma unroll 1
     for (int t = int(threadIdx.x) / lanes; t < count; t += int(blockDim.x) / lanes) {
       const int at = min(row(t), last);
-      const Vec3<T> sum = sum_over_lanes(lifted(fine, below_fine(), at, 0, lane), lanes / 2, 1);
+      const Vec3<T> sum =
+          sum_over_lanes(prolongated(fine, below_fine(), at, 0, lane), lanes / 2, 1);
       if (lane == 0 && row(t) <= last) m_.fine.z[at] = quad(vec3(m_.fine.z[at]) + sum);
     }
   }
 
  private:
   template <int B>
-  static constexpr int lanes_of_lift = B == 1 ? 4 : 8;
-  static constexpr int at_once = sizeof(T) == 4 ? 8 : 4;  // entries of a node that a lane asks for
-  static constexpr int most_of_lane = 16;                 // of them before more warps share a node
+  static constexpr int prolongation_lanes = B == 1 ? 4 : 8;
+  static constexpr int in_flight =
+      sizeof(T) == 4 ? 8 : 4;                       // entries of a node that a lane asks for
+  static constexpr int most_entries_per_lane = 16;  // of them before more warps share a node
 
   // One entry of a row: where its vectors stand, and their factors.
   template <int Count>
@@ -154,23 +157,23 @@ class DeviceCycle {
 
   // A lane's part of the sum over the entries of a row for unknown i of it, for which `read` gives an entry. A lane asks for
   // `Together` entries, then for all of their vectors.
-  template <int Lanes, int Together, int Count, class Read>
+  template <int Lanes, int InFlight, int Count, class Read>
   PD_DEVICE static Vec3<T> sum_of(const int32* start, int row, int i, int lane, const Read& read) {
     const int end = start[row + 1];
     Vec3<T> sum = {T(0), T(0), T(0)};
 #pragma unroll 1
-    for (int p = start[row] + lane; p < end; p += Together * Lanes) {
-      Entry<Count> entry[Together];
-      Vec3<T> x[Together][Count];
+    for (int p = start[row] + lane; p < end; p += InFlight * Lanes) {
+      Entry<Count> entry[InFlight];
+      Vec3<T> x[InFlight][Count];
 #pragma unroll
-      for (int u = 0; u < Together; ++u) read(min(p + u * Lanes, end - 1), i, entry[u]);
+      for (int u = 0; u < InFlight; ++u) read(min(p + u * Lanes, end - 1), i, entry[u]);
 #pragma unroll
-      for (int u = 0; u < Together; ++u) {
+      for (int u = 0; u < InFlight; ++u) {
 #pragma unroll
         for (int c = 0; c < Count; ++c) x[u][c] = vec3(entry[u].from[c]);
       }
 #pragma unroll
-      for (int u = 0; u < Together; ++u) {
+      for (int u = 0; u < InFlight; ++u) {
         const Vec3<T> part = product(entry[u].factor, x[u]);
         const bool in = p + u * Lanes < end;
         sum = {select(in, sum.x + part.x, sum.x), select(in, sum.y + part.y, sum.y),
@@ -202,7 +205,7 @@ class DeviceCycle {
   }
 
   // a row of a table of fours
-  PD_DEVICE static void read_four(const T* table, std::int64_t row, T (&factor)[4]) {
+  PD_DEVICE static void read_quad(const T* table, std::int64_t row, T (&factor)[4]) {
     const Quad<T> a = reinterpret_cast<const Quad<T>*>(table)[row];
     factor[0] = a.x;
     factor[1] = a.y;
@@ -219,7 +222,7 @@ class DeviceCycle {
       if constexpr (B == 1) {
         entry.factor[0] = level.value[p];
       } else {
-        read_four(level.value, std::int64_t(p) * B + i, entry.factor);
+        read_quad(level.value, std::int64_t(p) * B + i, entry.factor);
       }
     };
     const auto part = [&](int row, int i, int lane) {
@@ -231,45 +234,48 @@ class DeviceCycle {
   // z = S r, from zero
   template <int B>
   PD_DEVICE void smooth(const Level<B, T>& level, const LevelFields<T>& f) {
-    each_product(level, f.part, [&](int at, const Vec3<T>& product) {
-      f.z[at] = quad(smoothed(level, f, vec3(f.in[at]), at, product));
+    each_product(level, f.initial, [&](int at, const Vec3<T>& product) {
+      f.z[at] = quad(smoothed(level, f, vec3(f.right[at]), at, product));
     });
   }
 
   // what that leaves of r
   template <int B>
-  PD_DEVICE void find_rest(const Level<B, T>& level, const LevelFields<T>& f) {
+  PD_DEVICE void compute_residual(const Level<B, T>& level, const LevelFields<T>& f) {
     each_product(level, f.z, [&](int at, const Vec3<T>& product) {
-      const Vec3<T> rest = vec3(f.in[at]) - product;
-      f.rest[at] = quad(rest);
-      f.part[at] = quad(T(Smoother::first) * level.inverse[at] * rest);
+      const Vec3<T> residual = vec3(f.right[at]) - product;
+      f.residual[at] = quad(residual);
+      f.initial[at] = quad(T(Smoother::first) * level.inverse[at] * residual);
     });
   }
 
   // z += S rest
   template <int B>
-  PD_DEVICE void smooth_rest(const Level<B, T>& level, const LevelFields<T>& f) {
-    each_product(level, f.part, [&](int at, const Vec3<T>& product) {
-      f.z[at] = quad(vec3(f.z[at]) + smoothed(level, f, vec3(f.rest[at]), at, product));
+  PD_DEVICE void smooth_residual(const Level<B, T>& level, const LevelFields<T>& f) {
+    each_product(level, f.initial, [&](int at, const Vec3<T>& product) {
+      f.z[at] = quad(vec3(f.z[at]) + smoothed(level, f, vec3(f.residual[at]), at, product));
     });
   }
 
   // a lane's part of (F y) at unknown i of a row, y what the level below has found
   template <int B>
-  PD_DEVICE static Vec3<T> lifted(const Level<B, T>& level, const Quad<T>* below, int row, int i,
-                                  int lane) {
+  PD_DEVICE static Vec3<T> prolongated(const Level<B, T>& level, const Quad<T>* below, int row,
+                                       int i, int lane) {
     const auto read = [&](int p, int number, Entry<4>& entry) {
       entry.from = below + std::int64_t(level.lift_node[p]) * 4;
-      read_four(level.lift_weight, std::int64_t(p) * B + number, entry.factor);
+      read_quad(level.lift_weight, std::int64_t(p) * B + number, entry.factor);
     };
-    return sum_of<lanes_of_lift<B>, 2, 4>(level.lift_start, row, i, lane, read);
+    return sum_of<prolongation_lanes<B>, 2, 4>(level.lift_start, row, i, lane, read);
   }
 
   // z += F y
   template <int B>
-  PD_DEVICE void lift(const Level<B, T>& level, const LevelFields<T>& f, const Quad<T>* below) {
-    const auto part = [&](int row, int i, int lane) { return lifted(level, below, row, i, lane); };
-    each_sum<lanes_of_lift<B>>(
+  PD_DEVICE void prolongate(const Level<B, T>& level, const LevelFields<T>& f,
+                            const Quad<T>* below) {
+    const auto part = [&](int row, int i, int lane) {
+      return prolongated(level, below, row, i, lane);
+    };
+    each_sum<prolongation_lanes<B>>(
         level, part, [&](int at, const Vec3<T>& sum) { f.z[at] = quad(vec3(f.z[at]) + sum); });
   }
   PD_DEVICE const Quad<T>* below_fine() const {
@@ -281,25 +287,25 @@ class DeviceCycle {
   PD_DEVICE static Vec3<T> smoothed(const Level<B, T>& level, const LevelFields<T>& f,
                                     const Vec3<T>& right, int at, const Vec3<T>& product) {
     const T scale = T(Smoother::second) * level.inverse[at];
-    return multiply_add(T(Smoother::keep), vec3(f.part[at]), scale * (right - product));
+    return multiply_add(T(Smoother::keep), vec3(f.initial[at]), scale * (right - product));
   }
 
   // F^T r, a node by one warp, or by several of a block where it has many entries: the plan alone decides. `part`: what
   // smoothing on the level below begins with, null for the dense one. All threads.
   template <int B>
   PD_DEVICE void restrict_to(const Level<B, T>& level, const LevelFields<T>& f, Quad<T>* in,
-                             Quad<T>* part) {
+                             Quad<T>* initial) {
     const std::int64_t entries = std::int64_t(level.lift_start[level.rows]) * B;
     int parts = 1;
     while (parts < most_parts &&
-           entries > std::int64_t(parts) * level.nodes * warp_size * most_of_lane)
+           entries > std::int64_t(parts) * level.nodes * warp_size * most_entries_per_lane)
       parts *= 2;
     // blocks have a multiple of most_parts warps
     const int warp = int(threadIdx.x) / warp_size, lane = int(threadIdx.x) % warp_size;
     const int together = int(blockDim.x) / warp_size / parts;
     const auto keep = [&](int at, const Vec3<T>& sum) {
       in[at] = quad(sum);
-      if (part) part[at] = quad(T(Smoother::first) * levels_.middle_inverse[at] * sum);
+      if (initial) initial[at] = quad(T(Smoother::first) * levels_.middle_inverse[at] * sum);
     };
 #pragma unroll 1
     for (int first = 0; first < level.nodes; first += together * team_.blocks()) {
@@ -309,13 +315,13 @@ class DeviceCycle {
       const int node = node_of(warp / parts);
       Vec3<T> sum[4] = {};
       if (node < level.nodes)
-        add_node(level, f.in, node, warp % parts * warp_size + lane, parts * warp_size, sum);
+        add_node(level, f.right, node, warp % parts * warp_size + lane, parts * warp_size, sum);
 #pragma unroll
       for (int j = 0; j < 4; ++j) {
         const Vec3<T> total = sum_over_lanes(sum[j], warp_size / 2, 1);
         if (lane != j) continue;
         if (parts > 1) {
-          part_[warp * 4 + j] = quad(total);
+          warp_sums_[warp * 4 + j] = quad(total);
         } else if (node < level.nodes) {
           keep(4 * node + j, total);
         }
@@ -325,7 +331,8 @@ class DeviceCycle {
       const int number = int(threadIdx.x) / 4, j = int(threadIdx.x) % 4;
       if (number < together && node_of(number) < level.nodes) {
         Vec3<T> total = {T(0), T(0), T(0)};
-        for (int p = 0; p < parts; ++p) total = total + vec3(part_[(number * parts + p) * 4 + j]);
+        for (int p = 0; p < parts; ++p)
+          total = total + vec3(warp_sums_[(number * parts + p) * 4 + j]);
         keep(4 * node_of(number) + j, total);
       }
       __syncthreads();
@@ -340,20 +347,20 @@ class DeviceCycle {
     const std::int64_t begin = std::int64_t(level.node_start[node]) * B;
     const int count = (level.node_start[node + 1] - level.node_start[node]) * B;
 #pragma unroll 1
-    for (int p = first; p < count; p += at_once * stride) {
-      Vec3<T> x[at_once];
-      Quad<T> weight[at_once];
-      int row[at_once];
+    for (int p = first; p < count; p += in_flight * stride) {
+      Vec3<T> x[in_flight];
+      Quad<T> weight[in_flight];
+      int row[in_flight];
 #pragma unroll
-      for (int u = 0; u < at_once; ++u) {
+      for (int u = 0; u < in_flight; ++u) {
         const std::int64_t at = begin + min(p + u * stride, count - 1);
         row[u] = level.node_row[at / B] * B + int(at % B);
         weight[u] = weights[at];
       }
 #pragma unroll
-      for (int u = 0; u < at_once; ++u) x[u] = vec3(from[row[u]]);
+      for (int u = 0; u < in_flight; ++u) x[u] = vec3(from[row[u]]);
 #pragma unroll
-      for (int u = 0; u < at_once; ++u) {
+      for (int u = 0; u < in_flight; ++u) {
         if (p + u * stride >= count) continue;
         const T w[4] = {weight[u].x, weight[u].y, weight[u].z, weight[u].w};
 #pragma unroll
@@ -364,25 +371,25 @@ class DeviceCycle {
 
   // ---- what solves with L^-1: cuda/cycle_triangle.h
 
-  struct Stretch;
-  struct Triangle;
+  struct Segment;
+  struct TriangularFactor;
   PD_DEVICE void solve_rows();
   PD_DEVICE void solve_columns();
-  PD_DEVICE Triangle columns() const;
-  PD_DEVICE void each_dot(const Triangle& a);
+  PD_DEVICE TriangularFactor columns() const;
+  PD_DEVICE void multiply_factor(const TriangularFactor& a);
   template <int Rows>
-  static __device__ __noinline__ void dots_of(Triangle a, int i);
+  static __device__ __noinline__ void multiply_rows(TriangularFactor a, int i);
   template <int Count, int Rows>
-  PD_DEVICE static void add_chunks(const Quad<T>* x, const Stretch (&stretch)[Rows], int j,
+  PD_DEVICE static void add_chunks(const Quad<T>* x, const Segment (&segment)[Rows], int j,
                                    Vec3<T> (&sum)[Rows]);
   template <int Rows>
-  PD_DEVICE static void add_part(int n, const Quad<T>* x, const Stretch (&stretch)[Rows], int chunk,
+  PD_DEVICE static void add_part(int n, const Quad<T>* x, const Segment (&segment)[Rows], int chunk,
                                  Vec3<T> (&sum)[Rows]);
 
   const Levels<T>& levels_;
   const CycleMemory<T>& m_;
   BlockTeam& team_;
-  Quad<T>* part_;
+  Quad<T>* warp_sums_;
 };
 
 }  // namespace pd::inline PD_TARGET

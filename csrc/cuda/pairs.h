@@ -15,11 +15,11 @@ class PairLanes {
   PD_DEVICE void first_loop() {
     Numbers n;
 #pragma unroll
-    for (int a = 0; a < history; ++a) see(a, pairs_.product[own_][place(a)], n);
+    for (int a = 0; a < history; ++a) load(a, pairs_.product[own_][place(a)], n);
     double rest = pairs_.pulled[own_];
 #pragma unroll
     for (int a = 0; a < history; ++a) {
-      const double alpha = n.valid[a] ? across(rest, place(a)) * n.inverse[a] : 0;
+      const double alpha = n.valid[a] ? broadcast(rest, place(a)) * n.inverse[a] : 0;
       if (age() == a) pairs_.alpha[own_] = alpha;
       // pairs older than this one, to which it is a j
       if (n.valid[a] && age() > a) rest -= alpha * n.product[a];
@@ -30,13 +30,13 @@ class PairLanes {
   PD_DEVICE void second_loop(const double* with, double* c) {
     Numbers n;
 #pragma unroll
-    for (int a = 0; a < history; ++a) see(a, pairs_.product[place(a)][own_], n);
+    for (int a = 0; a < history; ++a) load(a, pairs_.product[place(a)][own_], n);
     double rest = with[own_];
     const double alpha = pairs_.alpha[own_];
 #pragma unroll
     for (int a = history - 1; a >= 0; --a) {
       const double mine =
-          n.valid[a] ? across(alpha, place(a)) - across(rest, place(a)) * n.inverse[a] : 0;
+          n.valid[a] ? broadcast(alpha, place(a)) - broadcast(rest, place(a)) * n.inverse[a] : 0;
       if (age() == a) c[own_] = mine;
       if (n.valid[a] && age() < a) rest += mine * n.product[a];
     }
@@ -50,14 +50,14 @@ class PairLanes {
     bool valid[history];
   };
 
-  PD_DEVICE void see(int a, double product, Numbers& n) const {
+  PD_DEVICE void load(int a, double product, Numbers& n) const {
     n.inverse[a] = pairs_.inverse[place(a)];
     n.valid[a] = pairs_.valid[place(a)];
     n.product[a] = product;
   }
   PD_DEVICE int place(int age) const { return Pairs::older(newest_, age); }
   PD_DEVICE int age() const { return (newest_ - own_ + history) % history; }
-  PD_DEVICE static double across(double value, int from) {
+  PD_DEVICE static double broadcast(double value, int from) {
     return __shfl_sync(full_warp, value, from);
   }
 

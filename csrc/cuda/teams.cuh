@@ -15,8 +15,8 @@ PD_HD void arrange(Arena& arena, const Levels<T>& levels, int teams, CycleMemory
   const std::int64_t middle = levels.has_middle() ? 4 * std::int64_t(levels.fine_nodes) : 0;
   const std::int64_t coarse = levels.coarse_unknowns(), below = levels.direct ? 0 : 1;
   const auto place = [&](LevelFields<T>& f, std::int64_t size) {
-    for (Quad<T>** array : {&f.in, &f.z}) arena.place(*array, teams * size);
-    for (Quad<T>** array : {&f.rest, &f.part}) arena.place(*array, teams * size * below);
+    for (Quad<T>** array : {&f.right, &f.z}) arena.place(*array, teams * size);
+    for (Quad<T>** array : {&f.residual, &f.initial}) arena.place(*array, teams * size * below);
   };
   place(m.fine, levels.vertices);
   place(m.middle, middle);
