@@ -1,4 +1,5 @@
-// The small problem of solver/corotation.h on a GPU: how it acts on vectors. See cuda/corotation_maker.h for how it is made.
+// Application of the coarse problem of solver/corotation.h to vectors on a GPU;
+// cuda/corotation_maker.h builds it.
 #pragma once
 #include "cuda/memory.h"
 #include "plan/shared_memory.h"
@@ -11,35 +12,36 @@ constexpr int turning_products = turning_numbers * turning_numbers;
 constexpr int turning_entries = turning_modes * turning_modes;
 constexpr int turning_totals = 2 * turning_products + turning_pairs;
 
-// Products of vertices that are added up together: the plan alone decides.
+// Vertices whose products are summed together. The plan alone decides, so that the bits are fixed.
 PD_HD int turning_chunk(int vertices) { return vertices < 64 * 128 ? 64 : (vertices + 127) / 128; }
 PD_HD int turning_chunks(int vertices) {
   return (vertices + turning_chunk(vertices) - 1) / turning_chunk(vertices);
 }
 
-// Device memory of a team. Sixteen numbers of a vertex are (w_k, w_k r) of group after group, or A times them.
+// Device memory of a team. Each vertex has sixteen numbers, (w_k, w_k r) for each group k, and
+// sixteen images, A times these numbers.
 template <class T>
 struct CorotationMemory {
-  Quad<T>* arm;              // [vertices] r, from the middle of the body
+  Quad<T>* arm;              // [vertices] lever arm r, relative to the centroid
   Quad<T>*numbers, *images;  // [groups, vertices]
-  double* products;          // [chunks, 2, turning_products] those of inertia, and of A
+  double* products;          // [chunks, 2, turning_products] with the inertia, and with A
   double* strains;           // [patches, turning_pairs]
   double* totals;            // [turning_totals]
-  double* springs;           // [chunks, turning_entries] of contacts; none without them
+  double* springs;           // [chunks, turning_entries] contact springs; empty without contacts
 };
 
-// In shared memory, the same in every block.
+// State of the coarse problem in shared memory, the same in every block.
 template <class T>
 struct CorotationControl {
   TurningMatrix inverse[2];  // Hc^-1, Ac^-1
   double own[turning_modes], scale[turning_modes];
   T mode[turning_modes];
-  DevicePlan<T> plan;  // of those who make it
-  bool sound, held;    // whether it could be made; whether contacts hold Hc
+  DevicePlan<T> plan;  // for CorotationMaker
+  bool sound, held;    // sound: positive definite; held: Hc includes contact springs
 
   PD_DEVICE double* at(int which) { return &inverse[which].at[0][0]; }
 
-  // what does nothing
+  // Makes the correction zero.
   PD_DEVICE void clear() {
     for (int i = threadIdx.x; i < turning_modes * turning_modes; i += blockDim.x)
       at(0)[i] = at(1)[i] = 0;
@@ -55,7 +57,7 @@ class DeviceCorotation {
   PD_DEVICE DeviceCorotation(int vertices, const CorotationMemory<T>& memory, std::byte* shared)
       : vertices_(vertices), m_(memory), c_(*reinterpret_cast<CorotationControl<T>*>(shared)) {}
 
-  // for those who make it, with a copy of the plan, which all threads write
+  // The control for CorotationMaker, with a copy of the plan, written by all threads.
   PD_DEVICE CorotationControl<T>& with_plan(const DevicePlan<T>& plan) const {
     constexpr int words = sizeof(plan) / sizeof(std::uint64_t);
     static_assert(sizeof(plan) % sizeof(std::uint64_t) == 0);
@@ -66,10 +68,10 @@ class DeviceCorotation {
     return c_;
   }
 
-  // as it was given to them
+  // the control as built
   PD_DEVICE CorotationControl<T>& control() const { return c_; }
 
-  // Products of all modes with a field, at a vertex; sums are those of them.
+  // Products of all modes with a field at a vertex, added to the sums.
   PD_DEVICE void multiply_modes(int i, const Vec3<T>& q, T (&sum)[turning_modes]) const {
     products(m_.numbers, i, q, sum);
   }
@@ -77,8 +79,9 @@ class DeviceCorotation {
     products(m_.images, i, z, sum);
   }
 
-  // Before M, of sums V^T q; q came multiplied by `scale`. But for deflation, which goes `around` M, nothing else is needed: what
-  // its result lacks is V (Hc^-1 - Ac^-1) V^T q.
+  // Before M, from the sums V^T q, where q was multiplied by `scale`. With deflation (`around` M),
+  // a second step follows. Otherwise the correction of M's result is complete: V (Hc^-1 - Ac^-1)
+  // V^T q.
   PD_DEVICE void measure(const double* sum, bool around, double scale) const {
     if (threadIdx.x < turning_modes) {
       const int i = threadIdx.x;
@@ -91,7 +94,7 @@ class DeviceCorotation {
   // (I - A V Ac^-1 V^T) q
   PD_DEVICE Vec3<T> without(int i, const Vec3<T>& q) const { return q - moved(m_.images, i); }
 
-  // After it, of sums (A V)^T z: what z lacks.
+  // After M, from the sums (A V)^T z: the remaining correction of z.
   PD_DEVICE void answer(const double* sum, double scale) const {
     if (threadIdx.x < turning_modes) {
       const int i = threadIdx.x;
@@ -125,7 +128,8 @@ class DeviceCorotation {
     return sum;
   }
 
-  // of a symmetric matrix, so that neighbouring threads read neighbouring numbers
+  // one row of a symmetric matrix, read by columns so that neighbouring threads read neighbouring
+  // numbers
   PD_DEVICE static double row(const TurningMatrix& a, int i, const double* x) {
     double sum = 0;
     for (int j = 0; j < turning_modes; ++j) sum += a.at[j][i] * x[j];

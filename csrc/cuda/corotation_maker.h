@@ -1,4 +1,5 @@
-// How a team of blocks makes the small problem of solver/corotation.h of an iterate; see also cpu/corotation_maker.h.
+// Builds the coarse problem of solver/corotation.h at an iterate, by a team of blocks; see also
+// cpu/corotation_maker.h.
 #pragma once
 #include "cuda/half.h"
 #include "cuda/outer_call.h"
@@ -6,7 +7,8 @@
 
 namespace pd::inline PD_TARGET {
 
-// Of an environment: x, 1 / D and a in the w of u and `inertia`, where it stands, and w V of every pair.
+// Inputs of one environment: x; 1 / D in the w of u; a in the w of `inertia`; the iterate; and w V
+// of every pair.
 template <class T>
 struct CorotationInput {
   const Quad<T>*x, *u, *inertia, *base;
@@ -49,7 +51,8 @@ class CorotationMaker {
     solve();
   }
 
-  // Contacts hold a vertex by springs as stiff as its diagonal, in the directions that they do not leave `free`.
+  // Adds contacts to Hc: each vertex gets a spring with the stiffness of its diagonal, in the
+  // directions that are not `free`.
   PD_DEVICE void hold(const Mat3<T>* free) const {
     if (!c_.sound) return;
 #pragma unroll 1
@@ -57,7 +60,7 @@ class CorotationMaker {
       add_springs(c, free);
     team_.barrier();
     const bool held = sum_energy(true);
-    // as it was
+    // unchanged
     if (!held && !c_.held) return;
     const bool sound = invert(energy(), 1) && held;
     if (held && !sound) {
@@ -70,11 +73,11 @@ class CorotationMaker {
   }
 
  private:
-  // Any place amid the vertices will do. What is held has no part in it, be it NaN.
+  // Any point amid the vertices will do. Pinned vertices are excluded, since they may be NaN.
   PD_DEVICE Vec3<T> find_centroid() const {
     const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
     const int count = turning_chunk(plan_.vertices), chunks = turning_chunks(plan_.vertices);
-    double* of_chunk = m_.products;  // which are not there yet
+    double* of_chunk = m_.products;  // m_.products is not in use yet
     double sum[4];
 #pragma unroll 1
     for (int c = team_.warp(); c < chunks; c += team_.warps()) {
@@ -107,7 +110,7 @@ class CorotationMaker {
     return {T(share * total[0]), T(share * total[1]), T(share * total[2])};
   }
 
-  // what is held, here or by what M was made of, turns with nothing
+  // vertices pinned here, or in the preconditioner's scene, take part in no rotation
   PD_DEVICE void set(int i, const Vec3<T>& arm, bool moves) const {
     m_.arm[i] = quad(arm);
     const bool has_part = moves && plan_.levels.fine_inverse[i] > T(0);
@@ -135,7 +138,7 @@ class CorotationMaker {
         for (int k = 0; k < turning_groups; ++k)
           sum[k] = multiply_add(a, m_.numbers[at(k, level.column[p])], sum[k]);
       }
-      // the lanes of a row keep a group each
+      // each lane of a row keeps one group
       static_assert(threads_of_row == turning_groups);
       const bool high = lane & 2, odd = lane & 1;
       const Quad<T> total = exchange_halves(odd, exchange_halves(high, sum[0], sum[2], 2),
@@ -144,7 +147,7 @@ class CorotationMaker {
     }
   }
 
-  // Products of the sixteen numbers of a chunk of vertices with a times them, and with their images.
+  // Sums the products of a chunk's vertex numbers with a times themselves, and with their images.
   PD_DEVICE void add_products(int chunk) const {
     constexpr int together = 64, stride = together + 1;  // vertices in shared memory at a time
     constexpr int vectors = 2 * turning_groups, sums = 2;
@@ -189,9 +192,10 @@ class CorotationMaker {
     }
   }
 
-  // Sums of products of the strains of all modes over a patch.
+  // Sums the products of all modes' strains over a patch.
   PD_DEVICE void add_strains(int number) const {
-    // a warp two groups, of which k is not before l, and one of some slices; what was in their place is of no use any more
+    // one warp per pair of groups k >= l and per slice; the sums overwrite c_.inverse, which is no
+    // longer needed
     constexpr int group_pairs = turning_groups * (turning_groups + 1) / 2, slices = 3;
     double* const sum = c_.at(0);
     static_assert(slices * turning_pairs * sizeof(double) <= sizeof(c_.inverse));
@@ -222,7 +226,7 @@ class CorotationMaker {
     }
   }
 
-  // A tetrahedron of the patch, to place threadIdx.x of the tile.
+  // Writes a tetrahedron of the patch to place threadIdx.x of the tile.
   PD_DEVICE void fill_tile(const Patch<T>& patch, int first, const TurningTile<T>& tile) const {
     const int place = threadIdx.x, tet = first + place;
     const TetInputs<T> numbers = load_tet<true>(patch, in_.weights, tet);
@@ -237,7 +241,7 @@ class CorotationMaker {
     const ComputedRest<T> rest = rest_of<true>(patch);
     Mat3<T> inverse = tet_rest(numbers, T(1) / rest.unit, rest.position).inverse(0);
     Mat3<T> f = deformation_gradient(x, inverse);
-    // what is not there may be anything
+    // data of missing tetrahedra is arbitrary
     const auto keep = [&](T& a, T other) { a = select(there, a, other); };
     for (int r = 0; r < 3; ++r) {
       for (T* a : {&inverse.row[r].x, &inverse.row[r].y, &inverse.row[r].z}) keep(*a, T(0));
@@ -254,7 +258,7 @@ class CorotationMaker {
     tile.weight(place) = select(there, numbers.weight, T(0));
   }
 
-  // A warp, which has every `Slices`-th 32 of `count` tetrahedra.
+  // Called by a warp, which processes every `Slices`-th group of 32 tetrahedra.
   template <int Slices>
   PD_DEVICE static void multiply_strains(const TurningTile<T>& tile, int slice, int count, int k,
                                          int l, double* sum) {
@@ -281,7 +285,7 @@ class CorotationMaker {
     }
   }
 
-  // A warp a number; all there are fewer than 2^31.
+  // One warp per total; all row counts are below 2^31.
   PD_DEVICE void add_up() const {
     const int lane = int(threadIdx.x) % warp_size;
 #pragma unroll 1
@@ -298,7 +302,8 @@ class CorotationMaker {
     }
   }
 
-  // A lane has a mode, and sums its products with all of them over the vertices of a chunk that contacts hold.
+  // A lane holds one mode, and sums its products with all modes over the chunk's vertices in
+  // contact.
   PD_DEVICE void add_springs(int chunk, const Mat3<T>* free) const {
     const int lane = int(threadIdx.x) % warp_size, count = turning_chunk(plan_.vertices);
     const int end = min((chunk + 1) * count, plan_.vertices);
@@ -328,15 +333,15 @@ class CorotationMaker {
     }
   }
 
-  // a projector has less than this trace where it takes anything
+  // a projector with any blocked direction has a smaller trace
   PD_DEVICE static bool leaves_all(const Mat3<T>& free) {
     return !((free.row[0].x + free.row[1].y) + free.row[2].z < T(2.5));
   }
 
-  // Hc, where invert() reads it before it writes there
+  // place of Hc, which invert() reads before it overwrites it
   PD_DEVICE TurningMatrix* energy() const { return reinterpret_cast<TurningMatrix*>(scratch_) + 3; }
 
-  // With the springs of contacts or without; whether there are any.
+  // Computes Hc with or without contact springs; returns whether any spring is nonzero.
   PD_DEVICE bool sum_energy(bool springs) const {
     const int chunks = springs ? turning_chunks(plan_.vertices) : 0;
     bool some = false;
@@ -351,7 +356,7 @@ class CorotationMaker {
     return __syncthreads_or(some);
   }
 
-  // what of a mode's displacement of a vertex is not free
+  // the blocked part of a mode's displacement of a vertex
   PD_DEVICE Vec3<double> held_mode(const Mat3<T>& free, int vertex, int mode) const {
     const Quad<T> n = m_.numbers[at(mode / 6, vertex)];
     const int a = mode % 3;
@@ -369,7 +374,7 @@ class CorotationMaker {
             d.z - dot(wide(free.row[2]), d)};
   }
 
-  // of Hc or Ac, by the totals
+  // An entry of Hc or Ac, from the totals.
   PD_DEVICE static double entry(const double* totals, int of, int i, int j) {
     using Products = double[turning_numbers][turning_numbers];
     const auto* products = reinterpret_cast<const Products*>(totals);
@@ -378,7 +383,7 @@ class CorotationMaker {
     return mode_product(products[of], i, j) + strain;
   }
 
-  // Every block for itself, from the same totals.
+  // Every block solves the same problem from the same totals.
   PD_DEVICE void solve() const {
     double* totals = reinterpret_cast<double*>(scratch_);
     static_assert(turning_totals * sizeof(double) <= turning_scratch_bytes);
@@ -407,7 +412,7 @@ class CorotationMaker {
             pd::multiply_add(a, b.z, c.z), pd::multiply_add(a, b.w, c.w)};
   }
 
-  // of two sums a lane keeps one and adds its neighbour's
+  // each lane keeps one of two sums and adds its neighbour's
   PD_DEVICE static Quad<T> exchange_halves(bool upper, const Quad<T>& a, const Quad<T>& b,
                                            int distance) {
     const auto half = [&](T x, T y) {
@@ -416,7 +421,7 @@ class CorotationMaker {
     return {half(a.x, b.x), half(a.y, b.y), half(a.z, b.z), half(a.w, b.w)};
   }
 
-  // visit(matrix, i, j): the entries of one or two matrices that this thread has
+  // visit(matrix, i, j) for this thread's entries of one or two matrices
   template <class Visit>
   PD_DEVICE static void each_entry(int matrices, const Visit& visit) {
     for (int e = threadIdx.x; e < matrices * turning_entries; e += blockDim.x) {
@@ -425,7 +430,8 @@ class CorotationMaker {
     }
   }
 
-  // Inverses of Hc alone, or of Ac too, in the scale of c_.scale; false where one is not positive. All threads.
+  // Inverts Hc, or Hc and Ac, scaled by c_.scale; returns false if a pivot is not positive. Called
+  // by all threads.
   PD_DEVICE bool invert(const TurningMatrix* matrix, int matrices) const {
     TurningMatrix *now = reinterpret_cast<TurningMatrix*>(scratch_), *next = now + 2;
     static_assert(4 * sizeof(TurningMatrix) <= turning_scratch_bytes);
@@ -458,15 +464,15 @@ class CorotationMaker {
   const DevicePlan<T>& plan_;
   std::byte* scratch_;  // in shared memory
   std::size_t scratch_bytes_;
-  double stiffness_ratio_;  // the material is that of A so many times at most
+  double stiffness_ratio_;  // upper bound of the ratio between the material and that of A
   const CorotationInput<T>& in_;
   const CorotationMemory<T>& m_;
   BlockTeam& team_;
   CorotationControl<T>& c_;
 };
 
-// Out of line, so that the iterations keep their registers, with all that it needs as values or in shared memory: what a kernel
-// is given is far away there. Returns where the team stands.
+// Out of line, so that the iterations keep their registers. All inputs are values or in shared
+// memory, since kernel parameters are slow to read here. Returns the team's state.
 template <class T>
 __device__ __noinline__ BlockTeam make_corotation(CorotationInput<T> in, CorotationMemory<T> memory,
                                                   BlockTeam team, std::byte* scratch,
@@ -476,7 +482,7 @@ __device__ __noinline__ BlockTeam make_corotation(CorotationInput<T> in, Corotat
   return team;
 }
 
-// The same of what contacts do to it.
+// The same for the contact springs.
 template <class T>
 __device__ __noinline__ BlockTeam hold_corotation(CorotationInput<T> in, const Mat3<T>* free,
                                                   CorotationMemory<T> memory, BlockTeam team,

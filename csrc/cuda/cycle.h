@@ -1,11 +1,12 @@
-// The preconditioner M of solver/multilevel.h on a GPU: one V-cycle, or a direct solve, by a team of blocks, in a fixed order of sums.
+// The preconditioner M of solver/multilevel.h on a GPU: one V-cycle or a direct solve, by a team of
+// blocks, with sums in a fixed order.
 #pragma once
 #include "cuda/block_team.h"
 #include "solver/multilevel.h"
 
 namespace pd::inline PD_TARGET {
 
-// Right side, result, and two to work with that a direct solve does without.
+// Right-hand side, result, and two work vectors, which a direct solve does not need.
 template <class T>
 struct LevelFields {
   Quad<T>*right, *z, *residual, *initial;
@@ -17,7 +18,7 @@ struct CycleMemory {
   Quad<T>*coarse_in, *coarse_half, *coarse_out;
 };
 
-// The arrays of one of several teams.
+// The arrays of one team.
 template <class T>
 PD_DEVICE CycleMemory<T> cycle_of_team(const Levels<T>& levels, CycleMemory<T> m, int team) {
   const auto move = [team](LevelFields<T>& f, std::int64_t size) {
@@ -43,22 +44,23 @@ PD_DEVICE Vec3<T> sum_over_lanes(Vec3<T> sum, int most, int least) {
   return sum;
 }
 
-// Warps that share a node, at most; the warps of any block of a cycle are a multiple of it.
+// Maximum number of warps per node; every block's number of warps is a multiple of it.
 constexpr int most_parts = 8;
 
 template <class T>
 class DeviceCycle {
  public:
-  // `part`: shared memory for four vectors of every warp of the block
+  // `warp_sums`: shared memory for four vectors per warp of the block
   PD_DEVICE DeviceCycle(const Levels<T>& levels, const CycleMemory<T>& memory, BlockTeam& team,
                         Quad<T>* warp_sums)
       : levels_(levels), m_(memory), team_(team), warp_sums_(warp_sums) {}
 
-  // The right side at a vertex. All are set, and met by a barrier, before a run.
+  // Sets the right-hand side at a vertex. All vertices are set, followed by a team barrier, before
+  // a run.
   PD_DEVICE void set(int i, const Vec3<T>& right) const {
     const T inverse = levels_.fine_inverse[i];
     if (levels_.direct) {
-      // what is held has no part in a product, be it NaN
+      // pinned vertices are excluded, since they may be NaN
       m_.fine.right[i] = quad(inverse > T(0) ? right : Vec3<T>{T(0), T(0), T(0)});
       return;
     }
@@ -69,13 +71,14 @@ class DeviceCycle {
   PD_DEVICE Vec3<T> result(int i) const { return vec3(m_.fine.z[i]); }
   PD_DEVICE void set_result(int i, const Vec3<T>& z) const { m_.fine.z[i] = quad(z); }
 
-  // result = M times what was set, there for all of the team when it returns
+  // Computes result = M times the right-hand side, visible to the whole team on return.
   PD_DEVICE void run() {
     run_but_last();
     finish();
   }
 
-  // The same but for its last part, for which there are two ways below. Between two barriers everything is done side by side.
+  // All of M but its last phase, which finish() or run_last() completes. Work between two barriers
+  // is independent.
   PD_DEVICE void run_but_last() {
     const Level<1, T> fine = fine_level(levels_);
     const Level<4, T> middle = middle_level(levels_);
@@ -106,7 +109,7 @@ class DeviceCycle {
     team_.barrier();
   }
 
-  // that part, by the team
+  // The last phase, by the team.
   PD_DEVICE void finish() {
     if (levels_.direct) {
       solve_columns();
@@ -116,8 +119,9 @@ class DeviceCycle {
     team_.barrier();
   }
 
-  // The same at the vertices row(0 ... count - 1) that are there, for all threads of the block when they have met. `count` is a
-  // multiple of 32, and so are the places from which on rows follow each other.
+  // The last phase at the vertices row(0 ... count - 1) that exist, for the threads of this block;
+  // a block barrier must follow. `count` is a multiple of 32, and rows are consecutive from each
+  // multiple of 32 on.
   template <class Row>
   PD_DEVICE void run_last(int count, const Row& row) {
     if (levels_.direct) {
@@ -145,18 +149,18 @@ class DeviceCycle {
   template <int B>
   static constexpr int prolongation_lanes = B == 1 ? 4 : 8;
   static constexpr int in_flight =
-      sizeof(T) == 4 ? 8 : 4;                       // entries of a node that a lane asks for
-  static constexpr int most_entries_per_lane = 16;  // of them before more warps share a node
+      sizeof(T) == 4 ? 8 : 4;                       // entries of a node that a lane loads at once
+  static constexpr int most_entries_per_lane = 16;  // before more warps share a node
 
-  // One entry of a row: where its vectors stand, and their factors.
+  // One entry of a row: its vectors and their factors.
   template <int Count>
   struct Entry {
     const Quad<T>* from;
     T factor[Count];
   };
 
-  // A lane's part of the sum over the entries of a row for unknown i of it, for which `read` gives an entry. A lane asks for
-  // `Together` entries, then for all of their vectors.
+  // A lane's partial sum over the entries of a row, for unknown i; `read` loads an entry. A lane
+  // loads `InFlight` entries, then all of their vectors.
   template <int Lanes, int InFlight, int Count, class Read>
   PD_DEVICE static Vec3<T> sum_of(const int32* start, int row, int i, int lane, const Read& read) {
     const int end = start[row + 1];
@@ -183,8 +187,9 @@ class DeviceCycle {
     return sum;
   }
 
-  // visit(unknown, sum) for the unknowns of a level in one of the `Lanes` threads that have a part(row, number in it, lane) of
-  // the sum each. The last warps come first, since what is done beside keeps the first ones busy.
+  // Calls visit(unknown, sum) for the unknowns of a level, on one of the `Lanes` threads that
+  // compute its partial sums part(row, unknown in the row, lane). It starts from the last warps,
+  // since concurrent work keeps the first warps busy.
   template <int Lanes, int B, class Part, class Visit>
   PD_DEVICE void each_sum(const Level<B, T>& level, const Part& part, const Visit& visit) {
     constexpr int per_warp = warp_size / Lanes;
@@ -204,7 +209,7 @@ class DeviceCycle {
     return multiply_add(a[1], x[1], a[0] * x[0]) + multiply_add(a[3], x[3], a[2] * x[2]);
   }
 
-  // a row of a table of fours
+  // one row of a table with four columns
   PD_DEVICE static void read_quad(const T* table, std::int64_t row, T (&factor)[4]) {
     const Quad<T> a = reinterpret_cast<const Quad<T>*>(table)[row];
     factor[0] = a.x;
@@ -239,7 +244,7 @@ class DeviceCycle {
     });
   }
 
-  // what that leaves of r
+  // the residual r - A z
   template <int B>
   PD_DEVICE void compute_residual(const Level<B, T>& level, const LevelFields<T>& f) {
     each_product(level, f.z, [&](int at, const Vec3<T>& product) {
@@ -249,7 +254,7 @@ class DeviceCycle {
     });
   }
 
-  // z += S rest
+  // z += S residual
   template <int B>
   PD_DEVICE void smooth_residual(const Level<B, T>& level, const LevelFields<T>& f) {
     each_product(level, f.initial, [&](int at, const Vec3<T>& product) {
@@ -257,7 +262,7 @@ class DeviceCycle {
     });
   }
 
-  // a lane's part of (F y) at unknown i of a row, y what the level below has found
+  // a lane's partial sum of (F y) at unknown i of a row; y is the result of the coarser level
   template <int B>
   PD_DEVICE static Vec3<T> prolongated(const Level<B, T>& level, const Quad<T>* below, int row,
                                        int i, int lane) {
@@ -282,7 +287,7 @@ class DeviceCycle {
     return levels_.has_middle() ? m_.middle.z : m_.coarse_out;
   }
 
-  // keep w + second / D (r - A w), w being f.part and `product` A w
+  // keep w + second / D (r - A w), with w = f.initial and `product` = A w
   template <int B>
   PD_DEVICE static Vec3<T> smoothed(const Level<B, T>& level, const LevelFields<T>& f,
                                     const Vec3<T>& right, int at, const Vec3<T>& product) {
@@ -290,8 +295,9 @@ class DeviceCycle {
     return multiply_add(T(Smoother::keep), vec3(f.initial[at]), scale * (right - product));
   }
 
-  // F^T r, a node by one warp, or by several of a block where it has many entries: the plan alone decides. `part`: what
-  // smoothing on the level below begins with, null for the dense one. All threads.
+  // Restriction F^T r: one warp per node, or several warps of a block for nodes with many entries,
+  // decided by the plan alone. `initial`: the coarser level's first smoothing vector, null for the
+  // dense level. Called by all threads.
   template <int B>
   PD_DEVICE void restrict_to(const Level<B, T>& level, const LevelFields<T>& f, Quad<T>* in,
                              Quad<T>* initial) {
@@ -339,7 +345,7 @@ class DeviceCycle {
     }
   }
 
-  // Sums over the entries first, first + stride ... of a node.
+  // Sums over the entries first, first + stride, ... of a node.
   template <int B>
   PD_DEVICE static void add_node(const Level<B, T>& level, const Quad<T>* from, int node, int first,
                                  int stride, Vec3<T> (&sum)[4]) {
@@ -369,7 +375,7 @@ class DeviceCycle {
     }
   }
 
-  // ---- what solves with L^-1: cuda/cycle_triangle.h
+  // ---- multiplication by L^-1: cuda/cycle_triangle.h
 
   struct Segment;
   struct TriangularFactor;

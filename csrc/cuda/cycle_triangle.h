@@ -1,4 +1,4 @@
-// Members of DeviceCycle that multiply by L^-1, row by row or column by column.
+// Members of DeviceCycle that multiply by L^-1, by rows or by columns.
 #pragma once
 #include "cuda/cycle.h"
 
@@ -11,7 +11,7 @@ struct DeviceCycle<T>::Segment {
   int first, end;
 };
 
-// L^-1 row by row, or column by column: a product with a vector [n].
+// L^-1 by rows or by columns, with the vectors [n] of a product.
 template <class T>
 struct DeviceCycle<T>::TriangularFactor {
   const T* numbers;
@@ -22,13 +22,14 @@ struct DeviceCycle<T>::TriangularFactor {
 
   PD_DEVICE Segment segment(int i) const {
     if (!by_columns) return {numbers + std::int64_t(i) * (i + 1) / 2, 0, i + 1};
-    // so that the numbers of row i are at i
+    // offset so that the number of row i is at index i
     const std::int64_t diagonal = std::int64_t(i) * n - std::int64_t(i) * (i - 1) / 2;
     return {numbers + diagonal - i, i, n};
   }
 };
 
-// L^-T (L^-1 r): symmetric and positive in any precision. A warp a row, then a warp a column.
+// L^-T (L^-1 r), symmetric and positive in any precision: one warp per row, then one warp per
+// column.
 template <class T>
 PD_DEVICE void DeviceCycle<T>::solve_rows() {
   const Quad<T>* in = levels_.direct ? m_.fine.right : m_.coarse_in;
@@ -56,8 +57,8 @@ PD_DEVICE void DeviceCycle<T>::multiply_factor(const TriangularFactor& a) {
   }
 }
 
-// `Rows` neighbouring stretches by a warp, from i on, chunk by chunk of a number for each lane. Out of line, since so many
-// call it.
+// Computes `Rows` neighbouring segments from i on by one warp, in chunks of one number per lane.
+// Out of line, since it has many callers.
 template <class T>
 template <int Rows>
 __device__ __noinline__ void DeviceCycle<T>::multiply_rows(TriangularFactor a, int i) {
@@ -70,7 +71,8 @@ __device__ __noinline__ void DeviceCycle<T>::multiply_rows(TriangularFactor a, i
     segment[r] = a.segment(min(i + r, n - 1));
     sum[r] = {T(0), T(0), T(0)};
   }
-  // rows end where they are, columns begin there; chunks that all of them fill lie between
+  // rows end and columns begin at different places; chunks between full and part are complete in
+  // all segments
   const Segment &one = segment[0], &other = segment[Rows - 1];
   const int full = (other.first + warp_size - 1) / warp_size, part = one.end / warp_size;
   int chunk = one.first / warp_size;
@@ -91,7 +93,7 @@ __device__ __noinline__ void DeviceCycle<T>::multiply_rows(TriangularFactor a, i
   }
 }
 
-// chunks from number j on; everything is asked for before it is used
+// from number j on; all loads come before their first use
 template <class T>
 template <int Count, int Rows>
 PD_DEVICE void DeviceCycle<T>::add_chunks(const Quad<T>* x, const Segment (&segment)[Rows], int j,
@@ -111,7 +113,7 @@ PD_DEVICE void DeviceCycle<T>::add_chunks(const Quad<T>* x, const Segment (&segm
   }
 }
 
-// a chunk of which some stretches have a part
+// a chunk that only some segments cover
 template <class T>
 template <int Rows>
 PD_DEVICE void DeviceCycle<T>::add_part(int n, const Quad<T>* x, const Segment (&segment)[Rows],

@@ -1,4 +1,4 @@
-// The iterations of the multilevel solver as functions, for the runner of a step.
+// Entry points of the multilevel solver's iterations, for StreamRunner.
 #pragma once
 #include "cuda/stream.h"
 
@@ -6,15 +6,16 @@
 
 namespace pd {
 
-// Bytes of device memory beside those of a step, aligned to 256.
+// Device memory in bytes beside that of a step, aligned to 256.
 template <class T>
 std::int64_t outer_bytes(const DeviceStep<T>& step);
 
-// Compares the material of a step with that of its preconditioner; once a call, after the weights.
+// Compares a step's material with that of its preconditioner; called once per call, after the
+// weights.
 template <class T>
 void run_comparison(const StreamCall<T>& call, void* memory, cudaStream_t stream);
 
-// multilevel_iterations of every environment.
+// Runs multilevel_iterations for every environment.
 template <class T>
 void run_outer(const StreamCall<T>& call, void* memory, cudaStream_t stream);
 

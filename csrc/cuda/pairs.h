@@ -1,12 +1,13 @@
-// The two loops of Pairs (solver/multilevel.h) by a warp, a lane a pair: the same operations on every number in the same order,
-// in a chain of eight steps instead of one of 36.
+// The two loops of L-BFGS over secant pairs (Pairs, solver/multilevel.h) by one warp, one pair per
+// lane. The operations on every number and their order are unchanged; the dependency chain is 8
+// steps long instead of 36.
 #pragma once
 #include "cuda/collect.h"
 #include "solver/multilevel.h"
 
 namespace pd::inline PD_TARGET {
 
-// A whole warp, of which lane `history` and above repeat others.
+// Called by a whole warp; lanes from `history` on repeat others.
 class PairLanes {
  public:
   PD_DEVICE PairLanes(Pairs& pairs, int newest)
@@ -21,7 +22,7 @@ class PairLanes {
     for (int a = 0; a < history; ++a) {
       const double alpha = n.valid[a] ? broadcast(rest, place(a)) * n.inverse[a] : 0;
       if (age() == a) pairs_.alpha[own_] = alpha;
-      // pairs older than this one, to which it is a j
+      // pairs older than this one, for which it is a j
       if (n.valid[a] && age() > a) rest -= alpha * n.product[a];
     }
     __syncwarp();
@@ -44,7 +45,7 @@ class PairLanes {
   }
 
  private:
-  // of the pairs by their age, asked for before the chain begins
+  // the pairs' values by age, loaded before the chain begins
   struct Numbers {
     double inverse[history], product[history];
     bool valid[history];

@@ -1,4 +1,5 @@
-// What a block keeps of tetrahedra in shared memory while it multiplies their strains (solver/corotation.h), and sums of a warp.
+// Tetrahedra in a block's shared memory for the strain products of solver/corotation.h, and warp
+// sums of 36 values.
 #pragma once
 #include "cuda/collect.h"
 #include "cuda/memory.h"
@@ -7,7 +8,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// Sums of 36 numbers over a warp: afterwards each lane has one or two of them in front.
+// Sums 36 values over a warp; on return each lane holds one or two of the sums in front.
 template <class T>
 PD_DEVICE void spread_sums(T (&value)[36]) {
   const int lane = int(threadIdx.x) % warp_size;
@@ -25,7 +26,7 @@ PD_DEVICE void spread_sums(T (&value)[36]) {
     size = half;
   }
 }
-// Which of them.
+// Indices of a lane's sums.
 struct KeptSums {
   int first = 0, count = 36;
 
@@ -41,7 +42,8 @@ struct KeptSums {
   }
 };
 
-// What the products of strains want of a tetrahedron: g and p of each group, and w V. Neighbours lie side by side.
+// Data of a tetrahedron for strain products: g and p of each group, and w V. Neighbouring
+// tetrahedra are adjacent in memory.
 template <class T>
 class TurningTile {
   static constexpr int of_group = 12, numbers = turning_groups * of_group + 1;
