@@ -148,9 +148,10 @@ class DeviceCycle {
  private:
   template <int B>
   static constexpr int prolongation_lanes = B == 1 ? 4 : 8;
-  static constexpr int in_flight =
-      sizeof(T) == 4 ? 8 : 4;                       // entries of a node that a lane loads at once
-  static constexpr int most_entries_per_lane = 16;  // before more warps share a node
+  // entries of a node that a lane loads at once
+  static constexpr int in_flight = sizeof(T) == 4 ? 8 : 4;
+  // and has at most, before more warps share a node
+  static constexpr int most_entries_per_lane = 16;
 
   // One entry of a row: its vectors and their factors.
   template <int Count>
