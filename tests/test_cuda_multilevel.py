@@ -237,7 +237,7 @@ def test_rollout_is_its_steps_and_a_recording_too() -> None:
     assert not host_waits(step.replay)
     # one launch for all iterations
     names = device_work(lambda: sim(start))
-    assert sum("outer_iterations" in name for name in names) == 1
+    assert sum("multilevel_kernel" in name for name in names) == 1
 
 
 @pytest.mark.parametrize("outer", SOLVERS)

@@ -34,7 +34,7 @@ struct CorotationMemory {
 template <class T>
 struct CorotationControl {
   TurningMatrix inverse[2];  // Hc^-1, Ac^-1
-  double own[turning_modes], scale[turning_modes];
+  double projection[turning_modes], scale[turning_modes];
   T mode[turning_modes];
   DevicePlan<T> plan;  // for CorotationMaker
   bool sound, held;    // sound: positive definite; held: Hc includes contact springs
@@ -82,27 +82,27 @@ class DeviceCorotation {
   // Before M, from the sums V^T q, where q was multiplied by `scale`. With deflation (`around` M),
   // a second step follows. Otherwise the correction of M's result is complete: V (Hc^-1 - Ac^-1)
   // V^T q.
-  PD_DEVICE void measure(const double* sum, bool around, double scale) const {
+  PD_DEVICE void compute_modes(const double* sum, bool around, double scale) const {
     if (threadIdx.x < turning_modes) {
       const int i = threadIdx.x;
       const double part = row(c_.inverse[1], i, sum);
-      c_.own[i] = sum[i];
+      c_.projection[i] = sum[i];
       c_.mode[i] = T(around ? part : row(c_.inverse[0], i, sum) / scale - part);
     }
     __syncthreads();
   }
   // (I - A V Ac^-1 V^T) q
-  PD_DEVICE Vec3<T> without(int i, const Vec3<T>& q) const { return q - moved(m_.images, i); }
+  PD_DEVICE Vec3<T> deflated(int i, const Vec3<T>& q) const { return q - moved(m_.images, i); }
 
   // After M, from the sums (A V)^T z: the remaining correction of z.
-  PD_DEVICE void answer(const double* sum, double scale) const {
+  PD_DEVICE void complete_modes(const double* sum, double scale) const {
     if (threadIdx.x < turning_modes) {
       const int i = threadIdx.x;
-      c_.mode[i] = T(row(c_.inverse[0], i, c_.own) / scale - row(c_.inverse[1], i, sum));
+      c_.mode[i] = T(row(c_.inverse[0], i, c_.projection) / scale - row(c_.inverse[1], i, sum));
     }
     __syncthreads();
   }
-  PD_DEVICE Vec3<T> with(int i, const Vec3<T>& z) const { return z + moved(m_.numbers, i); }
+  PD_DEVICE Vec3<T> corrected(int i, const Vec3<T>& z) const { return z + moved(m_.numbers, i); }
 
  private:
   PD_DEVICE void products(const Quad<T>* numbers, int i, const Vec3<T>& field,

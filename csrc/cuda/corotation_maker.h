@@ -11,7 +11,7 @@ namespace pd::inline PD_TARGET {
 // of every pair.
 template <class T>
 struct CorotationInput {
-  const Quad<T>*x, *u, *inertia, *base;
+  const Quad<T>*x, *u, *inertia, *iterate;
   const T* weights;
 };
 
@@ -35,7 +35,7 @@ class CorotationMaker {
   PD_DEVICE void make() const {
     const Vec3<T> centroid = find_centroid();
     for (int i = team_.thread(); i < plan_.vertices; i += team_.threads())
-      set(i, (vec3(in_.x[i]) - centroid) + vec3(in_.base[i]), in_.u[i].w > T(0));
+      set(i, (vec3(in_.x[i]) - centroid) + vec3(in_.iterate[i]), in_.u[i].w > T(0));
     team_.barrier();
     multiply();
     team_.barrier();
@@ -151,7 +151,7 @@ class CorotationMaker {
   PD_DEVICE void add_products(int chunk) const {
     constexpr int together = 64, stride = together + 1;  // vertices in shared memory at a time
     constexpr int vectors = 2 * turning_groups, sums = 2;
-    static_assert(2 * turning_products <= sums * small_outer_threads);
+    static_assert(2 * turning_products <= sums * small_multilevel_threads);
     Quad<T>* loaded = reinterpret_cast<Quad<T>*>(scratch_);  // [vectors, stride]
     T* inertia = reinterpret_cast<T*>(loaded + vectors * stride);
     static_assert((4 * vectors * stride + together) * sizeof(double) <= turning_scratch_bytes);
@@ -309,7 +309,7 @@ class CorotationMaker {
     const int end = min((chunk + 1) * count, plan_.vertices);
     Vec3<double>* force =
         reinterpret_cast<Vec3<double>*>(scratch_) + int(threadIdx.x) / warp_size * turning_modes;
-    static_assert(outer_warps * turning_modes * sizeof(*force) <= turning_scratch_bytes);
+    static_assert(multilevel_warps * turning_modes * sizeof(*force) <= turning_scratch_bytes);
     double sum[turning_modes] = {};
 #pragma unroll 1
     for (int first = chunk * count; first < end; first += warp_size) {

@@ -9,31 +9,32 @@
 
 namespace pd {
 
-static_assert(sizeof(OuterControl) + pass_static_bytes <= outer_static_bytes);
-static_assert(sizeof(OuterControl::warp_dot) >= 4 * outer_warps * sizeof(Quad<double>));
+static_assert(sizeof(MultilevelControl) + pass_static_bytes <= outer_static_bytes);
+static_assert(sizeof(MultilevelControl::warp_dot) >= 4 * multilevel_warps * sizeof(Quad<double>));
 
 template <class T, bool HasContacts, int Threads>
-__global__ void __launch_bounds__(Threads, Threads == outer_threads ? 1 : small_outer_blocks)
-    outer_iterations(const __grid_constant__ OuterCall<T> call) {
+__global__ void __launch_bounds__(Threads,
+                                  Threads == multilevel_threads ? 1 : small_multilevel_blocks)
+    multilevel_kernel(const __grid_constant__ MultilevelCall<T> call) {
   extern __shared__ __align__(16) std::byte shared[];
-  __shared__ __align__(16) std::byte control[sizeof(OuterControl)];
+  __shared__ __align__(16) std::byte control[sizeof(MultilevelControl)];
   const int number = int(blockIdx.x) / call.blocks;
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
-  OuterMemory<T> memory = of_team(call, number);
+  MultilevelMemory<T> memory = of_team(call, number);
   if (call.shared_cycle) {
     Arena arena(shared + call.shared_cycle);
     arrange(arena, call.plan().levels, 1, memory.cycle);
   }
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
     MultilevelRunner<T, HasContacts, Threads> runner(
-        call, memory, e, team, *reinterpret_cast<OuterControl*>(control), shared);
+        call, memory, e, team, *reinterpret_cast<MultilevelControl*>(control), shared);
     multilevel_iterations(runner, call.stream.step.settings);
   }
 }
 
 template <class T>
-__global__ void __launch_bounds__(outer_threads)
-    compare_material(const __grid_constant__ OuterCall<T> call) {
+__global__ void __launch_bounds__(multilevel_threads)
+    compare_material(const __grid_constant__ MultilevelCall<T> call) {
   const int number = int(blockIdx.x) / call.blocks;
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
   Range* const ranges = of_team(call, number).ranges;
@@ -55,13 +56,13 @@ struct CycleCall {
 };
 
 template <class T>
-__global__ void __launch_bounds__(outer_threads)
+__global__ void __launch_bounds__(multilevel_threads)
     precondition_fields(const __grid_constant__ CycleCall<T> call) {
   const int number = int(blockIdx.x) / call.blocks;
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.counter + number);
   const Levels<T>& levels = call.op.levels;
   const CycleMemory<T> memory = cycle_of_team(levels, call.memory, number);
-  __shared__ Quad<T> part[4 * outer_warps];
+  __shared__ Quad<T> part[4 * multilevel_warps];
   DeviceCycle<T> cycle(levels, memory, team, part);
   for (std::int64_t e = number; e < call.op.batch; e += call.teams) {
     const auto row = [&](int i) { return (e * levels.vertices + call.op.vertex_order[i]) * 3; };
@@ -76,18 +77,18 @@ __global__ void __launch_bounds__(outer_threads)
 }
 
 template <class T>
-using OuterKernel = void (*)(OuterCall<T>);
+using MultilevelKernel = void (*)(MultilevelCall<T>);
 
 template <class T>
-struct OuterLaunch {
-  OuterKernel<T> kernel;
+struct MultilevelLaunch {
+  MultilevelKernel<T> kernel;
   int threads;
   std::size_t shared, shared_cycle = 0, shared_corotation = 0;
   int resident;
 
-  explicit OuterLaunch(const DeviceStep<T>& step)
+  explicit MultilevelLaunch(const DeviceStep<T>& step)
       : kernel(kernel_of(step)),
-        threads(is_small(step) ? small_outer_threads : outer_threads),
+        threads(is_small(step) ? small_multilevel_threads : multilevel_threads),
         shared(pass_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries, 2)) {
     if (step.settings.schedule == ScheduleKind::corotated) add_corotation();
     resident = blocks_with(shared);
@@ -134,39 +135,40 @@ struct OuterLaunch {
 
   static bool is_small(const DeviceStep<T>& step) { return step.plan.patches == 1; }
 
-  static OuterKernel<T> kernel_of(const DeviceStep<T>& step) {
+  static MultilevelKernel<T> kernel_of(const DeviceStep<T>& step) {
     const auto of = [&]<int Threads>() {
-      return has_contacts(step) ? outer_iterations<T, true, Threads>
-                                : outer_iterations<T, false, Threads>;
+      return has_contacts(step) ? multilevel_kernel<T, true, Threads>
+                                : multilevel_kernel<T, false, Threads>;
     };
-    return is_small(step) ? of.template operator()<small_outer_threads>()
-                          : of.template operator()<outer_threads>();
+    return is_small(step) ? of.template operator()<small_multilevel_threads>()
+                          : of.template operator()<multilevel_threads>();
   }
 
-  OuterCall<T> call(const StreamCall<T>& stream) const {
+  MultilevelCall<T> call(const StreamCall<T>& stream) const {
     const DevicePlan<T>& plan = stream.step.plan;
     const bool spread = plan.levels.direct && !is_small(stream.step);
     const int useful =
-        std::max(plan.patches, spread ? useful_blocks(plan.levels, outer_threads) : 1);
+        std::max(plan.patches, spread ? useful_blocks(plan.levels, multilevel_threads) : 1);
     const Teams teams(stream.step.batch, resident, useful);
     return {stream, {}, teams.count, teams.blocks, shared_cycle, shared_corotation};
   }
 };
 
 template <class T>
-OuterMemory<T> arrange(Arena& arena, const OuterCall<T>& call) {
+MultilevelMemory<T> arrange(Arena& arena, const MultilevelCall<T>& call) {
   const DeviceStep<T>& step = call.stream.step;
   const std::int64_t teams = call.teams, n = step.plan.vertices;
   const std::int64_t pairs = step.settings.learns() ? history * n : 0;
   const std::int64_t small = step.settings.schedule == ScheduleKind::corotated ? teams : 0;
   const std::int64_t held = has_contacts(step) ? n : 0;
-  OuterMemory<T> m;
+  MultilevelMemory<T> m;
   // what must start as zero comes first
   arena.place(m.counter, teams);
-  for (Quad<T>** array : {&m.base, &m.pull, &m.fresh}) arena.place(*array, teams * n);
+  for (Quad<T>** array : {&m.iterate, &m.residual, &m.trial_residual})
+    arena.place(*array, teams * n);
   for (Quad<T>** array : {&m.s, &m.y}) arena.place(*array, teams * pairs);
-  for (Mat3<T>** array : {&m.free, &m.fresh_free}) arena.place(*array, teams * held);
-  for (Quad<T>** array : {&m.gradient, &m.fresh_gradient, &m.friction, &m.fresh_friction})
+  for (Mat3<T>** array : {&m.free, &m.trial_free}) arena.place(*array, teams * held);
+  for (Quad<T>** array : {&m.gradient, &m.trial_gradient, &m.friction, &m.trial_friction})
     arena.place(*array, teams * held);
   arrange(arena, step.plan.levels, int(teams), m.cycle);
   arena.place(m.corotation.arm, small * n);
@@ -184,32 +186,33 @@ OuterMemory<T> arrange(Arena& arena, const OuterCall<T>& call) {
 }
 
 template <class T>
-std::int64_t outer_bytes(const DeviceStep<T>& step) {
+std::int64_t multilevel_bytes(const DeviceStep<T>& step) {
   Arena arena(nullptr);
-  arrange(arena, OuterLaunch<T>(step).call({step, {}}));
+  arrange(arena, MultilevelLaunch<T>(step).call({step, {}}));
   return arena.size();
 }
 
 template <class T>
-OuterCall<T> outer_call(const StreamCall<T>& stream, const OuterLaunch<T>& launch, void* memory) {
+MultilevelCall<T> multilevel_call(const StreamCall<T>& stream, const MultilevelLaunch<T>& launch,
+                                  void* memory) {
   Arena arena(memory);
-  OuterCall<T> call = launch.call(stream);
+  MultilevelCall<T> call = launch.call(stream);
   call.memory = arrange(arena, call);
   return call;
 }
 
 template <class T>
-void run_comparison(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
-  const OuterLaunch<T> launch(stream.step);
-  OuterCall<T> call = outer_call(stream, launch, memory);
+void run_material_comparison(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
+  const MultilevelLaunch<T> launch(stream.step);
+  MultilevelCall<T> call = multilevel_call(stream, launch, memory);
   launch_teams(reinterpret_cast<const void*>(compare_material<T>), call, call.memory.counter,
                launch.threads, 0, to);
 }
 
 template <class T>
-void run_outer(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
-  const OuterLaunch<T> launch(stream.step);
-  OuterCall<T> call = outer_call(stream, launch, memory);
+void run_multilevel(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
+  const MultilevelLaunch<T> launch(stream.step);
+  MultilevelCall<T> call = multilevel_call(stream, launch, memory);
   launch_teams(reinterpret_cast<const void*>(launch.kernel), call, call.memory.counter,
                launch.threads, launch.shared, to);
 }
@@ -217,8 +220,8 @@ void run_outer(const StreamCall<T>& stream, void* memory, cudaStream_t to) {
 template <class T>
 CycleCall<T> cycle_call(const PreconditionCall<T>& op, void* memory, std::int64_t* bytes) {
   const void* kernel = reinterpret_cast<const void*>(precondition_fields<T>);
-  const Teams teams(op.batch, resident_blocks(kernel, outer_threads, 0),
-                    useful_blocks(op.levels, outer_threads));
+  const Teams teams(op.batch, resident_blocks(kernel, multilevel_threads, 0),
+                    useful_blocks(op.levels, multilevel_threads));
   CycleCall<T> call{op, {}, nullptr, teams.count, teams.blocks};
   Arena arena(memory);
   arena.place(call.counter, call.teams);
@@ -239,7 +242,7 @@ void run_precondition(const PreconditionCall<T>& op, void* memory, Stream stream
   std::int64_t bytes = 0;
   CycleCall<T> call = cycle_call(op, memory, &bytes);
   launch_teams(reinterpret_cast<const void*>(precondition_fields<T>), call, call.counter,
-               outer_threads, 0, static_cast<cudaStream_t>(stream));
+               multilevel_threads, 0, static_cast<cudaStream_t>(stream));
 }
 
 }  // namespace pd

@@ -15,8 +15,8 @@ class MultilevelRunner {
   struct Nothing {};
 
  public:
-  PD_DEVICE MultilevelRunner(const OuterCall<T>& call, const OuterMemory<T>& memory,
-                             std::int64_t environment, BlockTeam& team, OuterControl& control,
+  PD_DEVICE MultilevelRunner(const MultilevelCall<T>& call, const MultilevelMemory<T>& memory,
+                             std::int64_t environment, BlockTeam& team, MultilevelControl& control,
                              std::byte* shared)
       : call_(call),
         w_(call.stream, environment),
@@ -51,7 +51,9 @@ class MultilevelRunner {
       ThreadSums sums = {{0, 0, 0}};
       sums.value[0] += pass_over_patch(
           w_, patch, shared_, SolidGradient<true>{}, [&](int i) { return w_.v.load(i); },
-          [&](int i, const auto& seen, const Vec3<T>& force) { look_at(i, seen, force, sums); });
+          [&](int i, const auto& loaded, const Vec3<T>& force) {
+            evaluate_vertex(i, loaded, force, sums);
+          });
       write_sums<Visit::update>(sums, m_.patch_sums + patch * sums_count);
     }
     team_.barrier();
@@ -61,7 +63,7 @@ class MultilevelRunner {
     for (int patch = threadIdx.x; patch < w_.plan.patches; patch += blockDim.x) {
       for (int n = 0; n < 2; ++n) patch_sum_[n] += m_.patch_sums[patch * sums_count + n];
     }
-    look_back(k);
+    reduce_trial(k);
   }
 
   // every block decides from the same sums, so all decide alike
@@ -85,22 +87,22 @@ class MultilevelRunner {
     }
     __syncthreads();
     const bool moves = c_.accepted;
-    if (moves && !(c_.total[dots_held] == 0)) holds_ = false;
-    base_ = moves ? w_.v.u : m_.base;
-    pull_ = moves ? m_.fresh : m_.pull;
-    free_ = moves ? m_.fresh_free : m_.free;
+    if (moves && !(c_.total[dots_free_change] == 0)) contacts_current_ = false;
+    iterate_ = moves ? w_.v.u : m_.iterate;
+    residual_ = moves ? m_.trial_residual : m_.residual;
+    free_ = moves ? m_.trial_free : m_.free;
   }
 
   // the pair from the base to the trial, kept or not: it holds for the curvature on the way
   PD_DEVICE void learn(int k) {
     if (threadIdx.x < warp_size) {
-      if (lbfgs_) remember(k);
+      if (lbfgs_) store_pair(k);
       if (threadIdx.x == 0) {
         c_.outer.walk(c_.total[dots_change]);
-        stop(k, c_.total[dots_change], c_.total[dots_way]);
+        stop(k, c_.total[dots_change], c_.total[dots_displacement]);
       }
       __syncwarp();
-      if (lbfgs_) PairLanes(c_.pairs, newest_).first_loop();
+      if (lbfgs_) SecantPairLanes(c_.pairs, newest_).first_loop();
     }
     __syncthreads();
   }
@@ -114,7 +116,7 @@ class MultilevelRunner {
     __syncthreads();
     if (threadIdx.x == 0)
       c_.total[0] = c_.outer.send(w_.progress.schedule.limit, lbfgs_, corotated_,
-                                  corotates_ && made_ == 0, is_held());
+                                  corotates_ && builds_ == 0, has_contact_springs());
     ++used_;
     __syncthreads();
     const bool accelerates = c_.outer.accelerates(), falls_back = accelerates || c_.outer.plain;
@@ -126,9 +128,9 @@ class MultilevelRunner {
       const auto at = trial_vertex(v, i);
       // what momentum goes on along
       const Vec3<T> before = vec3(iteration_ == 0 ? w_.v.u[i]
-                                  : moved         ? m_.base[i]
+                                  : moved         ? m_.iterate[i]
                                                   : w_.v.before[i]);
-      if constexpr (HasContacts) keep_directions(i);
+      if constexpr (HasContacts) accept_contact_state(i);
       const Vec3<T> slope = HasContacts ? vec3(m_.gradient[i]) : at.residual;
       const Vec3<T> next =
           falls_back
@@ -138,12 +140,12 @@ class MultilevelRunner {
                     at.iterate - completed(i, length * direction(i) - beta * (at.iterate - before)),
                     at.iterate, slope);
       if (moved) w_.v.set_before(i, before);
-      m_.base[i] = quad(at.iterate);
-      m_.pull[i] = quad(at.residual);
+      m_.iterate[i] = quad(at.iterate);
+      m_.residual[i] = quad(at.residual);
       w_.v.set(i, v.hold(v.target, next));
     });
-    base_ = m_.base;
-    pull_ = m_.pull;
+    iterate_ = m_.iterate;
+    residual_ = m_.residual;
     free_ = m_.free;
   }
 
@@ -152,7 +154,7 @@ class MultilevelRunner {
     const T lost = c_.outer.energy < HUGE_VAL ? T(0) : T(NAN);
     const Vec3<T> none = {lost, lost, lost};
     if (!c_.accepted || !(lost == T(0)))
-      each_vertex([&](int i) { w_.v.set(i, vec3(m_.base[i]) + none); });
+      each_vertex([&](int i) { w_.v.set(i, vec3(m_.iterate[i]) + none); });
     if (is_first()) {
       w_.progress.schedule.restarts = c_.outer.restarts;
       w_.progress.done = c_.done;
@@ -167,67 +169,70 @@ class MultilevelRunner {
   PD_DEVICE static Vec3<T> none() { return {T(0), T(0), T(0)}; }
 
   // whether contacts are in the small problem
-  PD_DEVICE bool is_held() const { return HasContacts && made_ > 0 && corotation_.control().held; }
+  PD_DEVICE bool has_contact_springs() const {
+    return HasContacts && builds_ > 0 && corotation_.control().held;
+  }
 
-  PD_DEVICE void look_at(int i, const typename Vertices<T, HasContacts>::LoadedVertex& seen,
-                         const Vec3<T>& force, ThreadSums& sums) const {
-    const auto& v = seen.vertex;
-    sums.value[0] += seen.energy();
-    m_.fresh[i] = quad(v.unbalanced(w_.contacts, seen.u, force));
+  PD_DEVICE void evaluate_vertex(int i,
+                                 const typename Vertices<T, HasContacts>::LoadedVertex& loaded,
+                                 const Vec3<T>& force, ThreadSums& sums) const {
+    const auto& v = loaded.vertex;
+    sums.value[0] += loaded.energy();
+    m_.trial_residual[i] = quad(v.unbalanced(w_.contacts, loaded.u, force));
     if constexpr (HasContacts) {
-      const Leeway<T> left = v.leeway(w_.contacts, seen.u, force);
-      m_.fresh_free[i] = left.free;
-      m_.fresh_friction[i] = quad(v.friction(left.taken));
-      m_.fresh_gradient[i] = quad(v.gradient(seen.u, force));
+      const Leeway<T> left = v.leeway(w_.contacts, loaded.u, force);
+      m_.trial_free[i] = left.free;
+      m_.trial_friction[i] = quad(v.friction(left.taken));
+      m_.trial_gradient[i] = quad(v.gradient(loaded.u, force));
       // work against the friction of the base
       if (!c_.outer.known) return;
-      sums.value[1] += double(dot(vec3(m_.friction[i]), seen.u - vec3(m_.base[i])));
+      sums.value[1] += double(dot(vec3(m_.friction[i]), loaded.u - vec3(m_.iterate[i])));
     }
   }
 
   // The same at the shared vertices; then, at all of them, sums for the judgement and for the pair from the base to the trial,
   // whatever becomes of it.
-  PD_DEVICE void look_back(int k) {
+  PD_DEVICE void reduce_trial(int k) {
     newest_ = (newest_ + 1) % history;
     iteration_ = k;
     const int first_shared = w_.plan.patch_vertex[w_.plan.patches];
-    pass<outer_dots, T>([&](int i, T(&sum)[outer_dots]) {
+    pass<trial_dots, T>([&](int i, T(&sum)[trial_dots]) {
       if (i >= first_shared) {
         ThreadSums sums = {{0, 0, 0}};
-        const auto seen = w_.v.load(i);
-        look_at(i, seen, shared_force(w_, SharedPlaces(w_.plan, i - first_shared)), sums);
+        const auto loaded = w_.v.load(i);
+        evaluate_vertex(i, loaded, shared_force(w_, SharedPlaces(w_.plan, i - first_shared)), sums);
         for (int n = 0; n < 2; ++n) sum[dots_energy + n] = T(sums.value[n]);
       }
       const Vec3<T> u = vec3(w_.v.u[i]);
       if (w_.settings().tolerance > 0) {
-        const Vec3<T> way = u - vec3(w_.v.target[i]);
-        sum[dots_way] = dot(way, way);
+        const Vec3<T> displacement = u - vec3(w_.v.target[i]);
+        sum[dots_displacement] = dot(displacement, displacement);
       }
       // no base yet, or nothing left to learn for
       if (k == 0 || k == w_.settings().iterations) return;
-      const Vec3<T> change = u - vec3(m_.base[i]);
+      const Vec3<T> change = u - vec3(m_.iterate[i]);
       sum[dots_change] = dot(change, change);
       if constexpr (HasContacts) {
         for (int a = 0; corotates_ && a < 3; ++a) {
-          const Vec3<T> d = m_.fresh_free[i].row[a] - m_.free[i].row[a];
-          sum[dots_held] += dot(d, d);
+          const Vec3<T> d = m_.trial_free[i].row[a] - m_.free[i].row[a];
+          sum[dots_free_change] += dot(d, d);
         }
       }
       if (!lbfgs_) return;
-      const Vec3<T> fresh = vec3(m_.fresh[i]), pull = vec3(m_.pull[i]);
-      const Vec3<T> s = restricted(i, change), y = restricted(i, fresh - pull);
-      const Vec3<T> g = trial_vertex(w_.v.at(i), i).restricted(fresh, m_.fresh_free + i);
-      Vec3<T> ways[history];
-      see_pairs(m_.s, i, ways);
+      const Vec3<T> trial_residual = vec3(m_.trial_residual[i]), residual = vec3(m_.residual[i]);
+      const Vec3<T> s = restricted(i, change), y = restricted(i, trial_residual - residual);
+      const Vec3<T> g = trial_vertex(w_.v.at(i), i).restricted(trial_residual, m_.trial_free + i);
+      Vec3<T> differences[history];
+      load_pairs(m_.s, i, differences);
 #pragma unroll
       for (int j = 0; j < history; ++j) {
         if (j != newest_ && !c_.pairs.valid[j]) continue;
-        const Vec3<T> way = j == newest_ ? s : ways[j];
-        sum[dots_with + j] = dot(way, y);
-        sum[dots_pulled + j] = dot(way, g);
+        const Vec3<T> s_j = j == newest_ ? s : differences[j];
+        sum[dots_sy + j] = dot(s_j, y);
+        sum[dots_sg + j] = dot(s_j, g);
       }
-      sum[dots_back] = dot(s, restricted(i, pull));
-      sum[dots_turn] = dot(y, y);
+      sum[dots_s_residual] = dot(s, restricted(i, residual));
+      sum[dots_yy] = dot(y, y);
       m_.s[newest_ * vertices() + i] = quad(s);
       m_.y[newest_ * vertices() + i] = quad(y);
     });
@@ -250,8 +255,8 @@ class MultilevelRunner {
   template <int Count, class Sum, class Visit, class Prepare>
   PD_DEVICE void pass(const Visit& visit, const Prepare& prepare) {
     const int count = w_.plan.vertices;
-    const int together = call_.warps_of_chunk(), chunks = call_.chunks_of(count, together);
-    const int groups = warps / together;  // chunks that a block works on at a time
+    const int chunk_warps = call_.warps_of_chunk(), chunks = call_.chunks_of(count, chunk_warps);
+    const int groups = warps / chunk_warps;  // chunks that a block works on at a time
     const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
     // nobody overwrites what others may still read
     parity_ = !parity_;
@@ -263,14 +268,15 @@ class MultilevelRunner {
 #pragma unroll 1
     for (int round = 0; chunk_of(round, 0) < chunks; ++round) {
       if constexpr (!std::is_same_v<Prepare, Nothing>) {
-        const int each = together * warp_size;  // vertices of a chunk
-        const int ahead = (chunks - chunk_of(round, 0) + team_.blocks() - 1) / team_.blocks();
-        prepare(min(groups, ahead) * each,
+        const int each = chunk_warps * warp_size;  // vertices of a chunk
+        const int chunks_left = (chunks - chunk_of(round, 0) + team_.blocks() - 1) / team_.blocks();
+        prepare(min(groups, chunks_left) * each,
                 [&](int t) { return chunk_of(round, t / each) * each + t % each; });
         __syncthreads();
       }
       Sum sum[Count] = {};
-      const int from = (chunk_of(round, warp / together) * together + warp % together) * warp_size;
+      const int from =
+          (chunk_of(round, warp / chunk_warps) * chunk_warps + warp % chunk_warps) * warp_size;
       if (from < count) {
         if (from + lane < count) visit(from + lane, sum);
       }
@@ -279,7 +285,7 @@ class MultilevelRunner {
       const int group = threadIdx.x / Count, d = threadIdx.x % Count;
       if (group < groups && chunk_of(round, group) < chunks) {
         double total = 0;
-        for (int w = 0; w < together; ++w) total += c_.warp_dot[group * together + w][d];
+        for (int w = 0; w < chunk_warps; ++w) total += c_.warp_dot[group * chunk_warps + w][d];
         dots[d * chunks + chunk_of(round, group)] = total;
       }
       __syncthreads();
@@ -287,19 +293,19 @@ class MultilevelRunner {
     team_.barrier();
     constexpr int each = (Count + warps - 1) / warps;  // sums of a warp
     double sum[each] = {};
-    constexpr int at_once = 4;
+    constexpr int in_flight = 4;
 #pragma unroll 1
-    for (int chunk = lane; chunk < chunks; chunk += at_once * warp_size) {
-      double part[at_once][each];
+    for (int chunk = lane; chunk < chunks; chunk += in_flight * warp_size) {
+      double part[in_flight][each];
 #pragma unroll
-      for (int u = 0; u < at_once; ++u) {
+      for (int u = 0; u < in_flight; ++u) {
 #pragma unroll
         for (int n = 0; n < each; ++n)
           part[u][n] = dots[min(warp + n * warps, Count - 1) * chunks +
                             min(chunk + u * warp_size, chunks - 1)];
       }
 #pragma unroll
-      for (int u = 0; u < at_once; ++u) {
+      for (int u = 0; u < in_flight; ++u) {
 #pragma unroll
         for (int n = 0; n < each; ++n) sum[n] += chunk + u * warp_size < chunks ? part[u][n] : 0;
       }
@@ -313,45 +319,45 @@ class MultilevelRunner {
   }
 
   // the soft stop, by a trial that it went on from or went back from
-  PD_DEVICE void stop(int k, double change, double way) {
+  PD_DEVICE void stop(int k, double change, double displacement) {
     const double tolerance = w_.settings().tolerance;
     if (!(tolerance > 0) || k == 0) return;
-    c_.done = c_.outer.ends(tolerance, w_.progress.schedule, change, way);
+    c_.done = c_.outer.ends(tolerance, w_.progress.schedule, change, displacement);
   }
 
   // A warp, a lane a pair.
-  PD_DEVICE void remember(int k) {
+  PD_DEVICE void store_pair(int k) {
     const int j = int(threadIdx.x);
     Pairs& pairs = c_.pairs;
     if (j < history) {
-      pairs.product[j][newest_] = c_.total[dots_with + j];
+      pairs.product[j][newest_] = c_.total[dots_sy + j];
       if (c_.accepted) {
-        pairs.pulled[j] = c_.total[dots_pulled + j];
+        pairs.pulled[j] = c_.total[dots_sg + j];
       } else if (j == newest_) {
-        pairs.pulled[j] = c_.total[dots_back];
+        pairs.pulled[j] = c_.total[dots_s_residual];
       }
     }
     if (j != 0) return;
-    pairs.admit(newest_, k > 0 && c_.outer.teaches(), c_.total[dots_change], c_.total[dots_turn]);
+    pairs.admit(newest_, k > 0 && c_.outer.teaches(), c_.total[dots_change], c_.total[dots_yy]);
     if (c_.outer.forgets()) pairs.clear();
   }
 
-  PD_DEVICE void keep_directions(int i) const {
+  PD_DEVICE void accept_contact_state(int i) const {
     if (!c_.accepted) return;
-    m_.gradient[i] = m_.fresh_gradient[i];
-    m_.friction[i] = m_.fresh_friction[i];
-    m_.free[i] = m_.fresh_free[i];
+    m_.gradient[i] = m_.trial_gradient[i];
+    m_.friction[i] = m_.trial_friction[i];
+    m_.free[i] = m_.trial_free[i];
   }
 
   // from where it stands
   PD_DEVICE TrialVertex<Thread<T>, HasContacts> trial_vertex(
       const Vertex<Thread<T>, HasContacts>& v, int i) const {
-    return {v, vec3(base_[i]), vec3(pull_[i]), free_ + i, w_.plan.levels, i, outliers_};
+    return {v, vec3(iterate_[i]), vec3(residual_[i]), free_ + i, w_.plan.levels, i, outliers_};
   }
   // TrialVertex::completed, which reads memory as late as it can: kept in registers, its numbers are spilled.
   PD_DEVICE Vec3<T> completed(int i, const Vec3<T>& d) const {
     const auto free = [&](const Vec3<T>& field) { return free_[i] * field; };
-    const Vec3<T> diagonal = w_.v.u[i].w * vec3(pull_[i]);
+    const Vec3<T> diagonal = w_.v.u[i].w * vec3(residual_[i]);
     if (outliers_.some && is_outlier(i)) return diagonal;
     if constexpr (!HasContacts) return d;
     return free(d) + (diagonal - free(diagonal));
@@ -370,25 +376,25 @@ class MultilevelRunner {
   PD_DEVICE void corotate();
   PD_DEVICE void correct(bool last);
   PD_DEVICE Vec3<T> direction(int i) const;
-  PD_DEVICE void see_pairs(const Quad<T>* field, int i, Vec3<T> (&seen)[history]) const;
+  PD_DEVICE void load_pairs(const Quad<T>* field, int i, Vec3<T> (&loaded)[history]) const;
 
-  const OuterCall<T>& call_;
+  const MultilevelCall<T>& call_;
   const StreamWork<T, HasContacts> w_;
-  const OuterMemory<T>& m_;
+  const MultilevelMemory<T>& m_;
   BlockTeam& team_;
-  OuterControl& c_;
+  MultilevelControl& c_;
   DeviceCycle<T> cycle_;
   std::byte* shared_;
   bool lbfgs_, corotates_, corotated_ = false;
-  bool holds_ = false;  // the small problem knows what contacts hold at the base
+  bool contacts_current_ = false;  // the small problem knows what contacts hold at the base
   DeviceCorotation<T> corotation_;
   Outliers<T> outliers_;
   // where it stands: of the trial that was accepted until the next one goes out
-  const Quad<T>*base_ = nullptr, *pull_ = nullptr;
+  const Quad<T>*iterate_ = nullptr, *residual_ = nullptr;
   const Mat3<T>* free_ = nullptr;
   double patch_sum_[2] = {0, 0};
   int newest_ = 0, iteration_ = 0, used_ = 0;
-  int made_ = 0, doubted_ = 0;  // small problems, and trials that had failed by then
+  int builds_ = 0, restarts_at_build_ = 0;  // small problems, and trials that had failed by then
   bool parity_ = false;
 };
 

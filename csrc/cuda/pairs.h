@@ -8,9 +8,9 @@
 namespace pd::inline PD_TARGET {
 
 // Called by a whole warp; lanes from `history` on repeat others.
-class PairLanes {
+class SecantPairLanes {
  public:
-  PD_DEVICE PairLanes(Pairs& pairs, int newest)
+  PD_DEVICE SecantPairLanes(Pairs& pairs, int newest)
       : pairs_(pairs), newest_(newest), own_(int(threadIdx.x) % history) {}
 
   PD_DEVICE void first_loop() {

@@ -89,11 +89,11 @@ template <class T, bool HasContacts>
 class StreamRunner {
  public:
   // `outer`: memory of outer_bytes, for the multilevel solver only
-  StreamRunner(const StreamCall<T>& call, void* outer, cudaStream_t stream)
+  StreamRunner(const StreamCall<T>& call, void* multilevel_memory, cudaStream_t stream)
       : call_(call),
         set_(call_.step.settings),
         plan_(call_.step.plan),
-        outer_(outer),
+        multilevel_(multilevel_memory),
         stream_(stream),
         launcher_(stream),
         teams_(call.step.batch, resident_blocks(rounds_kernel(), rounds_threads, 0),
@@ -107,7 +107,7 @@ class StreamRunner {
   void rollout() {
     vertices<VertexTask::load>(0);
     assemble_diagonal();
-    if (set_.multilevel()) run_comparison(call_, outer_, stream_);
+    if (set_.multilevel()) run_material_comparison(call_, multilevel_, stream_);
     for (int t = 0; t < set_.steps; ++t) {
       if (set_.multilevel()) {
         multilevel_step(*this);
@@ -150,7 +150,7 @@ class StreamRunner {
     if (checks || set_.tolerance > 0) decide<Decision::iterate>(k);
   }
 
-  void descend() { run_outer(call_, outer_, stream_); }
+  void descend() { run_multilevel(call_, multilevel_, stream_); }
 
   // always false, since a query would synchronise; converged environments skip the kernels instead
   bool finished() const { return false; }
@@ -243,7 +243,7 @@ class StreamRunner {
   StreamCall<T> call_;
   const Settings& set_;
   const DevicePlan<T>& plan_;
-  void* outer_;
+  void* multilevel_;
   cudaStream_t stream_;
   Launcher launcher_;
   Teams teams_;           // for rigid motions
@@ -257,7 +257,7 @@ template <class T>
 std::int64_t stream_bytes(const DeviceStep<T>& step) {
   Arena arena(nullptr);
   arrange(arena, StreamCall<T>{step, {}});
-  return arena.size() + (step.settings.multilevel() ? outer_bytes(step) : 0);
+  return arena.size() + (step.settings.multilevel() ? multilevel_bytes(step) : 0);
 }
 
 // Raises the shared memory limit of the pass kernels above the default of 48 KB.
@@ -272,10 +272,10 @@ void allow_shared_memory(std::size_t bytes) {
 }
 
 template <class T, bool HasContacts>
-void run_stream_with(const StreamCall<T>& call, void* outer, cudaStream_t stream) {
+void run_stream_with(const StreamCall<T>& call, void* multilevel_memory, cudaStream_t stream) {
   allow_shared_memory<T, HasContacts>(
       pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 2));
-  StreamRunner<T, HasContacts>(call, outer, stream).rollout();
+  StreamRunner<T, HasContacts>(call, multilevel_memory, stream).rollout();
 }
 
 template <class T>
@@ -284,11 +284,11 @@ void run_stream(const DeviceStep<T>& step, void* memory, Stream to) {
   StreamCall<T> call{step, {}};
   Arena arena(memory);
   call.memory = arrange(arena, call);
-  void* outer = static_cast<std::byte*>(memory) + arena.size();
+  void* multilevel_memory = static_cast<std::byte*>(memory) + arena.size();
   if (has_contacts(step)) {
-    run_stream_with<T, true>(call, outer, stream);
+    run_stream_with<T, true>(call, multilevel_memory, stream);
   } else {
-    run_stream_with<T, false>(call, outer, stream);
+    run_stream_with<T, false>(call, multilevel_memory, stream);
   }
 }
 
