@@ -1,10 +1,10 @@
-// Runner of measure_misfit (solver/misfit.h) on a GPU.
+// Runs measure_misfit of solver/misfit.h on a GPU.
 #pragma once
 #include "cuda/multilevel.h"
 
 namespace pd::inline PD_TARGET {
 
-// All threads of a team.
+// Called by all threads of a team.
 template <class T>
 class MisfitRunner {
  public:
@@ -27,7 +27,7 @@ class MisfitRunner {
   PD_DEVICE void meet(Range (&range)[ranges_count]) {
     __shared__ double least[ranges_count][warp_size], largest[ranges_count][warp_size];
     const int lane = threadIdx.x % warp_size, warp = threadIdx.x / warp_size;
-    __syncthreads();  // the shared arrays of the round before have been read
+    __syncthreads();  // the previous round has read the shared arrays
     for (int n = 0; n < ranges_count; ++n) {
       const double low = warp_reduce(range[n].least, Min{});
       const double high = -warp_reduce(-range[n].largest, Min{});

@@ -1,4 +1,4 @@
-// The kernels of the multilevel solver and their launches, for one precision.
+// Kernels of the multilevel solver and their launches, in one precision.
 #pragma once
 #include "cuda/cycle_triangle.h"
 #include "cuda/misfit.h"
@@ -100,12 +100,13 @@ struct MultilevelLaunch {
     const auto of = [&](const void* any, std::size_t shared_bytes) {
       return resident_blocks(any, threads, shared_bytes);
     };
-    // the material is compared by the same teams
+    // the same teams compare the material
     return std::min(of(reinterpret_cast<const void*>(kernel), bytes),
                     of(reinterpret_cast<const void*>(compare_material<T>), 0));
   }
 
-  // The small problem, behind as much memory for making it as the number of blocks allows.
+  // Reserves shared memory for the coarse problem, behind as much scratch memory as possible
+  // without fewer resident blocks.
   void add_corotation() {
     const auto begin = [&](std::size_t scratch) { return corotation_begin(shared, scratch); };
     const auto blocks = [&](std::size_t scratch) {
@@ -118,7 +119,8 @@ struct MultilevelLaunch {
     shared = shared_corotation + corotation_bytes;
   }
 
-  // The fields of the cycle in shared memory, where one block has an environment to itself and there is room.
+  // Puts the fields of the cycle in shared memory if one block works on an environment and they
+  // fit.
   void keep_cycle(const DeviceStep<T>& step) {
     const bool one = step.plan.patches == 1;
     if (resident == 0 || (!one && step.batch < resident)) return;
@@ -162,7 +164,7 @@ MultilevelMemory<T> arrange(Arena& arena, const MultilevelCall<T>& call) {
   const std::int64_t small = step.settings.schedule == ScheduleKind::corotated ? teams : 0;
   const std::int64_t held = has_contacts(step) ? n : 0;
   MultilevelMemory<T> m;
-  // what must start as zero comes first
+  // zero-initialised arrays come first
   arena.place(m.counter, teams);
   for (Quad<T>** array : {&m.iterate, &m.residual, &m.trial_residual})
     arena.place(*array, teams * n);

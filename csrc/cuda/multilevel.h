@@ -1,5 +1,5 @@
-// Runner of solver/multilevel.h on a GPU: all iterations of one environment by a team of blocks, see also
-// cpu/multilevel_stepper.h. What goes before and after them is a launch each, as in stream.h.
+// Runs solver/multilevel.h on a GPU: all iterations of one environment by a team of blocks; see
+// also cpu/multilevel_stepper.h. Other parts of a step are launches of their own, as in stream.h.
 #pragma once
 #include "cuda/corotation_maker.h"
 #include "cuda/shared_vertices.h"
@@ -44,7 +44,8 @@ class MultilevelRunner {
 
   PD_DEVICE bool finished() const { return c_.done; }
 
-  // E and what is out of balance at the trial u, and what the pair from the base to it has in common with the others
+  // Computes energy and residual at the trial u, and the dot products of the newest secant pair
+  // with the others.
   PD_DEVICE void evaluate(int k) {
 #pragma unroll 1
     for (int patch = team_.rank(); patch < w_.plan.patches; patch += team_.blocks()) {
@@ -57,7 +58,7 @@ class MultilevelRunner {
       write_sums<Visit::update>(sums, m_.patch_sums + patch * sums_count);
     }
     team_.barrier();
-    // those of this thread, on the way to the shared vertices
+    // loads these sums early; the pass over the shared vertices hides the latency
     patch_sum_[0] = patch_sum_[1] = 0;
 #pragma unroll 1
     for (int patch = threadIdx.x; patch < w_.plan.patches; patch += blockDim.x) {
@@ -66,9 +67,10 @@ class MultilevelRunner {
     reduce_trial(k);
   }
 
-  // every block decides from the same sums, so all decide alike
+  // Decides whether to accept the trial. Every block reduces the same sums, so all blocks decide
+  // alike.
   PD_DEVICE void judge(int) {
-    // the shared vertices' part is there
+    // adds the patches' sums to those of the shared vertices
     double sum[2] = {patch_sum_[0], patch_sum_[1]};
     warp_reduce_sums(sum);
     const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
@@ -93,7 +95,8 @@ class MultilevelRunner {
     free_ = moves ? m_.trial_free : m_.free;
   }
 
-  // the pair from the base to the trial, kept or not: it holds for the curvature on the way
+  // Adds the secant pair from the iterate to the trial, accepted or not: it describes the curvature
+  // in between.
   PD_DEVICE void learn(int k) {
     if (threadIdx.x < warp_size) {
       if (lbfgs_) store_pair(k);
@@ -111,7 +114,8 @@ class MultilevelRunner {
 
   PD_DEVICE void precondition();  // cuda/multilevel_direction.h
 
-  // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi iteration
+  // Computes the next trial, projected out of the contacts: u + beta (u - before) - (1 + beta) t d,
+  // or a Jacobi iteration, plain or accelerated.
   PD_DEVICE void advance() {
     __syncthreads();
     if (threadIdx.x == 0)
@@ -126,7 +130,7 @@ class MultilevelRunner {
     each_vertex([&](int i) {
       const auto v = w_.v.at(i);
       const auto at = trial_vertex(v, i);
-      // what momentum goes on along
+      // the previous iterate, for momentum
       const Vec3<T> before = vec3(iteration_ == 0 ? w_.v.u[i]
                                   : moved         ? m_.iterate[i]
                                                   : w_.v.before[i]);
@@ -149,7 +153,7 @@ class MultilevelRunner {
     free_ = m_.free;
   }
 
-  // the last trial counts only if it is better than the base, and that only if its energy is a number
+  // Returns the last trial if it was accepted, else the iterate; NaN if the energy is not finite.
   PD_DEVICE void settle() {
     const T lost = c_.outer.energy < HUGE_VAL ? T(0) : T(NAN);
     const Vec3<T> none = {lost, lost, lost};
@@ -168,7 +172,7 @@ class MultilevelRunner {
   PD_DEVICE std::int64_t vertices() const { return w_.plan.vertices; }
   PD_DEVICE static Vec3<T> none() { return {T(0), T(0), T(0)}; }
 
-  // whether contacts are in the small problem
+  // whether the coarse problem includes contact springs
   PD_DEVICE bool has_contact_springs() const {
     return HasContacts && builds_ > 0 && corotation_.control().held;
   }
@@ -184,14 +188,14 @@ class MultilevelRunner {
       m_.trial_free[i] = left.free;
       m_.trial_friction[i] = quad(v.friction(left.taken));
       m_.trial_gradient[i] = quad(v.gradient(loaded.u, force));
-      // work against the friction of the base
+      // work against the friction of the iterate
       if (!c_.outer.known) return;
       sums.value[1] += double(dot(vec3(m_.friction[i]), loaded.u - vec3(m_.iterate[i])));
     }
   }
 
-  // The same at the shared vertices; then, at all of them, sums for the judgement and for the pair from the base to the trial,
-  // whatever becomes of it.
+  // The same at shared vertices; then sums over all vertices, for the decision and for the newest
+  // secant pair.
   PD_DEVICE void reduce_trial(int k) {
     newest_ = (newest_ + 1) % history;
     iteration_ = k;
@@ -208,7 +212,7 @@ class MultilevelRunner {
         const Vec3<T> displacement = u - vec3(w_.v.target[i]);
         sum[dots_displacement] = dot(displacement, displacement);
       }
-      // no base yet, or nothing left to learn for
+      // no iterate yet, or no iteration left that could use the pair
       if (k == 0 || k == w_.settings().iterations) return;
       const Vec3<T> change = u - vec3(m_.iterate[i]);
       sum[dots_change] = dot(change, change);
@@ -245,23 +249,25 @@ class MultilevelRunner {
     team_.barrier();
   }
 
-  // visit(vertex, sums); then the totals are in c_.total. `Sum`: of the sums of a warp.
+  // Calls visit(vertex, sums) for all vertices and reduces the sums into c_.total. `Sum`: type of
+  // the warp sums.
   template <int Count, class Sum, class Visit>
   PD_DEVICE void pass(const Visit& visit) {
     pass<Count, Sum>(visit, Nothing{});
   }
 
-  // Chunk by chunk of them, a lane each; before some are visited prepare(how many, which) is called by all of the block.
+  // The same, one chunk of vertices at a time, one vertex per lane. Before each round, all threads
+  // of the block call prepare(number of vertices, vertex of index).
   template <int Count, class Sum, class Visit, class Prepare>
   PD_DEVICE void pass(const Visit& visit, const Prepare& prepare) {
     const int count = w_.plan.vertices;
     const int chunk_warps = call_.warps_of_chunk(), chunks = call_.chunks_of(count, chunk_warps);
-    const int groups = warps / chunk_warps;  // chunks that a block works on at a time
+    const int groups = warps / chunk_warps;  // chunks in progress per block
     const int warp = threadIdx.x / warp_size, lane = threadIdx.x % warp_size;
-    // nobody overwrites what others may still read
+    // double buffer: other blocks may still read the previous sums
     parity_ = !parity_;
     double* dots = m_.chunk_dots + (parity_ ? std::int64_t(call_.chunks()) * most_sums : 0);
-    // neighbouring chunks in different blocks: few are spread over all multiprocessors
+    // consecutive chunks lie in different blocks, so a few chunks spread over all multiprocessors
     const auto chunk_of = [&](int round, int group) {
       return (round * groups + group) * team_.blocks() + team_.rank();
     };
@@ -291,7 +297,7 @@ class MultilevelRunner {
       __syncthreads();
     }
     team_.barrier();
-    constexpr int each = (Count + warps - 1) / warps;  // sums of a warp
+    constexpr int each = (Count + warps - 1) / warps;  // sums per warp
     double sum[each] = {};
     constexpr int in_flight = 4;
 #pragma unroll 1
@@ -318,14 +324,14 @@ class MultilevelRunner {
     __syncthreads();
   }
 
-  // the soft stop, by a trial that it went on from or went back from
+  // Applies the tolerance, from the change of a trial, accepted or not.
   PD_DEVICE void stop(int k, double change, double displacement) {
     const double tolerance = w_.settings().tolerance;
     if (!(tolerance > 0) || k == 0) return;
     c_.done = c_.outer.ends(tolerance, w_.progress.schedule, change, displacement);
   }
 
-  // A warp, a lane a pair.
+  // Called by one warp, one lane per secant pair.
   PD_DEVICE void store_pair(int k) {
     const int j = int(threadIdx.x);
     Pairs& pairs = c_.pairs;
@@ -349,12 +355,13 @@ class MultilevelRunner {
     m_.free[i] = m_.trial_free[i];
   }
 
-  // from where it stands
+  // The vertex's update from the current iterate.
   PD_DEVICE TrialVertex<Thread<T>, HasContacts> trial_vertex(
       const Vertex<Thread<T>, HasContacts>& v, int i) const {
     return {v, vec3(iterate_[i]), vec3(residual_[i]), free_ + i, w_.plan.levels, i, outliers_};
   }
-  // TrialVertex::completed, which reads memory as late as it can: kept in registers, its numbers are spilled.
+  // TrialVertex::completed, with loads as late as possible: held in registers, the values would
+  // spill.
   PD_DEVICE Vec3<T> completed(int i, const Vec3<T>& d) const {
     const auto free = [&](const Vec3<T>& field) { return free_[i] * field; };
     const Vec3<T> diagonal = w_.v.u[i].w * vec3(residual_[i]);
@@ -371,7 +378,7 @@ class MultilevelRunner {
     return trial_vertex(w_.v.at(i), i).restricted(field);
   }
 
-  // ---- direction of a trial: cuda/multilevel_direction.h
+  // ---- search direction: cuda/multilevel_direction.h
 
   PD_DEVICE void corotate();
   PD_DEVICE void correct(bool last);
@@ -386,15 +393,16 @@ class MultilevelRunner {
   DeviceCycle<T> cycle_;
   std::byte* shared_;
   bool lbfgs_, corotates_, corotated_ = false;
-  bool contacts_current_ = false;  // the small problem knows what contacts hold at the base
+  bool contacts_current_ = false;  // the coarse problem includes the contacts of the iterate
   DeviceCorotation<T> corotation_;
   Outliers<T> outliers_;
-  // where it stands: of the trial that was accepted until the next one goes out
+  // current iterate and residual; they point to the accepted trial until the next trial is written
   const Quad<T>*iterate_ = nullptr, *residual_ = nullptr;
   const Mat3<T>* free_ = nullptr;
   double patch_sum_[2] = {0, 0};
   int newest_ = 0, iteration_ = 0, used_ = 0;
-  int builds_ = 0, restarts_at_build_ = 0;  // small problems, and trials that had failed by then
+  // builds of the coarse problem, and restarts at the last build
+  int builds_ = 0, restarts_at_build_ = 0;
   bool parity_ = false;
 };
 

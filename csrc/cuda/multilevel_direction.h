@@ -1,10 +1,12 @@
-// Members of MultilevelRunner that find the direction of a trial: M, corrected by the pairs, where contacts leave vertices free.
+// Members of MultilevelRunner that compute the search direction: M with the L-BFGS correction,
+// along the free directions of contacts.
 #pragma once
 #include "cuda/multilevel.h"
 
 namespace pd::inline PD_TARGET {
 
-// direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
+// Computes direction = theta M g with the L-BFGS correction. Blocked directions and outliers use
+// the diagonal instead.
 template <class T, bool HasContacts, int Threads>
 PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::precondition() {
   if (corotates_) corotate();
@@ -22,8 +24,8 @@ PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::precondition() {
     }
     return T(scale) * q;
   };
-  // where something holds vertices that M has free, the small problem takes its part before the cycle, and gives what that
-  // lacks after it
+  // If vertices are held that M leaves free, the coarse problem deflates the right-hand side before
+  // the cycle and corrects the result after it.
   const bool deflates = corotated_ && !w_.plan.levels.direct && (HasContacts || outliers_.some);
   if (corotated_) {
     pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
@@ -35,7 +37,7 @@ PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::precondition() {
   } else {
     each_vertex([&](int i) { cycle_.set(i, right_side(i)); });
   }
-  // what follows the last part of the cycle in a pass has that part, too
+  // the last phase of the cycle can be fused with the pass that follows it
   const bool separate_finish = deflates || !lbfgs_;
   if (deflates)
     each_vertex([&](int i) { cycle_.set(i, corotation_.deflated(i, cycle_.right_side(i))); });
@@ -73,12 +75,11 @@ PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::corotate() {
   }
 }
 
-// the second loop of L-BFGS, and the slope g.d
-// `last`: the last part of the cycle has still to be done.
+// The second loop of L-BFGS, and the slope g . d. `last`: also runs the last phase of the cycle.
 template <class T, bool HasContacts, int Threads>
 PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::correct(bool last) {
   const auto visit = [&](int i, T(&sum)[history + 1]) {
-    // before anything is written, that it may be asked for with the rest
+    // loads come before the first store, so that they overlap
     Vec3<T> y[history];
     load_pairs(m_.y, i, y);
     Vec3<T> z = cycle_.result(i);
@@ -116,7 +117,8 @@ PD_DEVICE Vec3<T> MultilevelRunner<T, HasContacts, Threads>::direction(int i) co
   return d;
 }
 
-// A field of the pairs at a vertex, all asked for at once: in place of one that is not valid any that is there.
+// Loads a field of all secant pairs at a vertex, in parallel. An invalid pair loads any valid
+// address.
 template <class T, bool HasContacts, int Threads>
 PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::load_pairs(
     const Quad<T>* field, int i, Vec3<T> (&loaded)[history]) const {

@@ -1,4 +1,4 @@
-// What the kernel of the multilevel solver is given, and what it keeps where.
+// Arguments and memory layout of the multilevel kernel.
 #pragma once
 #include "cuda/corotation.h"
 #include "cuda/cycle.h"
@@ -7,17 +7,19 @@
 
 namespace pd::inline PD_TARGET {
 
-// Sums of a pass over the vertices at a trial u: what the shared ones have of the energy and of work against friction, in the
-// precision of the simulation, whose rounding the judgement allows for; s_j . y and s_j . g of the pairs j, the newest one too;
-// s . g of that with g at the base; |u - base|^2, |u|^2 from the target, |y|^2, and how much what contacts leave free differs.
+// Sums over the vertices at a trial u. dots_energy: the shared vertices' energy and work against
+// friction; energy_noise covers their rounding in T. dots_sy, dots_sg: s_j . y and s_j . g of every
+// secant pair j, the newest included. dots_s_residual: s . g with the residual g of the iterate.
+// dots_change, dots_displacement: |u - iterate|^2 and |u - target|^2. dots_yy: |y|^2.
+// dots_free_change: squared change of the free directions at contacts.
 constexpr int dots_energy = 0, dots_sy = 2, dots_sg = dots_sy + history;
 constexpr int dots_s_residual = dots_sg + history, dots_change = dots_s_residual + 1;
 constexpr int dots_displacement = dots_change + 1, dots_yy = dots_displacement + 1;
 constexpr int dots_free_change = dots_yy + 1, trial_dots = dots_free_change + 1;
 constexpr int most_sums = trial_dots > turning_modes ? trial_dots : turning_modes;  // of any pass
-constexpr int most_chunks = 640;  // of vertices, whose sums every block adds up
-// Threads of a block: a multiprocessor each, but for meshes of one patch, of which two share it. Few enough that each has the
-// registers for what it asks of memory at once.
+constexpr int most_chunks = 640;  // whose sums every block reduces
+// Threads per block. A block has a multiprocessor to itself; for meshes of one patch, two blocks
+// share one. Each thread has enough registers for all of its loads in flight.
 constexpr int multilevel_threads = 512, small_multilevel_threads = 256;
 constexpr int small_multilevel_blocks = 2;
 constexpr int multilevel_warps = multilevel_threads / warp_size;
@@ -26,14 +28,14 @@ constexpr int multilevel_warps = multilevel_threads / warp_size;
 template <class T>
 struct MultilevelMemory {
   Quad<T>*iterate, *residual, *trial_residual;  // [teams, vertices]
-  Quad<T>*s, *y;                                // [teams, history, vertices], with pairs
+  Quad<T>*s, *y;                                // [teams, history, vertices], with L-BFGS
   Mat3<T>*free, *trial_free;  // [teams, vertices], with contacts, as are the next four
   Quad<T>*gradient, *trial_gradient, *friction, *trial_friction;
   CycleMemory<T> cycle;            // [teams, ...]
-  CorotationMemory<T> corotation;  // [teams, ...], with its small problem
-  double* chunk_dots;              // [teams, 2, most_sums, chunks], passes alternate
+  CorotationMemory<T> corotation;  // [teams, ...], with a coarse problem
+  double* chunk_dots;              // [teams, 2, most_sums, chunks], double-buffered
   double* patch_sums;              // [teams, patches, sums_count]
-  Range* ranges;                   // [teams, 2, blocks, ranges_count], rounds alternate
+  Range* ranges;                   // [teams, 2, blocks, ranges_count], double-buffered
   Misfit* misfit;                  // [batch]
   unsigned* counter;               // [teams], zero at the launch
 };
@@ -43,13 +45,13 @@ struct MultilevelCall {
   StreamCall<T> stream;
   MultilevelMemory<T> memory;
   int teams, blocks;         // blocks of a team
-  std::size_t shared_cycle;  // where the cycle's fields stand in shared memory; 0: in device memory
-  std::size_t shared_corotation;  // where a CorotationControl stands there; 0: nowhere
+  std::size_t shared_cycle;  // offset of the cycle's fields in shared memory; 0: in device memory
+  std::size_t shared_corotation;  // offset of CorotationControl in shared memory; 0: none
 
   PD_HD const DevicePlan<T>& plan() const { return stream.step.plan; }
-  // Warps whose vertices are added up together, a divisor of those of a block: one where the block is small, since a patch
-  // has fewer slots than most_chunks warps have lanes. The plan alone decides, so that an environment gives the same bits
-  // whatever the number of blocks.
+  // Warps per chunk of vertices, a divisor of the warps of a block. It is 1 for small blocks, since
+  // a patch has fewer slots than most_chunks warps have lanes. The plan alone decides, so that the
+  // bits do not depend on the number of blocks.
   PD_HD int warps_of_chunk() const {
     for (int warps : {1, 2, 4, 8}) {
       if (chunks_of(plan().vertices, warps) <= most_chunks) return warps;
@@ -65,13 +67,14 @@ struct MultilevelCall {
 static_assert(small_multilevel_threads % (most_parts * warp_size) == 0 &&
               multilevel_threads % (most_parts * warp_size) == 0);
 
-// In shared memory: what all threads of a block go by; its first thread decides.
+// State of a block in shared memory; its first thread updates it.
 struct MultilevelControl {
   Outer outer;
   Pairs pairs;
   double total[most_sums];
-  double factor[history];                                    // of the pairs' ways in the direction
-  alignas(16) double warp_dot[multilevel_warps][most_sums];  // of passes; parts of the cycle's
+  double factor[history];  // coefficients of s_j in the direction
+  // of passes; also the cycle's partial sums
+  alignas(16) double warp_dot[multilevel_warps][most_sums];
   bool accepted, done;
 };
 
