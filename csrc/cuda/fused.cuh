@@ -79,8 +79,8 @@ inline double shape_cost(int environments, int warps, int rounds) {
 }
 constexpr int most_fitted_rounds = 3;
 
-// The best shape for a mesh and its shared memory: for as many environments as fit on a
-// multiprocessor, or for those of the plan if they are fewer. The batch of a call has no influence,
+// The best shape for a mesh and its shared memory. It serves as many environments as fit on a
+// multiprocessor, or those of the plan if they are fewer. The batch of a call has no influence,
 // so an environment gives the same bits alone and in any batch.
 template <class T>
 BlockShape block_shape(const DevicePlan<T>& plan, std::size_t shared) {

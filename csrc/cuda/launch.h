@@ -10,8 +10,8 @@ namespace pd {
 
 // Kernel of a plan, stored in DevicePlan::kernel.
 enum class DeviceKernel : int {
-  block =
-      0,  // one block per environment, or several small environments per block; one launch for all iterations
+  // one block per environment, or several small environments per block; one launch for all iterations
+  block = 0,
   cluster =
       1,       // one block per patch, with distributed shared memory; one launch for all iterations
   grid = 2,    // one block per patch; one launch for all iterations

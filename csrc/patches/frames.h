@@ -4,8 +4,8 @@
 // Patch p has a constraint of four vertices, its corners and an apex:
 //   G_p = Ds Dm^-1,   Ds = (x_2 - x_1, x_3 - x_1, x_apex - x_1).
 // With G = U diag(s) V^T and det U = det V = +1, the frames use
-//   G~ = U diag(f(s)) V^T,   f(s) = min(max(|s|, lower), upper),
-// which prevents inversion and flattening; where f changes nothing, they use G itself. The frame of
+//   G~ = U diag(f(s)) V^T,   f(s) = min(max(|s|, lower), upper).
+// This prevents inversion and flattening; where f changes nothing, they use G itself. The frame of
 // a vertex is the mean of G~ over its patches, weighted by rest area.
 //
 // With P = U^T dG V, the derivative of G~ is U K V^T. For each pair i, j, K scales the symmetric

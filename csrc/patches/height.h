@@ -2,8 +2,8 @@
 //
 // By default x = P(b) is a point of the base surface. Measured on the surface itself, x = P + h D,
 // and h is the root of
-//   g(h) = h - sum_i R_i(P + h D),
-// which is unique if sum_i 96/(25 sqrt 5) |a_i| |M_i D| < 1. With F_d = dD/db_d,
+//   g(h) = h - sum_i R_i(P + h D).
+// The root is unique if sum_i 96/(25 sqrt 5) |a_i| |M_i D| < 1. With F_d = dD/db_d,
 //   dh/db_d = grad R . (dP/db_d + h F_d) / (1 - grad R . D);
 // the terms in D and F vanish where x is P.
 #pragma once

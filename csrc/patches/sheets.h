@@ -10,9 +10,9 @@ constexpr int posed_patch_size = 45;
 // The posed surface patch by patch, with the products of its frames expanded. With A_k, v_k, e_k
 // and u_k of patches/surface.h,
 //   sum_k b_k (v_k + A_k u_k) = sum_k b_k v_k + sum_{k<j} b_k b_j (A_k - A_j)(V_j - V_k) / 2
-//   + sum_k b_k (h + l_k) A_k N_k,
-// which halves the arithmetic of every further evaluation on the patch. V_k and N_k follow, then
-// the bumps in groups of four.
+//   + sum_k b_k (h + l_k) A_k N_k.
+// This form halves the arithmetic of every further evaluation on the patch. V_k and N_k follow,
+// then the bumps in groups of four.
 template <class T>
 struct PosedPatches {
   Lists lists;

@@ -1,6 +1,6 @@
 // The surface in any pose. With posed corners v_k and their frames A_k,
-//   S(b) = sum_k b_k (v_k + A_k u_k),   u_k = e_k / 2 + (h + l_k) N_k,
-// where e_k, l_k and N_k belong to the shell at rest (patches/shell.h). Half of e_k blends the
+//   S(b) = sum_k b_k (v_k + A_k u_k),   u_k = e_k / 2 + (h + l_k) N_k.
+// Here e_k, l_k and N_k belong to the shell at rest (patches/shell.h). Half of e_k blends the
 // three affine maps of the corners (James 2020, Phong deformation); v_k already contains the other
 // half. At rest, with v = V and A = 1, the surface is P + h D. It follows an affine motion v = G V
 // + t, A = G exactly. It is linear in the pose, and both sides of an edge give the same numbers.
