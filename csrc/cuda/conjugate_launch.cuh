@@ -49,8 +49,8 @@ struct ConjugateLaunch {
   // Vertices of all teams together. Beyond it, fewer teams of more blocks are as fast and take less
   // memory.
   static constexpr std::int64_t most_vertices = std::int64_t(1) << 21;
-  // Vertices times iterations of a launch, which bound it to some tenths of a second on an H100, so
-  // that a GPU that also drives a display stays responsive. The next launch continues the solve.
+  // Vertices times iterations of a launch, some tenths of a second on an H100. The bound keeps a
+  // GPU responsive that also drives a display. The next launch continues the solve.
   static constexpr std::int64_t most_work = std::int64_t(1) << 30;
 
   const void* kernel;

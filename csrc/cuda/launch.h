@@ -10,12 +10,14 @@ namespace pd {
 
 // Kernel of a plan, stored in DevicePlan::kernel.
 enum class DeviceKernel : int {
-  // one block per environment, or several small environments per block; one launch for all iterations
+  // one launch for all iterations: one block per environment, or several small environments per block
   block = 0,
-  cluster =
-      1,       // one block per patch, with distributed shared memory; one launch for all iterations
-  grid = 2,    // one block per patch; one launch for all iterations
-  stream = 3,  // several launches per iteration
+  // one launch for all iterations: one block per patch, with distributed shared memory
+  cluster = 1,
+  // one launch for all iterations: one block per patch
+  grid = 2,
+  // several launches per iteration
+  stream = 3,
 };
 
 // Whether rest shapes are computed from stored rest positions instead of being stored themselves;
