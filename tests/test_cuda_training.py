@@ -137,7 +137,7 @@ def test_a_solve_is_one_kernel_behind_its_weights(kernel: str, precision: str) -
 
     names = [name for name in device_work(solve) if "pd::" in name]
     assert len(names) == 2
-    assert ("conjugate_alone" if kernel == "block" else "conjugate_teams") in names[1]
+    assert ("conjugate_block" if kernel == "block" else "conjugate_teams") in names[1]
     assert progress[:, 2].tolist() == [0.0] * len(right)
     product = torch.ops.torchpd.hessian_product
     wanted, *_ = conjugate_gradients(
@@ -176,7 +176,7 @@ def test_friction_is_solved_for_in_the_same_launch(shape: str, precision: str) -
 
     names = [name for name in device_work(solve) if "pd::" in name]
     assert len(names) == 2
-    assert ("conjugate_alone" if shape == "pairs" else "conjugate_teams") in names[1]
+    assert ("conjugate_block" if shape == "pairs" else "conjugate_teams") in names[1]
 
 
 def test_friction_goes_on_in_the_next_launch(precision: str) -> None:
