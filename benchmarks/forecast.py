@@ -29,7 +29,7 @@ Row = dict[str, Any]
 
 
 def error_of(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> float:
-    return exact.judge(sim(state).velocities[0].numpy() * sim.time_step).position
+    return exact.errors_of(sim(state).velocities[0].numpy() * sim.time_step).position
 
 
 def counts_to(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> list[int | None]:

@@ -79,7 +79,7 @@ def random_landing(rng: np.random.Generator) -> tuple[Row, pd.Simulator, pd.Stat
 
 
 def errors_of(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> Errors:
-    return exact.judge(sim(state).velocities[0].numpy() * sim.time_step)
+    return exact.errors_of(sim(state).velocities[0].numpy() * sim.time_step)
 
 
 @torch.no_grad()

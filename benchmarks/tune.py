@@ -93,7 +93,7 @@ def random_state(sim: pd.Simulator, rng: np.random.Generator) -> pd.State:
 
 @torch.no_grad()
 def judge(sim: pd.Simulator, state: pd.State) -> Row:
-    """Errors of steps along the motion of the tuned simulator, and what the promise says of each."""
+    """Errors of steps along the motion of the tuned simulator, and what the tuning result says of each."""
     solved = settled_steps if has_friction(sim.compiled) else exact_steps
     errors, raw, trusted, audits, residuals = [], [], [], [], []
     for step in range(max(JUDGED_STEPS) + 1):
@@ -104,9 +104,9 @@ def judge(sim: pd.Simulator, state: pd.State) -> Row:
                 displacement = after.velocities[0].double().numpy() * sim.time_step
                 errors.append(exact.error_beyond_rounding(displacement, sim.dtype))
                 raw.append(exact.position_error(displacement))
-                trusted.append(bool(sim.promise.holds(info)[0]))
+                trusted.append(bool(sim.tuning_result.is_valid(info)[0]))
                 residuals.append(float(info.residual[0]))
-                audits.append(float(sim.promise.audit(sim, state, after)[0]))
+                audits.append(float(sim.tuning_result.verify(sim, state, after)[0]))
         state = after
     return {
         "errors": errors, "errors_with_rounding": raw, "trusted": trusted, "audits": audits, "residuals": residuals,
@@ -128,14 +128,14 @@ def run_scene(number: int, error: float, dtype: torch.dtype) -> Row:
     begin = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", TuningWarning)
-        promise = sim.tune(start, error=error)
+        result = sim.tune(start, error=error)
     row["tuning_seconds"] = time.perf_counter() - begin
-    row.update(solver=str(promise.solver), iterations=promise.iterations, attained=promise.attained)
-    row.update(promised=promise.error, studied=promise.studied_error, milliseconds=promise.milliseconds)
-    row.update(studied_errors=promise.trials[-1].errors, studied_residuals=promise.trials[-1].residuals)
-    row.update(error_per_residual=promise.error_per_residual, unseen_error=promise.unseen_error)
+    row.update(solver=str(result.solver), iterations=result.iterations, attained=result.attained)
+    row.update(promised=result.error, studied=result.studied_error, milliseconds=result.milliseconds)
+    row.update(studied_errors=result.trials[-1].errors, studied_residuals=result.trials[-1].residuals)
+    row.update(error_per_residual=result.error_per_residual, unseen_error=result.error_at_zero_residual)
     row.update(judge(sim, other))
-    row["held"] = not row["errors"] or max(row["errors"]) <= promise.error
+    row["held"] = not row["errors"] or max(row["errors"]) <= result.error
     row["budget"] = judge_budget(sim, start, other)
     return row
 
@@ -154,18 +154,18 @@ def judge_budget(sim: pd.Simulator, start: pd.State, other: pd.State) -> Row:
         speed = min(median(ruler) for _ in range(5))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TuningWarning)
-            promise = sim.tune(start, milliseconds=1.5 * speed)
+            result = sim.tune(start, milliseconds=1.5 * speed)
         # on a shared machine the speed may change meanwhile, which says nothing about the choice
         steady = abs(min(median(ruler) for _ in range(5)) / speed - 1.0) < STEADY
     ratio = float(np.median([median(sim) / (1.5 * median(ruler)) for _ in range(7)]))
     return {
-        "budget": 1.5 * speed, "share": ratio, "iterations": promise.iterations, "kept": ratio <= SLACK,
+        "budget": 1.5 * speed, "share": ratio, "iterations": result.iterations, "kept": ratio <= SLACK,
         "attempts": attempts, "steady": steady,
     }  # fmt: skip
 
 
 def suspects(row: Row) -> list[bool]:
-    """Whether `Promise.estimate` exceeds the promise, of every judged step."""
+    """Whether `TuningResult.estimate` exceeds the bound, of every step."""
     # rows without one: the least that it can be
     studied = zip(row["studied_errors"], row["studied_residuals"], strict=True)
     least = max((error / residual for error, residual in studied if residual > 0.0), default=0.0)

@@ -28,16 +28,16 @@ def test_the_first_iterate_has_error_one_and_the_solution_none() -> None:
     case = beam(1e5)
     sim = simulator(case, torch.float64)
     step = exact_steps(sim, state_of(case, sim), start="inertial")[0]
-    assert step.judge(step.first) == pytest.approx(
-        (1.0, 1.0, step.judge(step.first).residual, step.judge(step.first).metres)
+    assert step.errors_of(step.first) == pytest.approx(
+        (1.0, 1.0, step.errors_of(step.first).residual, step.errors_of(step.first).metres)
     )
-    at_end = step.judge(step.solution)
+    at_end = step.errors_of(step.solution)
     assert at_end.position == at_end.metres == 0.0
     assert abs(at_end.energy) < 1e-12
     # |grad E| / min a bounds the error; Newton's method ends near rounding, here a condition of 1e5 above it
     assert step.uncertainty < 1e5 * 2.0**-52 * 100
     # halfway along the line, half the error: the definition is linear
-    assert step.judge(0.5 * (step.first + step.solution)).position == pytest.approx(0.5, rel=1e-12)
+    assert step.errors_of(0.5 * (step.first + step.solution)).position == pytest.approx(0.5, rel=1e-12)
     assert np.abs(step.solution - newton(case.problem(), case.problem().first_iterate("inertial"))).max() < 1e-10
 
 
@@ -45,7 +45,7 @@ def test_a_start_that_is_not_finite_is_infinitely_wrong() -> None:
     case = beam(1e4)
     sim = simulator(case, torch.float64)
     step = exact_steps(sim, state_of(case, sim))[0]
-    assert step.judge(np.full_like(step.first, np.nan)) == (np.inf,) * 4
+    assert step.errors_of(np.full_like(step.first, np.nan)) == (np.inf,) * 4
 
 
 def test_uncertainty_bounds_the_error() -> None:
@@ -89,7 +89,7 @@ def test_material_of_every_environment_is_that_of_now() -> None:
     converged.iterations = 4000
     after = converged(state).velocities * sim.time_step
     for step, u in zip(steps, after.numpy(), strict=True):
-        assert step.judge(u).position < 1e-9
+        assert step.errors_of(u).position < 1e-9
     alone = exact_steps(sim_of_one(sim, 2), pd.State(*(part[2:3] for part in state)))[0]
     assert np.abs(alone.solution - steps[2].solution).max() < 1e-12
 
@@ -106,7 +106,7 @@ def test_contacts_are_solved_without_friction() -> None:
     sim = simulator(case, torch.float64)
     step = exact_steps(sim, state_of(case, sim))[0]
     assert not step.problem.values.planes[:, 4].any()
-    assert step.judge(step.solution).residual < 1e-10
+    assert step.errors_of(step.solution).residual < 1e-10
     assert step.uncertainty < 1e-6
     # it slides: without friction the momentum along the ground is kept
     masses = step.problem.values.masses
@@ -124,7 +124,7 @@ def test_stiff_beams_are_solved(cells: int, youngs: float) -> None:
     after, info = sim(state, return_info=True)
     assert float(info.residual) < 1e-12
     # |grad E| / min m/h^2 of a residual of 1e-13 is some 1e-9 here
-    assert step.judge(after.velocities[0].numpy() * sim.time_step).position < 1e-8
+    assert step.errors_of(after.velocities[0].numpy() * sim.time_step).position < 1e-8
     assert step.uncertainty < 1e-8
 
 
@@ -137,10 +137,10 @@ def test_stiff_slivers_on_the_ground_are_solved() -> None:
     state.velocities[:] = torch.tensor([0.5, -2.0, 0.0])
     step = exact_steps(sim, state)[0]
     assert step.uncertainty < 1e-8
-    assert step.judge(step.solution).residual < 1e-10
+    assert step.errors_of(step.solution).residual < 1e-10
     assert (step.problem.smallest_gap(step.solution) > -1e-12).all()
     # no method finds a lower energy
-    assert step.judge(sim(state).velocities[0].numpy() * sim.time_step).energy > 0.0
+    assert step.errors_of(sim(state).velocities[0].numpy() * sim.time_step).energy > 0.0
 
 
 @pytest.mark.parametrize("kind", ["plane", "ball", "both"])

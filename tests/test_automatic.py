@@ -51,7 +51,7 @@ def test_stiff_steps_get_multilevel_and_reach_the_aim(youngs: float, kind: type)
     sim = beam(youngs)
     assert type(sim.solver) is kind
     exact = exact_steps(beam(youngs, solver=pd.Multilevel()), swinging(sim))[0]
-    left = exact.judge(sim(swinging(sim)).velocities[0].double().numpy() * sim.time_step).position
+    left = exact.errors_of(sim(swinging(sim)).velocities[0].double().numpy() * sim.time_step).position
     assert left <= AIM
     again = beam(youngs)
     assert (again.solver, again.iterations, again.choice) == (sim.solver, sim.iterations, sim.choice)
@@ -69,7 +69,7 @@ def test_the_relaxation_fits_the_spectrum() -> None:
     errors = []
     for solver in (soft.solver, pd.Chebyshev()):
         soft.solver, soft.iterations = solver, 4
-        errors.append(exact.judge(soft(state).velocities[0].double().numpy() * soft.time_step).position)
+        errors.append(exact.errors_of(soft(state).velocities[0].double().numpy() * soft.time_step).position)
     assert errors[0] < 1e-2 * errors[1]
 
 

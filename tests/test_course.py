@@ -8,7 +8,7 @@ from tuning_cases import bar
 
 import torchpd as pd
 from torchpd.accuracy import exact_steps, problem_of
-from torchpd.course import course_of
+from torchpd.course import unsolved_step
 
 H = 1 / 60
 
@@ -35,7 +35,7 @@ def test_it_is_that_of_the_reference(dtype: torch.dtype, device: torch.device) -
     )
     pins = sim.pin_targets[: len(held.vertices)].detach() + 0.02
     targets = {held: pins, ball: torch.tensor([0.2, -0.05, 0.05, 0.0, 0.6, 0.0]).to(pins)}
-    found = course_of(sim.plan, sim.material_at(targets, 3), sim.time_step, state).cpu().double()
+    found = unsolved_step(sim.plan, sim.material_at(targets, 3), sim.time_step, state).cpu().double()
     for item in range(3):
         expected = torch.tensor(problem_of(sim, state, item, targets=targets).course())
         torch.testing.assert_close(found[item], expected, rtol=0, atol=8 * torch.finfo(dtype).eps)
@@ -50,11 +50,11 @@ def test_an_audit_of_a_body_that_flies_measures_from_there(spin: float) -> None:
     state = sim.rest_state()
     state.velocities[..., 1] = -5.0 * state.positions[..., 0] ** 2
     state.velocities[..., 2] = spin * (state.positions[..., 0] - 0.5)
-    promise = sim.tune(state, error=1e-2, candidates=[pd.Chebyshev()])
+    result = sim.tune(state, error=1e-2, candidates=[pd.Chebyshev()])
     after = sim(state)
     (exact,) = exact_steps(sim, state)
     error = exact.position_error(after.velocities[0].numpy() * H)
-    assert float(promise.audit(sim, state, after)) == pytest.approx(error, rel=1e-3)
+    assert float(result.verify(sim, state, after)) == pytest.approx(error, rel=1e-3)
 
 
 def test_nothing_is_in_the_way() -> None:
@@ -62,6 +62,6 @@ def test_nothing_is_in_the_way() -> None:
     state = sim.rest_state(2)
     state.velocities[..., 0] = torch.rand(2, sim.vertices, dtype=torch.float64)
     free = sim.rest_positions[:, 0] > 0.0
-    found = course_of(sim.plan, sim.material(), sim.time_step, state)
+    found = unsolved_step(sim.plan, sim.material(), sim.time_step, state)
     assert torch.equal(found[:, free], H * state.velocities[:, free])
     assert not bool(found[:, ~free].any())

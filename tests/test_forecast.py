@@ -99,7 +99,7 @@ def test_a_step_takes_about_what_was_forecast(youngs: float, solver: Any) -> Non
     count = expected.iterations(1e-3)
     errors = []
     for sim.iterations in (count // 4, 2 * count):
-        errors.append(exact.judge(sim(state).velocities[0].numpy() * sim.time_step).position)
+        errors.append(exact.errors_of(sim(state).velocities[0].numpy() * sim.time_step).position)
     assert errors[0] > 1e-3 > errors[1]
 
 

@@ -199,10 +199,10 @@ def test_what_was_given_stays_the_callers() -> None:
 def test_a_parametrized_simulator_is_tuned_and_audited() -> None:
     sim, _ = parametrized(Exponential())
     state = sim.rest_state()
-    promise = sim.tune(state, error=1e-2)
-    assert sim.iterations == promise.iterations
+    result = sim.tune(state, error=1e-2)
+    assert sim.iterations == result.iterations
     after = sim(state)
-    assert bool(promise.audit(sim, state, after).all())
+    assert bool(result.verify(sim, state, after).all())
 
 
 def test_tuning_asks_for_no_new_optimiser() -> None:
@@ -213,7 +213,7 @@ def test_tuning_asks_for_no_new_optimiser() -> None:
     places = sim.pin_targets.detach().expand(6, -1, 3).contiguous()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        promise = sim.tune(error=1e-2, targets=places, candidates=ONE)
+        result = sim.tune(error=1e-2, targets=places, candidates=ONE)
     assert all(now is then for now, then in zip((sim.stiffness, sim.pin_targets), learned, strict=True))
     assert all(array.requires_grad for array in learned)
     made = simulator()
@@ -221,6 +221,6 @@ def test_tuning_asks_for_no_new_optimiser() -> None:
     for name, how in (("stiffness", Exponential()), ("pin_targets", torch.nn.Identity())):
         parametrize.register_parametrization(made, name, how)
     again = made.tune(error=1e-2, targets=places, candidates=ONE)
-    assert again.studied_error == pytest.approx(promise.studied_error, rel=1e-6)
+    assert again.studied_error == pytest.approx(result.studied_error, rel=1e-6)
     assert all(parametrize.is_parametrized(made, name) for name in ("stiffness", "pin_targets"))
     assert torch.allclose(made.stiffness, sim.stiffness, rtol=1e-14)

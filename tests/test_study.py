@@ -18,7 +18,7 @@ from PIL import Image
 from torchpd import study_axes, study_bench
 from torchpd.accuracy import ExactStep
 from torchpd.baselines import BASELINES
-from torchpd.contenders import CONTENDERS, DEFAULT
+from torchpd.contenders import CANDIDATES, DEFAULT
 from torchpd.dense_direct import DENSE
 from torchpd.ledger import Row
 from torchpd.study import StudyOptions, cost_table, paper_table, run_study, study_table
@@ -150,7 +150,7 @@ def test_the_front_has_what_nothing_beats() -> None:
 
 def test_every_curve_looks_different() -> None:
     drawn = [name for name, method in BASELINES.items() if method.compiled_twin in (None, DEFAULT)]
-    styles = [STYLES[name] for name in (*CONTENDERS, *drawn, *DENSE)]
+    styles = [STYLES[name] for name in (*CANDIDATES, *drawn, *DENSE)]
     assert len(set(styles)) == len(styles)
 
 
@@ -214,7 +214,7 @@ def test_a_stiff_beam_is_compared_with_its_converged_step() -> None:
     after, solved = solved_step(sim, bench.start(sim))
     assert solved
     exact = bench.hard_step(setting)[1]
-    assert exact.judge(after.velocities[0].numpy() * sim.time_step).position < 1e-6
+    assert exact.errors_of(after.velocities[0].numpy() * sim.time_step).position < 1e-6
 
 
 def test_uncertain_rows_are_marked_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

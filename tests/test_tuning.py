@@ -1,4 +1,4 @@
-"""`Simulator.tune` reaches what it promises, and says what it cannot."""
+"""`Simulator.tune` reaches the requested error, and reports what it cannot reach."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from tuning_cases import CANDIDATES, bar, swinging, worst_error
 import torchpd as pd
 from torchpd import tuning
 from torchpd.accuracy import ExactStep, exact_steps, settled_steps
-from torchpd.contenders import safe_solvers
+from torchpd.contenders import safe_candidates
 from torchpd.promise import Trial
 from torchpd.tuning import TuningWarning
 
 
 @pytest.mark.parametrize("error", [1e-1, 1e-3])
 @pytest.mark.parametrize("youngs", [1e3, 1e6])
-def test_a_promised_error_holds_in_another_motion(error: float, youngs: float) -> None:
+def test_the_error_bound_holds_in_another_motion(error: float, youngs: float) -> None:
     sim = bar(youngs)
-    promise = sim.tune(swinging(sim), error=error)
-    assert promise.attained
-    assert promise.error == error
-    assert (sim.solver, sim.iterations, sim.promise) == (promise.solver, promise.iterations, promise)
+    result = sim.tune(swinging(sim), error=error)
+    assert result.attained
+    assert result.error == error
+    assert (sim.solver, sim.iterations, sim.tuning_result) == (result.solver, result.iterations, result)
     other = swinging(sim, speed=-2.0)
     other.velocities[..., 2] = other.positions[..., 0]
     for _ in range(8):
@@ -39,24 +39,24 @@ def test_a_promised_error_holds_in_another_motion(error: float, youngs: float) -
 @pytest.mark.parametrize("name", CANDIDATES)
 def test_less_error_costs_more_iterations(name: str) -> None:
     sim = bar()
-    solver = safe_solvers(sim, swinging(sim))[name]
+    solver = safe_candidates(sim, swinging(sim))[name]
     counts = [sim.tune(swinging(sim), error=error, candidates=[solver]).iterations for error in (1e-1, 1e-2, 1e-3)]
     assert counts == sorted(set(counts))
 
 
 @pytest.mark.parametrize("favoured", CANDIDATES)
 def test_less_error_takes_longer(favoured: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With all candidates, one of which has iterations a tenth as long: the time that is promised grows too."""
+    """With all candidates, one of which has iterations a tenth as long: the measured time grows too."""
     sim = bar()
-    candidates = safe_solvers(sim, swinging(sim))
+    candidates = safe_candidates(sim, swinging(sim))
     assert list(candidates) == CANDIDATES
     cheap = candidates[favoured]
     monkeypatch.setattr(
         tuning, "_milliseconds", lambda sim, start, trial: trial.iterations * (0.1 if trial.solver == cheap else 1.0)
     )
-    promises = [sim.tune(swinging(sim), error=error) for error in (1e-1, 1e-2, 1e-3)]
-    assert all(promise.attained for promise in promises)
-    costs = [promise.milliseconds for promise in promises]
+    results = [sim.tune(swinging(sim), error=error) for error in (1e-1, 1e-2, 1e-3)]
+    assert all(result.attained for result in results)
+    costs = [result.milliseconds for result in results]
     assert costs == sorted(set(costs))
 
 
@@ -65,20 +65,20 @@ def test_stiff_bodies_almost_at_rest_in_float64() -> None:
     sim = bar(youngs=1e8, dtype=torch.float64, iterations=20)
     with warnings.catch_warnings():
         warnings.simplefilter("error", TuningWarning)
-        promise = sim.tune(error=1e-2)
-    assert promise.attained
-    assert promise.studied_error <= 1e-2
+        result = sim.tune(error=1e-2)
+    assert result.attained
+    assert result.studied_error <= 1e-2
 
 
 def test_out_of_reach_is_said_with_the_best_there_is() -> None:
     sim = bar(youngs=1e8, time_step=1 / 30)
-    with pytest.warns(TuningWarning, match=r"\(error 0.001 cannot be had\)"):
-        promise = sim.tune(swinging(sim), error=1e-3, most=8)
-    assert not promise.attained
-    assert promise.iterations <= 8
-    assert promise.error > 1e-3
-    assert worst_error(sim, swinging(sim)) <= promise.error
-    assert "cannot be had" in repr(sim)
+    with pytest.warns(TuningWarning, match=r"\(error 0.001 cannot be reached\)"):
+        result = sim.tune(swinging(sim), error=1e-3, most=8)
+    assert not result.attained
+    assert result.iterations <= 8
+    assert result.error > 1e-3
+    assert worst_error(sim, swinging(sim)) <= result.error
+    assert "cannot be reached" in repr(sim)
 
 
 def test_doubt_about_the_converged_step_counts_as_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +89,7 @@ def test_doubt_about_the_converged_step_counts_as_error(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("request_", [{"error": 0.3}, {"milliseconds": 1.0}])
-def test_without_a_converged_step_nothing_is_promised(
+def test_without_a_converged_step_there_is_no_result(
     request_: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And what the user has set stays."""
@@ -98,7 +98,7 @@ def test_without_a_converged_step_nothing_is_promised(
     monkeypatch.setattr(tuning, "exact_steps", lambda *_, **__: unsure * 7)
     with pytest.raises(RuntimeError, match=r"no converged step to compare with: .* wrong by 1\.4e\+01"):
         sim.tune(swinging(sim), **request_)  # type: ignore[arg-type]
-    assert (sim.solver, sim.iterations, sim.promise) == (pd.Multilevel(), 9, None)
+    assert (sim.solver, sim.iterations, sim.tuning_result) == (pd.Multilevel(), 9, None)
 
 
 def test_stiff_beams_are_tuned() -> None:
@@ -107,10 +107,10 @@ def test_stiff_beams_are_tuned() -> None:
     body = pd.Solid(mesh, youngs=1e7, density=1000.0)
     scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
     sim = pd.Simulator(scene, 1 / 30, 16, progress=False)
-    promise = sim.tune(swinging(sim, speed=10.0), error=1e-2)
-    assert promise.attained
-    assert isinstance(promise.solver, pd.Multilevel)
-    assert promise.iterations < 40
+    result = sim.tune(swinging(sim, speed=10.0), error=1e-2)
+    assert result.attained
+    assert isinstance(result.solver, pd.Multilevel)
+    assert result.iterations < 40
     assert worst_error(sim, swinging(sim, speed=-10.0)) <= 1e-2
 
 
@@ -119,9 +119,9 @@ def test_a_kernel_without_multilevel_is_tuned_without_it(monkeypatch: pytest.Mon
     for module in ("contenders", "tuning"):
         monkeypatch.setattr(f"torchpd.{module}.runs", lambda solver, _: not isinstance(solver, pd.Multilevel))
     sim = bar()
-    promise = sim.tune(swinging(sim), error=1e-2)
-    assert promise.attained
-    assert not any(isinstance(trial.solver, pd.Multilevel) for trial in promise.trials)
+    result = sim.tune(swinging(sim), error=1e-2)
+    assert result.attained
+    assert not any(isinstance(trial.solver, pd.Multilevel) for trial in result.trials)
 
 
 def test_every_environment_counts() -> None:
@@ -142,9 +142,9 @@ def test_material_of_environments(count: int) -> None:
     """A set of one serves any number of states; without a state every environment is studied."""
     sim = bar()
     sim.set_material(stiffness=sim.stiffness * torch.linspace(1.0, 0.5, count)[:, None])
-    promise = sim.tune(swinging(sim, 3), error=1e-2)
-    assert promise.attained
-    assert worst_error(sim, swinging(sim, 3)) <= promise.error
+    result = sim.tune(swinging(sim, 3), error=1e-2)
+    assert result.attained
+    assert worst_error(sim, swinging(sim, 3)) <= result.error
     assert sim.tune(error=1e-2).batch == count
     if count == 3:
         with pytest.raises(ValueError, match="state must have the 3 environments of the material, got 2"):
@@ -153,7 +153,7 @@ def test_material_of_environments(count: int) -> None:
 
 @pytest.mark.parametrize("by", ["forces", "targets"])
 def test_motion_by_forces_or_targets(by: str) -> None:
-    """Of a body that would rest without: each environment has its own, which the promise is about."""
+    """Of a body that would rest without: each environment has its own, which the result is about."""
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (6, 2, 2))
     body = pd.Solid(mesh, youngs=1e5)
     pin = pd.Pin(body, mesh.vertices[:, 0] == 0.0)
@@ -167,8 +167,8 @@ def test_motion_by_forces_or_targets(by: str) -> None:
     else:
         shift = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.1, 0.05]])[:, None]
         targets = {pin: state.positions[:, pin.vertices] + shift}
-    promise = sim.tune(state, error=1e-3, forces=forces, targets=targets)
-    assert promise.attained
+    result = sim.tune(state, error=1e-3, forces=forces, targets=targets)
+    assert result.attained
     after = sim(state, forces, targets).velocities.double().numpy() * sim.time_step
     exact = exact_steps(sim, state, forces=forces, targets=targets)
     assert exact[1].error_beyond_rounding(after[1], sim.dtype) <= 1e-3
@@ -194,10 +194,10 @@ def test_a_budget_is_spent(budget: float, iterations: int, attained: bool, monke
     sim = bar(1e8)  # which needs thousands
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        promise = sim.tune(swinging(sim), milliseconds=budget, most=200, candidates=[pd.Chebyshev()])
-    assert (promise.iterations, promise.attained) == (iterations, attained)
+        result = sim.tune(swinging(sim), milliseconds=budget, most=200, candidates=[pd.Chebyshev()])
+    assert (result.iterations, result.attained) == (iterations, attained)
     assert [entry.category for entry in said] == [] if attained else [TuningWarning]
-    assert worst_error(sim, swinging(sim)) <= promise.error
+    assert worst_error(sim, swinging(sim)) <= result.error
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -208,13 +208,13 @@ def test_no_more_than_rounding_is_paid_for(dtype: torch.dtype, monkeypatch: pyte
         tuning, "_milliseconds", lambda sim, start, trial: cost[type(trial.solver).__name__] * trial.iterations
     )
     sim = bar(dtype=dtype)
-    promise = sim.tune(swinging(sim), milliseconds=1e6)
-    assert promise.attained
-    assert promise.solver == pd.Chebyshev()
-    assert promise.error <= promise.rounding
-    assert worst_error(sim, swinging(sim)) <= promise.error
-    sim.iterations = 2 * promise.iterations // 3
-    assert worst_error(sim, swinging(sim)) > 0.5 * promise.error
+    result = sim.tune(swinging(sim), milliseconds=1e6)
+    assert result.attained
+    assert result.solver == pd.Chebyshev()
+    assert result.error <= result.rounding
+    assert worst_error(sim, swinging(sim)) <= result.error
+    sim.iterations = 2 * result.iterations // 3
+    assert worst_error(sim, swinging(sim)) > 0.5 * result.error
 
 
 def test_a_state_almost_at_rest_does_not_excuse_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,7 +242,7 @@ def test_a_real_budget_is_near() -> None:
 
 
 def test_what_friction_leaves_out_is_said() -> None:
-    """Where Multilevel was not tried, nobody knows that the error cannot be had."""
+    """Where Multilevel was not tried, nobody knows that the error cannot be reached."""
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (6, 2, 2))
     scene = pd.Scene(pd.Solid(mesh, youngs=1e7), pd.Gravity(), pd.Ground(0.0, friction=0.5))
     sim = pd.Simulator(scene, 1 / 30, progress=False, iterations=16)
@@ -250,7 +250,7 @@ def test_what_friction_leaves_out_is_said() -> None:
     state.velocities[..., 1] = -2.0
     with pytest.warns(TuningWarning, match=r"\(error 0.001 not reached; Multilevel, which friction leaves out, might"):
         sim.tune(state, error=1e-3, most=8)
-    with pytest.warns(TuningWarning, match="cannot be had"):
+    with pytest.warns(TuningWarning, match="cannot be reached"):
         sim.tune(state, error=1e-3, most=1, candidates=[pd.Chebyshev(), pd.Multilevel()])
 
 
@@ -276,11 +276,11 @@ def errors_of_a_slide(sim: pd.Simulator, state: pd.State, steps: int = 25) -> li
     return errors
 
 
-def test_friction_is_part_of_the_promise() -> None:
+def test_friction_is_part_of_the_error_bound() -> None:
     """The 49 iterations that reach 1e-2 on smooth ground leave 0.2."""
     sim, state = sliding(1e6)
-    promise = sim.tune(state, error=1e-2)
-    assert promise.attained
+    result = sim.tune(state, error=1e-2)
+    assert result.attained
     # another way, at the same speed
     state.velocities[..., 0], state.velocities[..., 2] = 0.8, 0.6
     assert max(errors_of_a_slide(sim, state)) <= 1e-2
@@ -299,9 +299,9 @@ def test_steps_without_an_end_attain_nothing(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(tuning, "settled_steps", unsettled)
     sim, state = sliding(1e5)
     with pytest.warns(TuningWarning, match="error 0.01 not reached"):
-        promise = sim.tune(state, error=1e-2, most=128)
-    assert not promise.attained
-    assert promise.error >= 0.2
+        result = sim.tune(state, error=1e-2, most=128)
+    assert not result.attained
+    assert result.error >= 0.2
     assert sim.tune(state, error=0.5).attained
 
 
@@ -311,11 +311,11 @@ def test_the_hardest_states_of_the_motion_are_studied() -> None:
     body = pd.Solid(mesh, youngs=1e5, density=1000.0)
     scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
     sim = pd.Simulator(scene, 1 / 30, 64, progress=False)
-    promise = sim.tune(error=1e-2)
+    result = sim.tune(error=1e-2)
     state, worst = sim.rest_state(), 0.0
     for _ in range(30):
         after = sim(state)
-        worst = max(worst, float(promise.audit(sim, state, after)))
+        worst = max(worst, float(result.verify(sim, state, after)))
         state = after
     # 0.46 from the states of five fixed steps
-    assert worst <= promise.error
+    assert worst <= result.error

@@ -52,7 +52,7 @@ def test_candidates_are_a_sequence(candidates: object) -> None:
 
 
 def test_numbers_of_a_request_may_be_tensors() -> None:
-    assert bar().tune(error=torch.tensor(0.125)).asked_error == 0.125  # type: ignore[arg-type]
+    assert bar().tune(error=torch.tensor(0.125)).requested_error == 0.125  # type: ignore[arg-type]
 
 
 def test_states_that_are_not_finite_are_named() -> None:
@@ -88,7 +88,7 @@ def test_a_scene_without_motion_is_named() -> None:
     free = pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e5), pd.Gravity()), progress=False)
     with pytest.raises(ValueError, match="no motion that needs solving"):
         free.tune(error=0.1)
-    assert free.promise is None
+    assert free.tuning_result is None
 
 
 @pytest.mark.parametrize(("youngs", "time_step"), [(1e9, 1 / 30), (3e8, 1 / 15)])

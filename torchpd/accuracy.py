@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .checks import of_each
+from .checks import expand_shared
 from .contact_newton import ContactNewton
 from .effects import Ground, Sphere
 from .material import MATERIAL_ROWS
@@ -105,7 +105,7 @@ class ExactStep:
             error = float(np.linalg.norm(displacement - self.solution)) / self.scale
         return error if np.isfinite(error) else np.inf
 
-    def judge(self, displacement: Array) -> Errors:
+    def errors_of(self, displacement: Array) -> Errors:
         """The errors of u [V, 3] m; inf where it left the range of numbers."""
         if not np.isfinite(displacement).all():
             return Errors(np.inf, np.inf, np.inf, np.inf)
@@ -154,7 +154,7 @@ def problem_of(
 ) -> StepProblem:
     """The step of one environment in the reference, with the simulator's present material and without friction."""
     arrays = sim.material_at(targets, state[0].shape[0])
-    forces = of_each(forces, state[0].shape)
+    forces = expand_shared(forces, state[0].shape)
     material = {}
     for name, array in zip(MATERIAL_ROWS, arrays, strict=True):
         shared = array.dim() == MATERIAL_ROWS[name].dims
@@ -241,7 +241,7 @@ def settled_steps(
 
     There is no energy that Newton's method could go down, so `Multilevel` in float64 on the CPU is followed by longer
     and longer runs of Chebyshev, and `ExactStep.uncertainty` is what the last two of them have still moved. It stays
-    large where they go round in circles, as between sticking and slipping. `ExactStep.judge` knows no friction.
+    large where they go round in circles, as between sticking and slipping. `ExactStep.errors_of` knows no friction.
 
     Args:
         sim: scene, time step and material; its solver and device do not matter.

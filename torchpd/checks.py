@@ -26,12 +26,12 @@ __all__ = [
     "check_target_file",
     "check_vector",
     "check_whole",
-    "has_numbers",
-    "in_full",
-    "of_each",
+    "expand_shared",
+    "has_values",
     "optional_module",
     "plain_tensor",
     "tensor_of",
+    "to_full_precision",
 ]
 
 # ends errors of a rollout about its constant forces and targets
@@ -111,7 +111,7 @@ def tensor_of(array: NDArray[Any]) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(array)) if array.size else torch.from_numpy(array).clone()
 
 
-def in_full(value: Any, like: torch.Tensor) -> Any:
+def to_full_precision(value: Any, like: torch.Tensor) -> Any:
     """What autocast made half as precise, in the precision of `like`, as torch's ops of full precision take it.
 
     Anything else, and where autocast is not on, as it is.
@@ -120,7 +120,7 @@ def in_full(value: Any, like: torch.Tensor) -> Any:
     return value.to(like.dtype) if half and torch.is_autocast_enabled(value.device.type) else value
 
 
-def of_each(value: Any, shape: torch.Size) -> Any:
+def expand_shared(value: Any, shape: torch.Size) -> Any:
     """What all environments share, [V, 3] or [1, V, 3], as a view [B, V, 3]; anything else as it is."""
     if not isinstance(value, torch.Tensor) or value.shape == shape:
         return value
@@ -199,6 +199,6 @@ def plain_tensor(tensor: torch.Tensor) -> torch.Tensor:
     return tensor
 
 
-def has_numbers(tensor: torch.Tensor) -> bool:
+def has_values(tensor: torch.Tensor) -> bool:
     """Whether the numbers of a tensor can be read: not of a subclass, nor on "meta"."""
     return type(tensor) in (torch.Tensor, torch.nn.Parameter) and not tensor.is_meta

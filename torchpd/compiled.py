@@ -17,11 +17,11 @@ from .plan import Plan
 from .scene import Scene
 from .solvers import Solver
 
-__all__ = ["CompiledScene", "ordinary"]
+__all__ = ["CompiledScene", "persistent_tensors"]
 
 
 @contextmanager
-def ordinary() -> Iterator[None]:
+def persistent_tensors() -> Iterator[None]:
     """For tensors that are kept: those that are made in inference mode can never be changed or differentiated.
 
     Those that name no device are for the CPU, whatever torch's default device.

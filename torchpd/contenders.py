@@ -14,11 +14,11 @@ from .state import State
 if TYPE_CHECKING:
     from .stepper import Stepper
 
-__all__ = ["CONTENDERS", "DEFAULT", "DEFAULT_ITERATIONS", "Contender", "safe_solvers"]
+__all__ = ["CANDIDATES", "DEFAULT", "DEFAULT_ITERATIONS", "Candidate", "safe_candidates"]
 
 
 @dataclass(frozen=True)
-class Contender:
+class Candidate:
     """A solver by the name that figures give it.
 
     `make(sim, state)` may run trials from the state; `safe` ones cannot diverge, on any mesh and at any stiffness.
@@ -39,18 +39,18 @@ def _classic(sim: Stepper, state: State) -> Solver:
         sim.solver = own
 
 
-CONTENDERS: dict[str, Contender] = {
-    "Jacobi": Contender(lambda sim, state: Jacobi(diagonal="plain"), safe=False),
-    "damped Jacobi": Contender(lambda sim, state: Jacobi(relaxation=1.9), safe=True),
-    "classic Chebyshev": Contender(_classic, safe=False),
-    "guarded Chebyshev": Contender(lambda sim, state: Chebyshev(), safe=True),
-    "Multilevel": Contender(lambda sim, state: Multilevel(), safe=True),
+CANDIDATES: dict[str, Candidate] = {
+    "Jacobi": Candidate(lambda sim, state: Jacobi(diagonal="plain"), safe=False),
+    "damped Jacobi": Candidate(lambda sim, state: Jacobi(relaxation=1.9), safe=True),
+    "classic Chebyshev": Candidate(_classic, safe=False),
+    "guarded Chebyshev": Candidate(lambda sim, state: Chebyshev(), safe=True),
+    "Multilevel": Candidate(lambda sim, state: Multilevel(), safe=True),
 }
 DEFAULT = "guarded Chebyshev"  # what `Simulator(scene)` does
 
 
-def safe_solvers(sim: Stepper, state: State) -> dict[str, Solver]:
+def safe_candidates(sim: Stepper, state: State) -> dict[str, Solver]:
     """Those that cannot diverge and run where the simulator is, the default first."""
-    here = {name: c for name, c in CONTENDERS.items() if c.safe and sim.device.type in c.devices}
+    here = {name: c for name, c in CANDIDATES.items() if c.safe and sim.device.type in c.devices}
     made = {name: here[name].make(sim, state) for name in sorted(here, key=lambda name: name != DEFAULT)}
     return {name: solver for name, solver in made.items() if runs(solver, sim.compiled)}

@@ -12,12 +12,12 @@ from .plan import Plan
 from .state import State
 from .tables import PLANES, SPHERES
 
-__all__ = ["course_of"]
+__all__ = ["unsolved_step"]
 
 
 @torch.no_grad()
-def course_of(plan: Plan, arrays: Sequence[Tensor], time_step: float, state: State) -> Tensor:
-    """Displacements [B, V, 3] [m] of a step in which nothing is solved: x_0 - x of `Promise`, without friction.
+def unsolved_step(plan: Plan, arrays: Sequence[Tensor], time_step: float, state: State) -> Tensor:
+    """Displacements [B, V, 3] [m] of a step in which nothing is solved: x_0 - x of `TuningResult`, without friction.
 
     As `torchpd.reference.StepProblem.course`. The iterations of a step start from where rigid motions lead from there.
 

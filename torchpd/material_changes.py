@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
 from .checks import check_has_values
-from .compiled import CompiledScene, ordinary
+from .compiled import CompiledScene, persistent_tensors
 from .diagonal import named_material
 from .material import (
     ARRAYS,
@@ -101,7 +101,7 @@ def check_change(
     check_batches(owner, hard_of_springs | checked, own)
     if "pin_stiffness" in checked:
         checked |= _pins_apart(own[PIN_HARD], owner, checked["pin_stiffness"], checked.get(PIN_HARD))
-    with ordinary():
+    with persistent_tensors():
         originals = {}
         for name in [name for name in checked if is_parametrized(sim, name)]:
             originals[name], checked[name] = invert(owner, sim, name, checked[name])
@@ -119,7 +119,7 @@ def check_change(
 
 def write_change(sim: nn.Module, change: Change) -> None:
     """Replace the arrays of a simulator; its plan is the caller's to replace."""
-    with ordinary():
+    with persistent_tensors():
         for name, tensor in change.arrays.items():
             if name in change.originals:
                 parametrization(sim, name).original.copy_(change.originals[name])

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from .automatic import Choice
 from .checks import check_whole
-from .compiled import ordinary
+from .compiled import persistent_tensors
 from .material import MATERIAL_ROWS, material_of
 from .material_changes import (
     check_change,
@@ -31,7 +31,7 @@ from .model_checks import (
     report_resolution,
 )
 from .notices import Notices, warn_of_overlaps
-from .pin_mask import PinMask, held_springs, look_at_pins, serves_any_mask
+from .pin_mask import PinMask, held_springs, read_pin_mask, serves_any_mask
 from .pins import PIN_HARD, hold_exactly
 from .placing import check_wanted_device, is_recording
 from .plan import Plan, compile_plan
@@ -42,10 +42,10 @@ from .settings import (
     NO_STEP,
     SETTINGS,
     Configuration,
+    check_iterations,
     choose,
     choose_again,
     is_auto,
-    judge,
     moved,
     prepare,
     reconfigure,
@@ -54,7 +54,7 @@ from .solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Solver, Solve
 from .state import State
 from .synonyms import check_arguments
 from .targets import Anchors, Targets
-from .written import Seen, check_rest
+from .written import MutationGuard, check_rest
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -64,10 +64,10 @@ __all__ = ["Model"]
 _PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
 
 
-class _Promise(Protocol):
-    """Of `tune`."""
+class _TuningResult(Protocol):
+    """What the model calls of a `TuningResult`."""
 
-    def doubt(self, other: bool) -> None: ...
+    def invalidate(self, other: bool) -> None: ...
 
 
 class Model(nn.Module):
@@ -112,7 +112,7 @@ class Model(nn.Module):
         self._solver: Solver = Chebyshev()
         given = self._solver if solver is None or is_auto(solver) else check_solver(solver, torch.device("cpu"))
         self.tolerance = tolerance
-        self.promise: _Promise | None = None
+        self.tuning_result: _TuningResult | None = None
         self.choice: Choice | None = None  # of "auto"
         self._kernel = check_kernel(kernel)
         self._batch = check_batch(batch)
@@ -122,15 +122,15 @@ class Model(nn.Module):
         report_resolution(values, dtype)
         self.anchors = Anchors(scene)
         self.pinned = values.pinned
-        self._seen_rest, self._seen_pins, self._notices = Seen(), Seen(), Notices(self, scene)
-        with ordinary():
+        self._rest_guard, self._pin_guard, self._notices = MutationGuard(), MutationGuard(), Notices(self, scene)
+        with persistent_tensors():
             self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
             self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
             arrays = material_of(values, dtype)
             for name in MATERIAL_ROWS:
                 self.register_parameter(name, nn.Parameter(arrays[name], requires_grad=False))
             self.register_buffer(PIN_HARD, arrays[PIN_HARD])
-        self._read_pins()
+        self._refresh_pin_mask()
         warn_of_overlaps(scene)
         if device is not None:  # first, since "auto" chooses for it
             self.to(device)
@@ -139,7 +139,7 @@ class Model(nn.Module):
         else:
             self.solver = given
             self.named_iterations = iterations is not None
-            self.judge_iterations(None)
+            self.check_iterations(None)
 
     @property
     def vertices(self) -> int:
@@ -182,10 +182,10 @@ class Model(nn.Module):
     @time_step.setter
     def time_step(self, time_step: float) -> None:
         self._time_step = check_time_step(time_step, self.dtype)
-        shortest, longest = self._judged_steps
+        shortest, longest = self._checked_time_steps
         # where it changes in every step hardly any change shall cost more than to ask
         if not (shortest <= self._time_step <= longest or is_recording(self.device)):
-            self.judge_iterations("time_step")
+            self.check_iterations("time_step")
 
     @property
     def iterations(self) -> int:
@@ -205,12 +205,12 @@ class Model(nn.Module):
     @named_iterations.setter
     def named_iterations(self, named: bool) -> None:
         self._named_iterations = named
-        self._judged_steps = EVERY_STEP if named else NO_STEP
+        self._checked_time_steps = EVERY_STEP if named else NO_STEP
 
-    def judge_iterations(self, changed: str | None) -> None:
+    def check_iterations(self, changed: str | None) -> None:
         """Warn where iterations that nobody named are too few for what has `changed`, once; awaits a GPU until then."""
-        if self._judged_steps != EVERY_STEP:
-            self._judged_steps = judge(self.compiled, changed).judged_steps
+        if self._checked_time_steps != EVERY_STEP:
+            self._checked_time_steps = check_iterations(self.compiled, changed).checked_time_steps
 
     @property
     def tolerance(self) -> float:
@@ -250,7 +250,7 @@ class Model(nn.Module):
         return Configuration(material=material, **kept, **own)
 
     def _reconfigure(self, **changes: Any) -> None:
-        with ordinary():
+        with persistent_tensors():
             self._take(reconfigure(self.compiled, **changes))
 
     def _take(self, new: Configuration) -> None:
@@ -267,7 +267,7 @@ class Model(nn.Module):
         again, and it takes 0.3 s for 8 thousand vertices, seconds for a million tetrahedra. Other solvers prepare
         nothing.
         """
-        with ordinary():
+        with persistent_tensors():
             self._take(prepare(self.compiled))
 
     def material(self) -> list[Tensor]:
@@ -286,11 +286,11 @@ class Model(nn.Module):
         assert hard is not None
         if torch.compiler.is_compiling():
             return hold_exactly(arrays[_PIN_STIFFNESS], hard)
-        seen = self._seen_pins
-        mask = seen.found if seen.holds(hard) else self._look_at_pins(arrays, hard)
+        seen = self._pin_guard
+        mask = seen.found if seen.holds(hard) else self._read_pin_mask(arrays, hard)
         return held_springs(mask, arrays[_PIN_STIFFNESS], hard)
 
-    def _look_at_pins(self, arrays: list[Tensor], hard: Tensor, *, wait: bool = False) -> PinMask:
+    def _read_pin_mask(self, arrays: list[Tensor], hard: Tensor, *, wait: bool = False) -> PinMask:
         """Let the plan follow a mask that lets more go than it knows of.
 
         A step reads the mask, for which it awaits a GPU, only after somebody has written to it, and not where the plan
@@ -298,18 +298,18 @@ class Model(nn.Module):
         """
         if not wait and serves_any_mask(self.plan):
             return PinMask(some=True)
-        seen, self.plan = look_at_pins(self._with_material(arrays), hard, wait=wait)
+        seen, self.plan = read_pin_mask(self._with_material(arrays), hard, wait=wait)
         if seen.holds(hard):
-            self._seen_pins = seen
+            self._pin_guard = seen
         mask: PinMask = seen.found
         return mask
 
-    def _read_pins(self) -> None:
+    def _refresh_pin_mask(self) -> None:
         """What later steps need of pins, after these were set or moved: then no step has to wait for a GPU."""
-        self._seen_pins = Seen()
+        self._pin_guard = MutationGuard()
         if self.anchors.pinned:
-            with ordinary():
-                self._look_at_pins([getattr(self, name) for name in MATERIAL_ROWS], self.pin_hard, wait=True)
+            with persistent_tensors():
+                self._read_pin_mask([getattr(self, name) for name in MATERIAL_ROWS], self.pin_hard, wait=True)
 
     def __copy__(self) -> Self:
         """Torch lets no parametrized module be copied as a pickle would."""
@@ -350,14 +350,15 @@ class Model(nn.Module):
 
     def _replace_material(self, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False) -> None:
         change = check_change(self, self.compiled, owner, arrays, anew=anew)
-        if self.promise is not None and any(not torch.equal(new, getattr(self, n)) for n, new in change.arrays.items()):
-            self.promise.doubt(True)
+        result = self.tuning_result
+        if result is not None and any(not torch.equal(new, getattr(self, n)) for n, new in change.arrays.items()):
+            result.invalidate(True)
         write_change(self, change)
         if change.alters_pins:
             self.plan = change.plan
-            self._read_pins()
+            self._refresh_pin_mask()
         if change.alters_rate:
-            self.judge_iterations(owner)
+            self.check_iterations(owner)
         warn_of_new_parameters(change)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
@@ -375,7 +376,7 @@ class Model(nn.Module):
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         load_material(self, state_dict, prefix, rest, self._replace_material, super()._load_from_state_dict)
-        self._read_pins()
+        self._refresh_pin_mask()
 
     def check_state(self, state: State, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:
         """Refuse what is no state, one of another precision or device, velocities and forces unlike its positions.
@@ -390,9 +391,9 @@ class Model(nn.Module):
 
     def _checked_rest(self) -> Tensor:
         rest = self.rest_positions
-        seen = check_rest(self._seen_rest, rest, self.scene)
-        if seen is not self._seen_rest:
-            self._seen_rest = seen
+        seen = check_rest(self._rest_guard, rest, self.scene)
+        if seen is not self._rest_guard:
+            self._rest_guard = seen
         return rest
 
     def numbers(self, *, inertial: bool, report: bool) -> dict[str, Any]:
@@ -425,7 +426,7 @@ class Model(nn.Module):
         choice, ends = self.choice, {self.device.type, wanted.device.type}
         # digits that float32 has lost do not come back by widening, and "meta" keeps none
         loses_positions = wanted.dtype != self.dtype or self.device.type == "meta"
-        with ordinary():
+        with persistent_tensors():
             # whatever it was, the other device may choose differently; coming from "meta" there are no values
             if chooses := choice is not None and len(ends) == 2 and "meta" not in ends:
                 new = moved(reconfigure(self.compiled, solver=Chebyshev()), wanted.dtype, wanted.device)
@@ -438,8 +439,8 @@ class Model(nn.Module):
                 values = self.scene.values()
                 report_resolution(values, wanted.dtype)
                 self.rest_positions = torch.tensor(values.rest_positions, dtype=wanted.dtype, device=wanted.device)
-        self._read_pins()
+        self._refresh_pin_mask()
         if chooses:
-            with ordinary():
+            with persistent_tensors():
                 self._take(choose_again(replace(self.compiled, choice=choice)))
         return self

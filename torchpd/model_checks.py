@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import check_like, check_whole, in_full, of_each
+from .checks import check_like, check_whole, expand_shared, to_full_precision
 from .scene import SceneValues
 from .state import State
 from .warn import warn_user
@@ -118,7 +118,7 @@ def check_state(rest: Tensor, state: State, *, forces: Tensor | None, fix: str) 
     check_like("velocities", state[1], state[0], "m/s")
     if forces is None:
         return None
-    forces = of_each(in_full(forces, state[0]), state[0].shape)
+    forces = expand_shared(to_full_precision(forces, state[0]), state[0].shape)
     check_like("forces", forces, state[0], "N", fix=fix)
     return forces
 

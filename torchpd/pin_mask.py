@@ -7,15 +7,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from .checks import has_numbers, plain_tensor
-from .compiled import CompiledScene, ordinary
+from .checks import has_values, plain_tensor
+from .compiled import CompiledScene, persistent_tensors
 from .multilevel import has_levels
 from .pins import hold_exactly
 from .placing import is_recording, loosened_plan, plan_that_holds
 from .plan import Plan
-from .written import Seen
+from .written import MutationGuard
 
-__all__ = ["PinMask", "held_springs", "look_at_pins", "serves_any_mask"]
+__all__ = ["PinMask", "held_springs", "read_pin_mask", "serves_any_mask"]
 
 
 class PinMask(NamedTuple):
@@ -46,21 +46,21 @@ def serves_any_mask(plan: Plan) -> bool:
     return (plan.loose is None or bool(plan.loose.all())) and not has_levels(plan.arrays)
 
 
-def look_at_pins(compiled: CompiledScene, hard: Tensor, *, wait: bool = False) -> tuple[Seen, Plan]:
+def read_pin_mask(compiled: CompiledScene, hard: Tensor, *, wait: bool = False) -> tuple[MutationGuard, Plan]:
     """What the mask `hard` says, as `PinMask` in what was seen, and the plan that follows it; awaits a GPU.
 
     Pieces that are let go get rigid motions, and a preconditioner no longer holds what it held. With `wait` later
     steps, on whatever stream, may take the springs that are made here.
     """
     plain, springs = plain_tensor(hard), compiled.named["pin_stiffness"]
-    if not has_numbers(plain) or is_recording(plain.device):
-        return Seen(found=PinMask(some=True)), compiled.plan
+    if not has_values(plain) or is_recording(plain.device):
+        return MutationGuard(found=PinMask(some=True)), compiled.plan
     rows = plain.cpu().reshape(-1, plain.shape[-1])
     mask = PinMask(some=bool(rows.any()))
-    with ordinary():
+    with persistent_tensors():
         plan = plan_that_holds(compiled, loosened_plan(compiled, rows), rows.all(0))
         # streams wait for what sets the material, but not for what another one has made in a step
         if plain is hard and type(springs) is nn.Parameter and mask.some and (wait or not hard.is_cuda):
             version = None if bool(rows.all()) else springs._version
             mask = PinMask(True, springs, hold_exactly(springs, hard), version)
-    return Seen(hard if plain is hard else None, mask), plan
+    return MutationGuard(hard if plain is hard else None, mask), plan

@@ -1,4 +1,4 @@
-"""What `Simulator.tune` promises, and how a run is watched by it."""
+"""The result of `Simulator.tune`, and estimates of a step's error from it."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ import torch
 from torch import Tensor
 
 from .accuracy import ROUNDINGS
-from .course import course_of
+from .course import unsolved_step
 from .material import fingerprint
 from .plan import Plan
 from .solvers import Solver
 from .state import Info, State
+from .synonyms import Renamed
 from .targets import Targets
 
-__all__ = ["Promise", "Trial"]
+__all__ = ["Trial", "TuningResult"]
 
 
 class Tuned(Protocol):
-    """What a promise reads of a simulator."""
+    """The parts of a simulator that a tuning result reads."""
 
     plan: Plan
     iterations: int
@@ -40,7 +41,7 @@ class Tuned(Protocol):
     def device(self) -> torch.device: ...
 
     @property
-    def promise(self) -> Any: ...
+    def tuning_result(self) -> Any: ...
 
     def material(self) -> list[Tensor]: ...
 
@@ -60,47 +61,62 @@ class Trial(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Promise:
-    """What `Simulator.tune` chose and what may be expected of it, for motions like the studied one of that material.
+class TuningResult:
+    """Solver and iterations chosen by `Simulator.tune`, with the error to expect for similar motions of this material.
 
-    |x - x*| <= error |x_0 - x*| + 10 eps |x|: x* the converged step, with its friction, x_0 = x + h v, eps of the
-    precision. The last term matters to steps that hardly change anything, as of a body that comes to rest.
+    The error bound of a step is |x - x*| <= error |x_0 - x*| + 10 eps |x|. Here x* is the converged step with
+    friction, x_0 = x + h v, and eps the machine epsilon. The last term matters when a step changes little, for example
+    when a body comes to rest.
+
+    See docs/accuracy.md for how to use it.
     """
 
-    asked_error: float | None
-    asked_milliseconds: float | None
-    attained: bool  # whether what was asked for can be had; if not, error and milliseconds say what can
+    requested_error: float | None
+    requested_milliseconds: float | None
+    attained: bool  # whether the request was met; if not, error and milliseconds are the best found
     solver: Solver
     iterations: int
-    error: float  # promised, of a step; no finer than the rounding of any, unless that was asked for
+    error: float  # expected bound of a step; no finer than rounding, unless that was requested
     studied_error: float  # worst of the study
-    rounding: float  # 10 eps |x| / |x_0 - x*|, largest of the study: what may come on top of `error`
-    milliseconds: float  # median of sim(state), of the batch that tune saw, on the machine where it ran
-    residual_limit: float  # `info.residual` above which the promise is not to be relied on
+    rounding: float  # largest 10 eps |x| / |x_0 - x*| of the study, which may come on top of `error`
+    milliseconds: float  # median of sim(state) for the batch of the study, on the machine where it ran
+    residual_limit: float  # `info.residual` above which `is_valid` is False
     error_per_residual: float  # largest ratio in the study
-    unseen_error: float  # largest in the study of a step whose residual is 0, with as many iterations or hardly fewer
+    # largest error in the study of a step with residual 0, at as many iterations or slightly fewer
+    error_at_zero_residual: float
     time_step: float  # s
     dtype: torch.dtype
     device: str
     batch: int
     trials: tuple[Trial, ...]
     material: str  # fingerprint of the arrays
-    left_out: str = ""  # solver that was not tried though it might do better, and why
-    # said by `Simulator.set_material`, and by `covers` of its own simulator
+    left_out: str = ""  # a solver that was not tried though it might do better, and why
+    # set by `Simulator.set_material`, and by `matches` for its own simulator
     other_material: bool = field(default=False, compare=False)
 
-    def holds(self, info: Info) -> Tensor:
-        """Whether the error may still be relied on [B] (bool), from the residual that `return_info=True` reports.
+    holds = Renamed("is_valid")
+    audit = Renamed("verify")
+    covers = Renamed("matches")
+    doubt = Renamed("invalidate")
+    asked_error = Renamed("requested_error")
+    asked_milliseconds = Renamed("requested_milliseconds")
+    unseen_error = Renamed("error_at_zero_residual")
 
-        An estimate, calibrated on the studied states: the promise is doubted when the residual is larger than they had
-        where their error was the promised one, and when it is not a number. Residuals weigh short waves and errors
-        long ones, so most steps that break a promise have a residual like any other: see `estimate` and `audit`.
-        Nowhere once `set_material` has brought other numbers; what an optimiser writes in place only `covers` finds.
+    def is_valid(self, info: Info) -> Tensor:
+        """Whether the error bound can be relied on [B] (bool), judged by the residual of the step.
+
+        The test is `info.residual <= residual_limit`, with a limit calibrated on the studied states; a NaN residual
+        fails it. Residuals weigh short waves and errors long ones, so most steps that exceed the bound have an ordinary
+        residual: use `estimate` and `verify` for those. False everywhere after `set_material` has changed the material;
+        changes that an optimiser writes in place are found by `matches` alone.
+
+        Args:
+            info: from `state, info = sim(state, return_info=True)`.
         """
-        return (_info(info, "holds").residual <= self.residual_limit) & (not self.other_material)
+        return (_info(info, "is_valid").residual <= self.residual_limit) & (not self.other_material)
 
     @torch.no_grad()
-    def audit(
+    def verify(
         self,
         sim: Tuned,
         state: State,
@@ -110,32 +126,32 @@ class Promise:
         *,
         info: Info | None = None,
     ) -> Tensor:
-        """Error of a step [B] beyond rounding, as `error` is, by solving on: x' three times as many iterations later.
+        """Relative error of a step beyond rounding [B], measured by solving the step further.
 
-        The least e >= 0 with |x - x'| <= e |x_0 - x'| + 10 eps |x|. Costs three steps and calibrates nothing: for now
-        and then. Low where even those iterations change little.
+        It is the least e >= 0 with |x - x'| <= e |x_0 - x'| + 10 eps |x|. x' is the solution after three times as many
+        further iterations. Costs three steps. Too low where those iterations change little.
 
         Args:
             sim: the tuned simulator.
-            state: where the step started.
-            after: where it ended.
-            forces: that the step was given.
-            targets: that it was given.
-            info: of the step. Environments that `estimate` does not doubt get their estimate, and where it doubts none
-                of the batch, as in two of three steps that keep the promise, nothing is solved; that awaits a GPU.
+            state: the start of the step.
+            after: the end of the step.
+            forces: the forces of the step.
+            targets: the targets of the step.
+            info: the report of the step. Environments whose `estimate` is within `error` get that estimate. If all
+                are, as in two of three steps within the bound, nothing is solved. Reading it waits for a GPU.
         """
         if info is not None:
             estimate = self.estimate(info)
-            trusted = (estimate <= self.error) & (not self.other_material)  # not a number is doubtful
+            trusted = (estimate <= self.error) & (not self.other_material)  # NaN is not trusted
             if bool(trusted.all()):
                 return estimate
-            return torch.where(trusted, estimate, self.audit(sim, state, after, forces, targets))
+            return torch.where(trusted, estimate, self.verify(sim, state, after, forces, targets))
         further = copy.copy(sim)
         further.iterations, further.tolerance = 3 * self.iterations, 0.0
         solved: Tensor = further(state, forces, targets, start=after[0])[1]
         material = sim.material_at(targets, len(state[0]))
         # displacements over the time step are velocities
-        first = course_of(sim.plan, material, sim.time_step, state) / self.time_step
+        first = unsolved_step(sim.plan, material, sim.time_step, state) / self.time_step
         error = (solved - after[1]).flatten(1).norm(dim=1)
         rounding = ROUNDINGS * torch.finfo(self.dtype).eps * state[0].flatten(1).norm(dim=1) / self.time_step
         # a body at rest has no error
@@ -144,39 +160,43 @@ class Promise:
         return beyond
 
     def estimate(self, info: Info) -> Tensor:
-        """Error of the step [B] that its residual may hide; NaN without a report.
+        """Estimate of a step's relative error [B] from its residual; NaN without a report.
 
-        At the largest ratio of the study, and no less than its steps had whose residual was 0, where rounding hides
-        forces: of stiff bodies in float32 that may be an error that matters. High rather than low: in float32 it
-        exceeds `error` on one in three steps that keep the promise; an `audit` tells which.
+        max(error_per_residual * residual, error_at_zero_residual). Rounding can hide forces, so steps with residual 0
+        may have a large error for stiff bodies in float32. The estimate is pessimistic: in float32 it exceeds `error`
+        on one of three steps within the bound; `verify` measures these.
+
+        Args:
+            info: from `state, info = sim(state, return_info=True)`.
         """
-        return (_info(info, "estimate").residual * self.error_per_residual).clamp(min=self.unseen_error)
+        return (_info(info, "estimate").residual * self.error_per_residual).clamp(min=self.error_at_zero_residual)
 
-    def covers(self, sim: Tuned) -> bool:
-        """Whether the simulator still has the settings and the material that were promised for; awaits a GPU."""
+    def matches(self, sim: Tuned) -> bool:
+        """Whether the simulator still has the settings and the material of the study; waits for a GPU."""
         now = (sim.solver, sim.iterations, sim.time_step, sim.dtype, str(sim.device), sim.tolerance)
         other = self.other_material
         if now[3:5] == (self.dtype, self.device):
             other = fingerprint(sim.material()) != self.material
-            if sim.promise is self:
-                self.doubt(other)
+            if sim.tuning_result is self:
+                self.invalidate(other)
         return now == (self.solver, self.iterations, self.time_step, self.dtype, self.device, 0.0) and not other
 
-    def doubt(self, other: bool) -> None:
-        """Note whether its simulator has another material now."""
+    def invalidate(self, other: bool) -> None:
+        """Record whether the simulator's material differs from that of the study."""
         object.__setattr__(self, "other_material", other)
 
     def __str__(self) -> str:
-        wanted = f"error {self.asked_error:g}" if self.asked_error is not None else f"{self.asked_milliseconds:g} ms"
-        why = f"{wanted} not reached; {self.left_out}" if self.left_out else f"{wanted} cannot be had"
+        error = self.requested_error
+        wanted = f"{self.requested_milliseconds:g} ms" if error is None else f"error {error:g}"
+        why = f"{wanted} not reached; {self.left_out}" if self.left_out else f"{wanted} cannot be reached"
         verdict = "" if self.attained else f" ({why})"
         rounding = f" and up to {self.rounding:.1e} of rounding" if self.rounding > 0.1 * self.error else ""
-        other = ", for another material than now" if self.other_material else ""
+        other = ", for another material than the present one" if self.other_material else ""
         return f"error {self.error:.1e}{rounding}, {self.milliseconds:.2g} ms a step of {self.batch}{verdict}{other}"
 
 
 def _info(info: object, name: str) -> Info:
     if not isinstance(info, Info):
         given = type(info).__name__
-        raise TypeError(f"{name}: info must be what `state, info = sim(state, return_info=True)` gives, got {given}")
+        raise TypeError(f"{name}: info must be an Info, from `state, info = sim(state, return_info=True)`, got {given}")
     return info

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from .adjoint import AdjointCall, step_gradient
-from .checks import in_full
+from .checks import to_full_precision
 from .diagonal import named_material, pinned_vertices, step_diagonal
 from .effects import Ground, Pin, Solid, Sphere
 from .material import MATERIAL_ROWS
@@ -150,7 +150,7 @@ def _checked_point(about: Tensor, positions: Tensor) -> Tensor:
             f"of each body, got {type(about).__name__}; torch.tensor(..., dtype=sim.dtype, device=sim.device) makes one"
         )
     batch = len(positions)
-    point: Tensor = in_full(about, positions)
+    point: Tensor = to_full_precision(about, positions)
     if point.dtype != positions.dtype or point.device != positions.device:
         raise TypeError(f"about must be {positions.dtype} on {positions.device}, got {point.dtype} on {point.device}")
     if point.shape not in ((3,), (1, 3), (batch, 3)):

@@ -26,10 +26,10 @@ __all__ = [
     "NO_STEP",
     "SETTINGS",
     "Configuration",
+    "check_iterations",
     "choose",
     "choose_again",
     "is_auto",
-    "judge",
     "moved",
     "prepare",
     "reconfigure",
@@ -40,7 +40,8 @@ __all__ = [
 EVERY_STEP, NO_STEP = (0.0, math.inf), (math.inf, 0.0)
 # what a simulator keeps of a `Configuration` beside plan, choice and material
 SETTINGS = (
-    "time_step", "iterations", "tolerance", "solver", "adjoint", "kernel", "batch", "named_iterations", "judged_steps",
+    "time_step", "iterations", "tolerance", "solver", "adjoint", "kernel", "batch", "named_iterations",
+    "checked_time_steps",
 )  # fmt: skip
 
 
@@ -50,7 +51,7 @@ class Configuration(CompiledScene):
 
     choice: Choice | None  # of "auto"
     named_iterations: bool  # whether somebody has given their number: then no warning says that they are too few
-    judged_steps: tuple[float, float]  # time steps [s] for which iterations need no warning
+    checked_time_steps: tuple[float, float]  # time steps [s] for which iterations need no warning
 
 
 def is_auto(solver: object) -> bool:
@@ -108,14 +109,14 @@ def moved(now: Configuration, dtype: torch.dtype, device: torch.device) -> Confi
     return replace(now, plan=plan_on(now, dtype, device))
 
 
-def judge(now: Configuration, changed: str | None) -> Configuration:
+def check_iterations(now: Configuration, changed: str | None) -> Configuration:
     """Warn where iterations that nobody named are too few for what has `changed`, once; awaits a GPU until then."""
-    if now.judged_steps == EVERY_STEP:
+    if now.checked_time_steps == EVERY_STEP:
         return now
     if warn_of_few_iterations(now, now.choice, changed):
-        return replace(now, judged_steps=EVERY_STEP)
-    shortest, longest = NO_STEP if changed != "time_step" else now.judged_steps
-    return replace(now, judged_steps=(min(shortest, now.time_step), max(longest, now.time_step)))
+        return replace(now, checked_time_steps=EVERY_STEP)
+    shortest, longest = NO_STEP if changed != "time_step" else now.checked_time_steps
+    return replace(now, checked_time_steps=(min(shortest, now.time_step), max(longest, now.time_step)))
 
 
 def _planned_anew(now: Configuration) -> Configuration:
@@ -128,8 +129,8 @@ def _planned_anew(now: Configuration) -> Configuration:
 
 def _solved_by(now: Configuration, solver: Solver) -> Configuration:
     # to another solver the same number of iterations is another promise
-    judged = EVERY_STEP if now.named_iterations else NO_STEP
-    now = replace(now, solver=solver, choice=None, judged_steps=judged)
+    checked = EVERY_STEP if now.named_iterations else NO_STEP
+    now = replace(now, solver=solver, choice=None, checked_time_steps=checked)
     return now if serves(now) else replace(now, plan=plan_for_solver(now))
 
 
@@ -140,7 +141,9 @@ def choose(now: Configuration, iterations: int | None) -> Configuration:
     solver, choice = choose_solver(now, iterations)
     now = replace(_solved_by(now, solver), choice=choice, iterations=choice.iterations)
     named = not choice.sets_iterations
-    return judge(replace(now, named_iterations=named, judged_steps=EVERY_STEP if named else NO_STEP), None)
+    return check_iterations(
+        replace(now, named_iterations=named, checked_time_steps=EVERY_STEP if named else NO_STEP), None
+    )
 
 
 def choose_again(now: Configuration) -> Configuration:

@@ -14,12 +14,12 @@ from .checks import check_has_values
 from .io import SavedSimulation, load_simulation, reading, save_simulation
 from .material import named_arrays
 from .multilevel import has_levels, precondition_plan, reference_of_levels
-from .promise import Promise
+from .promise import TuningResult
 from .solvers import Solver
 from .state import State
 from .stepper import Stepper
 from .summary import describe
-from .synonyms import no_attribute
+from .synonyms import Renamed, no_attribute
 from .targets import Targets
 
 __all__ = ["Simulator", "Targets"]
@@ -77,10 +77,11 @@ class Simulator(Stepper):
         progress: show a bar while a large scene compiles, for another device too.
     """
 
-    promise: Promise | None
+    tuning_result: TuningResult | None
+    promise = Renamed("tuning_result")
 
     def extra_repr(self) -> str:
-        return describe(self, self.promise)
+        return describe(self, self.tuning_result)
 
     def __getattr__(self, name: str) -> Any:
         parameters = self.__dict__.get("_parameters", ())
@@ -125,14 +126,14 @@ class Simulator(Stepper):
         candidates: Sequence[Solver] | None = None,
         most: int = 2048,
         progress: bool = False,
-    ) -> Promise:
+    ) -> TuningResult:
         """Choose solver and iterations for an error or a time, from a short study on this scene; sets them.
 
-        No step stops early then: `tolerance` becomes 0. Errors leave out 10 eps |x| of rounding, see `Promise`.
+        No step stops early then: `tolerance` becomes 0. Errors leave out 10 eps |x| of rounding, see `TuningResult`.
 
-        The promise also stays in `self.promise`: `promise.holds(info)` says during a run whether to rely on it. It is
-        for the material that is there now. A target out of reach gets the best there is, a promise with
-        `attained=False`, and a `TuningWarning`. Files do not keep it: times are of the machine that measured them.
+        The result is also kept in `self.tuning_result`, for the present material. Check steps of a run with
+        `result.is_valid(info)`. If the target cannot be reached, the best setting is taken, with `attained=False` and a
+        `TuningWarning`. Files do not keep the result, because times depend on the machine.
 
         Takes about a second for a thousand vertices, 2 to 8 s for 3 thousand and 20 s for 10 thousand on one core of a
         CPU: nine steps of each studied environment are solved to convergence in float64, on the CPU. With friction up
@@ -210,5 +211,5 @@ def _restored(saved: SavedSimulation) -> Simulator:
         sim.plan = precondition_plan(sim.plan, sim.scene.values(), *reference)
     sim.choice = saved.choice
     sim.named_iterations = saved.named_iterations
-    sim.judge_iterations("Simulator.load")
+    sim.check_iterations("Simulator.load")
     return sim

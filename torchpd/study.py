@@ -19,7 +19,7 @@ import torch
 from tqdm.auto import tqdm
 
 from .baselines import BASELINES
-from .contenders import CONTENDERS, DEFAULT
+from .contenders import CANDIDATES, DEFAULT
 from .dense_direct import DENSE
 from .ledger import Ledger, Row, write_csv
 from .packages import OPTIONAL, missing_packages
@@ -101,7 +101,7 @@ def _setting(subject: Subject, options: StudyOptions) -> Setting:
 
 def _solver_tasks(bench: Bench, setting: Setting, counts: list[int]) -> dict[str, Task]:
     tasks: dict[str, Task] = {}
-    for name, contender in CONTENDERS.items():
+    for name, contender in CANDIDATES.items():
         if bench.device.type not in contender.devices:
             continue
         for dtype in (torch.float32, torch.float64):

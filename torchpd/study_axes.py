@@ -105,7 +105,7 @@ def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) 
     setup = Timing.of([trace.setup_seconds for trace in traces]).median
     rows = [
         _baseline_row(
-            traces, iterations, exact.judge(traces[0].displacements[iterations]),
+            traces, iterations, exact.errors_of(traces[0].displacements[iterations]),
             {**common, "setup_milliseconds": setup, "bytes": memory.peak_bytes, "bytes_by": "tracemalloc"},
         )
         for iterations in _shown(traces[0], counts, every=method.few)
@@ -153,7 +153,7 @@ def dense_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, co
     for count in counts:
         watch = PeakMemory(bench.device, method.bytes)
         play = method.recorded(first, omegas[:count])
-        errors = exact.judge(play().double().cpu().numpy())
+        errors = exact.errors_of(play().double().cpu().numpy())
         held, how = watch.read()
         rows.append(
             Row(

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from .accuracy import ExactStep, exact_steps
-from .contenders import CONTENDERS
+from .contenders import CANDIDATES
 from .ledger import Row, Trajectory
 from .mesh import TetMesh
 from .simulator import Simulator
@@ -122,7 +122,7 @@ class Bench:
         state, _ = self.hard_step(setting)
         clock = clock_of(self.device)
         begin = clock()
-        solver = CONTENDERS[name].make(sim, state)
+        solver = CANDIDATES[name].make(sim, state)
         return solver, 1e3 * (clock() - begin)
 
 
@@ -275,7 +275,7 @@ def measure_step(
     sim.iterations = iterations
     given = State(*(part.to(sim.dtype) for part in state))
     after = sim(given)
-    errors = exact.judge(after.velocities[0].double().cpu().numpy() * sim.time_step)
+    errors = exact.errors_of(after.velocities[0].double().cpu().numpy() * sim.time_step)
     timing = time_calls(lambda: sim(given), sim.device, seconds=seconds, series=series)
     real = torch.finfo(sim.dtype).bits // 8
     memory = PeakMemory(sim.device, sim.plan.bytes + workspace_bytes(sim.plan, real, sim.solver))

@@ -18,7 +18,7 @@ from .tables import MULTILEVEL_TABLE
 
 if TYPE_CHECKING:
     from .plan import Plan
-    from .promise import Promise
+    from .promise import TuningResult
     from .stepper import Stepper
 
 __all__ = ["describe", "workspace_bytes"]
@@ -65,11 +65,11 @@ def _expectation_lines(sim: Stepper) -> list[str]:
     return lines
 
 
-def _promise_lines(sim: Stepper, promise: Promise | None) -> list[str]:
-    if promise is None:
+def _tuning_lines(sim: Stepper, result: TuningResult | None) -> list[str]:
+    if result is None:
         return []
-    stale = "" if promise.covers(sim) else "; settings have changed since, so it no longer holds"
-    return [f"tuned: {promise}{stale}"]
+    stale = "" if result.matches(sim) else "; no longer valid, since settings have changed"
+    return [f"tuned: {result}{stale}"]
 
 
 def _preconditioner_lines(sim: Stepper) -> list[str]:
@@ -193,7 +193,7 @@ def _step_bytes(sim: Stepper, real: int) -> str:
     return f"{taken}, at most {step_bytes(scene, plan, _ANY_BATCH, sim.device):,} B in all"
 
 
-def describe(sim: Stepper, promise: Promise | None) -> str:
+def describe(sim: Stepper, result: TuningResult | None) -> str:
     """Lines for `print(sim)`: sizes, solver, effects, passes, memory."""
     plan = sim.plan
     material = sum(array.numel() * array.element_size() for array in sim.material())
@@ -207,7 +207,7 @@ def describe(sim: Stepper, promise: Promise | None) -> str:
         return "\n  ".join([*lines, NO_VALUES])
     lines += [
         *_expectation_lines(sim),
-        *_promise_lines(sim, promise),
+        *_tuning_lines(sim, result),
         *_preconditioner_lines(sim),
         *_effect_lines(sim),
         *([_pass_line(sim)] if plan.kernel is None else _kernel_lines(sim)),

@@ -1,13 +1,15 @@
-"""Names of other libraries, answered with ours by the error that they raise."""
+"""Names that users may try: those of other libraries, which errors answer with ours, and our former ones."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
 from inspect import signature
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
-__all__ = ["SYNONYMS", "check_arguments", "no_attribute"]
+from .warn import warn_user
+
+__all__ = ["SYNONYMS", "Renamed", "check_arguments", "no_attribute"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -97,6 +99,36 @@ def no_attribute(owner: str, name: str, value: object = None) -> AttributeError:
     answer = _answer(owner, name)
     words = f"{owner or 'torchpd'} has no attribute {name!r}{'; ' if answer else ''}{answer}"
     return AttributeError(words, name=name, obj=value)
+
+
+class Renamed:
+    """The former name of an attribute or method: works as the new one, with a `DeprecationWarning` that names it.
+
+    Example:
+        >>> class TuningResult:
+        ...     holds = Renamed("is_valid")
+    """
+
+    def __init__(self, now: str) -> None:
+        self.now = now
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.former = f"{owner.__name__}.{name}"
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        if instance is None:
+            return self
+        self._warn()
+        return getattr(instance, self.now)
+
+    def __set__(self, instance: Any, value: Any) -> None:
+        self._warn()
+        setattr(instance, self.now, value)
+
+    def _warn(self) -> None:
+        warn_user(
+            f"{self.former} is now called {self.now}: use that, the former name will be removed", DeprecationWarning
+        )
 
 
 def check_arguments(owner: str) -> Callable[[Callable[P, R]], Callable[P, R]]:

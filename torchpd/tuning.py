@@ -1,9 +1,9 @@
 """Choose solver and iterations for an error or a time, from a short study on the user's own scene: `Simulator.tune`.
 
 The study takes a few states of the motion, solves each to convergence in float64 (`accuracy.exact_steps`, with friction
-`settled_steps`), and runs every candidate at doubling iteration counts from the same states. What it promises is kept
-as a `Promise`, whose `holds(info)` watches a run by the residual: error and residual of one scene fall together, and
-the study measures by how much.
+`settled_steps`), and runs every candidate at doubling iteration counts from the same states. The
+`TuningResult` keeps the error bound. Its `is_valid(info)` checks steps of a run by their residual, which falls with the
+error at a ratio that the study measures.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from tqdm.auto import tqdm
 from .accuracy import ExactStep, exact_steps, settled_steps
 from .automatic import runs
 from .checks import check_has_values, check_scalar, check_whole
-from .contenders import safe_solvers
+from .contenders import safe_candidates
 from .diagonal import step_diagonal
 from .forecast import has_friction
 from .material import MATERIAL_ROWS, dims_of, fingerprint, named_arrays
 from .parametrized import plain_copy
 from .pins import PIN_HARD
-from .promise import Promise, Trial
+from .promise import Trial, TuningResult
 from .solvers import Chebyshev, Multilevel, Solver
 from .state import State
 from .tables import PLANES
@@ -111,7 +111,7 @@ def tune(
     candidates: Sequence[Solver] | None = None,
     most: int = MOST_ITERATIONS,
     progress: bool = False,
-) -> Promise:
+) -> TuningResult:
     """See `Simulator.tune`."""
     check_has_values("tune", sim.device)
     error = None if error is None else check_scalar("tune: error", error)
@@ -130,7 +130,7 @@ def tune(
     if not has_friction(sim.compiled):
         check_known(study.exact, _doubt(error))
     named: Mapping[str, Solver] = (
-        _usual(sim, safe_solvers(study.sim, study.state))
+        _usual(sim, safe_candidates(study.sim, study.state))
         if candidates is None
         else {str(number): solver for number, solver in enumerate(dict.fromkeys(candidates))}
     )
@@ -150,7 +150,7 @@ def tune(
     promise = _promise(sim, study, start, trials, cost, error, milliseconds)
     if candidates is None and has_friction(sim.compiled):
         promise = replace(promise, left_out="Multilevel, which friction leaves out, might: see candidates")
-    sim.solver, sim.iterations, sim.tolerance, sim.promise = promise.solver, promise.iterations, 0.0, promise
+    sim.solver, sim.iterations, sim.tolerance, sim.tuning_result = promise.solver, promise.iterations, 0.0, promise
     if not promise.attained:
         warn_user(f"tune: {promise}", TuningWarning)
     elif min(study.roundings) > promise.error:
@@ -464,7 +464,7 @@ def _promise(
     cost: float,
     error: float | None,
     milliseconds: float | None,
-) -> Promise:
+) -> TuningResult:
     chosen = trials[-1]
     attained = chosen.error <= error / SAFETY if error is not None else cost <= 1.2 * (milliseconds or 0.0)
     # no finer than rounding of the liveliest state, unless that was asked for; where one error shows all of them count
@@ -473,9 +473,9 @@ def _promise(
     promised = error if attained and error is not None else reachable
     trials = _with_broken(study, trials, promised)
     limit, ratio, unseen = _residual_limit(study, trials, promised)
-    return Promise(
-        asked_error=error,
-        asked_milliseconds=milliseconds,
+    return TuningResult(
+        requested_error=error,
+        requested_milliseconds=milliseconds,
         attained=attained,
         solver=chosen.solver,
         iterations=chosen.iterations,
@@ -485,7 +485,7 @@ def _promise(
         milliseconds=cost,
         residual_limit=limit,
         error_per_residual=ratio,
-        unseen_error=unseen,
+        error_at_zero_residual=unseen,
         time_step=sim.time_step,
         dtype=sim.dtype,
         device=str(sim.device),
