@@ -15,7 +15,7 @@ from machine import describe_run, write_result
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.contenders import CONTENDERS
+from torchpd.contenders import CANDIDATES
 from torchpd.reference import step_problem
 from torchpd.reference_solvers import newton
 
@@ -69,7 +69,7 @@ def main() -> None:
         sim, state = beam(youngs)
         solved = solution(sim, state)
         for name in SOLVERS:
-            sim.solver = CONTENDERS[name].make(sim, state)
+            sim.solver = CANDIDATES[name].make(sim, state)
             counts = [iterations_to(sim, state, solved, error, options.most) for error in options.errors]
             rows.append({"youngs": youngs, "solver": name, "iterations": counts})
             cells = (f"> {options.most}" if count is None else str(count) for count in counts)

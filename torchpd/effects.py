@@ -1,6 +1,6 @@
-"""The parts of a scene: values only, no work. Each part is a frozen description that `Scene` gathers.
+"""The parts of a scene: frozen descriptions, without work, that `Scene` gathers.
 
-All quantities are in SI units. Scalars and per-element tensors are accepted alike.
+All quantities are in SI units. Numbers, sequences, arrays and tensors are accepted alike.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = ["Damping", "Gravity", "Ground", "Pin", "Solid", "Sphere"]
 Array = NDArray[np.float64]
 ArrayLike = float | Sequence[float] | Array | torch.Tensor
 
-# Bodies are rarely meant to be shorter or longer [m]: their meshes are in other units.
+# Meshes of shorter or longer bodies [m] are probably in other units.
 _SHORTEST, _LONGEST = 1e-3, 50.0
 
 
@@ -39,7 +39,7 @@ def _set(part: object, **values: Any) -> None:
 
 
 class _Part:
-    """Values only, so that a copy knows the same parts."""
+    """A value that a deep copy shares, so that copies of a scene know the same parts."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self
@@ -49,9 +49,9 @@ class _Part:
 
 
 class _Key(_Part):
-    """Parts that are keys, of `targets` and read-outs: frozen, but not by `dataclass(frozen=True)`.
+    """A part that serves as a key of `targets` and read-outs: frozen, but not by `dataclass(frozen=True)`.
 
-    torch.compile hashes a key of that kind by its fields, arrays here, whatever `eq` says.
+    torch.compile would hash such a dataclass by its fields, which are arrays, despite `eq=False`.
     """
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -73,7 +73,7 @@ def _per_element(name: str, value: ArrayLike, count: int, *, unit: str) -> Array
 
 
 def _longest_side(mesh: TetMesh) -> float:
-    """Longest side of the boxes around the pieces of a mesh [m], or of the box around all if that is not too long."""
+    """Longest side [m] of the box around a mesh or, if that is too long, of the boxes around its components."""
     points = mesh.vertices
     length = float(np.ptp(points, axis=0).max())
     if length <= _LONGEST:
@@ -86,7 +86,7 @@ def _longest_side(mesh: TetMesh) -> float:
 
 
 def _report_size(mesh: TetMesh) -> None:
-    """Warn of a body whose longest side hardly is in metres."""
+    """Warn of a body whose longest side is probably not in metres."""
     length = _longest_side(mesh)
     if not _SHORTEST <= length <= _LONGEST:
         fix = "scaled(1000) if these were divided by 1000"
@@ -100,18 +100,17 @@ def _report_size(mesh: TetMesh) -> None:
 
 @dataclass(eq=False, repr=False)
 class Solid(_Key):
-    """An elastic body: tetrahedra that resist every departure from their rest shape.
+    """An elastic body of tetrahedra.
 
-    Energy per tetrahedron, with F the deformation gradient and R its nearest rotation:
-    w V / 2 |F - R|^2, w = Young's modulus at Poisson ratio 0 (Vyatkin and Dolgovesov 2023, where st = w / 2).
+    Energy per tetrahedron, with F the deformation gradient and R its nearest rotation: w V / 2 |F - R|^2, where w is
+    Young's modulus at Poisson ratio 0 (Vyatkin and Dolgovesov 2023, where st = w / 2).
 
-    Tetrahedra that are partly empty (`mesh.fill`, of `tetrahedralize`) weigh and resist as much less: the simulator's
-    `stiffness` and `masses` are those of the material times the fill, stiffness times a tenth at least (Nesme et al.
-    2009, for embedded surfaces).
+    Tetrahedra that are partly empty (`mesh.fill`, from `tetrahedralize`) have mass and stiffness in proportion. The
+    stiffness is at least a tenth of the full one (Nesme et al. 2009, for embedded surfaces).
 
     Args:
-        mesh: the rest shape, in metres; a `MeshWarning` tells of one that is longer than 50 m or shorter than 1 mm.
-            `from_file(..., unit="mm")` turns the numbers of a file into metres.
+        mesh: the rest shape [m]. A `MeshWarning` comes if it is longer than 50 m or shorter than 1 mm; load such files
+            with `from_file(..., unit="mm")`.
         youngs: Young's modulus [Pa], a scalar or one value per tetrahedron, positive.
         density: [kg/m^3], a scalar or one value per tetrahedron, positive.
     """
@@ -139,13 +138,13 @@ class Solid(_Key):
 
 @dataclass(eq=False, repr=False)
 class Pin(_Key):
-    """Holds vertices of a solid at targets: at their rest positions, or where `targets` of a step puts them.
+    """Holds vertices of a solid at their rest positions, or at the `targets` of a step.
 
-    `Simulator.set_material(pin_hard=...)` lets hard ones go, and holds by them again.
+    `Simulator.set_material(pin_hard=...)` releases hard pins, and grasps again.
 
     Args:
-        solid: the body whose vertices are held.
-        vertices: vertex numbers of that body [P], or a boolean mask over all of its vertices.
+        solid: the body.
+        vertices: vertex numbers of that body [P], or a boolean mask over its vertices.
         stiffness: None holds them exactly (hard); a positive number or [P] is a spring k / 2 |x - target|^2 [N/m].
     """
 
@@ -189,7 +188,11 @@ class Pin(_Key):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Gravity(_Part):
-    """A uniform acceleration [m/s^2] of everything."""
+    """A uniform acceleration of all bodies.
+
+    Args:
+        vector: [3] m/s^2.
+    """
 
     vector: Array
 
@@ -202,12 +205,12 @@ class Gravity(_Part):
 class Ground(_Key):
     """A plane that vertices cannot pass: normal . x >= height, with Coulomb friction.
 
-    Contacts act one after another: in the wedge of two planes that are not at right angles a vertex ends somewhat
-    inside the earlier one, or, where they are flatter than 45 degrees, above it. Its gradient is that of the edge.
+    Planes act one after another. In the wedge of two planes that are not at right angles, a vertex ends slightly inside
+    the earlier one, or above it if the wedge is flatter than 45 degrees. Its gradient is that of the edge.
 
     Args:
         height: of the plane along its normal [m].
-        normal: towards the free side; normalised here.
+        normal: [3], towards the free side; normalised here.
         friction: Coulomb's coefficient, >= 0.
     """
 
@@ -234,13 +237,13 @@ class Ground(_Key):
 
 @dataclass(eq=False, repr=False)
 class Sphere(_Key):
-    """A ball that vertices cannot enter, with Coulomb friction. `targets` of a step may move its centre.
+    """A sphere that vertices cannot enter, with Coulomb friction; `targets` of a step may move its centre.
 
-    For friction to carry a body along a step has to be told the centre's velocity too, `targets={ball: [..., 6]}`;
-    `rollout` works it out of the centres that a function of the step number gives, the first from the scene's on.
+    Friction drags a body along only if the step gets the centre's velocity too: `targets={sphere: [..., 6]}`. `rollout`
+    derives it from the centres that a function of the step number gives.
 
     Args:
-        center: [3] in m.
+        center: [3] m.
         radius: [m], positive.
         friction: Coulomb's coefficient, >= 0.
     """
@@ -266,7 +269,7 @@ class Sphere(_Key):
 class Damping(_Part):
     """Drag proportional to mass: every velocity decays as dv/dt = -rate v.
 
-    Implicit: energy rate m / (2 h) |x - x_t|^2, so that a free motion is divided by 1 + rate h in a step.
+    It is implicit: the energy rate m / (2 h) |x - x_t|^2 divides a free motion by 1 + rate h in each step.
 
     Args:
         rate: [1/s], >= 0.

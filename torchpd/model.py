@@ -1,4 +1,4 @@
-"""What steps: a compiled scene with its material, precision and device."""
+"""Base of a simulator: a compiled scene with its material, precision and device."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class _TuningResult(Protocol):
 
 
 class Model(nn.Module):
-    """Plan, settings and material of a `Simulator`, which documents the arguments, and how they change."""
+    """Plan, settings and material of a `Simulator`, which documents the arguments, and their changes."""
 
     rest_positions: Tensor
     stiffness: Tensor
@@ -143,7 +143,7 @@ class Model(nn.Module):
 
     @property
     def vertices(self) -> int:
-        """Vertices of all bodies."""
+        """Number of vertices of all bodies."""
         return self.plan.vertices
 
     @property
@@ -153,12 +153,12 @@ class Model(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where states have to be."""
+        """Device of plan and states."""
         return self.plan.device
 
     @property
     def batch(self) -> int | None:
-        """Environments that a step will have; setting it makes the plan of a GPU and the choice of "auto" anew."""
+        """Expected environments of a step, or None; setting it replans a GPU and lets "auto" choose again."""
         return self._batch
 
     @batch.setter
@@ -167,7 +167,7 @@ class Model(nn.Module):
 
     @property
     def kernel(self) -> str:
-        """How a GPU is to step the scene; setting it makes the plan of one and the choice of "auto" anew."""
+        """Requested kernel of a GPU; setting it replans a GPU and lets "auto" choose again."""
         return self._kernel
 
     @kernel.setter
@@ -176,20 +176,20 @@ class Model(nn.Module):
 
     @property
     def time_step(self) -> float:
-        """h [s]; setting it warns as `set_material` does where iterations become far too few."""
+        """h [s]; setting it may give an `UnsolvedWarning`, as `set_material` does."""
         return self._time_step
 
     @time_step.setter
     def time_step(self, time_step: float) -> None:
         self._time_step = check_time_step(time_step, self.dtype)
         shortest, longest = self._checked_time_steps
-        # where it changes in every step hardly any change shall cost more than to ask
+        # a time step that changes in every step is rarely outside of the checked range
         if not (shortest <= self._time_step <= longest or is_recording(self.device)):
             self.check_iterations("time_step")
 
     @property
     def iterations(self) -> int:
-        """Local and global steps of one time step, at most."""
+        """Most local and global steps in a time step."""
         return self._iterations
 
     @iterations.setter
@@ -199,7 +199,7 @@ class Model(nn.Module):
 
     @property
     def named_iterations(self) -> bool:
-        """Whether somebody has given a number of iterations: then no warning says that they have become too few."""
+        """Whether the user gave the number of iterations: then no warning says that it has become too small."""
         return self._named_iterations
 
     @named_iterations.setter
@@ -208,13 +208,13 @@ class Model(nn.Module):
         self._checked_time_steps = EVERY_STEP if named else NO_STEP
 
     def check_iterations(self, changed: str | None) -> None:
-        """Warn where iterations that nobody named are too few for what has `changed`, once; awaits a GPU until then."""
+        """Warn once if default iterations are too few after a change of `changed`; waits for a GPU until then."""
         if self._checked_time_steps != EVERY_STEP:
             self._checked_time_steps = check_iterations(self.compiled, changed).checked_time_steps
 
     @property
     def tolerance(self) -> float:
-        """An environment stops iterating when about so much is left of the way that elasticity takes it; 0 never."""
+        """Estimated relative displacement error below which an environment stops iterating; 0: never."""
         return self._tolerance
 
     @tolerance.setter
@@ -223,7 +223,7 @@ class Model(nn.Module):
 
     @property
     def solver(self) -> Solver:
-        """How a step is solved. A multilevel one is prepared when it is set; "auto" sets iterations too."""
+        """The solver. Setting `Multilevel` prepares its matrix; "auto" sets iterations too."""
         return self._solver
 
     @solver.setter
@@ -232,7 +232,7 @@ class Model(nn.Module):
 
     @property
     def adjoint(self) -> str:
-        """What preconditions gradients, "solver" or "multilevel"; that matrix is made when it is set, and kept."""
+        """Preconditioner of gradients, "solver" or "multilevel"; setting "multilevel" prepares its matrix."""
         return self._adjoint
 
     @adjoint.setter
@@ -241,7 +241,7 @@ class Model(nn.Module):
 
     @property
     def compiled(self) -> Configuration:
-        """What modules below the simulator read: plan, material and settings of now."""
+        """Plan, material and present settings, for modules below the simulator."""
         return self._with_material(self.material())
 
     def _with_material(self, material: list[Tensor]) -> Configuration:
@@ -259,13 +259,13 @@ class Model(nn.Module):
         vars(self).update(own, plan=new.plan, choice=new.choice)
 
     def prepare_solver(self) -> None:
-        """Make anew what the material decides: the preconditioner of `Multilevel` or `adjoint`, the choice of "auto".
+        """Prepare the matrix of `Multilevel` or `adjoint` for the present material, and let "auto" choose again.
 
-        Worth it after the material has changed much, evenly or not, or time_step has, which `Info.rho` and
-        `Info.residual` tell, and for "auto" an `UnsolvedWarning`. `set_material` does it by itself only when it pins
-        other vertices hard, frees some, or gives them much stiffer springs: captured and compiled steps have to be made
-        again, and it takes 0.3 s for 8 thousand vertices, seconds for a million tetrahedra. Other solvers prepare
-        nothing.
+        Call it after large changes of material or time_step, which `Info.rho`, `Info.residual` and, for "auto", an
+        `UnsolvedWarning` show. Then capture captured steps again; compiled steps recompile. It takes 0.3 s for 8
+        thousand vertices and seconds for a million tetrahedra. Other solvers prepare nothing.
+
+        `set_material` calls it only when it pins other vertices hard, frees some, or gives them much stiffer springs.
         """
         with persistent_tensors():
             self._take(prepare(self.compiled))
@@ -273,16 +273,16 @@ class Model(nn.Module):
     def material(self) -> list[Tensor]:
         """The differentiable arrays in the order of the ops, contiguous whatever a call or a parametrization gives.
 
-        Springs of pins that are hard are inf here. The plan follows what `pin_hard` lets go.
+        Springs of hard pins are inf here. The plan follows when `pin_hard` releases pins.
         """
         arrays = [getattr(self, name) for name in MATERIAL_ROWS]
         if self.anchors.pinned:
             arrays[_PIN_STIFFNESS] = self._held_springs(arrays)
-        # to ask takes far less than contiguous(), which is 6 of the 40 us of a tiny step
+        # is_contiguous() is far cheaper than contiguous(), which takes 6 of the 40 us of a tiny step
         return [array if array.is_contiguous() else array.contiguous() for array in arrays]
 
     def _held_springs(self, arrays: list[Tensor]) -> Tensor:
-        hard = self._buffers[PIN_HARD]  # nn.Module.__getattr__ takes as long as all the rest
+        hard = self._buffers[PIN_HARD]  # nn.Module.__getattr__ would double the time of this method
         assert hard is not None
         if torch.compiler.is_compiling():
             return hold_exactly(arrays[_PIN_STIFFNESS], hard)
@@ -291,10 +291,10 @@ class Model(nn.Module):
         return held_springs(mask, arrays[_PIN_STIFFNESS], hard)
 
     def _read_pin_mask(self, arrays: list[Tensor], hard: Tensor, *, wait: bool = False) -> PinMask:
-        """Let the plan follow a mask that lets more go than it knows of.
+        """Let the plan follow a mask that releases pins the plan relies on.
 
-        A step reads the mask, for which it awaits a GPU, only after somebody has written to it, and not where the plan
-        holds nothing; with `wait` always.
+        A step reads the mask, and waits for a GPU, only after a write to it, and only if the plan relies on hard pins.
+        With `wait` it always does.
         """
         if not wait and serves_any_mask(self.plan):
             return PinMask(some=True)
@@ -305,46 +305,47 @@ class Model(nn.Module):
         return mask
 
     def _refresh_pin_mask(self) -> None:
-        """What later steps need of pins, after these were set or moved: then no step has to wait for a GPU."""
+        """Read the pins after they were set or moved, so that later steps need not wait for a GPU."""
         self._pin_guard = MutationGuard()
         if self.anchors.pinned:
             with persistent_tensors():
                 self._read_pin_mask([getattr(self, name) for name in MATERIAL_ROWS], self.pin_hard, wait=True)
 
     def __copy__(self) -> Self:
-        """Torch lets no parametrized module be copied as a pickle would."""
+        """A shallow copy; torch refuses to copy parametrized modules through pickling."""
         copied = type(self).__new__(type(self))
         copied.__dict__.update(self.__dict__)
         return copied
 
     def set_material(self, **arrays: Tensor | float) -> None:
-        """Replace differentiable arrays, for all environments or with a leading batch for each; all of them, or none.
+        """Check and replace material arrays, shared or with a leading batch; all of them, or none.
 
-        An array of the same shape is overwritten, so that optimisers keep it; another batch makes a new parameter, and
-        a warning where the one before was learned. What the numbers were made of gets no gradient, which a warning
-        says: for that `torch.func.functional_call` gives the simulator other arrays for one call, and a parametrization
-        (`torch.nn.utils.parametrize`) for all. One that is there is written to through its `right_inverse`.
+        An array of the same shape is overwritten, so optimisers keep it. Another batch makes a new parameter, with a
+        warning if the former one was trained. No gradient reaches the given values, and a warning says so. To get one,
+        give arrays to a call by `torch.func.functional_call`, or register a parametrization
+        (`torch.nn.utils.parametrize`). A registered one is written through its `right_inverse`.
 
-        `pin_hard` lets pins go and grasps again: one bool, [P], [B, 1] or [B, P]. A pin that is not hard is a spring of
-        its `pin_stiffness`, and 0 N/m holds nothing. A `pin_stiffness` without `pin_hard` decides too which pins are
-        hard: inf is, and is stored as 0; any other number is a spring. For a pin that is hard now 0 is refused, because
-        it does not say whether to let go.
+        `pin_hard` releases pins and grasps again: one bool, [P], [B, 1] or [B, P]. A soft pin is a spring of its
+        `pin_stiffness`; 0 N/m holds nothing. `pin_stiffness` without `pin_hard` also sets which pins are hard: inf is
+        hard and stored as 0, any other number is a spring. 0 for a pin that is now hard is refused as ambiguous.
 
-            sim.set_material(pin_hard=holds[:, None])                     # [B] bool: some environments let go
+            sim.set_material(pin_hard=holds[:, None])                     # [B] bool: some environments release
             sim.set_material(pin_hard=True, pin_targets=where)            # grasp at [B, P, 3] m
 
+        Other hard pins, or much stiffer ones, prepare the matrix of `Multilevel` or `adjoint` again, see
+        `prepare_solver`. Releasing a body that hard pins clamped makes the plan again. After either, capture captured
+        steps again. An `UnsolvedWarning` comes once if default iterations, or those of "auto", become too few.
+
         Args:
-            arrays: by name, see `Simulator`; one number is for all elements, vertices or pins of `stiffness`, `masses`
-                or `pin_stiffness`, and [B, 1] is one for each environment, of `damping` too. The last dimension always
-                counts elements: [n] is never one number for each of n environments. A number counts as it is: where
-                tetrahedra are partly full (`mesh.fill`) multiply `sim.stiffness` instead. Columns of contacts have
-                names too, to be given in place of `planes` and `spheres`: `friction` [C + S] of grounds, then spheres,
-                `height` [C] and `radius` [S] in m, each also one number, or [B, 1] for all of an environment. Shapes
-                and values are checked here, once, and that batches agree with each other and with those of the arrays
-                that stay. Pins that hold others, or much harder, make the matrix of `Multilevel`, or of `adjoint`,
-                anew, see `prepare_solver`. A body that hard pins clamped, and no longer do in some environment, makes
-                the plan anew, on a GPU as `to` does. Capture a captured step again then. Where the default iterations,
-                or those of "auto", become far too few an `UnsolvedWarning` says so, once.
+            arrays: by name, see `Simulator`. One number is for all elements, vertices or pins of `stiffness`, `masses`
+                or `pin_stiffness`; [B, 1] is one number for each environment, also of `damping`. The last dimension
+                never counts environments. A number replaces the effect of `mesh.fill`; multiply `sim.stiffness` to keep
+                it.
+            friction, height, radius: columns of `planes` and `spheres` by name, in place of these: `friction` [C + S]
+                of grounds, then spheres, `height` [C] and `radius` [S] in m. Each may be one number, or [B, 1].
+
+        Raises:
+            ValueError, TypeError: shapes, values, or batches that disagree with each other or with arrays that stay.
         """
         self._replace_material("set_material", arrays)
 
@@ -362,13 +363,13 @@ class Model(nn.Module):
         warn_of_new_parameters(change)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """As of `torch.nn.Module`, but all arrays or none: torch loads what it can before it refuses other names.
+        """As `torch.nn.Module.load_state_dict`, but loads all arrays or none.
 
-        Material of another batch makes new parameters, as `set_material` does, with its warning.
+        Material of another batch makes new parameters, with the warning of `set_material`. With `assign` nothing is
+        converted: arrays of another precision are refused.
 
-        As a part of another module the simulator is not asked whether names are missing; then torch's order holds, and
-        what does not fit is among the errors that torch reports together. With `assign` nothing is converted: arrays of
-        another precision are refused.
+        If the simulator is a submodule, torch loads it in its own order. Arrays that do not fit are then reported
+        together with torch's other errors.
         """
         check_keys(self, state_dict, strict=strict)
         check_originals(self, state_dict)
@@ -379,14 +380,17 @@ class Model(nn.Module):
         self._refresh_pin_mask()
 
     def check_state(self, state: State, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:
-        """Refuse what is no state, one of another precision or device, velocities and forces unlike its positions.
+        """Check a state and forces; return the forces of every environment.
 
-        Gives the forces of every environment; `fix` ends the errors about those of another shape.
+        Args:
+            state: of the precision and device of the simulator, velocities like positions.
+            forces: as in `forward`.
+            fix: end of the errors about forces of another shape.
         """
         return check_state(self._checked_rest(), state, forces=forces, fix=fix)
 
     def positions_of(self, state: State | Tensor, name: str = "state") -> Tensor:
-        """Positions of a state, or positions alone, after all checks: for what is not left to one op."""
+        """Positions of a state, or positions alone, after all checks."""
         return positions_of(self._checked_rest(), state, name)
 
     def _checked_rest(self) -> Tensor:
@@ -408,7 +412,7 @@ class Model(nn.Module):
         }
 
     def material_at(self, targets: Targets | None, batch: int, *, fix: str = "") -> list[Tensor]:
-        """The material with pins and spheres where `targets` puts them; `fix` ends errors about targets that do not."""
+        """The material with pins and spheres at `targets`; `fix` ends errors about targets of another shape."""
         material = self.material()
         if targets is None:
             return material
@@ -424,10 +428,10 @@ class Model(nn.Module):
             raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
         check_time_step(self.time_step, wanted.dtype)
         choice, ends = self.choice, {self.device.type, wanted.device.type}
-        # digits that float32 has lost do not come back by widening, and "meta" keeps none
+        # widening does not restore the digits that float32 lost, and "meta" has none
         loses_positions = wanted.dtype != self.dtype or self.device.type == "meta"
         with persistent_tensors():
-            # whatever it was, the other device may choose differently; coming from "meta" there are no values
+            # another device may choose differently; a simulator from "meta" has no values to choose by
             if chooses := choice is not None and len(ends) == 2 and "meta" not in ends:
                 new = moved(reconfigure(self.compiled, solver=Chebyshev()), wanted.dtype, wanted.device)
             else:
@@ -435,7 +439,7 @@ class Model(nn.Module):
             super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
             self._take(new)
             if loses_positions:
-                # the material may have been trained, and keeps the digits it has
+                # the material may have been trained, so it keeps its digits
                 values = self.scene.values()
                 report_resolution(values, wanted.dtype)
                 self.rest_positions = torch.tensor(values.rest_positions, dtype=wanted.dtype, device=wanted.device)

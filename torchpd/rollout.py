@@ -1,4 +1,4 @@
-"""Many steps: in one call of the op where nothing changes on the way, else in pieces."""
+"""Many time steps: one call of the op if nothing changes between them, else chunks."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .material import MATERIAL_ROWS
 from .state import Info, State, Track
 from .targets import Anchors, Targets
 
-__all__ = ["PerStep", "Rollout", "roll"]
+__all__ = ["PerStep", "Rollout", "run_rollout"]
 
 PerStep = Callable[[int], Any]
-_SECONDS_OF_PIECE = 0.1
+_CHUNK_SECONDS = 0.1
 _SPHERES = list(MATERIAL_ROWS).index("spheres")
 
 
 class Steps(Protocol):
-    """What a rollout asks of a simulator."""
+    """The parts of a simulator that a rollout uses."""
 
     anchors: Anchors
 
@@ -55,7 +55,7 @@ class Steps(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """What `Simulator.rollout` was asked for."""
+    """Arguments of `Simulator.rollout`."""
 
     state: State
     steps: int
@@ -67,16 +67,16 @@ class Rollout:
     first: int  # number of the first step
 
 
-def roll(sim: Steps, call: Rollout, *, progress: bool) -> Track:
-    """The recorded states."""
+def run_rollout(sim: Steps, call: Rollout, *, progress: bool) -> Track:
+    """Run a rollout and return the recorded states."""
     forces = sim.check_state(call.state, forces=None if callable(call.forces) else call.forces, fix=STEPS_DIFFER)
     material = _first_material(sim, call)
     if progress:
         with tqdm(total=call.steps, desc="simulating", unit="step", leave=False) as bar:
-            found = _in_pieces(sim, call, forces, material, bar)
+            found = _in_chunks(sim, call, forces, material, bar)
     elif callable(call.forces) or callable(call.targets):
-        # no bar that is switched off: torch.compile cannot make one
-        found = _in_pieces(sim, call, forces, material, None)
+        # without a disabled bar, because torch.compile cannot trace one
+        found = _in_chunks(sim, call, forces, material, None)
     else:
         found = sim.advance(
             call.state, forces, material, steps=call.steps, every=call.every, inertial=call.inertial, report=call.report
@@ -85,15 +85,15 @@ def roll(sim: Steps, call: Rollout, *, progress: bool) -> Track:
     return Track(positions, velocities, Info.from_rows(rows))
 
 
-def _in_pieces(
+def _in_chunks(
     sim: Steps, call: Rollout, forces: Tensor | None, material: list[Tensor], bar: tqdm[NoReturn] | None
 ) -> tuple[Tensor, ...]:
-    """Single steps where forces or targets are functions, else pieces of about 0.1 s.
+    """Take single steps if forces or targets are functions, else chunks of about 0.1 s.
 
-    The bar moves between pieces, and a GPU hears Ctrl-C there.
+    Between chunks the bar moves, and Ctrl-C is noticed on a GPU.
     """
-    grows = not (callable(call.forces) or callable(call.targets))
-    pieces, state, done, steps, size = [], call.state, 0, 0, 1
+    adaptive = not (callable(call.forces) or callable(call.targets))
+    chunks, state, done, steps, size = [], call.state, 0, 0, 1
     while done < call.steps:
         if callable(call.targets):
             material = _material_after(sim, material, call.targets(call.first + done), state[0].shape[0])
@@ -107,23 +107,23 @@ def _in_pieces(
         steps = min(steps, call.steps - done)
         recorded, every = steps >= left, min(steps, call.every)
         begin = time.perf_counter() if bar is not None else 0.0
-        piece = sim.advance(
+        chunk = sim.advance(
             state, forces, material, steps=steps, every=every, inertial=call.inertial, report=call.report and recorded
         )
         if recorded:
-            pieces.append(piece)
-        state, done = State(piece[0][-1], piece[1][-1]), done + steps
+            chunks.append(chunk)
+        state, done = State(chunk[0][-1], chunk[1][-1]), done + steps
         if bar is not None:
-            if grows and _finish(sim.device) - begin < _SECONDS_OF_PIECE:
+            if adaptive and _finish(sim.device) - begin < _CHUNK_SECONDS:
                 size *= 2
             bar.update(steps)
-    if not pieces:
-        pieces.append(sim.advance(call.state, None, material, steps=0, every=1, inertial=call.inertial, report=False))
-    return tuple(torch.cat(parts) for parts in zip(*pieces, strict=True))
+    if not chunks:
+        chunks.append(sim.advance(call.state, None, material, steps=0, every=1, inertial=call.inertial, report=False))
+    return tuple(torch.cat(parts) for parts in zip(*chunks, strict=True))
 
 
 def _finish(device: torch.device) -> float:
-    """Wait for a GPU, but hear signals. Returns the time [s] when it has finished."""
+    """Wait for a GPU while noticing signals; return the time [s] when it has finished."""
     if device.type == "cuda":
         reached = torch.cuda.Event()
         reached.record(torch.cuda.current_stream(device))
@@ -133,24 +133,24 @@ def _finish(device: torch.device) -> float:
 
 
 def _first_material(sim: Steps, call: Rollout) -> list[Tensor]:
-    """The material of the first step; where targets are a function, of the step before it."""
+    """Material of the first step or, if targets are a function, of the step before it."""
     batch = call.state[0].shape[0]
     if callable(call.targets):
-        # only for where its spheres were
+        # for the positions of its spheres only
         return sim.material_at(call.targets(call.first - 1), batch) if call.first else sim.material()
     material = sim.material_at(call.targets, batch, fix=STEPS_DIFFER)
     return _moved_on(material, call.first) if call.first else material
 
 
 def _material_after(sim: Steps, before: list[Tensor], targets: Targets | None, batch: int) -> list[Tensor]:
-    """The material of a step with these targets, after one with the material `before`."""
+    """Material of a step with these targets, after one with the material `before`."""
     if isinstance(targets, Mapping):
         targets = sim.anchors.with_velocities(targets, before[_SPHERES], batch=batch, time_step=sim.time_step)
     return sim.material_at(targets, batch)
 
 
 def _moved_on(material: list[Tensor], steps: int) -> list[Tensor]:
-    """The material with moving spheres where they are some steps later."""
+    """The material with moving spheres advanced by some steps."""
     moved = list(material)
     moved[_SPHERES] = Anchors.moved_on(material[_SPHERES], steps)
     return moved

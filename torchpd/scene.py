@@ -1,4 +1,4 @@
-"""A scene: bodies and effects, values only, and the flat arrays in the user's order that they amount to."""
+"""A scene of bodies and effects, and its flat arrays in the user's order."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class SceneValues:
-    """Everything that a scene says, flat, float64, in the user's order: bodies one after another."""
+    """Flat float64 arrays of a scene in the user's order, bodies one after another."""
 
     rest_positions: Array  # [V, 3] m
     tets: Index  # [E, 4]
-    stiffness: Array  # [E] Young's modulus, Pa, times how full the tet is, a tenth at least
-    density: Array  # [E] kg/m^3, times how full the tet is
+    stiffness: Array  # [E] Young's modulus times fill, Pa, with a fill of at least 0.1
+    density: Array  # [E] density times fill, kg/m^3
     masses: Array  # [V] kg, lumped: density * volume / 4 to each corner
     pin_vertices: Index  # [P]
     pin_stiffness: Array  # [P] N/m, inf where the pin is hard
@@ -36,18 +36,18 @@ class SceneValues:
     planes: Array  # [C, 5] unit normal, height, friction
     spheres: Array  # [S, 5] center, radius, friction
     damping: float  # 1/s
-    component: Index  # [V] number of the connected piece of mesh that a vertex belongs to
-    pinned: PinnedPieces  # where pins hold them
-    loose: NDArray[np.bool_]  # [pieces] whether hard pins leave a piece rigid motions
+    component: Index  # [V] number of the connected component of each vertex
+    pinned: PinnedPieces  # pinned points of the components
+    loose: NDArray[np.bool_]  # [components] whether hard pins leave a component rigid motions
 
 
-# What contacts and pins hold are vertices of tets that are partly empty: far softer ones would be squashed flat, and a
-# step would have several solutions.
+# Contacts and pins act on vertices of partly empty tetrahedra. If these were far softer, they would be squashed flat,
+# and a step would have several solutions.
 _LEAST_RESISTANCE = 0.1
 
 
 def _filled(solid: Solid, values: Array, least: float = 0.0) -> Array:
-    """What the material of a tet that is partly empty amounts to in all of it."""
+    """Values per tetrahedron, multiplied by the fill, or by `least` if that is more."""
     return values if solid.mesh.fill is None else values * np.maximum(solid.mesh.fill, least)
 
 
@@ -65,14 +65,14 @@ def _no_part(part: object) -> TypeError:
 
 
 class Scene:
-    """Bodies and effects, in any order. Compiled once by `Simulator`.
+    """Bodies and effects, in any order; `Simulator` compiles them.
 
-    Several bodies share gravity, grounds and spheres, and do not meet: they pass through each other and themselves. A
-    `Simulator` gives a `SceneWarning` where they overlap at rest, and once at a reported step after which they do.
+    Bodies share gravity, grounds and spheres, but pass through each other and themselves. A `Simulator` gives a
+    `SceneWarning` if they overlap at rest, and once if they overlap after a step with `return_info=True`.
 
     Args:
-        parts: `Solid`, `Pin`, `Gravity`, `Ground`, `Sphere`, `Damping`. At least one `Solid`; at most one `Gravity`
-            and one `Damping`; a `Pin` holds a `Solid` of this scene, and no vertex is pinned twice.
+        parts: `Solid`, `Pin`, `Gravity`, `Ground`, `Sphere`, `Damping`. At least one `Solid`; at most one `Gravity` and
+            one `Damping`. A `Pin` holds a `Solid` of this scene; no vertex is pinned twice.
     """
 
     @check_arguments("Scene")
@@ -97,7 +97,7 @@ class Scene:
             raise ValueError("Scene: two pins hold the same vertex")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
-        """Values only: a copied simulator knows the same parts."""
+        """The scene itself, so that a copied simulator knows the same parts."""
         return self
 
     def _pinned(self) -> Index:
@@ -125,7 +125,7 @@ class Scene:
         return self._all(Sphere)
 
     def vertex_range(self, solid: Solid) -> slice:
-        """Where the vertices of one body lie in positions [B, V, 3]."""
+        """Slice of a body's vertices in positions [B, V, 3]."""
         start = 0
         for other in self.solids:
             if other is solid:
@@ -134,7 +134,7 @@ class Scene:
         raise ValueError("Scene.vertex_range: this Solid is not a part of the scene")
 
     def pin_range(self, pin: Pin) -> slice:
-        """Where the targets of one pin lie in pin_targets [P, 3]."""
+        """Slice of a pin's targets in pin_targets [P, 3]."""
         start = 0
         for other in self.pins:
             if other is pin:

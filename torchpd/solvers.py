@@ -1,4 +1,4 @@
-"""How the global step iterates: values only."""
+"""Solvers of a step, as values."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _DESCENDS = ": a step of theta / D descends only there;"
 
 
 def _keep(solver: Solver, name: str, value: float) -> None:
-    """A number as a plain one, of whatever type it came: it is compared, and written into files."""
+    """Store a number as a plain float or int, for comparisons and files."""
     object.__setattr__(solver, name, value)
 
 
@@ -66,7 +66,7 @@ class Jacobi:
         _check_choice("Jacobi.diagonal", self.diagonal, ("weighted", "plain"))
 
     def numbers(self) -> dict[str, Any]:
-        """The keyword arguments of the ops."""
+        """Keyword arguments of the ops."""
         return {
             **_USUAL,
             "schedule": 0,
@@ -79,14 +79,14 @@ class Jacobi:
 class Chebyshev:
     """Jacobi iterations accelerated by the Chebyshev semi-iterative method (Wang 2015; Vyatkin and Dolgovesov 2023).
 
-    "guarded" needs no tuning: rho comes from the weights of the step, and the momentum starts afresh whenever the
-    energy rose between two checks, four iterations apart. "classic" is the recurrence of the papers: it needs `rho`
+    "guarded" needs no tuning: rho comes from the weights of the step, and the momentum restarts when the energy rose
+    since the check four iterations ago. "classic" is the recurrence of the papers: it needs `rho`
     (`torchpd.estimate_rho`) and may diverge.
 
     Args:
         schedule: "guarded" or "classic".
         rho: spectral radius of the Jacobi iteration, in (0, 1). Guarded: None derives it from the step.
-        delay: S of the classic schedule, iterations without acceleration; 10 when None. Guarded has none.
+        delay: S of the classic schedule, iterations without acceleration; None: 10. Guarded has none.
         relaxation: theta, in (0, 2). None: 1.9 guarded, 1 classic.
         diagonal: "weighted" or "plain", see `Jacobi`. None: weighted when guarded, plain when classic.
     """
@@ -122,7 +122,7 @@ class Chebyshev:
                 )
 
     def numbers(self) -> dict[str, Any]:
-        """The keyword arguments of the ops."""
+        """Keyword arguments of the ops."""
         guarded = self.schedule == "guarded"
         return {
             **_USUAL,
@@ -139,34 +139,28 @@ _SCHEDULES = {"corotated": 5, "lbfgs": 3, "momentum": 4}  # Multilevel.outer, as
 
 @dataclass(frozen=True)
 class Multilevel:
-    """Iterations with a multilevel approximation M of A^-1, A the constant matrix of projective dynamics.
+    """L-BFGS or momentum iterations preconditioned by a multilevel approximation M of A^-1.
 
-    For stiff and for accurate steps: a dozen or two of iterations do, however stiff or fine the mesh, each at four to
-    six times the cost of a Jacobi iteration on a CPU, and 11 to 29 times on a GPU, where M of a mesh of up to 1024
-    vertices is A^-1 itself unless it comes in batches (`Simulator(batch=...)`). The scene takes longer to compile.
+    A is the constant matrix of projective dynamics. Use it for stiff bodies, fine meshes and accurate steps: it needs
+    one or two dozen iterations at any stiffness and size. An iteration costs 4 to 6 times as much as a Jacobi iteration
+    on a CPU, and 11 to 29 times on a GPU. The scene takes longer to compile.
 
-    Every iterate is judged by its energy before the next one starts from it. After four failures in a row come two
-    accelerated Jacobi iterations, then four, eight and so on, until M serves again. Where contacts may hold a body
-    trials of "corotated" that fail are shortened instead: M learns of a contact only when a trial has found it, and a
-    stiff face that lands hovers within micrometres of many. Twelve failures bring Jacobi iterations there, and with
-    friction the first two, three times, because unsettled normal forces lead astray. "lbfgs" and "momentum" know
-    nothing of contacts; with friction "lbfgs" gives way at once.
-    M is made of the material when the simulator is, see `Simulator.prepare_solver`; an environment that differs gets
-    M / s, s its largest ratio of inertia or stiffness to that material. `Info.rho` says how unlike the two are. M holds
-    what hard pins hold in every environment. Where one holds more, its step is right but slower: M leaves these
-    vertices to the diagonal.
+    A line search checks the energy of each iterate. After four rejected trials in a row, two accelerated Jacobi
+    iterations follow, then four, eight and so on. With contacts, "corotated" shortens rejected trials instead, and
+    takes Jacobi iterations after twelve rejections; with friction also at the start. "lbfgs" and "momentum" do not
+    model contacts; with friction, "lbfgs" takes Jacobi iterations at once.
+
+    M is prepared once, for the material of that time (`Simulator.prepare_solver`). An environment with another material
+    gets M / s, where s is its largest ratio of inertia or stiffness to that material; `Info.rho` reports the mismatch.
+    M holds the pins that are hard in every environment. Further hard pins cost iterations, not accuracy.
+
+    See docs/solvers.md and docs/theory.md.
 
     Args:
-        outer: "lbfgs" corrects M by the last eight steps, "momentum" (no inner products) extrapolates. "corotated", the
-            usual one, is "lbfgs" with another M for motions in which whole parts of a body turn, for which A is far too
-            stiff: on the rigid motions of four overlapping groups of vertices it has the inverse of the energy's second
-            derivative, that of corotated elasticity, with springs where contacts hold vertices. That is made once in
-            most steps, after three iterations, or one where there are contacts, for the time of one or two more; in
-            steps that land, after each that leads far. Bodies that bend or spin need a third
-            to two thirds of the iterations of "lbfgs", bodies that rest or slide with friction a tenth to a third,
-            others as many.
-        relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8. "corotated" takes half
-            of it while contacts without friction hold vertices, where M is too soft.
+        outer: "lbfgs" corrects M by the last eight steps; "momentum" extrapolates, without inner products. "corotated"
+            is "lbfgs" with a coarse correction at the current positions, for parts that rotate or rest on contacts.
+        relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8. "corotated" halves it
+            while contacts without friction hold vertices, because M is too soft there.
     """
 
     outer: Literal["corotated", "lbfgs", "momentum"] = "corotated"
@@ -178,7 +172,7 @@ class Multilevel:
             _keep_within(self, "relaxation", 2)
 
     def numbers(self) -> dict[str, Any]:
-        """The keyword arguments of the ops."""
+        """Keyword arguments of the ops."""
         usual = 1.9 if self.outer == "momentum" else 1.8
         return {
             **_USUAL,
@@ -194,7 +188,7 @@ DEFAULT_ITERATIONS = 64  # of a simulator that is given none
 
 
 def check_solver(solver: object, device: torch.device) -> Solver:
-    """The solver, also by its name, if a simulator on this device can have it."""
+    """Return the solver, also for a name, or refuse what a simulator on this device cannot use."""
     solver = _NAMED.get(solver, solver) if isinstance(solver, str) else solver
     if not isinstance(solver, Jacobi | Chebyshev | Multilevel):
         given = repr(solver) if isinstance(solver, str) else type(solver).__name__

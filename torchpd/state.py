@@ -1,4 +1,4 @@
-"""What goes into a step and what comes out: named tuples of tensors, so they are pytrees."""
+"""States, reports and tracks: named tuples of tensors, hence pytrees."""
 
 from __future__ import annotations
 
@@ -17,27 +17,29 @@ __all__ = ["Info", "State", "StepCall", "Track"]
 
 
 class State(NamedTuple):
-    """Where everything is and how fast it moves, vertices in the user's order, bodies one after another.
+    """Positions and velocities of all vertices, in the order of the meshes, bodies one after another.
 
-    `torch.save` takes it, alone or in a checkpoint, and `torch.load` gives it back where torchpd is imported.
+    `torch.save` takes it, alone or in a checkpoint, and `torch.load` returns it where torchpd is imported.
     """
 
     positions: Tensor  # [B, V, 3] m
     velocities: Tensor  # [B, V, 3] m/s
 
     def to(self, *args: Any, **kwargs: Any) -> State:
-        """The same on another device or in another precision, as `Tensor.to`."""
+        """The state on another device or in another precision, as `Tensor.to`."""
         return State(self.positions.to(*args, **kwargs), self.velocities.to(*args, **kwargs))
 
     def clone(self) -> State:
-        """A copy that `step_` may overwrite, as `Tensor.clone`, but contiguous."""
+        """A contiguous copy, which `step_` may overwrite."""
         dense = torch.contiguous_format
         return State(self.positions.clone(memory_format=dense), self.velocities.clone(memory_format=dense))
 
     def where(self, condition: Tensor, other: State) -> State:
-        """Environments of this state where `condition` [B] holds, of another one elsewhere: resets of some.
+        """Take environments of this state where `condition` [B] is true, and of `other` elsewhere, for resets.
 
-        The other state has as many environments, or one for all.
+        Args:
+            condition: bool [B].
+            other: a state with as many environments, or with one for all.
         """
         if not isinstance(condition, Tensor):
             raise TypeError(f"State.where: condition must be a bool tensor, got {type(condition).__name__}")
@@ -67,7 +69,7 @@ class State(NamedTuple):
                 )
 
     def detach(self) -> State:
-        """The same numbers without their history, as `Tensor.detach`."""
+        """The state without its autograd history, as `Tensor.detach`."""
         return State(self.positions.detach(), self.velocities.detach())
 
     def __repr__(self) -> str:
@@ -75,32 +77,32 @@ class State(NamedTuple):
 
 
 class Info(NamedTuple):
-    """How the solve of a step went, per environment [B] (of a rollout [T, B]). Reading it on a GPU waits for it.
+    """Report of a step's solve, per environment [B] (of a rollout [T, B]). Reading it on a GPU synchronises.
 
-    Nothing here has a gradient: for one of an energy there is `Simulator.energy`, of the state that the step reached.
+    No field has a gradient; `Simulator.energy` of the next state has one.
 
     Attributes:
-        residual: the share of the step's forces that nothing balances, from 0 (solved, to rounding) to 1. It is
-            (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)): r is the part of grad E [N] that neither pins
-            nor contacts balance, f_i = a_i (u_i - s_i) the force of inertia, weight and springs on vertex i, and e_i
-            that of its elements. S x is every stiffness times position (csrc/solver/report.h), so that 4 eps |S x|
-            bounds the rounding that no iterations remove. Where all forces are smaller than that, the residual is 0
-            and tells nothing: in float32 a bar of 0.5 m and 100 MPa that starts to sag reads 0 at any number of
-            iterations. Take float64 there. Residuals weigh short waves, so the error of positions may be larger or
-            smaller. NaN unless it was asked for (`return_info`), and where state or material that the step uses are
-            not finite or negative. A contact that nothing touches is not used; a negative mass that a spring outweighs
-            does not show.
-        energy: the objective E at the last iterate [J], elastic energy and m / (2 h^2) |x - y|^2: what a solve lowers.
-            Not the mechanical energy, which `Simulator.energy` gives. NaN unless asked for.
-        iterations: that were used.
-        restarts: of the acceleration, because the energy rose. Of `Multilevel` trials that were taken back.
-        converged: whether the error was judged to be within `Simulator.tolerance` before the iterations ran out; False
-            without a tolerance. It is an error of positions, relative to the way that elasticity and contacts take
-            them, so it may be there while the residual is large.
-        rho: spectral radius that the schedule used. Of `Multilevel` 1 - q / s, where q A_0 <= A <= s A_0 and M was made
-            of A_0: 0 where M fits, near 1 where it does not (`Simulator.prepare_solver` makes it anew).
-        inverted: tetrahedra with det F <= 0 at the end of the step, turned inside out or flat. A body may come to rest
-            with some, converged, in a folded minimum of its energy. -1 unless asked for.
+        residual: share of the step's forces that is not balanced: 0 (solved, to rounding) to 1. NaN unless requested,
+            and where state or material of the step are not finite, or negative. See below.
+        energy: objective E at the last iterate [J], elastic energy + m / (2 h^2) |x - y|^2, which the solve lowers. The
+            mechanical energy is `Simulator.energy`. NaN unless requested.
+        iterations: number that ran.
+        restarts: of the acceleration, because the energy rose. For `Multilevel`: rejected trials.
+        converged: whether the estimated error was within `Simulator.tolerance` before the iterations ran out; False
+            without a tolerance. It is an error of positions, so it may hold while the residual is large.
+        rho: spectral radius used by the schedule. For `Multilevel` the material mismatch 1 - q / s, where q A_0 <= A <=
+            s A_0 and A_0 is the matrix it was prepared for: 0 if it fits, near 1 if not (`prepare_solver`).
+        inverted: tetrahedra with det F <= 0 at the end of the step. A body may rest with some, converged, in a folded
+            minimum of its energy. -1 unless requested.
+
+    The residual is (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)). Here r is the part of grad E [N] that
+    neither pins nor contacts balance. f_i = a_i (u_i - s_i) is the force of inertia, weight and springs on vertex i,
+    and e_i that of its elements. S x is the sum of stiffness times position (csrc/solver/report.h), so 4 eps |S x|
+    bounds the rounding that no iteration removes.
+
+    If all forces are below that bound, the residual is 0 and says nothing: see docs/limits.md and use float64 there.
+    The residual weighs short waves, so the error of positions may be larger or smaller. It ignores a contact that
+    nothing touches, and a negative mass that a spring outweighs.
     """
 
     residual: Tensor
@@ -109,11 +111,11 @@ class Info(NamedTuple):
     restarts: Tensor
     converged: Tensor
     rho: Tensor
-    inverted: Tensor = torch.tensor(-1)  # of files from before it was counted
+    inverted: Tensor = torch.tensor(-1)  # for older files, which lack it
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:
-        """From the rows [..., 7] that the ops return, or those of 6 columns from before `inverted`."""
+        """Build it from rows [..., 7] of the ops; files from before `inverted` have 6 columns."""
         residual, energy, iterations, restarts, converged, rho, *counted = rows.unbind(-1)
         inverted = counted[0] if counted else torch.full_like(rho, -1.0)
         return cls(residual, energy, iterations.long(), restarts.long(), converged.bool(), rho, inverted.long())
@@ -127,7 +129,7 @@ class Info(NamedTuple):
 
 
 class StepCall(Protocol):
-    """The types of a call of a simulator, which `torch.nn.Module` does not know; `Simulator.forward` documents it."""
+    """Types of a call of a simulator, for type checkers; `Simulator.forward` documents it."""
 
     @overload
     def __call__(
@@ -162,14 +164,14 @@ class StepCall(Protocol):
 
 
 class Track(NamedTuple):
-    """States along a rollout; the start is not among them."""
+    """Recorded states of a rollout, without its start."""
 
     positions: Tensor  # [T, B, V, 3] m
     velocities: Tensor  # [T, B, V, 3] m/s
     info: Info  # [T, B], of the last step before each record
 
     def state(self, record: int = -1) -> State:
-        """One record as a state to go on from."""
+        """One record as a state to continue from."""
         try:
             return State(self.positions[record], self.velocities[record])
         except IndexError:
@@ -184,8 +186,8 @@ class Track(NamedTuple):
 
 
 for _kind in (Info, State, Track):
-    # files name a class by its module: the package, and in files of before torchpd.state
+    # pickles name a class by its module: now torchpd, formerly torchpd.state
     _kind.__module__ = "torchpd"
-    # torch.load refuses other classes, and torch.export.save wants names of them; these hold tensors and run nothing
+    # allow-lists of torch.load and torch.export.save; these classes hold tensors and run nothing
     torch.serialization.add_safe_globals([_kind, (_kind, f"torchpd.state.{_kind.__name__}")])
     pytree._register_namedtuple(_kind, serialized_type_name=f"torchpd.{_kind.__name__}")

@@ -1,4 +1,4 @@
-"""Steps of a compiled scene: an `nn.Module` that moves states."""
+"""Steps of a compiled scene: an `nn.Module` that advances states."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .checks import check_like, check_whole
 from .material import MATERIAL_ROWS, environments_of_material, named_arrays
 from .ops import INFO_WIDTH, refuse_tangents
 from .readable import Readable
-from .rollout import PerStep, Rollout, roll
+from .rollout import PerStep, Rollout, run_rollout
 from .state import Info, State, StepCall, Track
 from .synonyms import check_arguments
 from .targets import Targets
@@ -23,7 +23,7 @@ _ops = torch.ops.torchpd
 
 
 class Stepper(Readable):
-    """What a `Simulator` does to states: steps, rollouts, energies and their gradients."""
+    """Steps, rollouts, energies and gradients of a `Simulator`."""
 
     __call__: StepCall
 
@@ -31,7 +31,11 @@ class Stepper(Readable):
 
     @check_arguments("Simulator.rest_state")
     def rest_state(self, batch: int | None = None) -> State:
-        """Everything at rest [batch, V, 3], by default once for each environment of the material."""
+        """The rest positions with zero velocities [batch, V, 3].
+
+        Args:
+            batch: environments; by default one for each environment of the material.
+        """
         count = (
             environments_of_material(named_arrays(self)) if batch is None else check_whole("batch", batch, minimum=0)
         )
@@ -47,26 +51,25 @@ class Stepper(Readable):
         start: str | Tensor = "velocity",
         return_info: bool = False,
     ) -> State | tuple[State, Info]:
-        """One time step.
+        """Advance a state by one time step.
 
-        Within `torch.autocast`, which changes no number of it, forces may be of half precision.
+        `torch.autocast` changes no result; within it, forces may have half precision.
+
+        Gradients come from the implicit adjoint at the end of the step, with friction, and hold for all arguments but
+        `start`. Their error follows that of the step: docs/limits.md#friction-and-gradients. Forward mode and
+        `torch.func.grad` are not provided.
 
         Args:
             state: positions and velocities [B, V, 3] [m, m/s].
-            forces: on the vertices [B, V, 3] [N], or [V, 3] or [1, V, 3] for all environments; constant during the
-                step.
-            targets: where pins and spheres are at the end of the step [m]: by part, or one tensor [P, 3] or [B, P, 3]
-                for all pins together. A sphere takes its centre [3] or [B, 3], and with its velocity [6] or [B, 6],
-                which friction then drags vertices along with.
+            forces: on the vertices [B, V, 3] [N], or [V, 3] or [1, V, 3] for all environments; constant in the step.
+            targets: of pins and spheres at the end of the step [m], by part; or one tensor [P, 3] or [B, P, 3] for all
+                pins. A sphere takes its centre [3] or [B, 3], or with its velocity [6] or [B, 6], which friction needs.
             start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
-                The first two are moved out of contacts and along rigid motions; bodies that planes would squeeze there
-                by more than is gained start from x instead.
-            return_info: also how the solve went; costs some ten iterations more, no synchronisation.
+                The first two are moved out of contacts by rigid motions where that lowers the energy.
+            return_info: also return a report of the solve; costs about ten iterations, no synchronisation.
 
         Returns:
-            The next state, or (state, info). Gradients: `torch.autograd` (implicit adjoint at the end of the step; its
-            error follows that of the step), friction included, see `torchpd.adjoint`, and for planes and spheres
-            themselves; none for `start`. Forward mode and `torch.func.grad` are not provided.
+            The next state, or (state, info).
         """
         forces = self.check_state(state, forces=forces)
         material = self.material_at(targets, state[0].shape[0])
@@ -98,9 +101,9 @@ class Stepper(Readable):
         *,
         info: Tensor | None = None,
     ) -> None:
-        """One time step that overwrites the state, without gradients. Arguments as in `forward`.
+        """Advance a state in place by one time step, without gradients. Arguments as in `forward`.
 
-        If an exception ends it, as Ctrl-C does, each environment is either before the step or after it.
+        If an exception such as Ctrl-C ends it, each environment is either at the start or at the end of the step.
 
         Args:
             info: rows [B, 7] float64 to fill in, see `Info.from_rows`; None leaves out residual, energy and inverted.
@@ -146,25 +149,24 @@ class Stepper(Readable):
         return_info: bool = False,
         progress: bool = False,
     ) -> Track:
-        """Many time steps.
+        """Advance a state by many time steps and record some of them.
 
-        Ctrl-C ends it within a second on a CPU, as any long step, and on a GPU with `progress`.
+        Ctrl-C ends it within a second on a CPU, and on a GPU with `progress`.
 
         Args:
-            state: where to start.
-            steps: how many.
-            every: steps from one record to the next; the track has steps // every records.
+            state: the start, which is not recorded.
+            steps: number of steps.
+            every: steps between records; the track has steps // every records.
             forces: as in `forward`, constant, or a function of the step number.
-            targets: as in `forward`, constant (a sphere with a velocity goes on with it), or a function of the step
-                number. A sphere's centre that comes from a function without a velocity has that of its way from where
-                the sphere was at the end of the step before: where the scene has it before step 0 and after steps that
-                leave it out.
-            first: number of the first step, where this rollout goes on from another: `rollout(state, 9)` ends as
-                `rollout(rollout(state, 5).state(), 4, first=5)` does. For where spheres were, a function of targets is
-                asked for the step before, too; others are moved on by an addition for each step before.
+            targets: as in `forward`, constant, or a function of the step number. A constant sphere with a velocity
+                moves on. If a function gives centres only, velocities are their differences between steps; before step
+                0 the scene counts.
+            first: number of the first step when this rollout continues another: `rollout(state, 9)` equals
+                `rollout(rollout(state, 5).state(), 4, first=5)`. A function of targets is then also called for step
+                first - 1.
             start: first iterate of every step, "velocity" or "inertial".
             return_info: fill in residual, energy and inverted of the recorded steps, see `Info`.
-            progress: show a bar, for which a GPU finishes a piece of about 0.1 s before the next one begins.
+            progress: show a bar; a GPU then synchronises every 0.1 s or so.
 
         Returns:
             Track of the recorded states.
@@ -174,7 +176,7 @@ class Stepper(Readable):
         if not _is_start(start):
             raise ValueError(f'rollout: start must be "velocity" or "inertial", got {_in_short(start)}')
         call = Rollout(state, steps, every, forces, targets, start == "inertial", return_info, first)
-        return roll(self, call, progress=progress)
+        return run_rollout(self, call, progress=progress)
 
     def advance(
         self,
@@ -187,14 +189,14 @@ class Stepper(Readable):
         inertial: bool,
         report: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Steps of a checked state and forces in one call of the op, spheres moving on from where `material` has them.
+        """Take steps from a checked state and forces in one call of the op; spheres start where `material` has them.
 
         Returns:
             Positions and velocities [steps // every, B, V, 3], and rows for `Info.from_rows`.
         """
         refuse_tangents(*state, forces, *material)
         self._notices.before(self, state, material, self.time_step, report=report)
-        # the op has a derivative where it records every state, as its adjoint needs them
+        # the adjoint needs every state, so the op has a derivative only with every=1
         thinned = every > 1 and torch.is_grad_enabled() and _requires_grad(*state, forces, *material)
         found = _ops.rollout(
             state[0],
@@ -207,7 +209,7 @@ class Stepper(Readable):
             **self.numbers(inertial=inertial, report=report),
         )
         if thinned:
-            # copies, since all states are kept for the adjoint: not by these, and not to change with them
+            # copies: a view would keep all states alive, and the adjoint's states must not change with these
             found = [out[every - 1 :: every].clone(memory_format=torch.contiguous_format) for out in found]
         positions, velocities, rows = found
         if report and not torch.compiler.is_compiling():
@@ -245,7 +247,7 @@ class Stepper(Readable):
         return 0.5 * (soft * (positions[:, vertices] - targets).square().sum(-1)).sum(-1)
 
     def gradient(self, positions: State | Tensor) -> Tensor:
-        """Gradient of the elastic energy [B, V, 3] [N]: minus the elastic forces.
+        """Gradient of the elastic energy [B, V, 3] [N], the negative of the elastic forces.
 
         Args:
             positions: [B, V, 3], or a `State`.
@@ -257,13 +259,14 @@ class Stepper(Readable):
     def step_gradient(
         self, state: State, after: State | Tensor, forces: Tensor | None = None, targets: Targets | None = None
     ) -> Tensor:
-        """Gradient of the objective of a step at some positions [B, V, 3] [N]: what a solve brings to zero.
+        """Gradient [B, V, 3] [N] of a step's objective at given positions; a solve drives it to zero.
 
-        Contacts do not enter: where one holds a vertex, its force remains, see `contact_forces`. Hard pins have none.
+        Contacts are not part of the objective: their forces remain in the gradient, see `contact_forces`. It is zero at
+        hard pins.
 
         Args:
-            state: where the step starts.
-            after: the positions [B, V, 3] to judge, or a `State`, for example the next one.
+            state: start of the step.
+            after: positions [B, V, 3] at which to evaluate it, or a `State`, for example the next one.
             forces: as in `forward`.
             targets: as in `forward`.
         """

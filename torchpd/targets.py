@@ -1,4 +1,4 @@
-"""Where pins and spheres are to be at the end of a step, as rows of the material."""
+"""Targets of pins and spheres at the end of a step, as rows of the material."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _LASTING = slice(SPHERES["center"].stop, SPHERES["motion"].start)  # radius and 
 
 
 def _overwrite(array: Tensor, rows: slice, value: Tensor) -> Tensor:
-    """`array` [.., n, k] with some rows replaced, batched when either is."""
+    """`array` [.., n, k] with some rows replaced, batched if either is."""
     lead = torch.broadcast_shapes(array.shape[:-2], value.shape[:-2])
     parts = (array[..., : rows.start, :], value, array[..., rows.stop :, :])
     return torch.cat([part.expand(*lead, *part.shape[-2:]) for part in parts], dim=-2)
 
 
 class Anchors:
-    """The pins and spheres of a scene, found by `id`, which torch.compile guards."""
+    """The pins and spheres of a scene, keyed by `id`, which torch.compile guards."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -34,15 +34,15 @@ class Anchors:
         self.pinned = sum(len(pin.vertices) for pin in scene.pins)
 
     def __reduce__(self) -> tuple[type[Anchors], tuple[Scene]]:
-        """What is pickled has parts of its own."""
+        """Rebuild from the scene, because unpickled parts have other ids."""
         return Anchors, (self.scene,)
 
     def place(
         self, targets: Targets | None, pins: Tensor, spheres: Tensor, *, batch: int, time_step: float, fix: str = ""
     ) -> tuple[Tensor, Tensor]:
-        """`pin_targets` [.., P, 3] and `spheres` [.., S, 8] where `targets` puts them.
+        """`pin_targets` [.., P, 3] and `spheres` [.., S, 8] with `targets` put in.
 
-        `fix` ends the errors about what has another shape or is no targets.
+        `fix` ends the errors about another shape or type.
         """
         if targets is None:
             return pins, spheres
@@ -84,13 +84,13 @@ class Anchors:
                 f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}{fix}"
             )
         if value.dtype != like.dtype or value.device != like.device:
-            # unlike forces not even within autocast
+            # half precision is refused even within autocast, unlike for forces
             half = "; in half precision they would be off by millimetres" if value.dtype.itemsize == 2 else ""
             raise TypeError(f"{name} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}{half}")
         return value
 
     def _row(self, spheres: Tensor, number: int, value: Tensor, time_step: float) -> Tensor:
-        """Centre at the end of the step, radius, friction, motion during the step."""
+        """Row of a sphere: centre at the end of the step, radius, friction, motion during the step."""
         own = spheres[..., number : number + 1, _LASTING]
         motion = value[..., 3:] * time_step if value.shape[-1] == 6 else torch.zeros_like(value)
         lead = torch.broadcast_shapes(own.shape[:-1], value.shape[:-1])
@@ -99,7 +99,7 @@ class Anchors:
     def with_velocities(
         self, targets: Mapping[Any, Tensor], before: Tensor, *, batch: int, time_step: float
     ) -> dict[Any, Tensor]:
-        """Adds to centres of spheres how fast they came there from where the spheres were `before` [.., S, 8]."""
+        """`targets` with velocities added to sphere centres, from their positions `before` [.., S, 8]."""
         filled = dict(targets)
         for part, value in targets.items():
             if id(part) not in self.spheres:
@@ -113,10 +113,10 @@ class Anchors:
 
     @staticmethod
     def moved_on(spheres: Tensor, steps: int) -> Tensor:
-        """Spheres after some steps of constant motion, added up as the kernels do."""
+        """Spheres after some steps of constant motion, summed in the order of the kernels."""
         if spheres.shape[-2] == 0:
             return spheres
-        # also where none moves: to ask would mean to wait for a GPU
+        # also if none moves, because testing that would wait for a GPU
         centre = spheres[..., SPHERES["center"]]
         for _ in range(steps):
             centre = centre + spheres[..., SPHERES["motion"]]
