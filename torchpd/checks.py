@@ -1,4 +1,4 @@
-"""Checks at the boundary: each names the argument, the contract and what came."""
+"""Checks of arguments: errors name the argument, the contract and the given value."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ __all__ = [
     "to_full_precision",
 ]
 
-# ends errors of a rollout about its constant forces and targets
-STEPS_DIFFER = "; for a rollout whose steps differ give a function of their number"
+# end of a rollout's errors about its constant forces and targets
+STEPS_DIFFER = "; for values that differ between steps, pass a function of the step number"
 NO_VALUES = (
-    'the simulator is on "meta", where arrays have no values; sim.to_empty(device="cpu") and then '
-    "sim.load_state_dict(...) give it some"
+    'the simulator is on "meta", where arrays have no values; load them with sim.to_empty(device="cpu") and then '
+    "sim.load_state_dict(...)"
 )
 
 
 def check_has_values(name: str, device: torch.device) -> None:
-    """Refuse what needs the values of a simulator on "meta"."""
+    """Refuse a simulator on "meta", whose arrays have no values."""
     if device.type == "meta":
         raise RuntimeError(f"{name}: {NO_VALUES}")
 
@@ -57,15 +57,15 @@ def optional_module(module: str, package: str, users: str, extra: str = "demo") 
 
 
 def as_array(name: str, value: Any, dtype: Any = None, *, for_picture: bool = False) -> NDArray[Any]:
-    """A private contiguous copy of numbers, sequences, arrays or tensors as a NumPy array.
+    """A private contiguous NumPy copy of numbers, sequences, arrays or tensors.
 
-    A warning says where a gradient ends, but of what is only looked at nobody expects one.
+    Warns if the copy cuts off a gradient, except `for_picture`, where nobody expects one.
     """
     if isinstance(value, torch.Tensor):
         if value.requires_grad and torch.is_grad_enabled() and not for_picture:
             warn_user(
-                f"{name} is copied as numbers, so no gradient gets to what they were made of: give what is learned to "
-                "calls by torch.func.functional_call(sim, {...}, (state,)), or detach() it"
+                f"{name} is copied, so no gradient reaches the given tensor: pass trained values to calls by "
+                "torch.func.functional_call(sim, {...}, (state,)), or detach() it"
             )
         value = value.detach().cpu()
         if value.is_floating_point() and value.element_size() < 4:
@@ -81,7 +81,7 @@ def as_array(name: str, value: Any, dtype: Any = None, *, for_picture: bool = Fa
 
 
 def check_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...], meaning: str) -> None:
-    """Shape must match, None standing for any length."""
+    """Check the shape; None stands for any length."""
     matches = array.ndim == len(shape) and all(
         want is None or have == want for have, want in zip(array.shape, shape, strict=True)
     )
@@ -91,9 +91,9 @@ def check_shape(name: str, array: NDArray[Any], shape: tuple[int | None, ...], m
 
 
 def check_like(name: str, value: Any, positions: torch.Tensor, meaning: str, *, fix: str = "") -> None:
-    """A tensor of the shape, precision and device of positions; reads no value, so that nothing waits for a GPU.
+    """Check that a tensor has the shape, precision and device of positions.
 
-    `fix` ends the errors about what has another shape or none.
+    Reads no value, so a GPU is not awaited. `fix` ends the errors about another shape or type.
     """
     like = f"like positions ({meaning}), got"
     if not isinstance(value, torch.Tensor):
@@ -107,28 +107,25 @@ def check_like(name: str, value: Any, positions: torch.Tensor, meaning: str, *, 
 
 
 def tensor_of(array: NDArray[Any]) -> torch.Tensor:
-    """A tensor in the memory of an array, but of none where that is empty: torch.export cannot save such."""
+    """A tensor that shares the memory of an array, or a copy if it is empty, which torch.export can save."""
     return torch.from_numpy(np.ascontiguousarray(array)) if array.size else torch.from_numpy(array).clone()
 
 
 def to_full_precision(value: Any, like: torch.Tensor) -> Any:
-    """What autocast made half as precise, in the precision of `like`, as torch's ops of full precision take it.
-
-    Anything else, and where autocast is not on, as it is.
-    """
+    """A half-precision tensor within autocast in the precision of `like`; anything else as it is."""
     half = isinstance(value, torch.Tensor) and value.dtype in (torch.float16, torch.bfloat16) and not value.is_meta
     return value.to(like.dtype) if half and torch.is_autocast_enabled(value.device.type) else value
 
 
 def expand_shared(value: Any, shape: torch.Size) -> Any:
-    """What all environments share, [V, 3] or [1, V, 3], as a view [B, V, 3]; anything else as it is."""
+    """A tensor shared by all environments, [V, 3] or [1, V, 3], as a view [B, V, 3]; anything else as it is."""
     if not isinstance(value, torch.Tensor) or value.shape == shape:
         return value
     return value.expand(shape) if value.shape in (shape[1:], (1, *shape[1:])) else value
 
 
 def check_finite(name: str, array: NDArray[Any]) -> None:
-    """No NaN, no infinity."""
+    """Refuse NaN and infinity."""
     bad = np.flatnonzero(~np.isfinite(array).reshape(-1))
     if bad.size:
         where = [int(i) for i in np.unravel_index(bad[0], array.shape)] if array.ndim else []
@@ -136,7 +133,7 @@ def check_finite(name: str, array: NDArray[Any]) -> None:
 
 
 def check_positive(name: str, array: NDArray[Any], *, unit: str) -> None:
-    """Every value > 0."""
+    """Refuse values that are not > 0."""
     bad = np.flatnonzero(~(array > 0))
     if bad.size:
         raise ValueError(f"{name} must be positive [{unit}], got {array[bad[0]]} at {int(bad[0])} ({bad.size} in all)")
@@ -156,7 +153,7 @@ def check_scalar(name: str, value: Any, *, minimum: float | None = None) -> floa
 
 
 def check_vector(name: str, value: Any) -> NDArray[np.float64]:
-    """Three finite numbers, read-only."""
+    """Three finite numbers, as a read-only array."""
     array = as_array(name, value, np.float64)
     check_shape(name, array, (3,), "a vector")
     check_finite(name, array)
@@ -178,7 +175,7 @@ def check_whole(name: str, value: Any, *, minimum: int, maximum: int | None = No
 
 
 def check_target_file(path: str | os.PathLike[str], name: str = "save") -> Path:
-    """A file that can be written, or written over."""
+    """The path of a file that can be written or overwritten."""
     target = Path(path)
     if not target.parent.is_dir():
         raise FileNotFoundError(f"{name}: there is no folder {target.parent} for {target.name}")
@@ -188,7 +185,7 @@ def check_target_file(path: str | os.PathLike[str], name: str = "save") -> Path:
 
 
 def plain_tensor(tensor: torch.Tensor) -> torch.Tensor:
-    """The tensor itself or, where torch maps it, the whole one, mapped dimensions first."""
+    """The tensor itself or, under vmap, the whole one with mapped dimensions first."""
     functorch = torch._C._functorch
     mapped = []
     while functorch.is_functorch_wrapped_tensor(tensor):
@@ -200,5 +197,5 @@ def plain_tensor(tensor: torch.Tensor) -> torch.Tensor:
 
 
 def has_values(tensor: torch.Tensor) -> bool:
-    """Whether the numbers of a tensor can be read: not of a subclass, nor on "meta"."""
+    """Whether the values of a tensor can be read: no subclass, not on "meta"."""
     return type(tensor) in (torch.Tensor, torch.nn.Parameter) and not tensor.is_meta

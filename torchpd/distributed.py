@@ -17,16 +17,16 @@ _Wrapped = TypeVar("_Wrapped", bound=nn.Module)
 
 
 def keep_material_per_rank(module: _Wrapped) -> _Wrapped:
-    """Make `DistributedDataParallel(module)` leave the material of each rank's environments as it is.
+    """Make `DistributedDataParallel(module)` leave each rank the material of its own environments.
 
-    `DistributedDataParallel` copies all parameters and buffers of rank 0 to the other ranks and averages gradients. For
-    simulators in `module` that is right only for learned arrays that all environments share. Their other arrays are
-    left to each rank: those that are not learned, and those with a batch, whose gradients belong to the environments of
-    their rank. A module that holds a simulator cannot be wrapped without this call.
+    `DistributedDataParallel` copies all parameters and buffers of rank 0 to the other ranks, and averages gradients.
+    For simulators in `module` that is right only for trained arrays that all environments share. This call excludes the
+    other arrays: those that are not trained, and those with a batch, whose gradients belong to the environments of
+    their rank. A module that holds a simulator cannot be wrapped without this call. See docs/distributed.md.
 
     Args:
-        module: what is to be wrapped, after `requires_grad_` and `set_material`; a `Simulator`, or a module that holds
-            some.
+        module: the module to be wrapped, a `Simulator` or a module that holds some. Call this after `requires_grad_`
+            and `set_material`.
 
     Returns:
         The same module.
@@ -41,26 +41,26 @@ def keep_material_per_rank(module: _Wrapped) -> _Wrapped:
 
 
 def names_per_rank(module: nn.Module) -> list[str]:
-    """Names of parameters and buffers of simulators in `module` that belong to a rank."""
+    """Names of parameters and buffers of simulators in `module` that belong to one rank."""
     found = []
     for path, sim in module.named_modules():
         if isinstance(sim, Stepper):
             names = [name for name, _ in sim.named_buffers()]
             names += [name for name, array in sim.named_parameters() if not _is_shared(name, array)]
             found += [f"{path}.{name}" for name in names]
-            # for a gradient torch calls what a module itself holds ".name"
+            # DistributedDataParallel names gradients of the root module ".name"
             found += names if not path else []
     return found
 
 
 def _is_shared(name: str, array: nn.Parameter) -> bool:
-    """Whether all environments of all ranks learn the array together."""
+    """Whether all environments of all ranks train the array together."""
     row = MATERIAL_ROWS.get(name.removeprefix("parametrizations.").split(".")[0])
     return array.requires_grad and (row is None or array.dim() <= row.dims)
 
 
 def _refuse_to_overwrite(parent: nn.Module, _name: str, child: nn.Module | None) -> None:
-    """Called by torch whenever a module becomes part of another; wrappers take theirs before they copy parameters."""
+    """Hook of torch for submodules; wrappers register theirs before they copy parameters."""
     if not isinstance(parent, DistributedDataParallel) or child is None:
         return
     left = sorted({n.removeprefix(".") for n in names_per_rank(child) if n not in parent.parameters_to_ignore})

@@ -102,7 +102,7 @@ def _report_size(mesh: TetMesh) -> None:
 class Solid(_Key):
     """An elastic body of tetrahedra.
 
-    Energy per tetrahedron, with F the deformation gradient and R its nearest rotation: w V / 2 |F - R|^2, where w is
+    The energy of a tetrahedron is w V / 2 |F - R|^2. F is the deformation gradient, R its nearest rotation, and w
     Young's modulus at Poisson ratio 0 (Vyatkin and Dolgovesov 2023, where st = w / 2).
 
     Tetrahedra that are partly empty (`mesh.fill`, from `tetrahedralize`) have mass and stiffness in proportion. The
@@ -206,7 +206,7 @@ class Ground(_Key):
     """A plane that vertices cannot pass: normal . x >= height, with Coulomb friction.
 
     Planes act one after another. In the wedge of two planes that are not at right angles, a vertex ends slightly inside
-    the earlier one, or above it if the wedge is flatter than 45 degrees. Its gradient is that of the edge.
+    the earlier one. It ends above it if the wedge is flatter than 45 degrees. Its gradient is that of the edge.
 
     Args:
         height: of the plane along its normal [m].

@@ -286,8 +286,8 @@ class Model(nn.Module):
         assert hard is not None
         if torch.compiler.is_compiling():
             return hold_exactly(arrays[_PIN_STIFFNESS], hard)
-        seen = self._pin_guard
-        mask = seen.found if seen.holds(hard) else self._read_pin_mask(arrays, hard)
+        guard = self._pin_guard
+        mask = guard.found if guard.is_current(hard) else self._read_pin_mask(arrays, hard)
         return held_springs(mask, arrays[_PIN_STIFFNESS], hard)
 
     def _read_pin_mask(self, arrays: list[Tensor], hard: Tensor, *, wait: bool = False) -> PinMask:
@@ -298,10 +298,10 @@ class Model(nn.Module):
         """
         if not wait and serves_any_mask(self.plan):
             return PinMask(some=True)
-        seen, self.plan = read_pin_mask(self._with_material(arrays), hard, wait=wait)
-        if seen.holds(hard):
-            self._pin_guard = seen
-        mask: PinMask = seen.found
+        guard, self.plan = read_pin_mask(self._with_material(arrays), hard, wait=wait)
+        if guard.is_current(hard):
+            self._pin_guard = guard
+        mask: PinMask = guard.found
         return mask
 
     def _refresh_pin_mask(self) -> None:
@@ -332,6 +332,8 @@ class Model(nn.Module):
             sim.set_material(pin_hard=holds[:, None])                     # [B] bool: some environments release
             sim.set_material(pin_hard=True, pin_targets=where)            # grasp at [B, P, 3] m
 
+        A number replaces the effect of `mesh.fill`; multiply `sim.stiffness` instead to keep it.
+
         Other hard pins, or much stiffer ones, prepare the matrix of `Multilevel` or `adjoint` again, see
         `prepare_solver`. Releasing a body that hard pins clamped makes the plan again. After either, capture captured
         steps again. An `UnsolvedWarning` comes once if default iterations, or those of "auto", become too few.
@@ -339,8 +341,7 @@ class Model(nn.Module):
         Args:
             arrays: by name, see `Simulator`. One number is for all elements, vertices or pins of `stiffness`, `masses`
                 or `pin_stiffness`; [B, 1] is one number for each environment, also of `damping`. The last dimension
-                never counts environments. A number replaces the effect of `mesh.fill`; multiply `sim.stiffness` to keep
-                it.
+                never counts environments.
             friction, height, radius: columns of `planes` and `spheres` by name, in place of these: `friction` [C + S]
                 of grounds, then spheres, `height` [C] and `radius` [S] in m. Each may be one number, or [B, 1].
 
@@ -395,9 +396,9 @@ class Model(nn.Module):
 
     def _checked_rest(self) -> Tensor:
         rest = self.rest_positions
-        seen = check_rest(self._rest_guard, rest, self.scene)
-        if seen is not self._rest_guard:
-            self._rest_guard = seen
+        guard = check_rest(self._rest_guard, rest, self.scene)
+        if guard is not self._rest_guard:
+            self._rest_guard = guard
         return rest
 
     def numbers(self, *, inertial: bool, report: bool) -> dict[str, Any]:

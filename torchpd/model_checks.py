@@ -1,4 +1,4 @@
-"""What a simulator refuses: settings out of their range, and what is no state of it."""
+"""Checks of a simulator's settings and states."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ __all__ = [
 ]
 
 
-ADJOINTS = ("solver", "multilevel")  # what preconditions the adjoint of a step
-_COARSEST = 1e-4  # of an edge: what positions are resolved to
+ADJOINTS = ("solver", "multilevel")  # preconditioners of the adjoint of a step
+_COARSEST = 1e-4  # largest spacing of float32 positions, in shortest edges, without a warning
 _LONGEST_STEP = {torch.float32: 1e12, torch.float64: 1e100}  # s
 
 
 def check_adjoint(adjoint: str) -> str:
-    """The preconditioner of gradients, one of `ADJOINTS`."""
+    """Check the preconditioner of gradients, one of `ADJOINTS`."""
     if adjoint not in ADJOINTS:
         names = " or ".join(f'"{name}"' for name in ADJOINTS)
         raise ValueError(f"Simulator: adjoint must be {names}, got {adjoint!r}")
@@ -43,14 +43,14 @@ def check_adjoint(adjoint: str) -> str:
 
 
 def check_batch(batch: int | None) -> int | None:
-    """Environments that a step will have, where they are known."""
+    """Check the expected environments of a step."""
     return None if batch is None else check_whole("batch", batch, minimum=1)
 
 
 def report_resolution(values: SceneValues, dtype: torch.dtype) -> None:
-    """Warn of tets so far from the origin that the next float32 is farther away than 1e-4 of their shortest edge.
+    """Warn of tets so far from the origin that float32 spacing exceeds 1e-4 of their shortest edge.
 
-    Rest shapes are compiled in float64: strains of that size push a body that starts at rest.
+    Rest shapes are compiled in float64, so rounded positions have strains of that size, which push a body at rest.
     """
     if dtype != torch.float32:
         return
@@ -64,14 +64,14 @@ def report_resolution(values: SceneValues, dtype: torch.dtype) -> None:
     if steps[worst] > _COARSEST:
         warn_user(
             f"Simulator: {farthest[worst]:.4g} m from the origin float32 resolves positions to "
-            f"{steps[worst] * shortest[worst]:.2g} m, which is {steps[worst]:.2g} of the shortest edge of a tet there "
-            f"({int((steps > _COARSEST).sum())} of {len(steps)} tets have more than {_COARSEST:g}): bodies at rest "
-            "move. Move the scene to the origin, mesh.translated(...), or pass dtype=torch.float64"
+            f"{steps[worst] * shortest[worst]:.2g} m, {steps[worst]:.2g} of the shortest edge of a tet there "
+            f"({int((steps > _COARSEST).sum())} of {len(steps)} tets have more than {_COARSEST:g}), so bodies at rest "
+            "will move. Move the scene to the origin with mesh.translated(...), or pass dtype=torch.float64"
         )
 
 
 def check_positive_number(name: str, value: float, unit: str) -> float:
-    """The number, of whatever type has one."""
+    """Check a number of any numeric type, and return a float."""
     number = _number_or_nan(value)
     if not 0.0 < number < float("inf"):
         raise ValueError(f"{name} must be positive and finite [{unit}], got {value!r}")
@@ -79,7 +79,7 @@ def check_positive_number(name: str, value: float, unit: str) -> float:
 
 
 def check_time_step(time_step: float, dtype: torch.dtype) -> float:
-    """The number, of which h^2 and 1 / h^2 times masses are numbers in that precision, too."""
+    """Check h [s]: h^2 and 1 / h^2 times masses must be finite in that precision, too."""
     number = check_positive_number("time_step", time_step, "s")
     longest = _LONGEST_STEP[torch.float64 if dtype == torch.float64 else torch.float32]
     if not 1.0 / longest <= number <= longest:
@@ -90,7 +90,7 @@ def check_time_step(time_step: float, dtype: torch.dtype) -> float:
 
 
 def check_tolerance(tolerance: float) -> float:
-    """The number, of whatever type has one."""
+    """Check a tolerance of any numeric type, and return a float."""
     number = _number_or_nan(tolerance)
     if not 0.0 <= number < 1.0:
         raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance!r}")
@@ -106,14 +106,14 @@ def _number_or_nan(value: Any) -> float:
 
 
 def check_state(rest: Tensor, state: State, *, forces: Tensor | None, fix: str) -> Tensor | None:
-    """What `Model.check_state` does, by the rest positions [V, 3] of a simulator."""
+    """Implementation of `Model.check_state`, by the rest positions [V, 3] of a simulator."""
     if not _is_pair(state):
         raise TypeError(
             f"state must be a State, positions and velocities [B, {len(rest)}, 3], got "
             f"{_kind_of(state)}; rest_state() makes one"
         )
     _check_kind(rest, "state", state[0])
-    if state[0].dim() == 0:  # whose batch is read before an op checks all of it
+    if state[0].dim() == 0:  # the batch is read before an op checks the shape
         raise ValueError(f"positions must be [B, {len(rest)}, 3], got []")
     check_like("velocities", state[1], state[0], "m/s")
     if forces is None:
@@ -124,7 +124,7 @@ def check_state(rest: Tensor, state: State, *, forces: Tensor | None, fix: str) 
 
 
 def positions_of(rest: Tensor, state: State | Tensor, name: str) -> Tensor:
-    """What `Model.positions_of` does, by the rest positions [V, 3] of a simulator."""
+    """Implementation of `Model.positions_of`, by the rest positions [V, 3] of a simulator."""
     alone = isinstance(state, Tensor)
     if not (alone or _is_pair(state)):
         raise TypeError(
@@ -154,6 +154,6 @@ def _is_pair(state: Any) -> bool:
 
 
 def _kind_of(value: object) -> str:
-    """A type by its name, a tuple with the types of its parts."""
+    """Name of a type; for a tuple also the types of its parts."""
     name = type(value).__name__
     return f"{name} of {' and '.join(type(part).__name__ for part in value)}" if isinstance(value, tuple) else name

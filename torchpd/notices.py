@@ -1,8 +1,7 @@
-"""What a step takes as it comes though hardly anybody means it, said once each: bodies that overlap, starts inside a
-contact, inverted elements.
+"""Warnings about probable mistakes, once each: overlapping bodies, starts inside a contact, inverted elements.
 
-Looks are cheap on a CPU. A GPU would have to be waited for, so nobody looks there, nor at what torch traces or maps.
-Copies of a simulator, of which studies make many, say nothing.
+The checks are cheap on a CPU. They do not run on a GPU, where they would synchronise, nor under tracing or vmap. Copies
+of a simulator, of which studies make many, do not warn.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ from .warn import SceneWarning, warn_user
 
 __all__ = ["Notices", "warn_of_overlaps"]
 
-_ROUNDINGS = 10.0  # of positions, which no contact is sure to keep
+_ROUNDINGS = 10.0  # machine epsilons of a position that a contact may be violated by
 _PLANES, _SPHERES, _GRAVITY = (list(MATERIAL_ROWS).index(name) for name in ("planes", "spheres", "gravity"))
-_ALONE = "bodies do not collide with each other: move them apart, or keep them apart by Ground and Sphere"
+_ALONE = "bodies do not collide with each other: move them apart, or separate them by Ground and Sphere"
 
 
 def warn_of_overlaps(scene: Scene) -> None:
-    """Say which bodies overlap at rest, where they are made."""
+    """Warn of bodies that overlap at rest."""
     if len(scene.solids) > 1:
         _say_overlaps(find_overlaps([solid.mesh for solid in scene.solids]), "at rest")
 
@@ -42,14 +41,14 @@ def _say_overlaps(found: list[Overlap], where: str) -> None:
 
 
 class Notices:
-    """What a simulator, the `owner`, has said of its scene."""
+    """Warnings that a simulator, the `owner`, has given about its scene."""
 
     def __init__(self, owner: object = None, scene: Scene | None = None) -> None:
         self._owner = None if owner is None else weakref.ref(owner)
         self._scene = scene
         self._said: set[str] = set()
         self._started = False
-        self._reports = self._next = 0  # reports with boxes that overlap, and that of the next look
+        self._reports = self._next = 0  # reports with overlapping boxes, and the next one to check
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Notices:
         return Notices()
@@ -58,8 +57,8 @@ class Notices:
         return Notices, ()
 
     def before(self, owner: object, state: State, material: list[Tensor], time_step: float, *, report: bool) -> None:
-        """Look at where the first step starts, and every one that reports."""
-        # first, so that no compiled step depends on what was said
+        """Check the start of the first step, and of every step that reports."""
+        # tested first, so that no compiled step depends on past warnings
         if torch.compiler.is_compiling() or not (report or not self._started) or "inside" in self._said:
             return
         scene = self._looked_at(owner, state[0])
@@ -67,7 +66,7 @@ class Notices:
             return
         planes, spheres, gravity = arrays = [material[row].detach() for row in (_PLANES, _SPHERES, _GRAVITY)]
         if any(len(a) not in (1, len(state[0])) for a, dims in zip(arrays, (3, 3, 2), strict=True) if a.dim() == dims):
-            return  # which the step refuses
+            return  # the step refuses these
         self._started = True
         if not (planes.numel() or spheres.numel()):
             return
@@ -75,7 +74,7 @@ class Notices:
         depth = _depth(scene, positions, planes, spheres)
         if not bool((depth > 0.0).any()):
             return
-        # no deeper than gravity falls in a step, nor than rounding puts what rests
+        # tolerated: the fall by gravity in a step, and the rounding of resting positions
         allowed = time_step**2 * gravity.norm(dim=-1).reshape(-1, 1)
         size = torch.finfo(positions.dtype).eps * positions.abs().amax(dim=(1, 2)).unsqueeze(1)
         inside = depth > torch.maximum(allowed, _ROUNDINGS * size)
@@ -86,14 +85,14 @@ class Notices:
         deepest = float(depth[environment].max())
         warn_user(
             f"Simulator: {int(inside[environment].sum())} vertices of environment {environment} start a step inside a "
-            f"ground or sphere, up to {deepest:.2g} m deep. The step puts them out, and velocities are what it moves "
-            f"vertices by over its duration, about {deepest / time_step:.2g} m/s there: start outside, or set the "
-            "velocities after that step to 0; of a sphere that moves there give the velocity in targets, too",
+            f"ground or sphere, up to {deepest:.2g} m deep. The step moves them out, which gives them velocities of "
+            f"about {deepest / time_step:.2g} m/s: start outside, or set the velocities after that step to 0. If a "
+            "sphere moved there, give its velocity in targets too",
             SceneWarning,
         )
 
     def after(self, owner: object, positions: Tensor, rows: Tensor) -> None:
-        """Look at a step that reports: positions [B, V, 3] and rows [B, 7]."""
+        """Check a step that reports: positions [B, V, 3] and rows [B, 7]."""
         scene = self._looked_at(owner, positions)
         if scene is None:
             return
@@ -102,16 +101,16 @@ class Notices:
             self._said.add("inverted")
             worst, tets = int(inverted.argmax()), sum(len(solid.mesh.tets) for solid in scene.solids)
             warn_user(
-                f"Simulator: {int(inverted[worst])} of {tets} tetrahedra of environment {worst} are "
-                "turned inside out or flat at the end of a step (info.inverted). A body that is too soft for its load, "
-                "or starts crushed, may stay folded like that, and be converged",
+                f"Simulator: {int(inverted[worst])} of {tets} tetrahedra of environment {worst} are inverted or flat "
+                "at the end of a step (info.inverted). A body that is too soft for its load, or starts crushed, may "
+                "stay folded, in a converged step",
                 SceneWarning,
             )
         if len(scene.solids) > 1 and "overlap" not in self._said:
             self._look_for_overlaps(scene, positions.detach())
 
     def _look_for_overlaps(self, scene: Scene, positions: Tensor) -> None:
-        """In the first environment where boxes of bodies overlap; at the first such report, the second, the fourth."""
+        """Check the first environment in which boxes overlap; at the 1st, 2nd, 4th, 8th ... such report."""
         ranges = [scene.vertex_range(solid) for solid in scene.solids]
         starts, corners = [part.start for part in ranges], positions.numpy()
         lows, highs = (end.reduceat(corners, starts, axis=1) for end in (np.minimum, np.maximum))  # [B, bodies, 3]
@@ -129,7 +128,7 @@ class Notices:
             _say_overlaps(found, f"in environment {environment} at the end of a step")
 
     def _looked_at(self, owner: object, positions: Tensor) -> Scene | None:
-        """The scene, where there is something to look at."""
+        """The scene, if this state can be checked."""
         if torch.compiler.is_compiling() or type(positions) not in (Tensor, nn.Parameter):
             return None
         if positions.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(positions):
@@ -141,7 +140,7 @@ class Notices:
 
 
 def _depth(scene: Scene, positions: Tensor, planes: Tensor, spheres: Tensor) -> Tensor:
-    """How far every vertex lies inside of a contact at the start of a step [B, V] m; pinned ones go where pins want."""
+    """Depth of every vertex inside contacts at the start of a step [B, V] m; 0 for pinned ones."""
     planes, spheres = (array if array.dim() == 3 else array[None] for array in (planes, spheres))
     depth = positions.new_zeros(positions.shape[:2])
     for plane in planes.unbind(1):

@@ -1,4 +1,4 @@
-"""Which bodies of a scene reach into each other: points at the surface of one lie inside tetrahedra of another."""
+"""Overlap of bodies: points behind the surface of one that lie inside tetrahedra of another."""
 
 from __future__ import annotations
 
@@ -19,23 +19,26 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_PULL = 1e-3  # of the way from a corner to a centroid: bodies that reach into each other by less are not seen
+_PULL = 1e-3  # share of the distance from a corner to a centroid; shallower overlaps are not found
 
 
 class Overlap(NamedTuple):
-    """Two bodies that reach into each other."""
+    """Two bodies that overlap."""
 
     first: int  # number of the body
     second: int
-    points: int  # at the surface of either that lie inside the other
+    points: int  # points behind the surface of either that lie inside the other
 
 
 def find_overlaps(meshes: Sequence[TetMesh], places: Sequence[Array] | None = None) -> list[Overlap]:
-    """Pairs of bodies, by their vertices [V, 3] m (those of the meshes), of which one has points inside the other.
+    """Pairs of bodies of which one has points inside the other.
 
-    Points are the corners and the centroids of tets behind the surface: where edges alone cross something thin, between
-    two such points, that is not seen. Pairs whose bounding boxes are apart cost nothing, others as much as lies
-    where their boxes overlap.
+    The points are corners and centroids of tets behind the surface. An overlap between two such points, where edges
+    cross a thin part, is not found. Pairs whose bounding boxes are apart cost nothing.
+
+    Args:
+        meshes: of the bodies.
+        places: their vertices [V, 3] m; by default those of the meshes.
     """
     places = [mesh.vertices for mesh in meshes] if places is None else places
     lows, highs = (np.stack([end(place, axis=0) for place in places]) for end in (np.min, np.max))
@@ -53,7 +56,7 @@ def find_overlaps(meshes: Sequence[TetMesh], places: Sequence[Array] | None = No
 
 
 def boxes_meet(lows: Array, highs: Array) -> Mask:
-    """In which environments some boxes overlap [B], by their corners [B, bodies, 3]; not where these are no numbers."""
+    """Whether some boxes overlap in each environment [B], by their corners [B, bodies, 3]; False for NaN."""
     found = np.zeros(len(lows), dtype=np.bool_)
     for first in range(lows.shape[1] - 1):
         found |= _overlap_of(first, lows, highs).any(axis=1)
@@ -61,23 +64,24 @@ def boxes_meet(lows: Array, highs: Array) -> Mask:
 
 
 def _overlap_of(first: int, lows: Array, highs: Array) -> Mask:
-    """Whether the box of one body overlaps those of the later ones [B, bodies - 1 - first]."""
+    """Whether the box of one body overlaps those of later bodies [B, bodies - 1 - first]."""
     later, one = slice(first + 1, None), slice(first, first + 1)
     low, high = np.maximum(lows[:, later], lows[:, one]), np.minimum(highs[:, later], highs[:, one])
     return np.asarray((low < high).all(axis=-1))
 
 
 def _near(lows: Array, highs: Array) -> Iterator[tuple[int, int]]:
-    """Pairs of bodies whose boxes overlap, by the corners of these [bodies, 3]."""
+    """Pairs of bodies whose boxes overlap, by the corners of the boxes [bodies, 3]."""
     for first in range(len(lows) - 1):
         for later in np.flatnonzero(_overlap_of(first, lows[None], highs[None])):
             yield first, first + 1 + int(later)
 
 
 def _points(mesh: TetMesh, place: Array, low: Array, high: Array) -> Array:
-    """Points behind the surface of a body, within a box: centroids of tets, and corners pulled a little towards one.
+    """Points behind the surface of a body in a box: centroids of tets, and corners pulled slightly towards a centroid.
 
-    So bodies that share a face do not overlap, and corners lie on no face of the other where both have the same grid.
+    So bodies that share a face do not overlap, and no corner lies on a face of the other body if both have the same
+    grid.
     """
     outer = np.zeros(len(place), dtype=np.bool_)
     outer[mesh.boundary()] = True
@@ -90,7 +94,7 @@ def _points(mesh: TetMesh, place: Array, low: Array, high: Array) -> Array:
 
 
 def _count_inside(points: Array, vertices: Array, tets: Index, low: Array, high: Array) -> int:
-    """How many points within a box lie inside some tet."""
+    """Number of points in a box that lie inside some tet."""
     corners = vertices[tets]
     meets = np.all((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low), axis=1)
     tets, corners = tets[meets], corners[meets]
@@ -102,7 +106,7 @@ def _count_inside(points: Array, vertices: Array, tets: Index, low: Array, high:
     sizes = np.fromiter(map(len, near), dtype=np.int64, count=len(near))
     which = np.fromiter(chain.from_iterable(near), dtype=np.int64, count=int(sizes.sum()))
     tet = np.repeat(np.arange(len(tets)), sizes)
-    with np.errstate(all="ignore"):  # flat tets have no inside
+    with np.errstate(all="ignore"):  # flat tets divide by zero and contain nothing
         gradients, _ = shape_gradients(vertices, tets)
         weights = np.einsum("pak,pk->pa", gradients[tet], points[which] - corners[tet, 0])
         weights[:, 0] = 1.0 - weights[:, 1:].sum(axis=1)

@@ -1,4 +1,4 @@
-"""Which pins are hard, as steps need it: anybody may write into the mask, and the plan follows what it lets go."""
+"""The mask of hard pins as steps need it: users may write into it, and the plan follows."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ __all__ = ["PinMask", "held_springs", "read_pin_mask", "serves_any_mask"]
 
 
 class PinMask(NamedTuple):
-    """What somebody found who looked at the mask of hard pins."""
+    """Result of reading the mask of hard pins."""
 
     some: bool  # whether any pin may be hard
-    springs: Tensor | None = None  # those that `held` was made of,
-    held: Tensor | None = None  # as the ops take them
-    version: int | None = None  # of the springs; None where all pins are hard, whatever the springs
+    springs: Tensor | None = None  # stored springs from which `held` was made
+    held: Tensor | None = None  # springs for the ops
+    version: int | None = None  # of `springs`; None if all pins are hard, when springs do not matter
 
 
 def held_springs(mask: PinMask, springs: Tensor, hard: Tensor) -> Tensor:
-    """`pin_stiffness` as the ops take it: inf where a pin is hard."""
+    """`pin_stiffness` for the ops: inf where a pin is hard."""
     some, known, held, version = mask
     if not some:
         return springs
     learned = springs.requires_grad and torch.is_grad_enabled()
-    # what a CUDA graph records shall see later masks
+    # a CUDA graph must see later masks
     if known is not springs or held is None or learned or (springs.is_cuda and is_recording(springs.device)):
         return hold_exactly(springs, hard)
     if version is not None and springs._version != version:
@@ -42,15 +42,15 @@ def held_springs(mask: PinMask, springs: Tensor, hard: Tensor) -> Tensor:
 
 
 def serves_any_mask(plan: Plan) -> bool:
-    """Whether a plan has nothing that depends on which pins are hard."""
+    """Whether nothing in a plan depends on which pins are hard."""
     return (plan.loose is None or bool(plan.loose.all())) and not has_levels(plan.arrays)
 
 
 def read_pin_mask(compiled: CompiledScene, hard: Tensor, *, wait: bool = False) -> tuple[MutationGuard, Plan]:
-    """What the mask `hard` says, as `PinMask` in what was seen, and the plan that follows it; awaits a GPU.
+    """Read the mask `hard`, which waits for a GPU; return a guard with a `PinMask`, and the plan that follows it.
 
-    Pieces that are let go get rigid motions, and a preconditioner no longer holds what it held. With `wait` later
-    steps, on whatever stream, may take the springs that are made here.
+    Released components get rigid motions, and a preconditioner stops holding them. With `wait`, later steps on any
+    stream may use the springs that are made here.
     """
     plain, springs = plain_tensor(hard), compiled.named["pin_stiffness"]
     if not has_values(plain) or is_recording(plain.device):
@@ -59,7 +59,7 @@ def read_pin_mask(compiled: CompiledScene, hard: Tensor, *, wait: bool = False) 
     mask = PinMask(some=bool(rows.any()))
     with persistent_tensors():
         plan = plan_that_holds(compiled, loosened_plan(compiled, rows), rows.all(0))
-        # streams wait for what sets the material, but not for what another one has made in a step
+        # streams wait for a change of material, but not for a tensor that another stream made in a step
         if plain is hard and type(springs) is nn.Parameter and mask.some and (wait or not hard.is_cuda):
             version = None if bool(rows.all()) else springs._version
             mask = PinMask(True, springs, hold_exactly(springs, hard), version)

@@ -1,4 +1,4 @@
-"""Pins that hold exactly: which ones do, and which pieces of the mesh they leave rigid motions."""
+"""Hard pins, and the rigid motions that they leave to connected components of the mesh."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 __all__ = ["PIN_HARD", "PinnedPieces", "hold_exactly", "split_springs"]
 
-PIN_HARD = "pin_hard"  # the buffer of a simulator
+PIN_HARD = "pin_hard"  # name of the buffer of a simulator
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -23,27 +23,27 @@ _APART = 1e-8
 
 
 def split_springs(springs: Tensor) -> tuple[Tensor, Tensor]:
-    """Stiffness to store [.., P] N/m, and whether each pin is hard: given as inf, stored as 0, which holds nothing."""
+    """Stiffness to store [.., P] N/m, and whether each pin is hard: inf is hard and stored as 0."""
     hard = springs.isinf()
     return springs.masked_fill(hard, 0.0), hard
 
 
 def hold_exactly(springs: Tensor, hard: Tensor) -> Tensor:
-    """Springs [.., P] N/m as the ops take them: inf where a pin is hard."""
+    """Springs [.., P] N/m for the ops: inf where a pin is hard."""
     return springs.masked_fill(hard, torch.inf)
 
 
 @dataclass(frozen=True)
 class PinnedPieces:
-    """Where pins hold the connected pieces of a scene, at rest."""
+    """Pinned points of the connected components of a scene, at rest."""
 
     points: Array  # [P, 3] m
-    piece: Index  # [P] number of the piece that each holds
-    squares: Array  # [pieces] m^2, mean square distance of a piece's vertices from their mean, by mass
+    piece: Index  # [P] number of the component that each holds
+    squares: Array  # [components] m^2, second moment by mass: mean square distance of vertices from their mean
 
     @staticmethod
     def of(positions: Array, masses: Array, component: Index, pin_vertices: Index) -> PinnedPieces:
-        """From the arrays of `SceneValues`."""
+        """Build it from arrays of `SceneValues`."""
 
         def means(values: Array) -> Array:
             total = np.bincount(component, weights=masses)
@@ -55,22 +55,24 @@ class PinnedPieces:
         return PinnedPieces(positions[pin_vertices], component[pin_vertices], squares)
 
     def loose(self, hard: Mask) -> Mask:
-        """Whether each piece can move rigidly in any environment [pieces]; `hard` is [P] or [B, P].
+        """Whether each component can move rigidly in any environment [components]; `hard` is [P] or [B, P].
 
-        Soft pins leave a piece all rigid motions. Hard ones leave it turns where they lie at a point or along a line:
-        then at most one eigenvalue of the spread of their positions counts against the size of the piece.
+        Soft pins leave a component all rigid motions. Hard ones leave it rotations if they lie at a point or along a
+        line: then at most one eigenvalue of their covariance is significant against the size of the component.
         """
         loose = np.ones(len(self.squares), dtype=np.bool_)
         if not len(self.points):
             return loose
         held, of = np.unique(self.piece, return_inverse=True)
         rows = hard.reshape(-1, len(self.points))
-        # each mask once; np.unique compares pin by pin
+        # distinct masks; np.unique would compare pin by pin
         distinct = {row.tobytes(): number for number, row in enumerate(np.packbits(rows, axis=1))}
         rows = rows[list(distinct.values())]
-        middle = np.stack([np.bincount(of, weights=axis) for axis in self.points.T], axis=1) / np.bincount(of)[:, None]
-        arms = self.points - middle[of]
-        # 1, arm and arm arm^T of each pin, to be summed over those of a piece that are hard
+        centroid = (
+            np.stack([np.bincount(of, weights=axis) for axis in self.points.T], axis=1) / np.bincount(of)[:, None]
+        )
+        arms = self.points - centroid[of]
+        # 1, arm and arm arm^T of each pin, summed below over the hard pins of a component
         moments = np.concatenate(
             [np.ones((len(arms), 1)), arms, (arms[:, :, None] * arms[:, None, :]).reshape(-1, 9)], axis=1
         )

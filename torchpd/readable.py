@@ -1,4 +1,4 @@
-"""A model whose contacts, pins and stress can be read out, and written to files."""
+"""Read-outs of a model: contact forces, reactions, stress, and files for ParaView."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ __all__ = ["Readable"]
 
 
 class Readable(Model):
-    """What a `Simulator` tells about steps and states; docs/readouts.md is a guide."""
+    """Read-outs of steps and states of a `Simulator`; docs/readouts.md is a guide."""
 
     def checked_call(
         self, state: State, after: State | Tensor, forces: Tensor | None, targets: Targets | None
     ) -> AdjointCall:
-        """The step from a state to the positions `after`, all arguments checked."""
+        """The step from a state to the positions `after`, with all arguments checked."""
         forces = self.check_state(state, forces=forces)
         before, positions = self.positions_of(state), self.positions_of(after, "after")
         check_like("after", positions, before, "m")
@@ -45,23 +45,24 @@ class Readable(Model):
         *,
         about: Tensor | None = None,
     ) -> ContactForces:
-        """Forces of grounds and spheres on the vertices in the step from `state` to `after` [N].
+        """Forces of grounds and spheres on the vertices [N] in the step from `state` to `after`.
 
-        They are what the gradient of the step's objective leaves at `after`: pushes along the normals, and friction up
-        to Coulomb's bound. Where several colliders hold a vertex, the pushes fit the gradient best, and friction is
-        shared; `torchpd.readouts` states the rule. What no contact and no pin balances is `residual`: compare it with
-        the forces to see how far to trust them. Hard pins take all at their vertices. Differentiable.
+        They are the part of the objective's gradient at `after` that contacts can supply: normal forces, and friction
+        up to Coulomb's bound. If several colliders hold a vertex, normal forces are fitted to the gradient, and
+        friction is shared; `torchpd.readouts` states the rule. `residual` is the part that neither contacts nor pins
+        balance: compare it with the forces to see how far to trust them. Hard pins take the whole gradient at their
+        vertices. Differentiable.
 
         Args:
-            state: where the step started.
-            after: where it ended, a `State` or positions [B, V, 3].
+            state: start of the step.
+            after: end of the step, a `State` or positions [B, V, 3].
             forces: as in `forward`, the same as in that step.
             targets: as in `forward`, the same as in that step.
             about: point of torques [3] or [B, 3] [m]; by default the centre of mass of each body at `after`.
 
         Returns:
             Forces of all colliders [B, V, 3], and of each: `contacts.colliders[ground].force`. Sums and torques by
-            body: `contacts.bodies[solid].force` [B, 3]. `colliders` is empty where the scene has none.
+            body: `contacts.bodies[solid].force` [B, 3]. `colliders` is empty if the scene has none.
 
         Example:
             >>> after = sim(state)
@@ -79,26 +80,26 @@ class Readable(Model):
         *,
         about: Tensor | None = None,
     ) -> Reactions:
-        """Forces of pins on their vertices in the step from `state` to `after` [N].
+        """Forces of pins on their vertices [N] in the step from `state` to `after`.
 
-        The force of a hard pin is the gradient of the step's objective without pins, that of a soft one
-        k (target - x'). The force of a hard pin therefore includes what contacts would do to its vertices, and what an
-        unsolved step leaves there; `ContactForces.residual` has that of the other vertices. Differentiable.
+        The force of a hard pin is the gradient of the step's objective without pins, that of a soft one k (target -
+        x'). The force of a hard pin therefore includes contact forces at its vertices, and the residual of the solve
+        there. The residual of other vertices is `ContactForces.residual`. Differentiable.
 
         Args:
             state, after, forces, targets, about: as in `contact_forces`.
 
         Returns:
             Forces in the order of `pin_targets` [B, P, 3] and on all vertices [B, V, 3], and by pin:
-            `reactions.pins[pin].wrench.force` [B, 3] is what it carries. `pins` is empty where the scene has none.
+            `reactions.pins[pin].wrench.force` [B, 3] is its total. `pins` is empty if the scene has none.
         """
         return reactions(self.scene, self.checked_call(state, after, forces, targets), about)
 
     def stress(self, state: State | Tensor) -> Stress:
         """Cauchy stress [B, E, 3, 3] and von Mises stress [B, E] [Pa] of every tetrahedron, and its strain.
 
-        sigma = w (F - R) F^T / det F, w Young's modulus, F the deformation gradient and R its nearest rotation. NaN
-        where det F > 0 fails, see `Stress.inverted`. Differentiable.
+        sigma = w (F - R) F^T / det F, with w Young's modulus, F the deformation gradient and R its nearest rotation.
+        NaN unless det F > 0, see `Stress.inverted`. Differentiable.
 
         Args:
             state: a `State`, or positions [B, V, 3].
@@ -108,10 +109,10 @@ class Readable(Model):
         return stress(self.scene, positions, stiffness)
 
     def vertex_average(self, values: Tensor) -> Tensor:
-        """Average at every vertex of what its tetrahedra have, weighted by their rest volumes. Differentiable.
+        """Average at every vertex of values of its tetrahedra, weighted by their rest volumes. Differentiable.
 
-        For colours and contours of a field that jumps between tetrahedra, such as `stress(state).von_mises`. A vertex
-        of an inverted tetrahedron, whose stress is NaN, has NaN.
+        For colours and contours of a field that jumps between tetrahedra, such as `stress(state).von_mises`. It is NaN
+        at vertices of inverted tetrahedra, whose stress is NaN.
 
         Args:
             values: of tetrahedra [B, E, ...].
@@ -131,19 +132,19 @@ class Readable(Model):
         point_data: Mapping[str, Any] | None = None,
         cell_data: Mapping[str, Any] | None = None,
     ) -> Path:
-        """Write a state as `.vtu` for ParaView; a track or a list of states as a `.pvd` with a numbered `.vtu` each.
+        """Write a state as `.vtu` for ParaView; a track or a list of states as a `.pvd` with one numbered `.vtu` each.
 
-        Displacement, velocity, stress, von Mises stress and body are always there, regions where meshes have some; see
-        `torchpd.vtu` for their names.
+        Files have displacement, velocity, stress, von Mises stress and body, and regions if meshes have them. See
+        `torchpd.vtu` for the names.
 
         Args:
             path: of the .vtu, or of the .pvd, beside which the others go; existing files are replaced.
-            states: what to write.
-            environment: which one; needed where states have several.
-            times: of the records [s]; by default those of a rollout that records every step, h, 2 h, ...
-            point_data: more fields by name, of vertices: [B, V, ...], of several states [T, B, V, ...]; or [V, ...] for
-                all of them. Tensors or arrays.
-            cell_data: the same of tetrahedra, E for V.
+            states: a state, a track, or a list of states.
+            environment: number of the environment; needed if states have several.
+            times: of the records [s]; by default h, 2 h, ... as of a rollout that records every step.
+            point_data: further fields of vertices by name: [B, V, ...], of several states [T, B, V, ...], or [V, ...]
+                for all of them. Tensors or arrays.
+            cell_data: further fields of tetrahedra, with E in place of V.
 
         Returns:
             The path.

@@ -1,21 +1,21 @@
 """Forces of contacts and pins in a step.
 
-At a solved step the gradient of its objective without pins, g, is what contacts and pins put on the vertices [N]:
+At a solved step the gradient g of its objective without pins equals the forces of contacts and pins [N]:
 
     g = m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - forces + elastic gradient = contacts + pins.
 
-Pins. A hard one puts g on its vertex, a soft one k (target - x'); r = g - pins is left for the contacts.
+Pins. A hard one puts g on its vertex, a soft one k (target - x'). The rest r = g - pins is left for the contacts.
 
-Contacts. The normals n_k of at most three colliders act on a vertex, those with the smallest gaps. Their pushes p_k
-minimise |r - sum_k p_k n_k|. Each that pushes has p_k > 0 and gap_k < 4 max(p_k, n_k . r) / D, since no iteration
-without that push crosses a wider gap. D is the diagonal of the step, and 4 bounds relaxation times acceleration, both
-below 2. Only where planes meet at flat angles are gaps of pushing contacts that large (see `Ground`). Several
-together have p_k = m_k . r with the m_k dual to their normals, as in csrc/solver/contact_gradients.h. The rest t is
-tangential to all of them. Colliders share it in proportion to their friction mu_k p_k, and take no more than that
-together (Coulomb). So at a corner normals come first: friction gets no force that a normal can give. What contacts do
-not take is the residual, forces that nothing balances.
+Contacts. At most three colliders act on a vertex, those with the smallest gaps; n_k are their normals. Their normal
+forces p_k minimise |r - sum_k p_k n_k|. An active contact has p_k > 0 and gap_k < 4 max(p_k, n_k . r) / D, because no
+iteration without its force crosses a wider gap. D is the diagonal of the step. The factor 4 bounds relaxation times
+acceleration, both below 2. Gaps of active contacts are that large only where planes meet at flat angles (see `Ground`).
 
-Sums over vertices are those of a fixed binary tree, so that an environment has the same bits in every batch.
+Several active contacts have p_k = m_k . r, with the m_k dual to their normals, as in csrc/solver/contact_gradients.h.
+The rest t is tangential to all of them. Colliders share it in proportion to mu_k p_k, and together take no more than
+that (Coulomb). So in a corner normal forces come first. The part that contacts do not take is the residual.
+
+Sums over vertices follow a fixed binary tree, so an environment has the same bits in every batch.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ __all__ = [
     "reactions",
 ]
 
-_SPANNED = 1e-6  # as in csrc/effects/contact.h: Gram determinant from which normals count as independent
-_FASTEST = 4.0  # bounds an iteration's relaxation times acceleration, both below 2
+_SPANNED = 1e-6  # Gram determinant from which normals count as independent, as in csrc/effects/contact.h
+_FASTEST = 4.0  # bound of relaxation times acceleration, both below 2
 _PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
 
 
@@ -65,12 +65,12 @@ class Wrench(NamedTuple):
 
 
 class ContactForce(NamedTuple):
-    """What one collider does to the vertices in a step; zero where it does not push."""
+    """Force of one collider on the vertices in a step; zero where it is not active."""
 
     force: Tensor  # [B, V, 3] N, on the vertices: normal part and friction
     friction: Tensor  # [B, V, 3] N, its tangential part
-    push: Tensor  # [B, V] N, size of its normal part
-    touches: Tensor  # [B, V] bool, whether it pushes
+    push: Tensor  # [B, V] N, magnitude of its normal part
+    touches: Tensor  # [B, V] bool, whether it is active
     bodies: dict[Solid, Wrench]  # sum and torque on each body
 
     def __repr__(self) -> str:
@@ -78,10 +78,10 @@ class ContactForce(NamedTuple):
 
 
 class ContactForces(NamedTuple):
-    """What contacts do to the vertices in a step, see `Simulator.contact_forces`."""
+    """Forces of all contacts on the vertices in a step, see `Simulator.contact_forces`."""
 
     force: Tensor  # [B, V, 3] N, of all colliders together, on the vertices
-    residual: Tensor  # [B, V, 3] N, what no contact and no pin balances; zero at a solved step
+    residual: Tensor  # [B, V, 3] N, the part that neither contacts nor pins balance; zero at a solved step
     bodies: dict[Solid, Wrench]  # sum and torque of all colliders on each body
     colliders: dict[Ground | Sphere, ContactForce]  # empty without colliders
 
@@ -90,7 +90,7 @@ class ContactForces(NamedTuple):
 
 
 class PinForce(NamedTuple):
-    """What one pin does to its vertices."""
+    """Force of one pin on its vertices."""
 
     force: Tensor  # [B, p, 3] N, on the vertices, in the order of `Pin.vertices`
     wrench: Wrench  # sum and torque
@@ -100,7 +100,7 @@ class PinForce(NamedTuple):
 
 
 class Reactions(NamedTuple):
-    """What pins do to their vertices in a step, see `Simulator.reactions`."""
+    """Forces of all pins on their vertices in a step, see `Simulator.reactions`."""
 
     force: Tensor  # [B, P, 3] N, on the pinned vertices, in the order of `pin_targets`
     on_vertices: Tensor  # [B, V, 3] N, the same on all vertices, zero on those without a pin
@@ -114,7 +114,7 @@ class Reactions(NamedTuple):
 
 
 def _tree_sum(values: Tensor) -> Tensor:
-    """Sum over vertices of [..., n, k] by a binary tree: the same order whatever stands in front."""
+    """Sum over vertices of [..., n, k] by a binary tree: the same order for any leading dimensions."""
     if values.shape[-2] == 0:
         return values.sum(-2)
     while (count := values.shape[-2]) > 1:
@@ -125,7 +125,7 @@ def _tree_sum(values: Tensor) -> Tensor:
 
 
 class _Body(NamedTuple):
-    """Where a body's vertices are, and the point that torques on them are about."""
+    """Vertices of a body, and the point that its torques are about."""
 
     rows: slice
     positions: Tensor  # [B, n, 3] m
@@ -169,7 +169,7 @@ def _wrench(forces: Tensor, positions: Tensor, about: Tensor) -> Wrench:
 
 
 def _pin_forces(call: AdjointCall) -> tuple[Tensor, Tensor]:
-    """Forces of pins [B, P, 3], and r [B, V, 3], what they leave of the gradient; exactly zero at hard ones."""
+    """Forces of pins [B, P, 3], and the rest r [B, V, 3] of the gradient; exactly zero at hard pins."""
     material = named_material(call.material)
     free = list(call.material)
     free[_PIN_STIFFNESS] = torch.zeros_like(free[_PIN_STIFFNESS])
@@ -183,7 +183,7 @@ def _pin_forces(call: AdjointCall) -> tuple[Tensor, Tensor]:
 
 
 def reactions(scene: Scene, call: AdjointCall, about: Tensor | None) -> Reactions:
-    """What `Simulator.reactions` does, for a checked call."""
+    """Implementation of `Simulator.reactions` for a checked call."""
     forces, _ = _pin_forces(call)
     vertices = pinned_vertices(call.plan)
     on_vertices = torch.zeros_like(call.after).index_add(1, vertices, forces)
@@ -200,7 +200,7 @@ def reactions(scene: Scene, call: AdjointCall, about: Tensor | None) -> Reaction
 
 
 class _Contacts(NamedTuple):
-    """Colliders as vertices meet them: grounds, then spheres."""
+    """Normals, gaps and friction of all colliders at the vertices: grounds, then spheres."""
 
     normals: Tensor  # [B, K, V, 3]
     gaps: Tensor  # [B, K, V] m
@@ -221,10 +221,10 @@ def _contacts(call: AdjointCall) -> _Contacts:
     return _Contacts(*(torch.cat(pair, dim=1) for pair in zip(*parts, strict=True)))
 
 
-def _pushes(normals: Tensor, force: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
-    """Pushes [B, M, V] of the active contacts, M <= 3, that fit the force [B, V, 3] best, and their Gram determinant.
+def _normal_forces(normals: Tensor, force: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
+    """Normal forces [B, M, V], M <= 3, of active contacts that fit the force [B, V, 3] best, and their Gram determinant.
 
-    N N^T p = N r, with a row of the identity for a contact that is not active.
+    N N^T p = N r, with a row of the identity for an inactive contact.
     """
     count = normals.shape[1]
     chosen = torch.where(active.unsqueeze(-1), normals, 0.0)
@@ -242,7 +242,7 @@ def _pushes(normals: Tensor, force: Tensor, active: Tensor) -> tuple[Tensor, Ten
 
 @torch.no_grad()
 def _active(contacts: _Contacts, force: Tensor, diagonal: Tensor) -> Tensor:
-    """Which contacts push [B, M, V]: of the sets in which all do, the one that leaves least of the force."""
+    """Which contacts are active [B, M, V]: of the sets in which all push, the one with the smallest remaining force."""
     normals, gaps, _ = contacts
     count = normals.shape[1]
     best = torch.zeros_like(gaps, dtype=torch.bool)
@@ -251,10 +251,10 @@ def _active(contacts: _Contacts, force: Tensor, diagonal: Tensor) -> Tensor:
     for size in range(1, count + 1):
         for members in combinations(range(count), size):
             mask = torch.stack([numbers == member for member in members]).any(0)
-            pushes, independent = _pushes(normals, force, mask.expand_as(gaps))
+            pushes, independent = _normal_forces(normals, force, mask.expand_as(gaps))
             reach = _FASTEST * torch.maximum(pushes, dot(normals, force[:, None])) / diagonal[..., None, :]
             acts = (pushes > 0.0) & (gaps < reach)
-            left = force - _added(pushes.unsqueeze(-1) * normals)
+            left = force - _sum_over_contacts(pushes.unsqueeze(-1) * normals)
             error = dot(left, left)
             better = (acts | ~mask).all(1) & (independent > _SPANNED) & (error < least)
             best = torch.where(better[:, None], mask, best)
@@ -263,7 +263,7 @@ def _active(contacts: _Contacts, force: Tensor, diagonal: Tensor) -> Tensor:
 
 
 def _nearest_three(contacts: _Contacts) -> tuple[_Contacts, Tensor | None]:
-    """The contacts with the smallest gaps, and their numbers [B, 3, V] where there were more."""
+    """The contacts with the smallest gaps, and their numbers [B, 3, V] if there were more than three."""
     if contacts.gaps.shape[1] <= 3:
         return contacts, None
     numbers = contacts.gaps.detach().sort(dim=1, stable=True).indices[:, :3]
@@ -272,14 +272,14 @@ def _nearest_three(contacts: _Contacts) -> tuple[_Contacts, Tensor | None]:
 
 
 def _split(contacts: _Contacts, force: Tensor, diagonal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pushes [B, K, V], friction [B, K, V, 3] and which contacts push [B, K, V], by the rule of this module."""
+    """Normal forces [B, K, V], friction [B, K, V, 3] and active contacts [B, K, V], by the rule of this module."""
     count = contacts.gaps.shape[1]
     near, numbers = _nearest_three(contacts)
     active = _active(near, force, diagonal)
-    pushes = torch.where(active, _pushes(near.normals, force, active)[0], 0.0)
-    tangential = force - _added(pushes.unsqueeze(-1) * near.normals)
+    pushes = torch.where(active, _normal_forces(near.normals, force, active)[0], 0.0)
+    tangential = force - _sum_over_contacts(pushes.unsqueeze(-1) * near.normals)
     bounds = near.friction * pushes
-    bound, size = _added(bounds.unsqueeze(-1)).squeeze(-1), length(tangential)
+    bound, size = _sum_over_contacts(bounds.unsqueeze(-1)).squeeze(-1), length(tangential)
     share = torch.maximum(bound, size)
     share = bounds / torch.where(share > 0.0, share, 1.0)[:, None]
     friction = share.unsqueeze(-1) * tangential[:, None]
@@ -294,7 +294,7 @@ def _split(contacts: _Contacts, force: Tensor, diagonal: Tensor) -> tuple[Tensor
     )
 
 
-def _added(values: Tensor) -> Tensor:
+def _sum_over_contacts(values: Tensor) -> Tensor:
     """Sum over contacts of [B, M, V, k], one after another."""
     total = torch.zeros_like(values[:, 0])
     for one in values.unbind(1):
@@ -303,7 +303,7 @@ def _added(values: Tensor) -> Tensor:
 
 
 def contact_forces(scene: Scene, call: AdjointCall, about: Tensor | None) -> ContactForces:
-    """What `Simulator.contact_forces` does, for a checked call."""
+    """Implementation of `Simulator.contact_forces` for a checked call."""
     _, force = _pin_forces(call)
     colliders: Sequence[Ground | Sphere] = (*scene.grounds, *scene.spheres)
     bodies = _bodies(scene, call.after, named_material(call.material)["masses"], about)
@@ -315,7 +315,7 @@ def contact_forces(scene: Scene, call: AdjointCall, about: Tensor | None) -> Con
         diagonal = step_diagonal(call.plan, call.material, call.time_step)[1]
     pushes, friction, active = _split(contacts, force, diagonal)
     forces = pushes.unsqueeze(-1) * contacts.normals + friction
-    total = _added(forces)
+    total = _sum_over_contacts(forces)
     wrenches = _on_bodies(forces, bodies)
     found = {
         part: ContactForce(

@@ -1,4 +1,4 @@
-"""How values that hold arrays print: in one line, with sizes in place of numbers."""
+"""Short reprs of values that hold arrays: one line, with sizes in place of numbers."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ def by_sizes(value: object, tensor: Any, *names: str, trailing: int = 1, more: s
     """`State(batch=32, vertices=4096, float32, cpu)`: a value by the shape of one of its tensors.
 
     Args:
-        value: what is printed.
-        tensor: one of its tensors; anything else prints as it is.
-        names: of the dimensions, the last of them always there.
-        trailing: dimensions behind these, the components of a vector.
-        more: what to add behind the sizes.
+        value: the value to print.
+        tensor: one of its tensors; anything else is printed as it is.
+        names: of the dimensions; leading ones may be absent.
+        trailing: number of further dimensions, the components of a vector.
+        more: text after the sizes.
     """
     kind = type(value).__name__
     if not isinstance(tensor, Tensor):

@@ -21,7 +21,7 @@ __all__ = [
     "check_solver",
 ]
 
-LARGEST_COUNT = 1_000_000_000  # of iterations, as the ops say
+LARGEST_COUNT = 1_000_000_000  # of iterations; the ops have the same limit
 Diagonal = Literal["weighted", "plain"]
 # settings of a step that the simulator says, whatever the solver
 _OTHERS = ("iterations", "time_step", "tolerance", "inertial", "report")
@@ -35,7 +35,7 @@ def _keep(solver: Solver, name: str, value: float) -> None:
 
 
 def _keep_within(solver: Solver, name: str, most: int, why: str = ",") -> None:
-    """The same of one that lies in (0, most)."""
+    """Check that an option lies in (0, most), and store it as a plain number."""
     value, full_name = getattr(solver, name), f"{type(solver).__name__}.{name}"
     number = check_scalar(full_name, value)
     if not 0.0 < number < most:
@@ -54,8 +54,8 @@ class Jacobi:
 
     Args:
         relaxation: theta of x - theta D^-1 grad E, in (0, 2).
-        diagonal: "weighted" never raises the energy, on any mesh; "plain" is the diagonal of the matrix of projective
-            dynamics, as in the literature, and diverges where its spectral radius exceeds 2 / theta.
+        diagonal: "weighted" never raises the energy, on any mesh. "plain" is the diagonal D of the matrix A of projective
+            dynamics, as in the literature. It diverges if D^-1 A has a spectral radius above 2 / theta.
     """
 
     relaxation: float = 1.0
@@ -79,9 +79,9 @@ class Jacobi:
 class Chebyshev:
     """Jacobi iterations accelerated by the Chebyshev semi-iterative method (Wang 2015; Vyatkin and Dolgovesov 2023).
 
-    "guarded" needs no tuning: rho comes from the weights of the step, and the momentum restarts when the energy rose
-    since the check four iterations ago. "classic" is the recurrence of the papers: it needs `rho`
-    (`torchpd.estimate_rho`) and may diverge.
+    "guarded" needs no tuning: rho comes from the weights of the step. Every four iterations it compares energies, and
+    restarts the momentum on a rise. "classic" is the recurrence of the papers. It needs `rho` (`torchpd.estimate_rho`)
+    and may diverge.
 
     Args:
         schedule: "guarded" or "classic".
@@ -134,7 +134,7 @@ class Chebyshev:
         }
 
 
-_SCHEDULES = {"corotated": 5, "lbfgs": 3, "momentum": 4}  # Multilevel.outer, as the ops call it
+_SCHEDULES = {"corotated": 5, "lbfgs": 3, "momentum": 4}  # numbers of Multilevel.outer in the ops
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class Multilevel:
 Solver = Jacobi | Chebyshev | Multilevel
 SolverName = Literal["auto", "chebyshev", "jacobi", "multilevel"]
 _NAMED: dict[object, Solver] = {"chebyshev": Chebyshev(), "jacobi": Jacobi(), "multilevel": Multilevel()}
-DEFAULT_ITERATIONS = 64  # of a simulator that is given none
+DEFAULT_ITERATIONS = 64  # without iterations=
 
 
 def check_solver(solver: object, device: torch.device) -> Solver:

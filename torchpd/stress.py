@@ -1,12 +1,12 @@
 """Stress and strain of every tetrahedron.
 
-The energy of a tetrahedron is w V / 2 |F - R|^2, w Young's modulus, F its deformation gradient and R the nearest
+The energy of a tetrahedron is w V / 2 |F - R|^2. w is Young's modulus, F the deformation gradient and R the nearest
 rotation (see `Solid`). So the first Piola-Kirchhoff stress is P = dE/dF / V = w (F - R), and Cauchy's is
 
     sigma = P F^T / det F = w (F F^T - R F^T) / det F.
 
-Both are constant in a tetrahedron. The material has Poisson ratio 0. Where a tetrahedron is partly full (`mesh.fill`)
-the stress is that of its average material.
+Both are constant in a tetrahedron. The material has Poisson ratio 0. In a partly full tetrahedron (`mesh.fill`) the
+stress is that of its average material.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ class Stress(NamedTuple):
     cauchy: Tensor  # [B, E, 3, 3] Pa, symmetric
     von_mises: Tensor  # [B, E] Pa, sqrt(3 / 2 s : s), s the deviator of `cauchy`
     strain: Tensor  # [B, E, 3, 3], Green's, (F^T F - 1) / 2
-    inverted: Tensor  # [B, E] bool, whether det F > 0 fails
+    inverted: Tensor  # [B, E] bool, true unless det F > 0
 
     def __repr__(self) -> str:
         return by_sizes(self, self.cauchy, "batch", "tets", trailing=2)
 
 
 class _Rest(NamedTuple):
-    """What read-outs need of the rest shape."""
+    """Arrays of the rest shape for read-outs."""
 
     tets: Tensor  # [E, 4]
     inverse_edges: Tensor  # [E, 3, 3] 1/m
     order: Tensor  # [4 E] tetrahedra of each vertex, vertex after vertex
-    counts: Tensor  # [V] how many each has
-    shares: Tensor  # [4 E] share of each in the volume of those of its vertex
+    counts: Tensor  # [V] number of them
+    shares: Tensor  # [4 E] share of each in the volume around its vertex
 
 
-# compiled scenes do not change; a copy to a GPU would wait for it
+# kept, because scenes do not change and a copy to a GPU would wait for it
 _REST: WeakKeyDictionary[Scene, dict[tuple[torch.device, torch.dtype], _Rest]] = WeakKeyDictionary()
 
 
@@ -73,7 +73,7 @@ def _rest(scene: Scene, device: torch.device, dtype: torch.dtype) -> _Rest:
 
 
 def stress(scene: Scene, positions: Tensor, stiffness: Tensor) -> Stress:
-    """What `Simulator.stress` does, for checked positions [B, V, 3] and stiffness [E] or [B, E]."""
+    """Implementation of `Simulator.stress` for checked positions [B, V, 3] and stiffness [E] or [B, E]."""
     rest = _rest(scene, positions.device, positions.dtype)
     corners = positions[:, rest.tets]
     F = product((corners[:, :, 1:] - corners[:, :, :1]).mT, rest.inverse_edges)
@@ -82,12 +82,12 @@ def stress(scene: Scene, positions: Tensor, stiffness: Tensor) -> Stress:
     a, b, c = F.unbind(-1)
     determinant = dot(a, torch.linalg.cross(b, c))
     inverted = ~(determinant.detach() > 0.0)
-    # no NaN reaches the derivatives of the others
+    # so that no NaN reaches the derivatives of the others
     lost = inverted[..., None, None]
     F = torch.where(lost, identity, F)
     scale = stiffness / torch.where(inverted, 1.0, determinant)
     cauchy = scale[..., None, None] * product(F - nearest_rotation(F), F.mT)
-    cauchy = 0.5 * (cauchy + cauchy.mT)  # but for rounding it is symmetric
+    cauchy = 0.5 * (cauchy + cauchy.mT)  # symmetric except for rounding
     xx, yy, zz = cauchy.diagonal(dim1=-2, dim2=-1).unbind(-1)
     shear = torch.stack((cauchy[..., 0, 1], cauchy[..., 1, 2], cauchy[..., 2, 0]), dim=-1)
     squared = 0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3.0 * dot(shear, shear)
@@ -97,7 +97,7 @@ def stress(scene: Scene, positions: Tensor, stiffness: Tensor) -> Stress:
 
 
 def vertex_average(scene: Scene, values: Tensor, like: Tensor) -> Tensor:
-    """What `Simulator.vertex_average` does, in the precision and on the device of `like`."""
+    """Implementation of `Simulator.vertex_average`, in the precision and on the device of `like`."""
     if not isinstance(values, Tensor):
         raise TypeError(f"vertex_average: values must be a tensor [B, E, ...], got {type(values).__name__}")
     if values.dtype != like.dtype or values.device != like.device:
@@ -109,7 +109,7 @@ def vertex_average(scene: Scene, values: Tensor, like: Tensor) -> Tensor:
     if values.dim() < 2 or values.shape[1] != len(rest.tets):
         raise ValueError(f"vertex_average: values must be [B, {len(rest.tets)}, ...], got {list(values.shape)}")
     rows = values.flatten(2) if values.dim() > 2 else values.unsqueeze(-1)
-    # the terms of a vertex are added one after another
+    # a segment is summed in order, so bits do not depend on the batch
     terms = (rows[:, rest.order] * rest.shares[:, None]).movedim(0, 1)
     total = torch.segment_reduce(terms.flatten(1), "sum", lengths=rest.counts, axis=0, unsafe=True)
     means: Tensor = total.unflatten(1, terms.shape[1:]).movedim(0, 1)

@@ -1,4 +1,4 @@
-"""Units of length that meshes come in. Everything behind `from_file` and `tetrahedralize` is in metres."""
+"""Units of length of meshes. After `from_file` and `tetrahedralize` everything is in metres."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
 
 def metres(owner: str, unit: Unit | None) -> float:
-    """How many metres a unit has; None is metres."""
+    """Length of a unit [m]; None is metres."""
     if unit is None:
         return 1.0
     if unit not in get_args(Unit):

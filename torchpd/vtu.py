@@ -1,14 +1,17 @@
-"""States as files for ParaView: `.vtu`, an unstructured grid, and `.pvd`, which lists those of a motion with times.
+"""States as files for ParaView: `.vtu`, an unstructured grid, and `.pvd`, a list of these with times.
 
     drop.pvd, drop_0000.vtu, drop_0001.vtu, ...
 
-Points are the positions of one environment [m], cells its tetrahedra. Every file has the fields
+Points are the positions of one environment [m], cells its tetrahedra. Every file has these fields:
 
-    points   displacement [m], velocity [m/s]
-    cells    stress [Pa], nine numbers row by row, and von_mises [Pa], both NaN where a tetrahedron is inverted;
-             body, the number of the solid; region, where a mesh has regions (0 in those without)
+    points  displacement  [m]
+            velocity      [m/s]
+    cells   stress        [Pa], nine numbers row by row, NaN in inverted tetrahedra
+            von_mises     [Pa], NaN in inverted tetrahedra
+            body          number of the solid
+            region        of the mesh, 0 in meshes without; absent if no mesh has regions
 
-and what the caller gives, for example contact forces.
+The caller may add fields, for example contact forces.
 """
 
 from __future__ import annotations
@@ -46,7 +49,7 @@ def write_vtu(
     point_data: Mapping[str, Any] | None,
     cell_data: Mapping[str, Any] | None,
 ) -> Path:
-    """What `Simulator.write_vtu` does; `check` refuses what is no state."""
+    """Implementation of `Simulator.write_vtu`; `check` refuses anything but a state."""
     check_has_values("write_vtu", compiled.device)
     target = check_target_file(path, "write_vtu")
     records, alone = _records(compiled, check, states)
@@ -75,7 +78,7 @@ def write_vtu(
 
 
 def _records(compiled: CompiledScene, check: Callable[[State], object], states: States) -> tuple[list[State], bool]:
-    """The states one by one, and whether it is a single one."""
+    """The states one by one, and whether a single one was given."""
     alone = False
     if isinstance(states, Track):
         found = [State(x, v) for x, v in zip(states.positions, states.velocities, strict=True)]
@@ -117,7 +120,7 @@ def _instants(time_step: float, times: Sequence[float] | None, count: int) -> li
 
 
 def _cells(scene: Scene) -> tuple[NDArray[np.int64], Fields]:
-    """Tets [E, 4], and what they belong to."""
+    """Tets [E, 4], and the labels of their bodies and regions."""
     meshes = [solid.mesh for solid in scene.solids]
     starts = [scene.vertex_range(solid).start for solid in scene.solids]
     labels: Fields = {"body": np.repeat(np.arange(len(meshes)), [len(mesh.tets) for mesh in meshes])}
@@ -140,7 +143,7 @@ def _own_fields(compiled: CompiledScene, state: State, chosen: int) -> tuple[Fie
 
 
 def _given(owner: str, data: Mapping[str, Any] | None, lead: tuple[int, ...], chosen: int) -> Fields:
-    """Fields of the chosen environment [T, n, k], T = 1 for what every record has alike."""
+    """Given fields of the chosen environment [T, n, k], with T = 1 for fields that all records share."""
     found: Fields = {}
     for name, value in (data or {}).items():
         label = f"write_vtu: {owner}[{name!r}]"
@@ -153,7 +156,7 @@ def _given(owner: str, data: Mapping[str, Any] | None, lead: tuple[int, ...], ch
         else:
             raise ValueError(f"{label} must be {[*lead, '...']} or {[count, '...']} for all, got {list(array.shape)}")
         array = array.reshape(len(array), count, -1) if array.ndim > 3 else array
-        # meshio writes names as they are
+        # meshio does not escape names
         found[escape(str(name), {'"': "&quot;", "\n": "&#10;"})] = (
             array.astype(np.uint8) if array.dtype == np.bool_ else array
         )
@@ -185,7 +188,7 @@ def _write(file: Path, positions: Tensor, tets: NDArray[np.int64], points: Field
 
 
 def _collection(files: Sequence[Path], instants: Sequence[float]) -> str:
-    """A .pvd: names relative to it, and times [s]."""
+    """Text of a .pvd: file names relative to it, and times [s]."""
     rows = [
         f'    <DataSet timestep="{instant!r}" group="" part="0" file={quoteattr(file.name)}/>'
         for file, instant in zip(files, instants, strict=True)
