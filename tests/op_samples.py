@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from runs import noise, numbers_of, plan_of, small
+from runs import noise, plan_of, settings_of, small
 from torch import Tensor
 
 import torchpd as pd
@@ -24,7 +24,7 @@ def samples(
     f, direction = noise(x), noise(x, 1)
     still, zero = sim.rest_state(BATCH)
     info = torch.full((BATCH, len(Info._fields)), float("nan"), dtype=torch.float64, device=device)
-    numbers = numbers_of(sim)
+    numbers = settings_of(sim)
     matrices = noise(torch.empty(5, 3, 3, dtype=dtype, device=device)) + 2.0 * torch.eye(3, dtype=dtype, device=device)
 
     def wanted(tensor: Tensor) -> Tensor:

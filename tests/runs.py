@@ -67,7 +67,7 @@ def rounded_problem(case: Case, dtype: torch.dtype) -> StepProblem:
 
 def first_of(problem: StepProblem, case: Case, solver: pd.Jacobi | pd.Chebyshev) -> Array:
     """The iterate that `solver` begins with, in the reference."""
-    return problem.first_iterate(case.start, weighted=solver.numbers()["weighted"])
+    return problem.first_iterate(case.start, weighted=solver.settings()["weighted"])
 
 
 def reference_run(
@@ -78,7 +78,7 @@ def reference_run(
     observe: Observer | None = None,
 ) -> Iterates:
     """The iterations of `solver` in the reference; `observe(k, u_k)` sees them."""
-    numbers = solver.numbers()
+    numbers = solver.settings()
     if isinstance(solver, pd.Jacobi):
         return jacobi(
             problem, first, iterations=iterations, relaxation=solver.relaxation, weighted=numbers["weighted"],
@@ -100,7 +100,7 @@ def reference_runs(
     """What `reference_run` gives for each of some counts, from one run; `energies` has that of its end."""
     seen: dict[int, Array] = {}
     run = reference_run(problem, first, solver, max(counts), seen.__setitem__)
-    diagonal = problem.weighted_diagonal if solver.numbers()["weighted"] else problem.plain_diagonal
+    diagonal = problem.weighted_diagonal if solver.settings()["weighted"] else problem.plain_diagonal
     for count in counts:
         u = problem.align(seen[count])
         residual = problem.relative_residual(u, diagonal)
@@ -153,9 +153,9 @@ def plan_of(sim: pd.Simulator) -> list[Tensor]:
     return list(sim.plan.arrays)
 
 
-def numbers_of(sim: pd.Simulator, **changed: Any) -> dict[str, Any]:
+def settings_of(sim: pd.Simulator, **changed: Any) -> dict[str, Any]:
     """The keyword arguments of `step`."""
-    return {**sim.numbers(inertial=False, report=True), "iterations": 4, "tolerance": 0.0, **changed}
+    return {**sim.step_settings(inertial=False, report=True), "iterations": 4, "tolerance": 0.0, **changed}
 
 
 def material_with(sim: pd.Simulator, stiffness: Tensor) -> list[Tensor]:

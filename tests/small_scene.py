@@ -27,8 +27,8 @@ def small_simulator() -> pd.Simulator:
     return pd.Simulator(scene(), 1 / 60, 2)
 
 
-def numbers(sim: pd.Simulator, **changed: Any) -> dict[str, Any]:
-    return {**sim.numbers(inertial=False, report=False), "iterations": 2, **changed}
+def settings(sim: pd.Simulator, **changed: Any) -> dict[str, Any]:
+    return {**sim.step_settings(inertial=False, report=False), "iterations": 2, **changed}
 
 
 def call_step(sim: pd.Simulator, **changed: Any) -> Any:
@@ -38,5 +38,5 @@ def call_step(sim: pd.Simulator, **changed: Any) -> Any:
         "positions": state.positions, "velocities": state.velocities, "forces": None, "start": None,
         "material": sim.material(), "plan": list(sim.plan.arrays),
     }  # fmt: skip
-    keywords = numbers(sim, **{k: v for k, v in changed.items() if k not in tensors})
+    keywords = settings(sim, **{k: v for k, v in changed.items() if k not in tensors})
     return ops.step(*(changed.get(name, tensor) for name, tensor in tensors.items()), **keywords)

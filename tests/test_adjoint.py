@@ -196,7 +196,7 @@ def test_the_adjoint_of_a_rollout_is_that_of_its_steps(batch: int, own: bool) ->
     arrays, plan = [array.detach() for array in sim.material()], list(sim.plan.arrays)
     if own:
         arrays = [array.expand(batch, *array.shape).clone() for array in arrays]
-    after, speeds, _ = torch.ops.torchpd.rollout(x, v, None, arrays, plan, steps=2, every=1, **sim.numbers(
+    after, speeds, _ = torch.ops.torchpd.rollout(x, v, None, arrays, plan, steps=2, every=1, **sim.step_settings(
         inertial=False, report=False
     ))  # fmt: skip
     h = {"time_step": sim.time_step}

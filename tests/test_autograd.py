@@ -146,7 +146,7 @@ def test_material_in_any_layout_is_material() -> None:
 def test_what_has_no_derivative_says_so() -> None:
     sim, state = body(pd.Ground(-10.0))
     start = state.positions.clone().requires_grad_()
-    settings = sim.numbers(inertial=False, report=False)
+    settings = sim.step_settings(inertial=False, report=False)
     positions, *_ = torch.ops.torchpd.step(*state, None, start, sim.material(), list(sim.plan.arrays), **settings)
     with pytest.raises(RuntimeError, match="first iterate"):
         positions.sum().backward()

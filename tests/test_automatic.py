@@ -60,7 +60,7 @@ def test_stiff_steps_get_multilevel_and_reach_the_aim(youngs: float, kind: type)
 def test_the_relaxation_fits_the_spectrum() -> None:
     """Where inertia is nearly all, 1.9 of it overshoots: two iterations of the right relaxation do as well as 28."""
     soft = beam(30.0, cells=2)
-    theta = soft.solver.numbers()["relaxation"]
+    theta = soft.solver.settings()["relaxation"]
     assert isinstance(soft.solver, pd.Chebyshev)
     assert 1.0 < theta < 1.2
     assert beam(1e5, iterations=1000).solver == pd.Chebyshev()

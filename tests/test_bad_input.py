@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from devices import missing_gpu
-from small_scene import call_step, numbers, scene, small_simulator
+from small_scene import call_step, scene, settings, small_simulator
 from torch import Tensor
 
 import torchpd as pd
@@ -125,7 +125,7 @@ def test_numbers_are_checked(name: str, sim: pd.Simulator) -> None:
 @pytest.mark.parametrize("solver", [pd.Jacobi(), pd.Chebyshev(), pd.Chebyshev("classic", rho=0.9), pd.Multilevel()])
 def test_a_simulator_gives_every_setting(solver: Solver) -> None:
     """In the types of the schemas, which follow from the table."""
-    given = pd.Simulator(scene(), 1 / 60, 2, solver).numbers(inertial=False, report=True)
+    given = pd.Simulator(scene(), 1 / 60, 2, solver).step_settings(inertial=False, report=True)
     assert {name: type(value).__name__ for name, value in given.items()} == {
         row.name: row.type for row in SETTINGS_TABLE
     }
@@ -138,7 +138,7 @@ def test_a_simulator_gives_every_setting(solver: Solver) -> None:
 def test_steps_of_a_rollout_are_checked(steps: int, every: int, sim: pd.Simulator) -> None:
     state = sim.rest_state()
     with pytest.raises(ValueError, match=r"steps must be 0\.\.1e9 and every 1\.\.1e9, got"):
-        ops.rollout(*state, None, sim.material(), list(sim.plan.arrays), **numbers(sim), steps=steps, every=every)
+        ops.rollout(*state, None, sim.material(), list(sim.plan.arrays), **settings(sim), steps=steps, every=every)
 
 
 def test_material_is_checked(sim: pd.Simulator) -> None:
@@ -240,10 +240,10 @@ def test_step_in_place_checks_what_it_writes(sim: pd.Simulator) -> None:
     info = torch.empty(2, 7, dtype=torch.float64)
     for bad in (info[:1], info.float(), info[:, :5], info.T.contiguous().T):
         with pytest.raises(ValueError, match=r"info must be a contiguous float64 \[2, 7\], got"):
-            ops.step_(x, v, bad, *rest, **numbers(sim))
+            ops.step_(x, v, bad, *rest, **settings(sim))
     for state in ((x.mT.contiguous().mT, v), (x, v.mT.contiguous().mT)):
         with pytest.raises(ValueError, match="step_: positions and velocities must be contiguous"):
-            ops.step_(*state, info, *rest, **numbers(sim))
+            ops.step_(*state, info, *rest, **settings(sim))
 
 
 def test_rotations_are_checked() -> None:

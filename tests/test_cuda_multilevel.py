@@ -294,7 +294,7 @@ def test_solvers_can_be_exchanged() -> None:
         block.solver = pd.Multilevel()
     assert block.solver == pd.Chebyshev()
     levels = sim_with_levels.plan.arrays[-len(MULTILEVEL_TABLE) :]
-    numbers = {**block.numbers(inertial=False, report=False), **pd.Multilevel().numbers()}
+    numbers = {**block.step_settings(inertial=False, report=False), **pd.Multilevel().settings()}
     with pytest.raises(ValueError, match="plan must be one for kernel 3"):
         torch.ops.torchpd.step(*start, None, None, block.material(), [*block.plan.arrays, *levels], **numbers)
 

@@ -33,9 +33,9 @@ from runs import (
     material_with,
     moving,
     noise,
-    numbers_of,
     plan_of,
     same_bits,
+    settings_of,
     simulate,
     simulator,
     small,
@@ -292,7 +292,7 @@ def test_plan_and_state_must_be_together() -> None:
         plain(state)
     with pytest.raises(TypeError, match=r"state must be torch.float32 on cuda:0"):
         sim(there)
-    numbers = numbers_of(sim)
+    numbers = settings_of(sim)
     with pytest.raises((ValueError, TypeError), match="plan"):
         ops.step(*state, None, None, sim.material(), plan_of(plain), **numbers)
     with pytest.raises((ValueError, TypeError), match="plan"):

@@ -98,7 +98,7 @@ def test_auto_is_held_to_ten_times_what_it_aims_for() -> None:
 def test_shorter_steps_overshoot_with_the_relaxation_of_auto() -> None:
     """Where inertia is all, an iteration multiplies the error by 1 - theta."""
     sim = beam(solver="auto")
-    left = (sim.solver.numbers()["relaxation"] - 1.0) ** sim.iterations
+    left = (sim.solver.settings()["relaxation"] - 1.0) ** sim.iterations
     assert left > 1e-2
     (message,) = said(lambda: setattr(sim, "time_step", 1e-6))
     assert f"an error of about {left:.1g} of a step" in message

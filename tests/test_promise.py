@@ -230,7 +230,7 @@ def test_a_result_is_for_its_material(change: Callable[[pd.Simulator], None]) ->
 def test_what_is_no_info_is_named(tuned: tuple[pd.Simulator, TuningResult]) -> None:
     sim, result = tuned
     for ask in (result.is_valid, result.estimate):
-        with pytest.raises(TypeError, match="info must be an Info, .* got tuple"):
+        with pytest.raises(TypeError, match=r"info must be an Info, .* got tuple"):
             ask(sim(sim.rest_state(), return_info=True))  # type: ignore[arg-type]
 
 
@@ -244,6 +244,8 @@ def test_former_names_work_and_warn(tuned: tuple[pd.Simulator, TuningResult]) ->
         assert [warning.filename for warning in caught] == [__file__]
     with pytest.warns(DeprecationWarning, match=r"^Simulator\.promise is now called tuning_result: "):
         assert sim.promise is sim.tuning_result
+    with pytest.warns(DeprecationWarning, match=r"^Model\.numbers is now called step_settings: "):
+        assert sim.numbers(inertial=False, report=False) == sim.step_settings(inertial=False, report=False)
     with pytest.warns(DeprecationWarning, match="tuning_result"):
         sim.promise = None
     assert sim.tuning_result is None

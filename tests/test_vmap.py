@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 import torch
-from runs import ULP, material_with, noise, numbers_of, plan_of, small
+from runs import ULP, material_with, noise, plan_of, settings_of, small
 from torch import Tensor
 
 import torchpd as pd
@@ -27,7 +27,7 @@ def test_vmap_over_states_forces_and_material(batch: int, dtype: torch.dtype, de
     velocities = factor[:, None, None, None] * state.velocities
     forces = noise(velocities)
     stiffness = factor[:, None] * sim.stiffness
-    numbers, material, plan = numbers_of(sim), sim.material(), plan_of(sim)
+    numbers, material, plan = settings_of(sim), sim.material(), plan_of(sim)
 
     def step(v: Tensor, f: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return cast(
@@ -59,7 +59,7 @@ def test_vmap_over_another_dimension_and_nested(dtype: torch.dtype, device: torc
 def test_vmap_of_rollout_fields_and_rotations(dtype: torch.dtype, device: torch.device) -> None:
     sim, state = small(dtype, device)
     x = state.positions + 0.01 * noise(torch.empty(4, *state.positions.shape, dtype=dtype, device=device))
-    numbers = {**numbers_of(sim), "steps": 4, "every": 2}
+    numbers = {**settings_of(sim), "steps": 4, "every": 2}
     material, plan, w = sim.material(), plan_of(sim), sim.stiffness.detach()
     d = noise(x, 1)
     own = w * torch.linspace(0.5, 1.5, BATCH, dtype=dtype, device=device)[:, None]  # a stiffness for each environment
@@ -90,7 +90,7 @@ def test_vmap_of_rollout_fields_and_rotations(dtype: torch.dtype, device: torch.
 
 def test_vmap_of_the_multilevel_solver(dtype: torch.dtype) -> None:
     sim, state = small(dtype, solver=pd.Multilevel())
-    plan, material, numbers = plan_of(sim), sim.material(), numbers_of(sim)
+    plan, material, numbers = plan_of(sim), sim.material(), settings_of(sim)
     field = noise(torch.empty(4, *state.positions.shape, dtype=dtype))
     assert torch.equal(
         torch.vmap(lambda f: ops.precondition(f, plan))(field), torch.stack([ops.precondition(f, plan) for f in field])
@@ -121,7 +121,7 @@ def test_one_map_is_refused_as_it_is_alone(device: torch.device) -> None:
     sim, state = small(torch.float64, device, solver=pd.Multilevel())
     x, v = state
     plan, material, w = plan_of(sim), sim.material(), sim.stiffness
-    numbers = numbers_of(sim)
+    numbers = settings_of(sim)
     maps = torch.ones(3, 1, 1, 1, dtype=x.dtype, device=device)
     cases: list[tuple[Callable[..., Any], tuple[Tensor, ...]]] = [
         (lambda a, b: sim((a, b)), (x, v)),
@@ -175,7 +175,7 @@ def test_vmap_of_the_adjoint_of_a_step(batch: int, dtype: torch.dtype, device: t
     maps, plan, shared = 3, plan_of(sim), [array.detach() for array in sim.material()]
     factor = torch.linspace(0.5, 2.0, maps, dtype=dtype, device=device)
     w = shared[0]
-    after = ops.step(x, v, None, None, shared, plan, **numbers_of(sim, iterations=64))[0]
+    after = ops.step(x, v, None, None, shared, plan, **settings_of(sim, iterations=64))[0]
     grads = noise(torch.empty(maps, *x.shape, dtype=dtype, device=device))
     of_each = [array.expand(batch, *array.shape).clone() for array in shared]
 
@@ -205,7 +205,7 @@ def test_vmap_of_the_adjoint_of_a_rollout(batch: int, dtype: torch.dtype, device
     """Any argument mapped. What environments share adds up over the steps first there, which rounds differently."""
     sim, (x, v) = small(dtype, device, batch)
     plan, shared = plan_of(sim), [array.detach() for array in sim.material()]
-    after, speeds, _ = ops.rollout(x, v, None, shared, plan, **numbers_of(sim, iterations=64), steps=2, every=1)
+    after, speeds, _ = ops.rollout(x, v, None, shared, plan, **settings_of(sim, iterations=64), steps=2, every=1)
     grads = noise(torch.empty(3, *after.shape, dtype=dtype, device=device))
     factor = torch.linspace(0.5, 2.0, 3, dtype=dtype, device=device)[:, None]
 
@@ -248,7 +248,7 @@ def test_vmap_of_the_adjoint_of_a_rollout(batch: int, dtype: torch.dtype, device
 def test_batched_gradients_of_every_op(dtype: torch.dtype, device: torch.device) -> None:
     """`is_grads_batched`, which is an older vmap, is a loop over the gradients."""
     sim, (x, v) = small(dtype, device)
-    plan, numbers = plan_of(sim), numbers_of(sim, iterations=256)
+    plan, numbers = plan_of(sim), settings_of(sim, iterations=256)
     levels = plan_of(small(dtype, device, solver=pd.Multilevel())[0])
     w, d = sim.stiffness.detach(), noise(x, 1)
     own = w * torch.linspace(0.5, 1.5, BATCH, dtype=dtype, device=device)[:, None]
@@ -309,7 +309,7 @@ def test_the_older_vmap_is_not_nested() -> None:
 def test_vectorized_jacobians_and_hessians(device: torch.device) -> None:
     """Of a step for forces and stiffness, and of an energy, the loop's."""
     sim, state = small(torch.float64, device)
-    x, rest, numbers = state.positions, sim.material()[1:], numbers_of(sim, iterations=64)
+    x, rest, numbers = state.positions, sim.material()[1:], settings_of(sim, iterations=64)
 
     def step(forces: Tensor, stiffness: Tensor) -> Tensor:
         material = [stiffness, *rest]

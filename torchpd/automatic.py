@@ -207,7 +207,7 @@ def _relaxation(spectrum: Spectrum | None) -> float | None:
     if spectrum is None:
         return None
     best = 2.0 / (1.0 + spectrum.least)
-    return best if best < Chebyshev().numbers()["relaxation"] else None
+    return best if best < Chebyshev().settings()["relaxation"] else None
 
 
 def runs(solver: Solver, compiled: CompiledScene) -> bool:

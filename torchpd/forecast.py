@@ -103,7 +103,7 @@ def spectrum_of(compiled: CompiledScene) -> Spectrum | None:
     mean = torch.nan_to_num(next(sums) / next(sums), nan=1.0)
     least = float(ratio.min())
     # the guarded schedule takes no more momentum than this ratio asks for, so only below it does a flat element matter
-    floor = (1.0 - _LARGEST_RHO) / Chebyshev().numbers()["relaxation"]
+    floor = (1.0 - _LARGEST_RHO) / Chebyshev().settings()["relaxation"]
     slow = float(torch.maximum(ratio.amin(1), mean.clamp(max=floor)).min())
     valid = math.isfinite(least) and 0.0 < least <= slow <= 1.0
     return Spectrum(least, slow) if valid else None
@@ -136,7 +136,7 @@ def forecast(
     """
     solver = compiled.solver if solver is None else solver
     spectrum = spectrum_of(compiled) if spectrum is None else spectrum
-    numbers = solver.numbers()
+    numbers = solver.settings()
     if spectrum is None or not numbers["weighted"]:
         return None
     if isinstance(solver, Multilevel) and not has_contacts(compiled):

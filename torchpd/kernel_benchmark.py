@@ -27,7 +27,7 @@ def steps_of(
     """`key` and `step` of `quickest_plan` for a scene on a GPU: what times depend on, and steps from rest."""
     values, batch = scene.scene.values(), scene.environments
     numbers = {
-        **scene.solver.numbers(),
+        **scene.solver.settings(),
         "iterations": scene.iterations,
         "time_step": scene.time_step,
         "tolerance": 0.0,

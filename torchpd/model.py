@@ -52,7 +52,7 @@ from .settings import (
 )
 from .solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Solver, SolverName, check_solver
 from .state import State
-from .synonyms import check_arguments
+from .synonyms import Renamed, check_arguments
 from .targets import Anchors, Targets
 from .written import MutationGuard, check_rest
 
@@ -401,10 +401,12 @@ class Model(nn.Module):
             self._rest_guard = guard
         return rest
 
-    def numbers(self, *, inertial: bool, report: bool) -> dict[str, Any]:
+    numbers = Renamed("step_settings")
+
+    def step_settings(self, *, inertial: bool, report: bool) -> dict[str, Any]:
         """The settings as keyword arguments of the ops."""
         return {
-            **self.solver.numbers(),
+            **self.solver.settings(),
             "iterations": self.iterations,
             "time_step": self.time_step,
             "tolerance": self.tolerance,

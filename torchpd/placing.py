@@ -192,7 +192,7 @@ def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.de
     levels = plan.level_sizes.numpy() if has_levels(plan.arrays) else np.empty(0, dtype=np.int32)
     planes, spheres, stiffness = (compiled.named[name] for name in ("planes", "spheres", "stiffness"))
     own = stiffness.dim() == 2 and len(stiffness) == batch
-    schedule: int = compiled.solver.numbers()["schedule"]
+    schedule: int = compiled.solver.settings()["schedule"]
     with torch.cuda.device(device):
         return _C.step_bytes(
             real, plan.sizes.numpy(), levels, schedule, batch, planes.shape[-2], spheres.shape[-2], own

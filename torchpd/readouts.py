@@ -222,7 +222,7 @@ def _contacts(call: AdjointCall) -> _Contacts:
 
 
 def _normal_forces(normals: Tensor, force: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
-    """Normal forces [B, M, V], M <= 3, of active contacts that fit the force [B, V, 3] best, and their Gram determinant.
+    """Normal forces [B, M, V], M <= 3, of active contacts that best fit the force [B, V, 3], and the Gram determinant.
 
     N N^T p = N r, with a row of the identity for an inactive contact.
     """

@@ -54,8 +54,8 @@ class Jacobi:
 
     Args:
         relaxation: theta of x - theta D^-1 grad E, in (0, 2).
-        diagonal: "weighted" never raises the energy, on any mesh. "plain" is the diagonal D of the matrix A of projective
-            dynamics, as in the literature. It diverges if D^-1 A has a spectral radius above 2 / theta.
+        diagonal: "weighted" never raises the energy, on any mesh. "plain" is the diagonal D of projective dynamics'
+            matrix A, as in the literature. It diverges if D^-1 A has a spectral radius above 2 / theta.
     """
 
     relaxation: float = 1.0
@@ -65,7 +65,7 @@ class Jacobi:
         _keep_within(self, "relaxation", 2, _DESCENDS)
         _check_choice("Jacobi.diagonal", self.diagonal, ("weighted", "plain"))
 
-    def numbers(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """Keyword arguments of the ops."""
         return {
             **_USUAL,
@@ -121,7 +121,7 @@ class Chebyshev:
                     'Chebyshev.diagonal must be "weighted" when guarded: its descent rests on that diagonal'
                 )
 
-    def numbers(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """Keyword arguments of the ops."""
         guarded = self.schedule == "guarded"
         return {
@@ -171,7 +171,7 @@ class Multilevel:
         if self.relaxation is not None:
             _keep_within(self, "relaxation", 2)
 
-    def numbers(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """Keyword arguments of the ops."""
         usual = 1.9 if self.outer == "momentum" else 1.8
         return {

@@ -24,21 +24,21 @@ _ops = torch.ops.torchpd
 
 
 def _diagonal(sim: Stepper) -> tuple[Tensor, Tensor]:
-    weighted = sim.solver.numbers()["weighted"]
+    weighted = sim.solver.settings()["weighted"]
     return step_diagonal(sim.plan.arrays, sim.material(), sim.time_step, weighted=weighted)
 
 
 def _bound(sim: Stepper) -> float:
-    numbers = sim.solver.numbers()
+    settings = sim.solver.settings()
     inertia, diagonal = _diagonal(sim)
     ratio = torch.where(torch.isinf(inertia), torch.ones_like(inertia), inertia / diagonal)
-    relaxation: float = numbers["relaxation"]
+    relaxation: float = settings["relaxation"]
     return 1.0 - relaxation * float(ratio.min())
 
 
 def _power(sim: Stepper, state: State, iterations: int) -> float:
     """Largest |eigenvalue| of I - theta D^-1 H at the state, H the Hessian of the step's objective."""
-    numbers = sim.solver.numbers()
+    settings = sim.solver.settings()
     inertia, diagonal = (t.unsqueeze(-1) for t in _diagonal(sim))
     free = torch.isfinite(inertia)
     inertia = torch.where(free, inertia, torch.zeros_like(inertia))
@@ -49,7 +49,7 @@ def _power(sim: Stepper, state: State, iterations: int) -> float:
         vector = torch.where(free, vector, torch.zeros_like(vector))
         vector = vector / vector.norm()
         product = inertia * vector + _ops.hessian_product(state[0], vector, material, plan)
-        vector = vector - numbers["relaxation"] * product / diagonal
+        vector = vector - settings["relaxation"] * product / diagonal
         scale = vector.norm()
     return float(scale)
 
@@ -69,15 +69,15 @@ def _residual(sim: Stepper, state: State, solver: Jacobi | Chebyshev, iterations
 
 def _two_stage(sim: Stepper, state: State, iterations: int) -> float:
     """The pre-simulation of the source paper: a ratio of residuals, then trial runs around it."""
-    numbers = sim.solver.numbers()
-    diagonal: Literal["weighted", "plain"] = "weighted" if numbers["weighted"] else "plain"
-    jacobi = Jacobi(relaxation=numbers["relaxation"], diagonal=diagonal)
+    settings = sim.solver.settings()
+    diagonal: Literal["weighted", "plain"] = "weighted" if settings["weighted"] else "plain"
+    jacobi = Jacobi(relaxation=settings["relaxation"], diagonal=diagonal)
     before, after = (_residual(sim, state, jacobi, k) for k in (iterations - 1, iterations))
     first = min(after / before, _LARGEST) if 0.0 < before < math.inf else 0.9
     best = (math.inf, first)
     for halvings in range(-1, 8):
         rho = min(max(1.0 - (1.0 - first) * 0.5**halvings, 0.05), _LARGEST)
-        solver = Chebyshev("classic", rho=rho, relaxation=numbers["relaxation"], diagonal=diagonal)
+        solver = Chebyshev("classic", rho=rho, relaxation=settings["relaxation"], diagonal=diagonal)
         best = min(best, (_residual(sim, state, solver, iterations), rho))
     return best[1]
 

@@ -83,7 +83,7 @@ class Stepper(Readable):
             given,
             material,
             list(self.plan.arrays),
-            **self.numbers(inertial=inertial, report=return_info),
+            **self.step_settings(inertial=inertial, report=return_info),
         )
         after = State(positions, velocities)
         if not return_info:
@@ -130,7 +130,7 @@ class Stepper(Readable):
             given,
             material,
             list(self.plan.arrays),
-            **self.numbers(inertial=inertial, report=info is not None),
+            **self.step_settings(inertial=inertial, report=info is not None),
         )
         if info is not None:
             self._notices.after(self, state[0], info)
@@ -206,7 +206,7 @@ class Stepper(Readable):
             list(self.plan.arrays),
             steps=steps // every * every if thinned else steps,
             every=1 if thinned else every,
-            **self.numbers(inertial=inertial, report=report),
+            **self.step_settings(inertial=inertial, report=report),
         )
         if thinned:
             # copies: a view would keep all states alive, and the adjoint's states must not change with these

@@ -31,18 +31,18 @@ _TURNING_MODES = 24  # of the small problem of Multilevel("corotated"), see csrc
 
 
 def _solver_line(sim: Stepper) -> str:
-    numbers = sim.solver.numbers()
+    settings = sim.solver.settings()
     name = "Jacobi"
     if isinstance(sim.solver, Chebyshev):
         name = f"Chebyshev {sim.solver.schedule}"
     if isinstance(sim.solver, Multilevel):
         name = f"Multilevel {sim.solver.outer}"
     stop = f"at most {sim.iterations}" if sim.tolerance else f"{sim.iterations}"
-    rho = f", rho {numbers['rho']:g}" if numbers["rho"] else ""
-    diagonal = "weighted" if numbers["weighted"] else "plain"
+    rho = f", rho {settings['rho']:g}" if settings["rho"] else ""
+    diagonal = "weighted" if settings["weighted"] else "plain"
     tolerance = f", tolerance {sim.tolerance:g}" if sim.tolerance else ""
     return (
-        f"solver: {name}: {stop} iterations, relaxation {numbers['relaxation']:g}, {diagonal} diagonal{rho}{tolerance}"
+        f"solver: {name}: {stop} iterations, relaxation {settings['relaxation']:g}, {diagonal} diagonal{rho}{tolerance}"
     )
 
 
