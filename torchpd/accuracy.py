@@ -1,13 +1,13 @@
-"""How wrong a step is: the converged step in float64, and the distance of any other answer from it.
+"""Errors of a step, relative to its converged solution in float64.
 
-Errors are relative, so that 1 is where all would fly to, u_0 = h v on the pins and out of the contacts, and 0 the
-converged step:
+Errors are 1 at the unsolved step u_0, which is h v with hard pins at their targets and out of contacts. They are 0 at
+the converged step u*:
 
     position   |u - u*| / |u_0 - u*|                over all vertices, u = x_{t+1} - x_t
     energy     (E(u) - E(u*)) / (E(u_0) - E(u*))    of the objective of the step
-    residual   what is not balanced of the forces, relative to them: `StepProblem.relative_residual`, `Info.residual`
+    residual   share of the forces that is not balanced: `StepProblem.relative_residual`, `Info.residual`
 
-The converged step of `exact_steps` has no friction, which has no energy to go down; `settled_steps` has it.
+`exact_steps` solves without friction, which has no energy to minimise; `settled_steps` has friction.
 """
 
 from __future__ import annotations
@@ -48,23 +48,23 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-# Solvers of exact steps, with iterations between two looks at the residual. The first is the best by far without
-# contacts; with them each knows scenes on which the others creep.
+# Solvers of exact steps, with iterations between checks of the residual. The first is the best by far without contacts.
+# With contacts, each solves scenes on which the others stagnate.
 _SOLVERS: tuple[tuple[Solver, int], ...] = ((Multilevel(), 50), (Multilevel("momentum"), 100), (Chebyshev(), 500))
-_SOLVED = 1e-13  # residual at which nothing is left to gain
-_NEARLY = 1e-9  # residual that may be as low as rounding lets it
-_PATIENCE = 3  # looks in which no residual halves, one where all are nearly solved
+_SOLVED = 1e-13  # residual at which a solver ends
+_NEARLY = 1e-9  # residual that may be the lowest that rounding allows
+_PATIENCE = 3  # checks without a halved residual before a solver ends; one if all are below _NEARLY
 _SURE = 1e-8  # uncertainty of a converged step that ends the search for a better one
-# and that Newton's method is spared for: what rounding of the precision hides
+# uncertainty, by precision, that rounding hides: no Newton's method is needed
 _FINE = {torch.float32: 1e-8, torch.float64: 1e-14}
-# of steps with friction: iterations of Multilevel, and of Chebyshev one run after another
+# steps with friction: iterations of Multilevel, then of successive runs of Chebyshev
 _LEADING, _SETTLING = 64, (256, 512, 1024, 2048, 4096, 8192)
-# of the positions: what rounding them already moves a body that only falls, and what a stiff one scatters by
+# machine epsilons of positions: rounding error of a body in free fall, and scatter of a stiff one
 ROUNDINGS = 10.0
 
 
 class Errors(NamedTuple):
-    """Of one answer to one step; see the module for the definitions."""
+    """Errors of one solution of one step; see the module for the definitions."""
 
     position: float
     energy: float
@@ -74,12 +74,12 @@ class Errors(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ExactStep:
-    """A step in float64 with its converged answer."""
+    """A step in float64 with its converged solution."""
 
     problem: StepProblem
-    first: Array  # [V, 3] m: u_0, where nothing has been solved
+    first: Array  # [V, 3] m: u_0, the unsolved step
     solution: Array  # [V, 3] m: u*
-    uncertainty: float  # bound on the error of u* itself, relative as the errors are
+    uncertainty: float  # bound on the relative error of u* itself
 
     @property
     def scale(self) -> float:
@@ -87,44 +87,44 @@ class ExactStep:
         return float(np.linalg.norm(self.first - self.solution))
 
     def rounding(self, dtype: torch.dtype, roundings: float = ROUNDINGS) -> float:
-        """`roundings` times eps |x_t| [m]; by default what no number of iterations in `dtype` is sure to get below."""
+        """`roundings` eps |x_t| [m]; by default the error floor of any number of iterations in `dtype`."""
         return roundings * torch.finfo(dtype).eps * float(np.linalg.norm(self.problem.positions))
 
     def moves(self, dtype: torch.dtype) -> bool:
-        """Whether solving this step changes more than rounding does, from where bodies move as rigid ones."""
-        way = min(self.scale, float(np.linalg.norm(self.problem.first_iterate() - self.solution)))
-        return way > self.rounding(dtype)
+        """Whether solving this step changes more than rounding does, compared with rigid motions."""
+        change = min(self.scale, float(np.linalg.norm(self.problem.first_iterate() - self.solution)))
+        return change > self.rounding(dtype)
 
     def error_beyond_rounding(self, displacement: Array, dtype: torch.dtype, roundings: float = ROUNDINGS) -> float:
         """The least e >= 0 with |u - u*| <= e |u_0 - u*| + `rounding`."""
         return max(self.position_error(displacement) - self.rounding(dtype, roundings) / self.scale, 0.0)
 
     def position_error(self, displacement: Array) -> float:
-        """|u - u*| / |u_0 - u*| of u [V, 3] m, which costs far less than all `Errors`; inf without numbers."""
+        """|u - u*| / |u_0 - u*| of u [V, 3] m, far cheaper than all `Errors`; inf for NaN."""
         with np.errstate(all="ignore"):
             error = float(np.linalg.norm(displacement - self.solution)) / self.scale
         return error if np.isfinite(error) else np.inf
 
     def errors_of(self, displacement: Array) -> Errors:
-        """The errors of u [V, 3] m; inf where it left the range of numbers."""
+        """The errors of u [V, 3] m; inf if it is not finite."""
         if not np.isfinite(displacement).all():
             return Errors(np.inf, np.inf, np.inf, np.inf)
         problem = self.problem
-        off = displacement - self.solution
+        error = displacement - self.solution
         with np.errstate(all="ignore"):
             energies = [problem.energy(u) for u in (displacement, self.first, self.solution)]
-            lift = energies[1] - energies[2]
+            gain = energies[1] - energies[2]
             found = Errors(
                 self.position_error(displacement),
-                (energies[0] - energies[2]) / lift if lift > 0.0 else 0.0,
+                (energies[0] - energies[2]) / gain if gain > 0.0 else 0.0,
                 problem.relative_residual(displacement),
-                float(np.linalg.norm(off, axis=1).max()),
+                float(np.linalg.norm(error, axis=1).max()),
             )
         return Errors(*(value if np.isfinite(value) else np.inf for value in found))
 
 
 def scene_without_friction(scene: Scene) -> Scene:
-    """The same parts, planes and spheres smooth."""
+    """The same parts, with frictionless planes and spheres."""
     parts: list[Part] = []
     for part in scene.parts:
         if isinstance(part, Ground):
@@ -137,7 +137,7 @@ def scene_without_friction(scene: Scene) -> Scene:
 
 
 def frictionless(sim: Stepper, dtype: torch.dtype | None = None) -> Stepper:
-    """A copy of the simulator with its present material, smooth contacts, and no stop before the last iteration."""
+    """A copy of the simulator with its present material, frictionless contacts and no tolerance."""
     with torch.inference_mode(False), torch.no_grad():
         twin = plain_copy(sim)
         if dtype is not None:
@@ -152,7 +152,7 @@ def frictionless(sim: Stepper, dtype: torch.dtype | None = None) -> Stepper:
 def problem_of(
     sim: Stepper, state: State, item: int = 0, *, forces: Tensor | None = None, targets: Targets | None = None
 ) -> StepProblem:
-    """The step of one environment in the reference, with the simulator's present material and without friction."""
+    """One environment's step in the reference, with the simulator's present material and without friction."""
     arrays = sim.material_at(targets, state[0].shape[0])
     forces = expand_shared(forces, state[0].shape)
     material = {}
@@ -207,22 +207,24 @@ def exact_steps(
     start: str = "velocity",
     iterations: int = 5000,
 ) -> list[ExactStep]:
-    """The converged step of every environment, from the state and material that `sim` holds, rounded as they are.
+    """The converged frictionless step of every environment, for the state and material as rounded in `sim`.
 
-    `Multilevel` in float64 on the CPU until the residual stops falling, then Newton's method where it leaves a doubt,
-    contacts or not; if that does not help, other solvers go on from the best so far. `ExactStep.uncertainty` bounds
-    what is left: |grad E| / min m/h^2 >= |u - u*| where the elements are stable, or twice the next step of Newton's
-    method, which stiff bodies have far shorter. It may be large: then there is no converged step to compare with.
+    `Multilevel` runs in float64 on the CPU until the residual stops falling. Newton's method follows if the result is
+    uncertain, with contacts or without. Other solvers then continue from the best result so far.
+
+    `ExactStep.uncertainty` bounds the remaining error: |grad E| / min m/h^2 >= |u - u*| where the elements are stable,
+    or twice the next step of Newton's method, which is far shorter for stiff bodies. If it is large, there is no
+    converged step to compare with.
 
     Args:
-        sim: scene, time step and material; its solver and device do not matter, float32 is content with less certainty.
-        state: where the steps start, [B, V, 3].
+        sim: scene, time step and material; its solver and device do not matter. float32 needs less certainty.
+        state: start of the steps [B, V, 3].
         forces: [B, V, 3] N.
         targets: of pins and spheres, as in `Simulator.forward`.
-        start: of the u_0 that errors are relative to: "velocity", h v, or the "inertial" first iterate.
-        iterations: of each solver, at most.
+        start: u_0 of the errors: "velocity", h v, or the "inertial" first iterate.
+        iterations: most of each solver.
     """
-    # whatever torch's default device
+    # independent of torch's default device
     with torch.device("cpu"):
         search = _Search(sim, state, forces, targets, start)
         for solver, chunk in _SOLVERS:
@@ -237,15 +239,15 @@ def exact_steps(
 def settled_steps(
     sim: Stepper, state: State, *, forces: Tensor | None = None, enough: float = _SURE
 ) -> list[ExactStep]:
-    """The step of every environment with its friction, where iterations from "velocity" come to rest.
+    """The step of every environment with its friction, if iterations from "velocity" settle.
 
-    There is no energy that Newton's method could go down, so `Multilevel` in float64 on the CPU is followed by longer
-    and longer runs of Chebyshev, and `ExactStep.uncertainty` is what the last two of them have still moved. It stays
-    large where they go round in circles, as between sticking and slipping. `ExactStep.errors_of` knows no friction.
+    There is no energy for Newton's method to minimise. So `Multilevel` in float64 on the CPU is followed by longer and
+    longer runs of Chebyshev. `ExactStep.uncertainty` is the change by the last two runs. It stays large if the
+    iterations cycle, for example between sticking and slipping. `ExactStep.errors_of` ignores friction.
 
     Args:
         sim: scene, time step and material; its solver and device do not matter.
-        state: where the steps start, [B, V, 3].
+        state: start of the steps [B, V, 3].
         forces: [B, V, 3] N.
         enough: uncertainty at which to stop.
     """
@@ -264,7 +266,7 @@ def settled_steps(
         after, moves = run(Multilevel(), _LEADING), [torch.inf * torch.ones(len(first), dtype=torch.float64)]
         for iterations in _SETTLING:
             before, after = after, run(Chebyshev(), iterations, after.positions)
-            # not the difference of positions, which has lost digits
+            # from velocities, because a difference of positions loses digits
             moves.append((after.velocities - before.velocities).flatten(1).norm(dim=1) * twin.time_step)
             scale = (first - after.velocities * twin.time_step).flatten(1).norm(dim=1)
             rounding = ROUNDINGS * torch.finfo(torch.float64).eps * wide.positions.flatten(1).norm(dim=1)
@@ -280,10 +282,10 @@ def settled_steps(
 
 
 class _Search:
-    """Looks for the converged steps of a batch; keeps the best of each environment."""
+    """Search for the converged steps of a batch; keeps the best result of each environment."""
 
     def __init__(self, sim: Stepper, state: State, forces: Tensor | None, targets: Targets | None, start: str) -> None:
-        # the CPU has all solvers, whatever kernel a GPU was asked for
+        # the CPU runs all solvers; a GPU's kernel may not
         self.twin = frictionless(sim)
         self.twin.solver = Chebyshev()
         self.twin = self.twin.to("cpu", torch.float64)
@@ -301,16 +303,16 @@ class _Search:
 
     @property
     def sure(self) -> bool:
-        """Whether every step is known well enough."""
+        """Whether the uncertainty of every step is small enough."""
         return all(step is not None and step.uncertainty <= _SURE for step in self.found)
 
     def iterate(self, solver: Solver, chunk: int, most: int) -> None:
-        """Go on from the best with a solver until no residual falls any more."""
+        """Continue from the best result with a solver until no residual falls any more."""
         self.twin.solver, self.twin.iterations = solver, chunk
         guess, idle = self.state.positions + self.best, 0
         for _ in range(0, most, chunk):
             after, info = self.twin(self.state, self.forces, self.targets, guess, return_info=True)
-            # not the difference of positions, which has lost digits
+            # from velocities, because a difference of positions loses digits
             reached = after.velocities * self.twin.time_step
             better = info.residual < self.lowest
             halved = bool((info.residual < 0.5 * self.lowest).any())
@@ -323,35 +325,36 @@ class _Search:
             guess = after.positions
 
     def polish(self, fine: float) -> None:
-        """Judge the best of every environment that is not yet known, by Newton's method where the residual does not."""
+        """Bound the error of uncertain environments, by Newton's method where the residual does not suffice."""
         for item, (problem, first) in enumerate(zip(self.problems, self.firsts, strict=True)):
             known = self.found[item]
             if known is not None and known.uncertainty <= _SURE:
                 continue
-            step = _judged(problem, first, self.best[item].numpy(), fine)
+            step = _certified(problem, first, self.best[item].numpy(), fine)
             if known is None or step.uncertainty < known.uncertainty:
                 self.found[item] = step
                 self.best[item] = torch.from_numpy(step.solution)
 
 
-def _judged(problem: StepProblem, first: Array, near: Array, fine: float) -> ExactStep:
-    """The solution next to an almost converged displacement, and how certain it is."""
-    step = ExactStep(problem, first, near, _doubt(problem, first, near))
+def _certified(problem: StepProblem, first: Array, near: Array, fine: float) -> ExactStep:
+    """The solution next to an almost converged displacement, with its uncertainty."""
+    step = ExactStep(problem, first, near, _uncertainty(problem, first, near))
     if step.uncertainty <= fine:
         return step
     newton = ContactNewton(problem)
     solution = newton.minimise(near)
-    way, own = newton.step(solution)
-    doubt = min(_doubt(problem, first, solution), _share(2.0 * way, first - solution) if own else np.inf)
-    return min(step, ExactStep(problem, first, solution, doubt), key=lambda found: found.uncertainty)
+    direction, stable = newton.step(solution)
+    bound = _relative_norm(2.0 * direction, first - solution) if stable else np.inf
+    bound = min(_uncertainty(problem, first, solution), bound)
+    return min(step, ExactStep(problem, first, solution, bound), key=lambda found: found.uncertainty)
 
 
-def _doubt(problem: StepProblem, first: Array, displacement: Array) -> float:
+def _uncertainty(problem: StepProblem, first: Array, displacement: Array) -> float:
     """|grad E| / min m/h^2 over |u_0 - u|."""
     weakest = float(problem.weight[problem.free].min(initial=np.inf))
-    return _share(problem.residual(displacement) / weakest, first - displacement)
+    return _relative_norm(problem.residual(displacement) / weakest, first - displacement)
 
 
-def _share(way: Array, whole: Array) -> float:
+def _relative_norm(part: Array, whole: Array) -> float:
     size = float(np.linalg.norm(whole))
-    return float(np.linalg.norm(way)) / size if size > 0.0 else 0.0
+    return float(np.linalg.norm(part)) / size if size > 0.0 else 0.0

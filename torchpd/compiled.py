@@ -1,4 +1,4 @@
-"""A scene with all that a step of it has: what modules below the simulator read."""
+"""A compiled scene with everything that a step needs, for modules below the simulator."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ __all__ = ["CompiledScene", "persistent_tensors"]
 
 @contextmanager
 def persistent_tensors() -> Iterator[None]:
-    """For tensors that are kept: those that are made in inference mode can never be changed or differentiated.
+    """Context for tensors that are kept: those made in inference mode could never be changed or differentiated.
 
-    Those that name no device are for the CPU, whatever torch's default device.
+    New tensors without a device go to the CPU, whatever torch's default device.
     """
     with torch.inference_mode(False), torch.no_grad(), torch.device("cpu"):
         yield
@@ -34,11 +34,11 @@ def persistent_tensors() -> Iterator[None]:
 class CompiledScene:
     """Plan, material and settings of a scene at one time; `Simulator` documents the settings.
 
-    A value: other settings make another one, with `dataclasses.replace` or `reconfigure`.
+    A value: other settings make another one, by `dataclasses.replace` or `reconfigure`.
     """
 
     scene: Scene
-    pinned: PinnedPieces  # where pins hold the pieces of the scene
+    pinned: PinnedPieces  # pinned points of the scene's components
     plan: Plan
     material: list[Tensor]  # in the order of the ops, with inf for springs of hard pins
     time_step: float  # h [s]
@@ -52,7 +52,7 @@ class CompiledScene:
 
     @property
     def vertices(self) -> int:
-        """Vertices of all bodies."""
+        """Number of vertices of all bodies."""
         return self.plan.vertices
 
     @property
@@ -62,7 +62,7 @@ class CompiledScene:
 
     @property
     def device(self) -> torch.device:
-        """Where states are."""
+        """Device of states."""
         return self.plan.device
 
     @cached_property
@@ -72,5 +72,5 @@ class CompiledScene:
 
     @property
     def environments(self) -> int:
-        """Environments of a step: those that were announced, or those of the material."""
+        """Environments of a step: the announced batch, or those of the material."""
         return self.batch or environments_of_material(self.named)

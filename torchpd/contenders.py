@@ -1,4 +1,4 @@
-"""The compiled solvers that studies compare and that `Simulator.tune` chooses from: a further one is one more entry."""
+"""Candidate solvers of studies and of `Simulator.tune`; add an entry for a new solver."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ __all__ = ["CANDIDATES", "DEFAULT", "DEFAULT_ITERATIONS", "Candidate", "safe_can
 
 @dataclass(frozen=True)
 class Candidate:
-    """A solver by the name that figures give it.
+    """A solver by its name in figures.
 
-    `make(sim, state)` may run trials from the state; `safe` ones cannot diverge, on any mesh and at any stiffness.
+    `make(sim, state)` may run trials from the state. `safe` solvers cannot diverge, on any mesh and at any stiffness.
     """
 
     make: Callable[[Stepper, State], Solver]
@@ -30,7 +30,7 @@ class Candidate:
 
 
 def _classic(sim: Stepper, state: State) -> Solver:
-    """The schedule of the papers, with the two-stage estimate of rho that goes with it."""
+    """The schedule of the papers, with their two-stage estimate of rho."""
     own = sim.solver
     sim.solver = Jacobi(diagonal="plain")
     try:
@@ -46,11 +46,11 @@ CANDIDATES: dict[str, Candidate] = {
     "guarded Chebyshev": Candidate(lambda sim, state: Chebyshev(), safe=True),
     "Multilevel": Candidate(lambda sim, state: Multilevel(), safe=True),
 }
-DEFAULT = "guarded Chebyshev"  # what `Simulator(scene)` does
+DEFAULT = "guarded Chebyshev"  # the solver of `Simulator(scene)`
 
 
 def safe_candidates(sim: Stepper, state: State) -> dict[str, Solver]:
-    """Those that cannot diverge and run where the simulator is, the default first."""
+    """Solvers that cannot diverge and run on the simulator's device, the default first."""
     here = {name: c for name, c in CANDIDATES.items() if c.safe and sim.device.type in c.devices}
     made = {name: here[name].make(sim, state) for name in sorted(here, key=lambda name: name != DEFAULT)}
     return {name: solver for name, solver in made.items() if runs(solver, sim.compiled)}

@@ -1,4 +1,4 @@
-"""Where the error of a step is measured from: h v, with pins where they are to be, and out of contacts."""
+"""The unsolved step, relative to which errors are measured: h v, with hard pins at their targets, out of contacts."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ __all__ = ["unsolved_step"]
 
 @torch.no_grad()
 def unsolved_step(plan: Plan, arrays: Sequence[Tensor], time_step: float, state: State) -> Tensor:
-    """Displacements [B, V, 3] [m] of a step in which nothing is solved: x_0 - x of `TuningResult`, without friction.
+    """Displacements [B, V, 3] [m] of a step without solving: x_0 - x of `TuningResult`, without friction.
 
-    As `torchpd.reference.StepProblem.course`. The iterations of a step start from where rigid motions lead from there.
+    The same as `torchpd.reference.StepProblem.course`. The iterations of a step start from its rigid motions.
 
     Args:
         plan: of the scene.
-        arrays: the material of the step, with its targets, see `Simulator.material_at`.
+        arrays: material of the step, with its targets, see `Simulator.material_at`.
         time_step: h [s].
-        state: where the step starts.
+        state: start of the step.
     """
     x, moved = state[0], time_step * state[1]
     material = named_material(arrays)
@@ -39,17 +39,17 @@ def unsolved_step(plan: Plan, arrays: Sequence[Tensor], time_step: float, state:
     places = headed
     for row in material["planes"].unbind(-2):
         normals = row[..., None, PLANES["normal"]]
-        places = _out_of(places, normals, (places * normals).sum(-1) - row[..., PLANES["height"], None])
+        places = _pushed_out(places, normals, (places * normals).sum(-1) - row[..., PLANES["height"], None])
     for row in material["spheres"].unbind(-2):
-        # by the normal at where the vertices were headed
+        # with the normal at the vertex before any contact
         centers = row[..., None, SPHERES["center"]]
         arms = headed - centers
         lengths = arms.norm(dim=-1, keepdim=True)
         normals = torch.where(lengths > 0.0, arms / lengths, torch.eye(3, dtype=x.dtype, device=x.device)[1])
         gaps = ((places - centers) * normals).sum(-1) - row[..., SPHERES["radius"], None]
-        places = _out_of(places, normals, gaps)
+        places = _pushed_out(places, normals, gaps)
     return torch.where(free, moved + (places - headed), moved)
 
 
-def _out_of(places: Tensor, normals: Tensor, gaps: Tensor) -> Tensor:
+def _pushed_out(places: Tensor, normals: Tensor, gaps: Tensor) -> Tensor:
     return places + (-gaps).clamp(min=0.0)[..., None] * normals

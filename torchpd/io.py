@@ -1,8 +1,7 @@
-"""Simulations as files: one safetensors file, whose metadata says in JSON what the tensors mean. Nothing is executed.
+"""Simulations as one safetensors file, whose JSON metadata describes the tensors. Nothing in it is executed.
 
-The scene comes back as it was described, with the material of the simulator beside it, so that a loaded simulation
-takes the same steps bit for bit. Tensors are named after their part: `part.0.youngs`, `mesh.0.tets`,
-`material.stiffness`.
+The file holds the scene as described, and the material of the simulator, so a loaded simulation takes the same steps
+bit for bit. Tensors are named after their part: `part.0.youngs`, `mesh.0.tets`, `material.stiffness`.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ from .version import __version__
 __all__ = ["FORMAT_VERSION", "SavedSimulation", "load_simulation", "reading", "save_simulation"]
 
 FORMAT_VERSION = 2
-# of format 1, whose hard pins have inf for stiffness
+# arrays of format 1, in which hard pins have stiffness inf
 _FIRST_ARRAYS = (
     "stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets", "planes", "spheres",
 )  # fmt: skip
-_KEY = "torchpd"  # of the metadata, beside which others may write theirs
+_KEY = "torchpd"  # of the metadata; others may add their own keys
 _KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in (Solid, Pin, Gravity, Ground, Sphere, Damping)}
 _SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel)}
-# what a preconditioner was made of: together with the mesh it decides its bits
+# inputs of a preconditioner, which with the mesh determine its bits
 _REFERENCE = ("stiffness", "inertia")
 _DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in (torch.float32, torch.float64)}
 
@@ -52,23 +51,23 @@ Record = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SavedSimulation:
-    """A simulation as values: what a file holds, and what `Simulator` is made of."""
+    """A simulation as values: the content of a file, and the inputs of `Simulator`."""
 
     scene: Scene
     settings: dict[str, Any]  # arguments of `Simulator` by name
     named_iterations: bool
-    choice: Choice | None  # of solver="auto", which is made anew on another device
+    choice: Choice | None  # of solver="auto", which chooses again on another device
     material: dict[str, Tensor]  # arguments of `set_material` by name
-    trained: list[str]  # names of arrays that want a gradient
-    reference: tuple[Tensor, Tensor] | None  # stiffness and inertia that a preconditioner was made of
+    trained: list[str]  # names of arrays that require a gradient
+    reference: tuple[Tensor, Tensor] | None  # stiffness and inertia for which a preconditioner was made
 
 
 def save_simulation(saved: SavedSimulation, path: str | Path) -> None:
     """Write scene, settings and material to one file.
 
     Args:
-        saved: to be written, tensors on any device.
-        path: of the file; an existing one is replaced. Any ending will do, `.safetensors` is usual.
+        saved: the simulation, with tensors on any device.
+        path: of the file, usually ending in `.safetensors`; an existing one is replaced.
     """
     target = check_target_file(path)
     scene, settings = saved.scene, saved.settings
@@ -100,7 +99,7 @@ def save_simulation(saved: SavedSimulation, path: str | Path) -> None:
 
 
 def load_simulation(path: str | Path) -> SavedSimulation:
-    """Read what `save_simulation` wrote."""
+    """Read a file of `save_simulation`."""
     record, tensors = _read(Path(path))
     with reading(path):
         return _saved(record, tensors)
@@ -108,7 +107,7 @@ def load_simulation(path: str | Path) -> SavedSimulation:
 
 @contextmanager
 def reading(path: str | Path) -> Iterator[None]:
-    """Say of errors that the content of a file raises that the file is damaged."""
+    """Turn errors about the content of a file into errors that name the file as damaged."""
     try:
         yield
     except _MissingTensorError as missing:
@@ -121,7 +120,7 @@ def reading(path: str | Path) -> Iterator[None]:
 
 
 def _distinct_meshes(scene: Scene) -> list[TetMesh]:
-    """Every mesh once, however many bodies share it."""
+    """Every mesh once, although bodies may share it."""
     return list({id(solid.mesh): solid.mesh for solid in scene.solids}.values())
 
 
@@ -147,7 +146,7 @@ def _part_arrays(part: Part) -> dict[str, NDArray[Any]]:
 
 
 def _part_record(part: Part, scene: Scene, meshes: list[TetMesh]) -> Record:
-    """The fields of a part that are no arrays: numbers as they are, other objects by their number."""
+    """The fields of a part that are no arrays: numbers as they are, other parts by number."""
     kind = next(kind for kind in _KINDS.values() if isinstance(part, kind))  # a body of patches as the Solid it is
     record: Record = {"kind": kind.__name__}
     if isinstance(part, Solid):
@@ -170,7 +169,7 @@ def _tensors(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Iterator[tuple[
 
 
 class _MissingTensorError(Exception):
-    """The record speaks of a tensor that the file does not hold."""
+    """The metadata names a tensor that the file lacks."""
 
 
 class _Tensors:
@@ -188,7 +187,7 @@ class _Tensors:
         return self._tensors[name]
 
     def array(self, name: str) -> NDArray[Any]:
-        """A copy: tensors may be mapped into the file, which may be written over while the simulation lives."""
+        """A copy, because tensors may be mapped into the file, which may be overwritten later."""
         return self[name].numpy().copy()
 
 
@@ -222,7 +221,7 @@ def _record(path: Path, metadata: Mapping[str, str] | None) -> Record:
 
 def _saved(record: Record, tensors: _Tensors) -> SavedSimulation:
     choice = dict(record.get("choice") or {})
-    former = choice.pop("batch", 1)  # of files of before simulators had one
+    former = choice.pop("batch", 1)  # older files have the batch here
     meshes = [_mesh(number, mesh, tensors) for number, mesh in enumerate(record["meshes"])]
     settings = {
         "time_step": record["time_step"],
@@ -230,11 +229,11 @@ def _saved(record: Record, tensors: _Tensors) -> SavedSimulation:
         "solver": _solver(record["solver"]),
         "dtype": _DTYPES[record["dtype"]],
         "tolerance": record["tolerance"],
-        "kernel": record.get("kernel", "auto"),  # files of before there was a choice
+        "kernel": record.get("kernel", "auto"),  # older files have no kernel
         "batch": record.get("batch", former if former > 1 else None),
         "adjoint": record.get("adjoint", "solver"),
     }
-    # the scene's values stay where a file has none
+    # arrays that the file lacks keep the scene's values
     material = {name: tensors[f"material.{name}"] for name in record.get("material", _FIRST_ARRAYS)}
     if "pin_stiffness" in material:
         material.setdefault(PIN_HARD, material["pin_stiffness"].isinf())
@@ -245,7 +244,7 @@ def _saved(record: Record, tensors: _Tensors) -> SavedSimulation:
     return SavedSimulation(
         scene=Scene(*_parts(record["parts"], meshes, tensors)),
         settings=settings,
-        named_iterations=record.get("named_iterations", True),  # files of before do not say
+        named_iterations=record.get("named_iterations", True),  # absent in older files
         choice=Choice(**choice) if choice else None,
         material=material,
         trained=record["trained"],
@@ -263,7 +262,7 @@ def _mesh(number: int, record: Record, tensors: _Tensors) -> TetMesh:
         tensors.array(f"{prefix}.{name}") if tensors.has(f"{prefix}.{name}") else None for name in ("fill", "regions")
     )
     mesh = trusted(tensors.array(f"{prefix}.vertices"), tensors.array(f"{prefix}.tets"), fill, regions)
-    # what was turned when the mesh was made is not inverted any more
+    # tets that were flipped when the mesh was made are upright in the file
     store(mesh, flipped=record["flipped"])
     if not tensors.has(f"{prefix}.embedding.tets"):
         return mesh
@@ -277,7 +276,7 @@ def _mesh(number: int, record: Record, tensors: _Tensors) -> TetMesh:
 
 
 def _parts(records: list[Record], meshes: list[TetMesh], tensors: _Tensors) -> list[Part]:
-    """The parts in their order; a pin may stand before the body that it holds."""
+    """The parts in their order; a pin may come before its body."""
     parts: dict[int, Part] = {}
     for pins in (False, True):
         for number, record in enumerate(records):
@@ -299,6 +298,6 @@ def _part(number: int, record: Record, meshes: list[TetMesh], parts: Mapping[int
             fields[field.name] = tensors.array(f"part.{number}.{field.name}")
     part: Part = kind(**fields)
     if isinstance(part, Ground):
-        # a unit vector divided by its length may lose its last bit
+        # normalising again might change the last bit
         store(part, normal=fields["normal"])
     return part

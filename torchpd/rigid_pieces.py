@@ -1,13 +1,13 @@
-"""Steps of bodies that have stiff pieces in soft surroundings: rigid motions of the pieces between the iterations.
+"""Steps of bodies with stiff pieces in soft surroundings: rigid motions of the pieces between the iterations.
 
-Every solver here goes by the constant matrix A of projective dynamics. Turning a stiff piece costs it as much as
-straining it would, in A; in truth, by the Hessian H, next to nothing. For each piece three eigenvalues of A^-1 H are
-about the contrast of the stiffnesses, and that many directions are slow however good M is.
+Every solver here uses the constant matrix A of projective dynamics. In A, rotating a stiff piece costs as much as
+straining it. In the Hessian H it costs almost nothing. For each piece, three eigenvalues of A^-1 H are about the
+contrast of the stiffnesses, and those directions converge slowly however good M is.
 
-So the pieces are moved as rigid bodies from time to time, by Newton's method on their rigid motions. Z has four
-functions for each piece, see `stiff_pieces`. With f_k, where the piece has the axis k of X - c now, its velocity is
-Z (v, w x f_k), the matrix of these motions follows from Z^T A Z, and the step is Z (v, (R - 1) f_k), R the rotation of
-w: linear in Z, and it does not strain the piece.
+So the pieces are moved as rigid bodies between rounds, by Newton's method on their rigid motions. Z has four functions
+for each piece, see `stiff_pieces`. f_k is the present direction of axis k of X - c in the piece. Its velocity is Z (v,
+w x f_k), and the matrix of these motions follows from Z^T A Z. The step is Z (v, (R - 1) f_k), with R the rotation of
+w. It is linear in Z, and does not strain the piece.
 """
 
 from __future__ import annotations
@@ -29,39 +29,41 @@ if TYPE_CHECKING:
 
 __all__ = ["RigidPieces"]
 
-_NOISE = {torch.float32: 1e-5, torch.float64: 1e-12}  # of an energy by rounding, as in csrc/solver/outer.h
-# what the pieces and their functions depend on
+_NOISE = {torch.float32: 1e-5, torch.float64: 1e-12}  # relative rounding of an energy, as in csrc/solver/outer.h
+# arrays on which the pieces and their functions depend
 _MADE_OF = ("stiffness", "masses", "damping", "pin_stiffness", "pin_hard")
 
 
 class RigidPieces:
-    """Stiff pieces of a scene, and steps that move them as rigid bodies between the iterations of the simulator.
+    """Stiff pieces of a scene, and steps that move them as rigid bodies between iterations of the simulator.
 
-    A piece is a connected set of elements that are stiffer than the rest; one that hard pins hold is left to the
-    solver. Worth it from contrasts of about a thousand, with `Multilevel("lbfgs")`: rounds are too short for
-    "corotated". Made for the material, time step, precision and device of now: after a change of these a step is
-    refused until `prepare` (writes through `.data` cannot be seen). Contacts are not known to these motions: such
-    scenes are refused. Results may depend on the batch by rounding. `Simulator.rollout`, `capture`, `tune`, `save` and
-    `load` do not know of it: they take the simulator's own steps.
+    A piece is a connected set of elements that are stiffer than the rest. Pieces that hard pins hold are left to the
+    solver. It pays from contrasts of about a thousand, with `Multilevel("lbfgs")`: rounds are too short for
+    "corotated". `Simulator.rollout`, `capture`, `tune`, `save` and `load` ignore it and take the simulator's own steps.
 
-    Holds four numbers for each vertex and piece, in the precision of the simulator. Making it takes a sparse
-    factorisation of the matrix of the surroundings and a solve for each of these columns, on the CPU in float64, a few
-    columns at a time.
+    It is made for the present material, time step, precision and device. After a change of these, steps are refused
+    until `prepare`; writes through `.data` are not noticed. Results may depend on the batch by rounding.
+    docs/solvers.md is a guide.
+
+    It holds four numbers for each vertex and piece, in the precision of the simulator. Making it factorises the sparse
+    matrix of the surroundings and solves for each of these columns, on the CPU in float64.
 
     Args:
-        sim: whose steps; it keeps its settings.
+        sim: the simulator; it keeps its settings.
         stiffer_than: stiffness [Pa] above which an element belongs to a piece. None: the geometric mean of the lowest
-            and the highest, where these are a hundredfold apart.
+            and the highest, which must differ by a factor of 100.
 
     Raises:
-        ValueError: a scene with contacts, without a free piece, with more than 256, or that does not fit into memory.
+        ValueError: contacts in the scene, no free piece, more than 256 pieces, or too little memory.
     """
 
     def __init__(self, sim: Stepper, *, stiffer_than: float | None = None) -> None:
         if not isinstance(sim, Stepper):
             raise TypeError(f"RigidPieces: sim must be a Simulator, got {type(sim).__name__}")
         if sim.planes.shape[-2] or sim.spheres.shape[-2]:
-            raise ValueError("RigidPieces: the scene has contacts, which rigid motions do not know of; use sim alone")
+            raise ValueError(
+                "RigidPieces: the scene must have no contacts, which rigid motions do not model; use sim alone"
+            )
         self.sim = sim
         self.stiffer_than = (
             None if stiffer_than is None else check_scalar("RigidPieces.stiffer_than", stiffer_than, minimum=0.0)
@@ -69,10 +71,9 @@ class RigidPieces:
         self.prepare()
 
     def prepare(self) -> None:
-        """Make it anew, of the material, time step, precision and device that the simulator has now.
+        """Make it again for the present material, time step, precision and device of the simulator.
 
-        Needed after a change of these, as `Simulator.prepare_solver` is worth it for a solver, and takes as long as
-        making it. A refusal changes nothing.
+        Needed after a change of these; takes as long as making it. A refusal changes nothing.
         """
         sim = self.sim
         check_has_values("RigidPieces", sim.device)
@@ -103,17 +104,17 @@ class RigidPieces:
         start: str | Tensor = "velocity",
         return_info: bool = False,
     ) -> State | tuple[State, Info]:
-        """One time step: `rounds` times the iterations of the simulator, with a rigid motion between two of them.
+        """Take one time step of `rounds` times the simulator's iterations, with a rigid motion between rounds.
 
-        Four iterations a round do well. Gradients are those of the simulator's step.
+        Four iterations a round work well. Gradients are those of the simulator's step.
 
         Args:
-            state: as of `Simulator.forward`, like the arguments that follow.
+            state: as in `Simulator.forward`, like the following arguments.
             rounds: a whole number >= 1.
             forces: on the vertices [B, V, 3] [N].
             targets: of pins.
             start: first iterate.
-            return_info: also how the last round went.
+            return_info: also return a report of the last round.
         """
         self._check_made_of()
         self._check_state(state)
@@ -128,11 +129,11 @@ class RigidPieces:
     def move(
         self, state: State, positions: Tensor, *, forces: Tensor | None = None, targets: Targets | None = None
     ) -> Tensor:
-        """A rigid motion of every piece that lowers the objective of a step, and its surroundings with it [B, V, 3] m.
+        """Move every piece rigidly, with its surroundings, to lower the objective of a step [B, V, 3] m.
 
         Args:
-            state: where the step starts.
-            positions: where the pieces are [B, V, 3] m; environments whose energy would rise stay there.
+            state: start of the step.
+            positions: present positions [B, V, 3] m; environments whose energy would rise keep them.
             forces: as in `step`.
             targets: as in `step`.
         """
@@ -144,11 +145,11 @@ class RigidPieces:
         return self._moved(state, positions, forces, targets)
 
     def _check_made_of(self) -> None:
-        """Refuse what the simulator has become since `prepare`. Waits for a device only after something was written."""
+        """Refuse a simulator that has changed since `prepare`. Waits for a device only after a write."""
         sim, (stiffness, inertia) = self.sim, self._reference
         if (sim.dtype, sim.device) != (stiffness.dtype, stiffness.device):
             raise RuntimeError(
-                f"RigidPieces was made for {stiffness.dtype} on {stiffness.device}, and its simulator is "
+                f"RigidPieces was made for {stiffness.dtype} on {stiffness.device}, but its simulator is "
                 f"{sim.dtype} on {sim.device} now; call prepare() to make it anew"
             )
         seen = _look(sim)
@@ -188,8 +189,8 @@ class RigidPieces:
             raise ValueError(f"{wanted}, got {list(field.shape)}")
 
     def _moved(self, state: State, positions: Tensor, forces: Tensor | None, targets: Targets | None) -> Tensor:
-        """`move`, of arguments that were checked."""
-        # in the precision of the step, also where autocast asks for less
+        """`move`, for checked arguments."""
+        # in the precision of the step, even within autocast
         with torch.autocast(positions.device.type, enabled=False):
             gradient = self.sim.step_gradient(state, positions, forces, targets)
             batch, nodes = len(positions), len(self.pieces)
@@ -206,9 +207,9 @@ class RigidPieces:
             return torch.where(falls[:, None, None], positions + moved, positions)
 
     def _falls(self, positions: Tensor, moved: Tensor, gradient: Tensor, inertia: Tensor) -> Tensor:
-        """Whether the objective of each environment does not rise [B], but for rounding.
+        """Whether the objective of each environment does not rise [B], except by rounding.
 
-        It is half a |x - y|^2 and the elastic energy; a (x - y) is what the elastic forces leave of the gradient.
+        It is half a |x - y|^2 plus the elastic energy; a (x - y) is the gradient minus its elastic part.
         """
         sim, free = self.sim, inertia.isfinite()
         pull = torch.where(free, gradient - sim.gradient(positions), 0.0)
@@ -223,7 +224,7 @@ class RigidPieces:
 
 
 def _look(sim: Stepper) -> list[tuple[Any, ...]]:
-    """What tells without reading values whether anything was written: the objects, their versions and places."""
+    """Evidence of writes that needs no values: the objects, their versions and addresses."""
     arrays = [getattr(sim, name) for name in _MADE_OF]
     # tensors of inference mode count no versions
     versions = [0 if array.is_inference() else array._version for array in arrays]
@@ -247,7 +248,7 @@ def _rotation(vectors: Tensor) -> Tensor:
 
 
 def _newton(pull: Tensor, shape: Tensor, coarse: Tensor) -> Tensor:
-    """Velocity and rotation vector of every piece [B, P, 6] that balance the pull [B, P, 4, 3] N.
+    """Velocity and rotation vector of every piece [B, P, 6] that balance the gradient [B, P, 4, 3] N.
 
     Args:
         pull: Z^T grad E.
@@ -262,7 +263,7 @@ def _newton(pull: Tensor, shape: Tensor, coarse: Tensor) -> Tensor:
     matrix = torch.einsum("bpaxi,bpaxqj->bpiqj", motions, bent).reshape(batch, 6 * nodes, 6 * nodes)
     right = torch.einsum("bpaxi,bpax->bpi", motions, pull).reshape(batch, 6 * nodes)
     scale = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()
-    # without a check, which would wait for a device: what is not finite does not lower the energy
+    # no check, which would wait for a device: a non-finite motion does not lower the energy
     solved, _ = torch.linalg.solve_ex(scale[:, :, None] * matrix * scale[:, None, :], scale * right)
     found: Tensor = -(scale * solved).view(batch, nodes, 6)
     return found

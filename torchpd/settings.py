@@ -1,7 +1,7 @@
-"""Settings of a simulator and what follows from them: the plan, a preconditioner, the choice of "auto".
+"""Settings of a simulator and their consequences: the plan, a preconditioner, the choice of "auto".
 
-A change makes another `Configuration` of the one before. What is refused on the way changes nothing, since a simulator
-takes over only what is complete.
+A change computes a new `Configuration` from the present one. The simulator takes over only a complete one, so a refused
+change alters nothing.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ __all__ = [
     "reconfigure",
 ]
 
-# Shortest and longest time step for which iterations need no warning, nor for what lies between: long ones are slow,
-# and short ones overshoot with a relaxation for long ones.
+# Shortest and longest time step for which the iterations were checked, and suffice between them. Both ends count: long
+# steps converge slowly, and short ones overshoot with a relaxation for long ones.
 EVERY_STEP, NO_STEP = (0.0, math.inf), (math.inf, 0.0)
-# what a simulator keeps of a `Configuration` beside plan, choice and material
+# fields of a `Configuration` that a simulator keeps besides plan, choice and material
 SETTINGS = (
     "time_step", "iterations", "tolerance", "solver", "adjoint", "kernel", "batch", "named_iterations",
     "checked_time_steps",
@@ -47,20 +47,20 @@ SETTINGS = (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Configuration(CompiledScene):
-    """A compiled scene, and how its iterations came about."""
+    """A compiled scene, with the origin of its iterations."""
 
     choice: Choice | None  # of "auto"
-    named_iterations: bool  # whether somebody has given their number: then no warning says that they are too few
-    checked_time_steps: tuple[float, float]  # time steps [s] for which iterations need no warning
+    named_iterations: bool  # whether the user gave the number of iterations: then no warning about it
+    checked_time_steps: tuple[float, float]  # range of time steps [s] that needs no further check
 
 
 def is_auto(solver: object) -> bool:
-    """Whether a solver is to be chosen."""
+    """Whether a solver is "auto"."""
     return isinstance(solver, str) and solver == "auto"
 
 
 def reconfigure(now: Configuration, **changes: Any) -> Configuration:
-    """The configuration with another `batch`, `kernel`, `solver` or `adjoint`, and all that follows from it."""
+    """The configuration with another `batch`, `kernel`, `solver` or `adjoint`, and all consequences."""
     for name, value in changes.items():
         now = _CHANGES[name](now, value)
     return now
@@ -96,7 +96,7 @@ _CHANGES: dict[str, Callable[[Configuration, Any], Configuration]] = {
 
 
 def prepare(now: Configuration) -> Configuration:
-    """The configuration with what the material decides made anew, see `Simulator.prepare_solver`."""
+    """The configuration with everything that depends on the material made again, see `Simulator.prepare_solver`."""
     check_has_values("prepare_solver", now.device)
     new = choose_again(now)
     return new if new.plan is not now.plan else replace(new, plan=plan_for_solver(new))
@@ -110,7 +110,7 @@ def moved(now: Configuration, dtype: torch.dtype, device: torch.device) -> Confi
 
 
 def check_iterations(now: Configuration, changed: str | None) -> Configuration:
-    """Warn where iterations that nobody named are too few for what has `changed`, once; awaits a GPU until then."""
+    """Warn once if default iterations are too few after a change of `changed`; waits for a GPU until then."""
     if now.checked_time_steps == EVERY_STEP:
         return now
     if warn_of_few_iterations(now, now.choice, changed):
@@ -120,24 +120,24 @@ def check_iterations(now: Configuration, changed: str | None) -> Configuration:
 
 
 def _planned_anew(now: Configuration) -> Configuration:
-    """After what a GPU's plan and the choice of "auto" depend on has changed."""
-    # "auto" begins with a plan for Chebyshev
+    """Make a GPU's plan and the choice of "auto" again, after a change of their inputs."""
+    # "auto" starts from a plan for Chebyshev
     if now.plan.kernel is not None and not (now.choice is not None and now.plan.for_levels):
         now = replace(now, plan=move_plan(now, plan_anew(now, now.dtype, now.device), now.device))
     return choose_again(now)
 
 
 def _solved_by(now: Configuration, solver: Solver) -> Configuration:
-    # to another solver the same number of iterations is another promise
+    # the same number of iterations means another error for another solver
     checked = EVERY_STEP if now.named_iterations else NO_STEP
     now = replace(now, solver=solver, choice=None, checked_time_steps=checked)
     return now if serves(now) else replace(now, plan=plan_for_solver(now))
 
 
 def choose(now: Configuration, iterations: int | None) -> Configuration:
-    """What "auto" does, see `choose_solver`."""
+    """Choose as "auto" does, see `choose_solver`."""
     if now.plan.for_levels:
-        now = _solved_by(now, Chebyshev())  # its kernel is one of the costs that are compared
+        now = _solved_by(now, Chebyshev())  # the costs are compared with the kernel of Chebyshev
     solver, choice = choose_solver(now, iterations)
     now = replace(_solved_by(now, solver), choice=choice, iterations=choice.iterations)
     named = not choice.sets_iterations
@@ -147,7 +147,7 @@ def choose(now: Configuration, iterations: int | None) -> Configuration:
 
 
 def choose_again(now: Configuration) -> Configuration:
-    """The choice of "auto" made anew where there is one; iterations that somebody has set since stay."""
+    """Repeat the choice of "auto", if there is one; iterations that were set since stay."""
     if now.choice is None:
         return now
     own = now.choice.sets_iterations and now.iterations == now.choice.iterations

@@ -37,7 +37,7 @@ def _bound(sim: Stepper) -> float:
 
 
 def _power(sim: Stepper, state: State, iterations: int) -> float:
-    """Largest |eigenvalue| of I - theta D^-1 H at the state, H the Hessian of the step's objective."""
+    """Largest |eigenvalue| of I - theta D^-1 H at the state; H is the Hessian of the step's objective."""
     settings = sim.solver.settings()
     inertia, diagonal = (t.unsqueeze(-1) for t in _diagonal(sim))
     free = torch.isfinite(inertia)
@@ -55,7 +55,7 @@ def _power(sim: Stepper, state: State, iterations: int) -> float:
 
 
 def _trial(sim: Stepper, solver: Jacobi | Chebyshev, iterations: int) -> Stepper:
-    """The same simulation, sharing plan and material, with another solver."""
+    """A copy of the simulation with another solver, sharing plan and material."""
     trial = copy.copy(sim)
     trial.solver, trial.iterations, trial.tolerance = solver, iterations, 0.0
     return trial
@@ -102,13 +102,14 @@ def estimate_rho(
 ) -> float:
     """Spectral radius of the Jacobi iteration of `sim`, with the relaxation and diagonal of its solver.
 
+    "two-stage" is the pre-simulation of the source paper: |e^K| / |e^{K-1}| with e = grad E, then trial runs. It comes
+    out low where convergence is slow: 0.997 instead of 0.9997. "power" iterates the linearisation at the state. "bound"
+    is 1 - theta min(a / D), from the weights alone. It needs no run, and is never too low for a solver that converges.
+
     Args:
         sim: the simulator.
         state: a representative state; the worst environment counts.
-        method: "two-stage" is the source paper's pre-simulation: |e^K| / |e^{K-1}| with e = grad E, then trial runs
-            (it comes out low where convergence is slow: 0.997 where the truth is 0.9997). "power" iterates the
-            linearisation at the state. "bound" is 1 - theta min(a / D), from the weights alone; it needs no run and is
-            never too low for a solver that converges.
+        method: "two-stage", "power" or "bound".
         iterations: K of the first stage and length of a trial, or steps of the power iteration.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What a simulator will run, in words: `print(sim)`."""
+"""Text of `print(sim)`."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 __all__ = ["describe", "workspace_bytes"]
 
-# What each effect adds to a step; folded ones are part of the weights and targets that every vertex has anyway.
+# cost of an effect that only changes the weights and targets, which every vertex has anyway
 _FOLDED = "folded into the inertia of a vertex: nothing per iteration"
 
 _ANY_BATCH = 2**31 - 1
-_TURNING_MODES = 24  # of the small problem of Multilevel("corotated"), see csrc/solver/corotation.h
+_TURNING_MODES = 24  # of the coarse problem of Multilevel("corotated"), see csrc/solver/corotation.h
 
 
 def _solver_line(sim: Stepper) -> str:
@@ -47,20 +47,20 @@ def _solver_line(sim: Stepper) -> str:
 
 
 def _expectation_lines(sim: Stepper) -> list[str]:
-    """Why "auto" chose, and what the iterations are worth."""
+    """The reason for the choice of "auto", and the error expected of the iterations."""
     lines = [] if sim.choice is None else [f"chosen because {sim.choice.why}"]
     scene = sim.compiled
     expected = forecast(scene)
     if expected is not None:
         left = expected.error(sim.iterations)
         verdict = f"; {sim.iterations} leave about {left:.1g}: far too few" if left > FAR_TOO_FEW else ""
-        hardest = " where what is stiff lands" if is_bound(scene) else ""
+        hardest = " when a stiff body lands" if is_bound(scene) else ""
         counts = " and ".join(f"{error:g} after {expected.words(error)}" for error in (1e-2, 1e-3))
-        lines.append(f"expected{hardest}: an error of {counts} iterations, from the weights alone{verdict}")
+        lines.append(f"expected{hardest}: an error of {counts} iterations, estimated from the weights{verdict}")
         if sim.tolerance and expected.iterations(sim.tolerance) > sim.iterations:
             words = expected.words(sim.tolerance)
             lines.append(
-                f"tolerance {sim.tolerance:g} asks for {words} iterations: few steps will meet it in {sim.iterations}"
+                f"tolerance {sim.tolerance:g} needs {words} iterations: few steps will reach it in {sim.iterations}"
             )
     return lines
 
@@ -73,7 +73,7 @@ def _tuning_lines(sim: Stepper, result: TuningResult | None) -> list[str]:
 
 
 def _preconditioner_lines(sim: Stepper) -> list[str]:
-    """Levels and bytes of what `Multilevel`, or gradients, have prepared."""
+    """Levels and bytes of the matrix of `Multilevel`, or of gradients."""
     plan = sim.plan
     if not has_levels(plan.arrays):
         return []
@@ -91,7 +91,7 @@ def _effect_lines(sim: Stepper) -> list[str]:
     lines = [f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step an iteration"]
     if any(solid.mesh.fill is not None for solid in scene.solids):
         lines.append(
-            "fill: stiffness and masses are those of the material times how full tetrahedra are (mesh.fill), unless set"
+            "fill: stiffness and masses are multiplied by the fill of each tetrahedron (mesh.fill), unless set"
         )
     lines += _pin_lines(sim)
     if bool((sim.gravity != 0).any()):
@@ -106,14 +106,14 @@ def _effect_lines(sim: Stepper) -> list[str]:
 
 
 def _pin_lines(sim: Stepper) -> list[str]:
-    """Hard pins and springs: those of every environment first."""
+    """Hard pins and springs, those of every environment first."""
     rows = sim.pin_hard.expand(1, -1) if sim.pin_hard.dim() == 1 else sim.pin_hard
     always, ever = int(rows.all(0).sum()), int(rows.any(0).sum())
     lines = []
     if always:
-        lines.append(f"hard pins: {always} vertices that do not move: nothing per iteration")
+        lines.append(f"hard pins: {always} fixed vertices: nothing per iteration")
     if ever > always:
-        lines.append(f"pins that are hard in some environments: {ever - always}, springs in the others")
+        lines.append(f"pins that are hard in some environments only: {ever - always}, springs in the others")
     if soft := rows.shape[1] - ever:
         lines.append(f"soft pins: {soft} springs, {_FOLDED}")
     return lines
@@ -125,7 +125,7 @@ def _pass_line(sim: Stepper) -> str:
     second = f" and one over {shared} vertices that patches share" if shared else ""
     return (
         f"an iteration is one pass over {plan.patches} patches{second}; "
-        "from 8 environments on, SIMD lanes run over environments"
+        "with 8 or more environments, SIMD lanes run over environments"
     )
 
 
@@ -150,11 +150,11 @@ def _kernel_lines(sim: Stepper) -> list[str]:
     launches = _LEVEL_LAUNCHES if plan.for_levels else _LAUNCHES[kernel]
     others = any_of([name for name in _LAUNCHES if name != kernel])
     if kernel == "block" and sim.batch is None:
-        others = others.replace('"cluster"', '"cluster", sooner done with a few environments (batch=1)')
-    # those whose plan is the same for every batch
+        others = others.replace('"cluster"', '"cluster", faster for a few environments (batch=1)')
+    # kernels whose plan is the same for every batch
     fixed = sim.kernel in ("cluster", "stream") and not plan.for_levels
     batch = f"; for a batch of {sim.batch}" if sim.batch and not fixed else ""
-    asked = "" if has_levels(plan.arrays) else f"; Simulator(..., kernel=...) may ask for {others}"
+    asked = "" if has_levels(plan.arrays) else f"; Simulator(..., kernel=...) can select {others}"
     return [
         f"kernel {kernel}: {launches}",
         f"mesh: {patches}, {shared}, {block:,} B of shared memory a thread block",
@@ -163,7 +163,7 @@ def _kernel_lines(sim: Stepper) -> list[str]:
 
 
 def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
-    """Memory of a step on the CPU beside plan, material and states, of one environment; `real` bytes a number."""
+    """Memory of a CPU step for one environment [B], besides plan, material and states; `real` bytes a number."""
     # five vectors of four numbers, two weights, and the slots of the patches
     numbers = 22 * plan.vertices + 8 * len(plan.slot_vertex)
     if not isinstance(solver, Multilevel):
@@ -179,7 +179,7 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
 
 
 def _step_bytes(sim: Stepper, real: int) -> str:
-    """Memory that a step takes beside plan, material and states."""
+    """Text about the memory of a step, besides plan, material and states."""
     plan = sim.plan
     if plan.kernel is None:
         return f"{workspace_bytes(plan, real, sim.solver):,} B an environment during a step"
@@ -189,12 +189,12 @@ def _step_bytes(sim: Stepper, real: int) -> str:
     taken = f"{each:,} B an environment during a step{f' of {batch:,}' if batch > 1 else ''}"
     if plan.kernel == "stream":
         return taken
-    # only those that the GPU has in work at a time take any
+    # only environments that run at the same time take memory
     return f"{taken}, at most {step_bytes(scene, plan, _ANY_BATCH, sim.device):,} B in all"
 
 
 def describe(sim: Stepper, result: TuningResult | None) -> str:
-    """Lines for `print(sim)`: sizes, solver, effects, passes, memory."""
+    """Lines of `print(sim)`: sizes, solver, effects, passes, memory."""
     plan = sim.plan
     material = sum(array.numel() * array.element_size() for array in sim.material())
     real = torch.finfo(sim.dtype).bits // 8

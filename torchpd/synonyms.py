@@ -1,4 +1,4 @@
-"""Names that users may try: those of other libraries, which errors answer with ours, and our former ones."""
+"""Names that users may try: those of other libraries, which errors answer with ours, and our former names."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FRICTION = "Coulomb's coefficient is `friction`"
 _TIME_STEP = "the time step is `time_step` [s]"
 _VERTICES = "positions are `vertices` [V, 3] in m"
 
-# By what is asked, "" for the module: names that are not there, separated by blanks, and what to use instead.
+# By owner ("" for the module): missing names, separated by blanks, and the answer.
 SYNONYMS: dict[str, dict[str, str]] = {
     "": {
         "Body DeformableBody FEM FEMEntity SoftBody": "an elastic body is `Solid(mesh, youngs=..., density=...)`",
@@ -28,7 +28,7 @@ SYNONYMS: dict[str, dict[str, str]] = {
         "Engine Env Environment Model Sim World": "`Simulator(scene)` steps a `Scene`",
         "Anchor Attachment Constraint Fixed FixedConstraint": "`Pin(solid, vertices)` holds vertices",
         "Floor GroundPlane HalfSpace Plane": "a plane is `Ground(height, normal, friction=...)`",
-        "Ball": "a ball is `Sphere(center, radius)`",
+        "Ball": "a sphere is `Sphere(center, radius)`",
         "Mesh": "`TetMesh` is what bodies are made of, `TriMesh` a surface",
         "step": "`Simulator(scene)` is called: after = sim(state)",
         "reset": "`Simulator(scene).rest_state()` is where everything starts",
@@ -95,7 +95,7 @@ def _answer(owner: str, name: str) -> str:
 
 
 def no_attribute(owner: str, name: str, value: object = None) -> AttributeError:
-    """The error of an attribute that is not there, of a class or ("") of the module."""
+    """The error about a missing attribute of a class or ("") of the module."""
     answer = _answer(owner, name)
     words = f"{owner or 'torchpd'} has no attribute {name!r}{'; ' if answer else ''}{answer}"
     return AttributeError(words, name=name, obj=value)
@@ -132,11 +132,11 @@ class Renamed:
 
 
 def check_arguments(owner: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate what users know as `owner` so that errors of arguments name it and what it takes."""
+    """Decorate a function known to users as `owner`, so that errors about arguments name it and its arguments."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         known = [name for name, one in signature(function).parameters.items() if one.kind != one.VAR_POSITIONAL]
-        # python's own errors, of missing arguments and of too many, name the function by it
+        # Python's own errors about arguments use this name
         function.__qualname__ = owner + ".__init__" * (function.__name__ == "__init__")
 
         @wraps(function)

@@ -1,4 +1,4 @@
-"""What `Simulator.tune` refuses."""
+"""Checks of the arguments of `Simulator.tune`."""
 
 from __future__ import annotations
 
@@ -21,20 +21,21 @@ __all__ = ["check_known", "check_request", "check_start"]
 
 
 def check_request(error: float | None, milliseconds: float | None) -> None:
-    """One of the two, within its range."""
+    """Check that one target is given, within its range."""
     if (error is None) == (milliseconds is None):
         raise ValueError(
-            f"tune takes one of error and milliseconds, got error={error} and milliseconds={milliseconds}; "
+            f"tune: exactly one of error and milliseconds must be given, got error={error} and "
+            f"milliseconds={milliseconds}; "
             "for example sim.tune(error=1e-2)"
         )
     if error is not None and not 0.0 < error < 1.0:
-        raise ValueError(f"tune: error must lie in (0, 1), 1 being x + h v; got {error}")
+        raise ValueError(f"tune: error must lie in (0, 1), where 1 is the unsolved step x + h v; got {error}")
     if milliseconds is not None and not 0.0 < milliseconds < math.inf:
         raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
 
 
 def check_start(sim: Stepper, state: State, forces: Tensor | None) -> None:
-    """States, forces and material that can be studied."""
+    """Check that states, forces and material are finite and the system is not singular."""
     sim.check_state(state, forces=forces)
     if forces is not None:
         check_like("forces", forces, state[0], "N")
@@ -49,7 +50,7 @@ def check_start(sim: Stepper, state: State, forces: Tensor | None) -> None:
             raise ValueError(f"tune: state.{name} must be finite, got NaN or infinity in environment {int(bad[0])}")
     values = {"forces": forces} if forces is not None else {}
     for name, array in (values | dict(zip(MATERIAL_ROWS, sim.material(), strict=True))).items():
-        # hard pins have springs without end
+        # hard pins have infinite springs
         bad = (array.isnan() if name == "pin_stiffness" else ~array.isfinite()).nonzero()
         if len(bad):
             raise ValueError(f"tune: {name} must be finite, got NaN or infinity at {bad[0].tolist()}")
@@ -59,16 +60,16 @@ def check_start(sim: Stepper, state: State, forces: Tensor | None) -> None:
         vertex = int(bad.nonzero()[0])
         raise ValueError(
             f"tune: the system is singular: vertex {vertex} has inertia {float(inertia[..., vertex].min()):g} N/m and "
-            f"diagonal {float(diagonal[..., vertex].min()):g} N/m, which must be positive; look at masses and stiffness"
+            f"diagonal {float(diagonal[..., vertex].min()):g} N/m, which must be positive; check masses and stiffness"
         )
 
 
 def check_known(steps: Sequence[ExactStep], allowed: float) -> None:
-    """Nothing is promised where there is nothing to compare with."""
-    doubt = max(step.uncertainty for step in steps)
-    if not doubt <= allowed:
+    """Refuse a study without converged steps to compare with."""
+    uncertainty = max(step.uncertainty for step in steps)
+    if not uncertainty <= allowed:
         raise RuntimeError(
             f"tune: no converged step to compare with: the best float64 solution of one of the {len(steps)} studied "
-            f"steps may itself be wrong by {doubt:.1e}, which must be at most {allowed:.1e}; solver and iterations "
-            "stay as they were. Look for slivers in the mesh (quality()), or ask for a larger error"
+            f"steps may itself be wrong by {uncertainty:.1e}, which must be at most {allowed:.1e}; solver and "
+            "iterations are unchanged. Look for slivers in the mesh (quality()), or request a larger error"
         )
