@@ -118,7 +118,7 @@ def test_parts_of_a_scene_lose_their_history_aloud() -> None:
         "TetMesh.vertices": lambda: pd.TetMesh(torch.tensor(solid.mesh.vertices).requires_grad_(), solid.mesh.tets),
     }
     for name, make in makers.items():
-        with pytest.warns(UserWarning, match=rf"^{name} is copied as numbers, so no gradient gets to what .* detach"):
+        with pytest.warns(UserWarning, match=rf"^{name} is copied, so no gradient reaches .* detach"):
             make()
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("error")

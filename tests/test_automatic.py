@@ -202,7 +202,7 @@ def test_few_iterations_on_smooth_contacts_are_multilevels(friction: float) -> N
     many = pd.Simulator(scene, 1 / 60, 4000, solver="auto", dtype=torch.float64, progress=False)
     assert isinstance(many.solver, pd.Chebyshev)
     if friction == 0.0:
-        assert "expected where what is stiff lands" in repr(few)
+        assert "expected when a stiff body lands" in repr(few)
 
 
 @pytest.mark.parametrize("iterations", [2, 4, 8])

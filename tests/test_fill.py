@@ -328,7 +328,7 @@ def test_meshes_say_how_full_they_are() -> None:
     mesh = pd.tetrahedralize(block(1.0, 0.1, 0.1), cells=20)
     assert "74% filled, carrying" in repr(mesh)  # of 1.35 times the volume
     assert "of which 0.01 m^3 are filled" in str(mesh.quality())
-    assert "times how full tetrahedra are" in str(pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e4))))
+    assert "fill: stiffness and masses are multiplied by" in str(pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e4))))
 
 
 # Stiffness:

@@ -62,7 +62,7 @@ def test_a_tolerance_beyond_the_iterations_is_said() -> None:
     expected = forecast(beam(1e6, 5, iterations=64).compiled)
     assert expected is not None
     text = repr(beam(1e6, 5, iterations=64, tolerance=1e-3))
-    assert f"tolerance 0.001 asks for {expected.words(1e-3)} iterations: few steps will meet it in 64" in text
+    assert f"tolerance 0.001 needs {expected.words(1e-3)} iterations: few steps will reach it in 64" in text
     assert "asks for" not in repr(beam(1e6, 5, iterations=expected.iterations(1e-3), tolerance=1e-3))
     assert "asks for" not in repr(beam(1e6, 5, iterations=64))
 

@@ -350,7 +350,7 @@ def test_a_soft_body_that_rests_folded_says_so(device: torch.device) -> None:
     state = sim.rest_state()
     state.velocities[..., 1] = -2.0
     state = sim.rollout(state, 120, 120).state()
-    with says("turned inside out", device):
+    with says("tetrahedra of environment 0 are inverted", device):
         after, info = sim(state, return_info=True)
     corners = after.positions[0].double().cpu().numpy()[mesh.tets]
     expected = int((np.linalg.det(corners[:, 1:] - corners[:, :1]) <= 0.0).sum())

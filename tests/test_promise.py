@@ -99,7 +99,7 @@ def test_rounding_is_told_apart_from_error(error: float) -> None:
     """Rounding of a float32 step, 10 eps |x|, is more than these bounds, which hold beyond it."""
     sim = bar()
     state = swinging(sim)
-    with pytest.warns(TuningWarning, match="more than the error, in every state of the study.*dtype=torch.float64"):
+    with pytest.warns(TuningWarning, match="rounding exceeds the error in every studied state.*dtype=torch.float64"):
         result = sim.tune(state, error=error)
     assert result.attained
     (exact,) = exact_steps(sim, state)

@@ -273,7 +273,7 @@ def test_errors_of_others_are_left_alone() -> None:
 
 def test_capture_wants_a_gpu() -> None:
     sim = simulate(torch.float32)
-    with pytest.raises(RuntimeError, match=r'capture: .* this one is on cpu: move it with \.to\("cuda"\)'):
+    with pytest.raises(RuntimeError, match=r'capture: .* got cpu: move it with \.to\("cuda"\)'):
         sim.capture(moving(sim))
 
 

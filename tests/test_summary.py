@@ -94,7 +94,7 @@ def test_absent_effects_change_no_bits(dtype: torch.dtype, device: torch.device)
             (
                 "1 patch,",
                 "one thread block an environment",
-                '"cluster", sooner done with a few environments (batch=1), "grid" or "stream"',
+                '"cluster", faster for a few environments (batch=1), "grid" or "stream"',
             ),
         ),
         (
