@@ -248,7 +248,9 @@ def test_what_friction_leaves_out_is_said() -> None:
     sim = pd.Simulator(scene, 1 / 30, progress=False, iterations=16)
     state = sim.rest_state()
     state.velocities[..., 1] = -2.0
-    with pytest.warns(TuningWarning, match=r"\(error 0.001 not reached; Multilevel, not tried because of friction, might"):
+    with pytest.warns(
+        TuningWarning, match=r"\(error 0.001 not reached; Multilevel, not tried because of friction, might"
+    ):
         sim.tune(state, error=1e-3, most=8)
     with pytest.warns(TuningWarning, match="cannot be reached"):
         sim.tune(state, error=1e-3, most=1, candidates=[pd.Chebyshev(), pd.Multilevel()])
