@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import torch
 
 from .checks import check_scalar, check_whole
-from .tables import SETTINGS_TABLE
+from .extension import load_extension
 
 __all__ = [
     "DEFAULT_ITERATIONS",
@@ -25,7 +25,11 @@ LARGEST_COUNT = 1_000_000_000  # of iterations; the ops have the same limit
 Diagonal = Literal["weighted", "plain"]
 # settings of a step that the simulator says, whatever the solver
 _OTHERS = ("iterations", "time_step", "tolerance", "inertial", "report")
-_USUAL = {row.name: row.usual for row in SETTINGS_TABLE if row.name not in _OTHERS}
+_DEFAULTS: dict[str, Any] = {}  # of the others, as csrc/plan/settings.def declares them
+if load_extension()[0] is not None:  # a solver can be described without it
+    from .tables import SETTINGS_TABLE
+
+    _DEFAULTS = {row.name: row.usual for row in SETTINGS_TABLE if row.name not in _OTHERS}
 _DESCENDS = ": a step of theta / D descends only there;"
 
 
@@ -68,7 +72,7 @@ class Jacobi:
     def settings(self) -> dict[str, Any]:
         """Keyword arguments of the ops."""
         return {
-            **_USUAL,
+            **_DEFAULTS,
             "schedule": 0,
             "relaxation": float(self.relaxation),
             "weighted": self.diagonal == "weighted",
@@ -125,7 +129,7 @@ class Chebyshev:
         """Keyword arguments of the ops."""
         guarded = self.schedule == "guarded"
         return {
-            **_USUAL,
+            **_DEFAULTS,
             "schedule": 2 if guarded else 1,
             "relaxation": float(self.relaxation if self.relaxation is not None else (1.9 if guarded else 1.0)),
             "rho": float(self.rho or 0.0),
@@ -175,7 +179,7 @@ class Multilevel:
         """Keyword arguments of the ops."""
         usual = 1.9 if self.outer == "momentum" else 1.8
         return {
-            **_USUAL,
+            **_DEFAULTS,
             "schedule": _SCHEDULES[self.outer],
             "relaxation": float(self.relaxation if self.relaxation is not None else usual),
         }
