@@ -86,7 +86,7 @@ $(VENV)/requirements.stamp: requirements/dev.txt requirements/lock.txt $(VENV)/b
 	@touch $@
 
 # Object files stay in build/, so that ninja compiles only what changed.
-$(VENV)/extension.stamp: $(NATIVE_SOURCES) setup.py torchpd/toolkit.py $(VENV)/build.stamp
+$(VENV)/extension.stamp: $(NATIVE_SOURCES) setup.py torchpd/common/toolkit.py $(VENV)/build.stamp
 	$(BIN)/python setup.py --quiet build_ext --inplace
 	@touch $@
 

@@ -86,8 +86,8 @@ from torch.utils import cpp_extension  # noqa: E402
 
 # The ninja that pip installed lies beside python, which is not on the PATH of an environment that is not activated.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-TOOLKIT = runpy.run_path(str(ROOT / "torchpd" / "toolkit.py"))
-LINKING = runpy.run_path(str(ROOT / "torchpd" / "linking.py"))
+TOOLKIT = runpy.run_path(str(ROOT / "torchpd" / "common" / "toolkit.py"))
+LINKING = runpy.run_path(str(ROOT / "torchpd" / "common" / "linking.py"))
 
 
 def relative(pattern: str) -> list[str]:

@@ -15,9 +15,9 @@ from machine import describe_run, write_result
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.contenders import CANDIDATES
+from torchpd.accuracy.candidates import CANDIDATES
 from torchpd.reference import step_problem
-from torchpd.reference_solvers import newton
+from torchpd.reference.solvers import newton
 
 STIFFNESSES = (1e4, 1e5, 1e6)
 ERRORS = (1e-2, 1e-3, 1e-6)

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 import torchpd as pd
-from torchpd.fit_targets import FitTarget, base_triangles, target_of
-from torchpd.patch_samples import inner_points
-from torchpd.simplify import simplify
+from torchpd.freeform.fit_samples import inner_points
+from torchpd.freeform.targets import FitTarget, base_triangles, target_of
+from torchpd.geometry.decimate import simplify
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]

@@ -20,7 +20,7 @@ from machine import describe_run, measure, write_result
 from tqdm.auto import tqdm
 
 import torchpd as pd
-from torchpd.solvers import Solver
+from torchpd.scene.solvers import Solver
 
 ERRORS = (1e-1, 1e-2, 1e-3)
 COUNTS = sorted({round(2.0 ** (k / 4)) for k in range(45)})  # to 2048

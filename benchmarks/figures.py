@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from torchpd.animation import write_film
+from torchpd.viewing.animation import write_film
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDY = ROOT / "benchmarks" / "results" / "study-beam" / "study.csv"

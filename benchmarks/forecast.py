@@ -17,8 +17,8 @@ from tune import random_scene, random_state
 
 import torchpd as pd
 from torchpd.accuracy import ExactStep, exact_steps, frictionless
-from torchpd.automatic import AIM
-from torchpd.forecast import forecast, spectrum_of
+from torchpd.estimate.convergence import forecast, spectrum_of
+from torchpd.estimate.solver_choice import AIM
 
 ERRORS = (1e-1, 1e-2, 1e-3)
 COUNTS = sorted({round(2.0 ** (k / 4)) for k in range(49)})  # to 4096

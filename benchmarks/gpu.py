@@ -21,9 +21,9 @@ from scenes import TIME_STEP
 from tqdm.auto import tqdm
 
 import torchpd as pd
-from torchpd.gpu import properties_of
+from torchpd.common.gpu import properties_of
 from torchpd.plan import KERNELS
-from torchpd.study_axes import PAPER_TESTS
+from torchpd.study.axes import PAPER_TESTS
 
 Row = dict[str, Any]
 

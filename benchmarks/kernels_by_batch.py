@@ -2,7 +2,7 @@
 
 Bars that are held at one end and swing, 64 guarded iterations. A time is that of a CUDA graph of one step, so the start
 of the graph is in it; medians. Every kernel that fits is made for the batch, as "auto" makes it, and the times stand
-beside those that `torchpd.kernel_costs` expects.
+beside those that `torchpd.plan.kernel_costs` expects.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from scenes import TIME_STEP
 from tqdm.auto import tqdm
 
 import torchpd as pd
-from torchpd.gpu import properties_of
-from torchpd.kernel_costs import iteration_microseconds
+from torchpd.common.gpu import properties_of
 from torchpd.plan import KERNELS
+from torchpd.plan.kernel_costs import iteration_microseconds
 
 Row = dict[str, Any]
 

@@ -25,9 +25,9 @@ from tune import random_mesh
 
 import torchpd as pd
 from torchpd.accuracy import Errors, ExactStep, exact_steps
-from torchpd.automatic import AIM, MARGIN
-from torchpd.forecast import forecast, is_uneven
-from torchpd.quality import smallest_dihedral
+from torchpd.estimate.convergence import forecast, is_uneven
+from torchpd.estimate.solver_choice import AIM, MARGIN
+from torchpd.geometry.mesh_quality import smallest_dihedral
 
 STEPS = 6
 SOFT = 60  # iterations of Chebyshev

@@ -17,7 +17,8 @@ from typing import Any
 import torch
 from tqdm.auto import tqdm
 
-from torchpd import _C, provenance
+from torchpd import _C
+from torchpd.common import provenance
 
 Record = dict[str, Any]
 

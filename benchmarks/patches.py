@@ -28,7 +28,7 @@ from machine import describe_run, measure, multiply_adds_per_second, write_resul
 
 import torchpd as pd
 from torchpd import _C
-from torchpd.render import Camera
+from torchpd.viewing.render import Camera
 
 LANES = {"avx512": 16, "avx2": 8}
 CAMERA = Camera((0.0, 0.0, 4.2), (0.0, 0.0, 0.0), 32.0)

@@ -31,11 +31,11 @@ from tqdm.auto import tqdm
 
 import torchpd as pd
 from torchpd.accuracy import problem_of
-from torchpd.automatic import CPU_CHEBYSHEV, Cost, multilevel_cost
-from torchpd.forecast import forecast
-from torchpd.solvers import Solver
-from torchpd.study_bench import clock_of
-from torchpd.subjects import SUBJECTS
+from torchpd.estimate.convergence import forecast
+from torchpd.estimate.solver_choice import CPU_CHEBYSHEV, Cost, multilevel_cost
+from torchpd.scene.solvers import Solver
+from torchpd.study.bench import clock_of
+from torchpd.study.scenes import SUBJECTS
 
 SIZES = {"256": 3, "1k": 5, "3k": 8, "10k": 12, "30k": 18, "100k": 26}  # cells across
 ALONE = [size for size in SIZES if size != "256"]  # unless asked for: smaller ones come in batches
@@ -252,14 +252,14 @@ def _plain(number: float, *, down: bool = False) -> str:
 
 
 def cost_in_use(name: str, row: Row) -> Cost | None:
-    """What `torchpd.automatic` holds for a solver; None for Chebyshev on a GPU: see `kernels_by_batch.py`."""
+    """What `solver_choice` holds for a solver; None for Chebyshev on a GPU: see `kernels_by_batch.py`."""
     if name == "Multilevel":
         return multilevel_cost(row["vertices"], on_gpu=row["kernel"] is not None)
     return CPU_CHEBYSHEV if row["kernel"] is None else None
 
 
 def costs_of_batches(rows: list[Row]) -> str:
-    """What `torchpd.automatic` holds of environments beside the first, for which its own number is taken."""
+    """What `solver_choice` holds of environments beside the first, for which its own number is taken."""
     lines = []
     for row in rows:
         vertices, batch = row["vertices"], row["batch"]
@@ -276,7 +276,7 @@ def costs_of_batches(rows: list[Row]) -> str:
 
 
 def costs(rows: list[Row]) -> str:
-    """Microseconds of an iteration by kernel and size: what `torchpd.automatic` holds."""
+    """Microseconds of an iteration by kernel and size: what `torchpd.estimate.solver_choice` holds."""
     lines = []
     for kernel in sorted({row["kernel"] or "cpu" for row in rows}):
         for name in SOLVERS:

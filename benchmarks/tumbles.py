@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 import torchpd as pd
 from torchpd.reference import StepProblem, step_problem
-from torchpd.reference_solvers import guarded_chebyshev
+from torchpd.reference.solvers import guarded_chebyshev
 
 STEPS = 8
 LEFT = 1e-5  # of the residual: a step that is looked at

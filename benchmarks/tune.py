@@ -25,8 +25,8 @@ from tqdm.auto import tqdm
 
 import torchpd as pd
 from torchpd.accuracy import exact_steps, settled_steps
-from torchpd.forecast import has_friction
-from torchpd.tuning import TuningWarning
+from torchpd.accuracy.tuning import TuningWarning
+from torchpd.estimate.convergence import has_friction
 
 JUDGED_STEPS = (1, 5, 20, 45)  # of the other motion
 SLACK = 1.2  # of a budget in milliseconds

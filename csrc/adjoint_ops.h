@@ -214,7 +214,7 @@ std::tuple<Tensor, Tensor> conjugate_gradients(const Tensor& positions, const Te
           sliding ? at::maximum(found.error, found.friction) : found.error.contiguous()};
 }
 
-// The solution with what stands in where there is none, and the warnings: torchpd/adjoint.py.
+// The solution with what stands in where there is none, and the warnings: torchpd/ops/adjoint.py.
 inline Tensor mend(const AdjointTensors& t, const AdjointSystem& s, double time_step,
                    const Solved& found) {
   static const auto op =

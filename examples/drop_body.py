@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 import torchpd as tpd
-from torchpd.animation import write_surface
+from torchpd.viewing.animation import write_surface
 
 TIME_STEP = 1 / 60  # s
 

@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 
 import torchpd as tpd
-from torchpd.render import Camera
+from torchpd.viewing.render import Camera
 
 VIEWS = 4
 CAMERA = Camera((0.0, 0.6, 4.2), (0.0, 0.0, 0.0), 36.0)

@@ -9,8 +9,8 @@ import torch
 import trimesh
 
 import torchpd as tpd
-from torchpd.animation import write_surface
-from torchpd.seams import measure_seams
+from torchpd.freeform.continuity import measure_seams
+from torchpd.viewing.animation import write_surface
 
 TIME_STEP = 1 / 60  # s
 

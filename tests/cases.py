@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay
 
 from torchpd import TetMesh
-from torchpd.effects import Gravity, Ground, Pin, Solid, Sphere
 from torchpd.reference import StepProblem, elements, step_problem
 from torchpd.scene import Part, Scene
+from torchpd.scene.effects import Gravity, Ground, Pin, Solid, Sphere
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

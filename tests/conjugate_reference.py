@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpd.multilevel import has_levels, reference_of_levels
+from torchpd.plan.preconditioner import has_levels, reference_of_levels
 
 __all__ = ["System", "conjugate_gradients", "stabilised_gradients"]
 

@@ -15,9 +15,9 @@ from runs import ULP
 from scipy.spatial import Delaunay
 
 import torchpd as pd
-from torchpd.device_plan import compile_device_plan
+from torchpd.common.tables import DEVICE_PLAN_TABLE
+from torchpd.plan.gpu_plan import compile_device_plan
 from torchpd.scene import SceneValues
-from torchpd.tables import DEVICE_PLAN_TABLE
 
 LANES, SLICE, NONE, SENDERS = 32, 8, 65535, 7
 SLOT_STEP = 8  # slots in pair_corner

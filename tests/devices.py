@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchpd.extension import load_extension
+from torchpd.common.extension import load_extension
 
 
 def missing_gpu() -> str:

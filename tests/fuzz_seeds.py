@@ -11,8 +11,9 @@ import meshio
 import numpy as np
 import trimesh
 
-from torchpd import TetMesh, TriMesh, shapes
+from torchpd import TetMesh, TriMesh
 from torchpd.formats.registry import FORMATS
+from torchpd.geometry import shapes
 
 __all__ = ["Seed", "make_seeds"]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from torchpd import TetMesh, TriMesh, shapes
+from torchpd import TetMesh, TriMesh
+from torchpd.geometry import shapes
 
 
 def signed_volumes(mesh: TetMesh) -> np.ndarray:

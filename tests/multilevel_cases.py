@@ -14,8 +14,8 @@ from scipy.spatial import Delaunay
 
 import torchpd as pd
 from torchpd import _C
-from torchpd.multilevel import precondition_plan, reference_of_levels
 from torchpd.plan import Plan
+from torchpd.plan.preconditioner import precondition_plan, reference_of_levels
 
 SOLVERS = [pd.Multilevel("lbfgs"), pd.Multilevel("momentum"), pd.Multilevel()]
 IDS = ["lbfgs", "momentum", "corotated"]

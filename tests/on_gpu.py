@@ -16,8 +16,8 @@ from cases import Case, box
 from runs import simulate, simulator, small
 
 import torchpd as pd
-from torchpd import regimes
-from torchpd.gpu import properties_of
+from torchpd.common.gpu import properties_of
+from torchpd.plan import kernel_choice as regimes
 
 KERNELS = ("block", "cluster", "grid", "stream")
 GPU = torch.device("cuda", 0)

@@ -9,7 +9,7 @@ from runs import noise, plan_of, settings_of, small
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.state import Info
+from torchpd.simulation.state import Info
 
 BATCH = 3
 

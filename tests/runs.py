@@ -12,7 +12,7 @@ from torch import Tensor
 
 import torchpd as pd
 from torchpd.reference import StepProblem, step_problem
-from torchpd.reference_solvers import Iterates, Observer, classic_chebyshev, guarded_chebyshev, jacobi
+from torchpd.reference.solvers import Iterates, Observer, classic_chebyshev, guarded_chebyshev, jacobi
 
 ULP = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}  # rounding of one operation, relative
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 import torchpd as pd
-from torchpd.quality import shape_gradients
+from torchpd.geometry.mesh_quality import shape_gradients
 
 
 def elastic_matrix(solid: pd.Solid) -> csr_array:

@@ -10,7 +10,7 @@ from cases import beam, contact_block, sliver_mesh
 from runs import full_scene, moving, simulate, simulator, state_of
 
 import torchpd as pd
-from torchpd import accuracy
+from torchpd.accuracy import error as accuracy
 from torchpd.accuracy import (
     exact_steps,
     frictionless,
@@ -18,10 +18,10 @@ from torchpd.accuracy import (
     scene_without_friction,
     settled_steps,
 )
-from torchpd.contact_newton import ContactNewton
+from torchpd.baselines.contact_newton import ContactNewton
 from torchpd.reference import StepProblem, step_problem
-from torchpd.reference_solvers import newton, newton_step, solve_with_contact
-from torchpd.subjects import SUBJECTS
+from torchpd.reference.solvers import newton, newton_step, solve_with_contact
+from torchpd.study.scenes import SUBJECTS
 
 
 def test_the_first_iterate_has_error_one_and_the_solution_none() -> None:

@@ -8,7 +8,7 @@ from adjoint_cases import body
 from torch.profiler import ProfilerActivity, profile
 
 import torchpd as pd
-from torchpd.tables import MATERIAL_TABLE
+from torchpd.common.tables import MATERIAL_TABLE
 
 # A central difference with relative step 1e-5 errs by about 1e-10 (truncation) and 1e-16 / 1e-5 (rounding), relative to
 # the largest terms; sums that cancel lose some digits more.

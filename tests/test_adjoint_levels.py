@@ -12,7 +12,7 @@ from runs import noise, same_bits
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.multilevel import has_levels, reference_of_levels
+from torchpd.plan.preconditioner import has_levels, reference_of_levels
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

@@ -12,8 +12,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils import _pytree as pytree
 
 import torchpd as pd
-from torchpd.diagonal import named_material, step_diagonal
-from torchpd.tables import MATERIAL_TABLE
+from torchpd.common.tables import MATERIAL_TABLE
+from torchpd.ops.diagonal import named_material, step_diagonal
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -162,7 +162,7 @@ def test_the_system_with_contacts(own: str, forces: bool, dtype: torch.dtype, de
     wanted, diagonal = (t.expand(BATCH, -1) for t in step_diagonal(plan_of(sim), material, h))
     moves = wanted.isfinite()
     diagonal = torch.where(moves, diagonal, 1.0)
-    residual = pd.adjoint.step_gradient(pd.adjoint.AdjointCall(x, v, f, after, material, plan_of(sim), h))
+    residual = pd.ops.adjoint.step_gradient(pd.ops.adjoint.AdjointCall(x, v, f, after, material, plan_of(sim), h))
     held, sticks, curvature, slides = held_by_contacts(known, after, after - x, residual, diagonal)
     assert torch.equal(stuck, sticks)
     assert 0 < int(stuck.sum()) < stuck.numel()
@@ -222,7 +222,7 @@ def test_the_result_with_contacts(dtype: torch.dtype, device: torch.device) -> N
     assert all(t[1].isnan().all() for t in found)
     passed = (projector * (g + w / h - elastic).unsqueeze(-2)).sum(-1)
     wanted = without[0] + torch.where(stuck[..., None], passed, 0.0)
-    assert errors[2] > pd.adjoint.ADJOINT_TOLERANCE[dtype]
+    assert errors[2] > pd.ops.adjoint.ADJOINT_TOLERANCE[dtype]
     across = sliding[..., 2, :].clone()
     across[2] = 0.0
     wanted = wanted + across * (across * multiplier).sum(-1, keepdim=True)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from pxr import Usd, UsdGeom
 
-from torchpd.animation import write_film, write_surface
-from torchpd.shading import SmoothSurface
+from torchpd.viewing.animation import write_film, write_surface
+from torchpd.viewing.shading import SmoothSurface
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from adjoint_cases import body
 from runs import same_bits
 
 import torchpd as pd
-from torchpd.diagonal import step_diagonal
+from torchpd.ops.diagonal import step_diagonal
 
 
 def test_forward_mode_is_refused() -> None:
@@ -180,7 +180,7 @@ def test_compiles_with_its_backward() -> None:
 
 
 @pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "levels"])
-def test_autocast_does_not_touch_the_adjoint(solver: pd.solvers.Solver) -> None:
+def test_autocast_does_not_touch_the_adjoint(solver: pd.scene.solvers.Solver) -> None:
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (8, 2, 2))
     bar = pd.Solid(mesh, 5e4)
     scene = pd.Scene(bar, pd.Pin(bar, mesh.vertices[:, 0] == 0.0), pd.Gravity(), pd.Sphere((0.5, -0.3, 0.13), 0.3, 0.3))
@@ -200,7 +200,7 @@ def test_autocast_does_not_touch_the_adjoint(solver: pd.solvers.Solver) -> None:
 
 @pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "levels"])
 @pytest.mark.parametrize("factor", [1e-25, 1e20])
-def test_a_loss_may_be_of_any_size(factor: float, solver: pd.solvers.Solver, device: torch.device) -> None:
+def test_a_loss_may_be_of_any_size(factor: float, solver: pd.scene.solvers.Solver, device: torch.device) -> None:
     """In float32, where the squares of its gradients would be zero, or infinite; nobody warns."""
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (8, 2, 2))
     bar = pd.Solid(mesh, 5e4)

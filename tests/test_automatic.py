@@ -17,15 +17,16 @@ from programs import ROOT
 from runs import same_bits, state_of
 
 import torchpd as pd
-from torchpd import automatic, settings
 from torchpd.accuracy import exact_steps
-from torchpd.automatic import AIM, CPU_CHEBYSHEV, MOST_OF_CHEBYSHEV, PATIENCE, Cost, multilevel_cost
-from torchpd.compiled import CompiledScene
-from torchpd.forecast import MOST_OF_LEVELS
-from torchpd.gpu import H100
-from torchpd.kernel_costs import iteration_microseconds
-from torchpd.regimes import choose_plan
-from torchpd.subjects import SUBJECTS
+from torchpd.common.gpu import H100
+from torchpd.estimate import solver_choice as automatic
+from torchpd.estimate.convergence import MOST_OF_LEVELS
+from torchpd.estimate.solver_choice import AIM, CPU_CHEBYSHEV, MOST_OF_CHEBYSHEV, PATIENCE, Cost, multilevel_cost
+from torchpd.plan.compiled import CompiledScene
+from torchpd.plan.kernel_choice import choose_plan
+from torchpd.plan.kernel_costs import iteration_microseconds
+from torchpd.simulation import settings
+from torchpd.study.scenes import SUBJECTS
 
 
 def beam(youngs: float, cells: int = 5, **options: Any) -> pd.Simulator:

@@ -13,9 +13,9 @@ from small_scene import call_step, scene, settings, small_simulator
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.material import MATERIAL_ROWS
-from torchpd.solvers import Solver
-from torchpd.tables import SETTINGS_TABLE
+from torchpd.common.tables import SETTINGS_TABLE
+from torchpd.plan.material import MATERIAL_ROWS
+from torchpd.scene.solvers import Solver
 
 ops = torch.ops.torchpd
 PATCHES, MOST_SLOTS = 5, 8  # in the order of PlanSize

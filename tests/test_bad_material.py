@@ -9,7 +9,7 @@ import torch
 from small_scene import body, scene, small_simulator
 
 import torchpd as pd
-from torchpd.material import named_arrays
+from torchpd.plan.material import named_arrays
 
 
 @pytest.fixture(scope="module")

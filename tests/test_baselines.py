@@ -14,21 +14,21 @@ from runs import simulator
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import torchpd as pd
-from torchpd import dense_direct
 from torchpd.baselines import (
     BASELINES,
     Baseline,
     GaussSeidel,
     colour_vertices,
+    dense_direct,
     factorised,
     run_baseline,
     two_stage_rho,
 )
-from torchpd.compiled_step import CompiledStep, CountedStep
-from torchpd.dense_direct import DENSE, DenseDirect
-from torchpd.newton_krylov import NewtonKrylov
+from torchpd.baselines.compiled_step import CompiledStep, CountedStep
+from torchpd.baselines.dense_direct import DENSE, DenseDirect
+from torchpd.baselines.newton_krylov import NewtonKrylov
 from torchpd.reference import StepProblem, step_problem
-from torchpd.reference_solvers import newton, preconditioned_lbfgs, relative_error, solve_with_contact
+from torchpd.reference.solvers import newton, preconditioned_lbfgs, relative_error, solve_with_contact
 
 
 def swinging() -> Case:

@@ -19,8 +19,8 @@ import torch
 from devices import missing_gpu
 from programs import ROOT
 
-from torchpd.gpu import properties_of
-from torchpd.study_axes import PAPER_TESTS
+from torchpd.common.gpu import properties_of
+from torchpd.study.axes import PAPER_TESTS
 
 SCHEMA: dict[str, Any] = {
     "schema": int,

@@ -10,7 +10,7 @@ import torch
 from device_plans import CLUSTER, MOST_CLUSTER, NONE, SLICE, Arrays, Lanes, rows_of, values_of
 from numpy.typing import NDArray
 
-from torchpd.device_plan import compile_device_plan
+from torchpd.plan.gpu_plan import compile_device_plan
 from torchpd.scene import SceneValues
 
 CASES = (

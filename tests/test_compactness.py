@@ -15,7 +15,7 @@ from patch_cases import ball
 from programs import ROOT
 
 import torchpd as pd
-from torchpd.fit_targets import target_of
+from torchpd.freeform.targets import target_of
 
 
 @pytest.fixture

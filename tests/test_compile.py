@@ -12,7 +12,7 @@ from torch import Tensor
 from torch._dynamo.backends.common import aot_autograd
 
 import torchpd as pd
-from torchpd.solvers import Solver
+from torchpd.scene.solvers import Solver
 
 ops = torch.ops.torchpd
 BATCH = 3

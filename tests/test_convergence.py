@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 import torchpd as pd
-from torchpd.convergence import SolvedAlreadyError, compare_solvers, measure_convergence, plot_convergence
+from torchpd.study.convergence import SolvedAlreadyError, compare_solvers, measure_convergence, plot_convergence
 
 
 def _pressed_beam(friction: float) -> tuple[pd.Simulator, pd.State]:

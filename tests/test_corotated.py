@@ -14,7 +14,7 @@ from runs import arguments_of, displacement, simulator, state_of
 from scipy.sparse import csr_array, diags_array
 
 import torchpd as pd
-from torchpd.reference_solvers import newton, preconditioned_lbfgs, relative_error, solve_with_contact
+from torchpd.reference.solvers import newton, preconditioned_lbfgs, relative_error, solve_with_contact
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

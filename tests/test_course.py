@@ -8,7 +8,7 @@ from tuning_cases import bar
 
 import torchpd as pd
 from torchpd.accuracy import exact_steps, problem_of
-from torchpd.course import unsolved_step
+from torchpd.accuracy.unsolved_step import unsolved_step
 
 H = 1 / 60
 

@@ -29,10 +29,10 @@ from runs import moving, noise, same_bits, state_of
 from torch import Tensor
 
 import torchpd as pd
-from torchpd import regimes
-from torchpd.gpu import properties_of
+from torchpd.common.gpu import properties_of
 from torchpd.ops import INFO_WIDTH
-from torchpd.state import Info
+from torchpd.plan import kernel_choice as regimes
+from torchpd.simulation.state import Info
 
 require_gpu()
 

@@ -14,7 +14,7 @@ from runs import noise, same_bits
 
 import torchpd as pd
 from torchpd.ops import INFO_WIDTH
-from torchpd.state import Info
+from torchpd.simulation.state import Info
 
 require_gpu()
 

@@ -14,7 +14,7 @@ from on_gpu import DTYPES, GPU, KERNELS, host_waits, poll, small_on_gpu
 from runs import noise, small
 
 import torchpd as pd
-from torchpd.pins import hold_exactly
+from torchpd.scene.pins import hold_exactly
 
 require_gpu()
 

@@ -36,10 +36,10 @@ from runs import (
 )
 
 import torchpd as pd
-from torchpd import regimes
-from torchpd.pins import hold_exactly
+from torchpd.plan import kernel_choice as regimes
 from torchpd.reference import StepProblem, nearest_rotation_fast
-from torchpd.reference_solvers import Iterates
+from torchpd.reference.solvers import Iterates
+from torchpd.scene.pins import hold_exactly
 
 require_gpu()
 pytestmark = pytest.mark.usefixtures("poisoned")

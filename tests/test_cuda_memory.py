@@ -14,10 +14,10 @@ from runs import noise, plan_of, simulator, small
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.gpu import properties_of
+from torchpd.common.gpu import properties_of
+from torchpd.common.tables import DEVICE_SIZES
 from torchpd.ops import INFO_WIDTH
-from torchpd.placing import step_bytes
-from torchpd.tables import DEVICE_SIZES
+from torchpd.plan.placement import step_bytes
 
 require_gpu()
 

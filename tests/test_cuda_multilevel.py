@@ -17,9 +17,9 @@ from runs import arguments_of, noise, same_bits, simulator, small, state_of
 from scipy.sparse import csr_array
 
 import torchpd as pd
-from torchpd import multilevel
-from torchpd.multilevel import precondition_plan, reference_of_levels
-from torchpd.tables import MULTILEVEL_TABLE
+from torchpd.common.tables import MULTILEVEL_TABLE
+from torchpd.plan import preconditioner as multilevel
+from torchpd.plan.preconditioner import precondition_plan, reference_of_levels
 
 require_gpu()
 

@@ -45,8 +45,8 @@ from runs import (
 from torch import Tensor
 
 import torchpd as pd
-from torchpd import kernel_benchmark
-from torchpd.gpu import properties_of
+from torchpd.common.gpu import properties_of
+from torchpd.plan import kernel_benchmark
 
 require_gpu()
 ops = torch.ops.torchpd

@@ -14,8 +14,9 @@ from on_gpu import DTYPES, GPU, KERNELS, bar, has_clusters, moved, small_on_gpu,
 from runs import moving, same_bits, simulate, simulator, small, state_of
 
 import torchpd as pd
-from torchpd import placing, regimes
-from torchpd.gpu import Properties
+from torchpd.common.gpu import Properties
+from torchpd.plan import kernel_choice as regimes
+from torchpd.plan import placement as placing
 
 require_gpu()
 

@@ -11,7 +11,7 @@ from on_gpu import DTYPES, GPU, KERNELS, compiled_for, host_waits
 from runs import same_bits
 
 import torchpd as pd
-from torchpd.solvers import Solver
+from torchpd.scene.solvers import Solver
 
 require_gpu()
 

@@ -17,9 +17,9 @@ from torch import Tensor
 
 import torchpd as pd
 from torchpd import _C
-from torchpd.diagonal import step_diagonal
-from torchpd.gpu import H100, properties_of
-from torchpd.material import MATERIAL_ROWS
+from torchpd.common.gpu import H100, properties_of
+from torchpd.ops.diagonal import step_diagonal
+from torchpd.plan.material import MATERIAL_ROWS
 
 require_gpu()
 

@@ -136,7 +136,7 @@ def test_missing_package_is_said_before_the_work(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setattr(
-        "torchpd.demo.missing_packages", lambda packages: [p for p in packages if p.module == "mitsuba"]
+        "torchpd.cli.demo.missing_packages", lambda packages: [p for p in packages if p.module == "mitsuba"]
     )
     assert main(["demo", "--out", str(tmp_path / "out")]) == 2
     assert "mitsuba, not installed: pip install torchpd[demo]" in capsys.readouterr().err

@@ -19,8 +19,8 @@ from programs import HELPERS
 from runs import simulator
 
 import torchpd as pd
-from torchpd.extension import load_extension
-from torchpd.pins import hold_exactly
+from torchpd.common.extension import load_extension
+from torchpd.scene.pins import hold_exactly
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

@@ -38,10 +38,10 @@ from runs import ULP
 
 import torchpd as pd
 from torchpd import _C
-from torchpd.device_plan import compile_device_plan
+from torchpd.common.tables import DEVICE_PLAN_TABLE
+from torchpd.plan.gpu_plan import compile_device_plan
 from torchpd.reference import elements
 from torchpd.scene import SceneValues
-from torchpd.tables import DEVICE_PLAN_TABLE
 
 
 def test_every_tetrahedron_is_in_one_lane(lanes: Lanes, values: SceneValues) -> None:

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchpd import doctor
-from torchpd.toolkit import Toolkit, choose_toolkit
+from torchpd.cli import doctor
+from torchpd.common.toolkit import Toolkit, choose_toolkit
 from torchpd.version import __version__
 
 BUILD = {

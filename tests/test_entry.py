@@ -43,7 +43,11 @@ def test_a_checker_infers_the_types_of_a_script(tmp_path: Path) -> None:
     )
     said = [line.partition(": ")[2] for line in run.stdout.splitlines() if line.startswith("script.py")]
     shown = [line for line in said if "Revealed" in line]
-    assert [re.findall(r"torchpd\.state\.(\w+)", line) for line in shown] == [["State"], ["State", "Info"], []]
+    assert [re.findall(r"torchpd\.simulation\.state\.(\w+)", line) for line in shown] == [
+        ["State"],
+        ["State", "Info"],
+        [],
+    ]
     assert shown[-1].endswith('"torch._tensor.Tensor"')
     errors = [line for line in said if line.startswith("error")]
     assert [word in line for line, word in zip(errors, ('"nu"', '"Cloth"'), strict=True)] == [True, True]
@@ -69,7 +73,7 @@ def test_device_is_where_it_steps() -> None:
 
 
 def test_a_device_that_is_not_there_is_refused_before_the_scene_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchpd.model.compile_plan", lambda *_, **__: pytest.fail("compiled"))
+    monkeypatch.setattr("torchpd.simulation.model.compile_plan", lambda *_, **__: pytest.fail("compiled"))
     with pytest.raises(RuntimeError, match="gpu"):
         pd.Simulator(SCENE, device="gpu")
 

@@ -28,9 +28,9 @@ from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import eigsh
 
 import torchpd as pd
-from torchpd.diagonal import step_diagonal
+from torchpd.ops.diagonal import step_diagonal
 from torchpd.reference import StepProblem
-from torchpd.reference_solvers import newton, relative_error
+from torchpd.reference.solvers import newton, relative_error
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

@@ -13,10 +13,10 @@ import pytest
 import torch
 
 import torchpd as pd
-from torchpd import settings
-from torchpd.automatic import Choice
-from torchpd.compiled import CompiledScene
-from torchpd.forecast import UnsolvedWarning, forecast
+from torchpd.estimate.convergence import UnsolvedWarning, forecast
+from torchpd.estimate.solver_choice import Choice
+from torchpd.plan.compiled import CompiledScene
+from torchpd.simulation import settings
 
 
 def beam(youngs: float = 1e4, time_step: float = 1 / 60, **options: Any) -> pd.Simulator:

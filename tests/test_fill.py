@@ -16,7 +16,7 @@ from scipy.sparse.linalg import spsolve
 from small_strains import elastic_matrix
 
 import torchpd as pd
-from torchpd.fill import LEAST_FILL, parts_of
+from torchpd.geometry.occupancy import LEAST_FILL, parts_of
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from torchpd import fit_problem
-from torchpd.fit_problem import HeightProblem, QuadricNumbers, levenberg_marquardt, ridge_amplitudes, within_radii
+from torchpd.freeform import least_squares as fit_problem
+from torchpd.freeform.least_squares import (
+    HeightProblem,
+    QuadricNumbers,
+    levenberg_marquardt,
+    ridge_amplitudes,
+    within_radii,
+)
 
 
 def some(count: int = 5, seed: int = 0) -> QuadricNumbers:

@@ -12,8 +12,8 @@ from cases import sliver_mesh
 
 import torchpd as pd
 from torchpd.accuracy import exact_steps
-from torchpd.forecast import Forecast, Spectrum, UnsolvedWarning, forecast, is_uneven, spectrum_of
-from torchpd.quality import smallest_dihedral
+from torchpd.estimate.convergence import Forecast, Spectrum, UnsolvedWarning, forecast, is_uneven, spectrum_of
+from torchpd.geometry.mesh_quality import smallest_dihedral
 
 
 def beam(youngs: float, cells: int = 3, **options: Any) -> pd.Simulator:

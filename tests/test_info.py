@@ -13,7 +13,7 @@ from runs import displacement, moving, simulate, simulator, state_of, tensor_of
 
 import torchpd as pd
 from torchpd.reference import step_problem
-from torchpd.reference_solvers import newton, relative_error
+from torchpd.reference.solvers import newton, relative_error
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

@@ -15,8 +15,8 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import torchpd as pd
-from torchpd.io import FORMAT_VERSION
-from torchpd.solvers import Solver
+from torchpd.files.simulation_file import FORMAT_VERSION
+from torchpd.scene.solvers import Solver
 
 
 def everything() -> pd.Scene:

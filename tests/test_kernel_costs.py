@@ -13,11 +13,10 @@ import torch
 from device_plans import box_values
 from programs import ROOT
 
-from torchpd import kernel_benchmark, kernel_costs
-from torchpd.gpu import H100, Properties
-from torchpd.kernel_costs import clusters_together, iteration_microseconds, kernel_microseconds
-from torchpd.plan import Plan
-from torchpd.regimes import choose_plan, shared_bytes
+from torchpd.common.gpu import H100, Properties
+from torchpd.plan import Plan, kernel_benchmark, kernel_costs
+from torchpd.plan.kernel_choice import choose_plan, shared_bytes
+from torchpd.plan.kernel_costs import clusters_together, iteration_microseconds, kernel_microseconds
 
 # of those that benchmarks/kernels_by_batch.py measures, what is quickly made
 REGULAR = [(3, 3, 3), (15, 3, 3), (8, 5, 5), (15, 4, 4), (25, 5, 5), (19, 8, 8), (40, 8, 8), (39, 15, 15), (60, 24, 24)]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from torchpd.ledger import Ledger, Row, write_csv
+from torchpd.study.results_log import Ledger, Row, write_csv
 
 ROWS = [
     Row("solver", "a", iterations=3, error=0.5, milliseconds=1.5, more={"turn": 0.25}),

@@ -72,7 +72,7 @@ def test_a_part_that_does_not_fit_is_named_among_torchs_errors(assign: bool) -> 
 
 
 @pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Multilevel()], ids=["plain", "levels"])
-def test_an_exported_step_is_saved_and_loaded(solver: pd.solvers.Solver) -> None:
+def test_an_exported_step_is_saved_and_loaded(solver: pd.scene.solvers.Solver) -> None:
     policy = Policy()
     policy.sim = simulator(solver=solver)
     state = policy.sim.rest_state(2)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchpd as pd
-from torchpd.tables import PLANES, SPHERES
+from torchpd.common.tables import PLANES, SPHERES
 
 H = 1 / 60
 G = 9.81

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchpd import memory, stiff_pieces
+from torchpd.common import memory
+from torchpd.simulation import stiff_pieces
 
 PHYSICAL = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 UNLIMITED = 9223372036854771712  # what version 1 says then

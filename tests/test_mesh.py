@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from mesh_cases import jittered_box, signed_volumes
 
-from torchpd import MeshWarning, TetMesh, TriMesh, shapes
-from torchpd.embedding import embed_triangles
+from torchpd import MeshWarning, TetMesh, TriMesh
+from torchpd.geometry import shapes
+from torchpd.geometry.embedding import embed_triangles
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 TET = np.array([[0, 1, 2, 3]])

@@ -17,9 +17,10 @@ from mesh_cases import jittered_box, signed_volumes
 from numpy.typing import NDArray
 
 import torchpd as pd
-from torchpd import MeshWarning, TetMesh, TriMesh, shapes
-from torchpd.embedding import embed_triangles
-from torchpd.mesh_faces import TET_FACES, count_pieces, merge_near, sort_faces
+from torchpd import MeshWarning, TetMesh, TriMesh
+from torchpd.geometry import shapes
+from torchpd.geometry.embedding import embed_triangles
+from torchpd.geometry.mesh_faces import TET_FACES, count_pieces, merge_near, sort_faces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -122,7 +123,9 @@ def test_faces_are_matched_as_a_dictionary_does_it(damage: str) -> None:
 def test_words_that_collide_are_told_apart_by_corners(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = jittered_box()
     right = sort_faces(mesh.tets)
-    monkeypatch.setattr("torchpd.mesh_faces.corner_words", lambda elements: np.zeros(elements.shape, dtype=np.uint64))
+    monkeypatch.setattr(
+        "torchpd.geometry.mesh_faces.corner_words", lambda elements: np.zeros(elements.shape, dtype=np.uint64)
+    )
     np.testing.assert_array_equal(sort_faces(mesh.tets).lone, right.lone)
 
 

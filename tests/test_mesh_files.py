@@ -12,9 +12,10 @@ import pytest
 import trimesh
 from mesh_cases import jittered_box, signed_volumes
 
-from torchpd import MeshWarning, TetMesh, TriMesh, shapes
-from torchpd.effects import Solid
-from torchpd.embedding import embed_triangles
+from torchpd import MeshWarning, TetMesh, TriMesh
+from torchpd.geometry import shapes
+from torchpd.geometry.embedding import embed_triangles
+from torchpd.scene.effects import Solid
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 TET = np.array([[0, 1, 2, 3]])

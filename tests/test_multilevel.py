@@ -11,8 +11,8 @@ from runs import ULP, noise, simulator
 from scipy.sparse import bsr_array, csr_array
 
 import torchpd as pd
-from torchpd.multilevel import has_levels, reference_of_levels
-from torchpd.tables import MULTILEVEL_TABLE, PLAN_TABLE
+from torchpd.common.tables import MULTILEVEL_TABLE, PLAN_TABLE
+from torchpd.plan.preconditioner import has_levels, reference_of_levels
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 ops = torch.ops.torchpd

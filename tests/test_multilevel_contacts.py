@@ -13,7 +13,7 @@ from multilevel_cases import IDS, SOLVERS, plate
 from runs import arguments_of, displacement, simulator, state_of
 
 import torchpd as pd
-from torchpd.reference_solvers import relative_error, solve_with_contact
+from torchpd.reference.solvers import relative_error, solve_with_contact
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

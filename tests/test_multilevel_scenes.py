@@ -16,9 +16,9 @@ from multilevel_cases import IDS, SOLVERS, swing
 from runs import displacement, moving, same_bits, simulate, simulator, state_of
 
 import torchpd as pd
-from torchpd import placing
 from torchpd.accuracy import problem_of
-from torchpd.reference_solvers import relative_error
+from torchpd.plan import placement as placing
+from torchpd.reference.solvers import relative_error
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

@@ -13,7 +13,7 @@ from multilevel_cases import Tables, converged, irregular, solved_directly, swin
 from runs import arguments_of, displacement, simulator, state_of
 
 import torchpd as pd
-from torchpd.reference_solvers import newton, preconditioned_lbfgs, relative_error
+from torchpd.reference.solvers import newton, preconditioned_lbfgs, relative_error
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

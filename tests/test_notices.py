@@ -14,7 +14,7 @@ import torch
 from torch._dynamo.testing import CompileCounterWithBackend
 
 import torchpd as pd
-from torchpd.overlaps import find_overlaps
+from torchpd.geometry.overlaps import find_overlaps
 
 BOX = pd.shapes.box((0.2, 0.2, 0.2), (3, 3, 3))
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from patch_cases import F64, ball, patches_on, sheet, torus, triangle
 
 import torchpd as pd
-from torchpd.patch_constraints import skeleton, volumes
+from torchpd.freeform.constraints import skeleton, volumes
+from torchpd.geometry.visibility import depths, is_blocked
 from torchpd.reference import elements, gradient_operator
-from torchpd.visibility import depths, is_blocked
 
 Array = NDArray[np.float64]
 SOLVERS = [pd.Chebyshev(), pd.Chebyshev(schedule="classic", rho=0.9), pd.Jacobi(), pd.Multilevel()]

@@ -12,8 +12,8 @@ from PIL import Image
 
 import torchpd as pd
 from torchpd.__main__ import main
-from torchpd.patch_demo import PAPER_SCENES, PatchScene, spindle
-from torchpd.seams import measure_seams
+from torchpd.cli.patch_demo import PAPER_SCENES, PatchScene, spindle
+from torchpd.freeform.continuity import measure_seams
 
 
 @pytest.mark.parametrize("scene", PAPER_SCENES, ids=lambda scene: scene.name)

@@ -12,7 +12,7 @@ import trimesh
 from patch_cases import F64, ball, central, lump, patches_on, quadrics_on, triangle
 
 import torchpd as pd
-from torchpd.render import Camera
+from torchpd.viewing.render import Camera
 
 CORNERS = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]
 
@@ -219,7 +219,7 @@ STATE = pd.State(*(torch.zeros(1, 13, 3, dtype=F64) for _ in range(2)))
             r"origins must be a tensor \[R, 3\], or \[B, R, 3\] .*, got list",
         ),
         (lambda: RAYS.cast(RAY, RAY, patches=3), "patches must be FreeFormPatches, got int"),
-        (lambda: RAYS.render(None, (8, 6)), "camera must be a torchpd.render.Camera, got NoneType"),
+        (lambda: RAYS.render(None, (8, 6)), "camera must be a torchpd.viewing.render.Camera, got NoneType"),
         (lambda: RAYS.render(CAMERA, (8, 6.5)), r"size must be two whole numbers, .* got \(8, 6.5\)"),
         (lambda: RAYS.render(CAMERA, 8), "size must be two whole numbers, width and height in pixels, got 8"),
         (lambda: BODY.pose(STATE), r"positions must be a tensor \[B, 13, 3\], got State; take state.positions"),

@@ -13,8 +13,8 @@ from patch_cases import F64, ball, patches_on
 from programs import ROOT
 
 import torchpd as pd
-from torchpd.fit_targets import target_of
-from torchpd.patch_fit import measure_fit
+from torchpd.freeform.fit import measure_fit
+from torchpd.freeform.targets import target_of
 
 BOX = [[-1.5] * 3, [1.5] * 3]
 

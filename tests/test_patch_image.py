@@ -9,7 +9,7 @@ import torch
 from patch_cases import F64, ball, central, lump, patches_on, triangle, tumbled
 
 import torchpd as pd
-from torchpd.render import Camera
+from torchpd.viewing.render import Camera
 
 CAMERA = Camera((0.0, 0.0, 5.0), (0.0, 0.0, 0.0), 40.0)
 SIZE = (24, 16)  # width, height

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from patch_cases import F64, KIND_NAMES, KINDS, ball, patches_on, quadrics_on, sheet, triangle
 
 import torchpd as pd
-from torchpd.patch_lists import triangle_distances
-from torchpd.patch_reference import PatchReference
+from torchpd.freeform.adjacency import triangle_distances
+from torchpd.freeform.reference import PatchReference
 
 
 @settings(max_examples=200, deadline=None)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from patch_cases import F64, KIND_NAMES, KINDS, ball, central, patches_on, sheet, torus, triangle, tumbled
 
 import torchpd as pd
-from torchpd.patch_mesh import grid
+from torchpd.freeform.tessellation import grid
 
 LEVELS = [1, 2, 3, 4, 7]
 

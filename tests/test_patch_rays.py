@@ -26,7 +26,7 @@ from patch_cases import (
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.patch_mesh import grid
+from torchpd.freeform.tessellation import grid
 
 
 @pytest.mark.parametrize("reading", ["clip", "literal"])

@@ -9,7 +9,7 @@ from patch_cases import F64, KIND_NAMES, KINDS, ball, central, patches_on, sampl
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.patch_reference import PatchReference, clamped_gradient, literal_field, vertex_frames
+from torchpd.freeform.reference import PatchReference, clamped_gradient, literal_field, vertex_frames
 
 
 def array(tensor: Tensor) -> np.ndarray:

@@ -10,13 +10,14 @@ import torch
 from runs import simulate, simulator, small_case
 
 import torchpd as pd
-from torchpd import placing, settings
-from torchpd.compiled import CompiledScene
-from torchpd.gpu import H100
-from torchpd.material import in_order, material_of
-from torchpd.multilevel import has_levels
+from torchpd.common.gpu import H100
 from torchpd.plan import Plan, compile_plan
-from torchpd.regimes import choose_plan
+from torchpd.plan import placement as placing
+from torchpd.plan.compiled import CompiledScene
+from torchpd.plan.kernel_choice import choose_plan
+from torchpd.plan.material import in_order, material_of
+from torchpd.plan.preconditioner import has_levels
+from torchpd.simulation import settings
 
 GPU = torch.device("cuda", 0)
 STEP = 123_456  # bytes

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 import torchpd as pd
 from torchpd import _C
-from torchpd.material import in_order, material_of
+from torchpd.common.tables import PLAN_TABLE
 from torchpd.plan import Plan, compile_plan
+from torchpd.plan.material import in_order, material_of
 from torchpd.reference import elements
 from torchpd.scene import SceneValues
-from torchpd.tables import PLAN_TABLE
 
 LANES = 16
 
@@ -249,7 +249,7 @@ def test_compiling_twice_gives_the_same_plan(values: SceneValues) -> None:
 
 def test_large_meshes_show_progress(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     values = values_of("beam")
-    monkeypatch.setattr("torchpd.plan._WORTH_A_BAR", 1000)
+    monkeypatch.setattr("torchpd.plan.cpu_plan._WORTH_A_BAR", 1000)
     compile_plan(values, progress=False)
     assert capsys.readouterr().err == ""
     compile_plan(values)

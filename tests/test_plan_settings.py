@@ -8,15 +8,17 @@ import pytest
 import torch
 
 import torchpd as pd
-from torchpd import automatic, model, placing, settings
-from torchpd.compiled import CompiledScene
-from torchpd.forecast import Spectrum
-from torchpd.gpu import H100
-from torchpd.multilevel import precondition_plan, reference_of
-from torchpd.parametrized import plain_copy
+from torchpd.common.gpu import H100
+from torchpd.estimate import solver_choice as automatic
+from torchpd.estimate.convergence import Spectrum
 from torchpd.plan import Plan, compile_plan
-from torchpd.regimes import choose_plan
+from torchpd.plan import placement as placing
+from torchpd.plan.compiled import CompiledScene
+from torchpd.plan.kernel_choice import choose_plan
+from torchpd.plan.preconditioner import precondition_plan, reference_of
 from torchpd.scene import SceneValues
+from torchpd.simulation import model, settings
+from torchpd.simulation.parametrization import plain_copy
 
 
 def test_another_kernel_makes_the_plan_anew(monkeypatch: pytest.MonkeyPatch) -> None:

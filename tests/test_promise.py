@@ -12,11 +12,10 @@ import torch
 from tuning_cases import bar, swinging, worst_error
 
 import torchpd as pd
-from torchpd import tuning
-from torchpd.accuracy import exact_steps
-from torchpd.promise import Trial, TuningResult
-from torchpd.synonyms import Renamed
-from torchpd.tuning import TuningWarning
+from torchpd.accuracy import exact_steps, tuning
+from torchpd.accuracy.tuning import TuningWarning
+from torchpd.accuracy.tuning_result import Trial, TuningResult
+from torchpd.common.synonyms import Renamed
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.readouts import _Contacts, _split
+from torchpd.simulation.readouts import _Contacts, _split
 
 
 def tilted(degrees: float) -> pd.Gravity:

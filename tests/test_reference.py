@@ -28,7 +28,6 @@ from scipy.spatial.transform import Rotation
 
 from torchpd import TetMesh
 from torchpd.baselines import BASELINES
-from torchpd.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from torchpd.reference import (
     Array,
     StepProblem,
@@ -40,7 +39,7 @@ from torchpd.reference import (
     potential_energy,
     step_problem,
 )
-from torchpd.reference_solvers import (
+from torchpd.reference.solvers import (
     Iterates,
     classic_chebyshev,
     classic_omegas,
@@ -53,6 +52,7 @@ from torchpd.reference_solvers import (
     spectrum,
 )
 from torchpd.scene import Scene
+from torchpd.scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 
 GRAVITY = np.array([0.0, -9.8, 0.0])
 

@@ -14,13 +14,15 @@ from device_plans import box_values
 from programs import ROOT
 
 import torchpd as pd
-from torchpd import _C, kernel_costs, placing, regimes
-from torchpd.gpu import H100, Properties, refuse_full_memory, why_not
-from torchpd.multilevel import precondition_plan
-from torchpd.plan import KERNELS, Plan, compile_plan
-from torchpd.regimes import choose_plan, most_shared_bytes, shared_bytes
+from torchpd import _C
+from torchpd.common.gpu import H100, Properties, refuse_full_memory, why_not
+from torchpd.common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
+from torchpd.plan import KERNELS, Plan, compile_plan, kernel_costs
+from torchpd.plan import kernel_choice as regimes
+from torchpd.plan import placement as placing
+from torchpd.plan.kernel_choice import choose_plan, most_shared_bytes, shared_bytes
+from torchpd.plan.preconditioner import precondition_plan
 from torchpd.scene import SceneValues
-from torchpd.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 
 A100 = Properties(108, 166_912)
 SMALL = Properties(20, 101_376)

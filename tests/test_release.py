@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.func import functional_call
 
 import torchpd as pd
-from torchpd.gpu import Properties
+from torchpd.common.gpu import Properties
 from torchpd.plan import Plan
-from torchpd.regimes import choose_plan
-from torchpd.solvers import Solver
+from torchpd.plan.kernel_choice import choose_plan
+from torchpd.scene.solvers import Solver
 
 
 def simulator(

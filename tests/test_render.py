@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
-from torchpd.render import Camera, Studio, contact_sheet, frame_camera, render
+from torchpd.viewing.render import Camera, Studio, contact_sheet, frame_camera, render
 
 Array = NDArray[np.float64]
 

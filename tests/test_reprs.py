@@ -7,8 +7,8 @@ import torch
 from torch._subclasses import FakeTensorMode
 
 import torchpd as pd
-from torchpd.readouts import Wrench
-from torchpd.render import Camera
+from torchpd.simulation.readouts import Wrench
+from torchpd.viewing.render import Camera
 
 MESH = pd.shapes.box((1.0, 0.2, 0.2), (5, 1, 1))
 SOLID = pd.Solid(MESH, youngs=1e5)

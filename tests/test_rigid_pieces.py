@@ -12,10 +12,10 @@ import torch
 from runs import same_bits
 
 import torchpd as pd
-from torchpd import stiff_pieces
-from torchpd.multilevel import reference_of
+from torchpd.plan.preconditioner import reference_of
 from torchpd.reference import step_problem
-from torchpd.reference_solvers import newton, relative_error
+from torchpd.reference.solvers import newton, relative_error
+from torchpd.simulation import stiff_pieces
 
 STEP = 1.0 / 30.0
 

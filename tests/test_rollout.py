@@ -15,7 +15,7 @@ from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchpd as pd
-from torchpd.state import Info
+from torchpd.simulation.state import Info
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

@@ -22,7 +22,7 @@ from runs import (
 
 import torchpd as pd
 from torchpd.reference import StepProblem
-from torchpd.reference_solvers import Iterates
+from torchpd.reference.solvers import Iterates
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

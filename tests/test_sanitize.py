@@ -11,9 +11,10 @@ import pytest
 import torch
 from programs import ROOT
 
-from torchpd import _C, regimes
-from torchpd.gpu import Properties
+from torchpd import _C
+from torchpd.common.gpu import Properties
 from torchpd.plan import Plan
+from torchpd.plan import kernel_choice as regimes
 
 TOOLS = ROOT / "tools"
 H100 = Properties(132, 232448, 16)

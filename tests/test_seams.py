@@ -10,7 +10,7 @@ import trimesh
 from patch_cases import F64, ball, patches_on, sheet, triangle
 
 import torchpd as pd
-from torchpd.seams import Seams, measure_seams
+from torchpd.freeform.continuity import Seams, measure_seams
 
 
 def test_creases_of_a_cube_and_its_diagonals() -> None:

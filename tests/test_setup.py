@@ -13,7 +13,7 @@ import pytest
 from programs import ROOT
 
 from torchpd.__main__ import main
-from torchpd.linking import libraries_in, library_names, runtime_fault, shared_runtime
+from torchpd.common.linking import libraries_in, library_names, runtime_fault, shared_runtime
 
 
 def failure(*command: str, modules: Path | None = None, **environment: str) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchpd.shading import SmoothSurface
+from torchpd.viewing.shading import SmoothSurface
 
 
 def test_box_keeps_its_edges() -> None:

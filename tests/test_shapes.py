@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchpd import TriMesh, shapes
-from torchpd.contour import contour
-from torchpd.tetrahedralize import tetrahedralize
+from torchpd import TriMesh
+from torchpd.geometry import shapes
+from torchpd.geometry.isosurface import contour
+from torchpd.geometry.tetrahedralize import tetrahedralize
 
 
 def test_box_numbers_its_vertices_by_the_formula() -> None:

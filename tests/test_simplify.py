@@ -9,8 +9,8 @@ import trimesh
 from patch_cases import ball, sheet, torus
 
 import torchpd as pd
-from torchpd.patch_checks import check_surface
-from torchpd.simplify import simplify
+from torchpd.freeform.checks import check_surface
+from torchpd.geometry.decimate import simplify
 
 
 def euler(mesh: pd.TriMesh) -> int:

@@ -15,10 +15,10 @@ from cases import box
 from runs import moving, same_bits, simulate
 
 import torchpd as pd
-from torchpd.material import named_arrays
-from torchpd.placing import check_wanted_device
 from torchpd.plan import KERNELS
-from torchpd.solvers import Solver
+from torchpd.plan.material import named_arrays
+from torchpd.plan.placement import check_wanted_device
+from torchpd.scene.solvers import Solver
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -248,7 +248,7 @@ def test_a_checkpoint_of_torch_holds_states(tmp_path: Path) -> None:
     assert same_bits(loaded["track"].state(), track.state())
     # wherever in the package their classes are
     assert {kind.__module__ for kind in (pd.State, pd.Info, pd.Track)} == {"torchpd"}
-    assert b"torchpd.state" not in pickle.dumps((after, info, track))
+    assert b"torchpd.simulation.state" not in pickle.dumps((after, info, track))
     assert same_bits(pickle.loads(pickle.dumps(track)).state(), track.state())
 
 

@@ -15,14 +15,14 @@ import pytest
 import torch
 from PIL import Image
 
-from torchpd import study_axes, study_bench
 from torchpd.accuracy import ExactStep
+from torchpd.accuracy.candidates import CANDIDATES, DEFAULT
 from torchpd.baselines import BASELINES
-from torchpd.contenders import CANDIDATES, DEFAULT
-from torchpd.dense_direct import DENSE
-from torchpd.ledger import Row
+from torchpd.baselines.dense_direct import DENSE
 from torchpd.study import StudyOptions, cost_table, paper_table, run_study, study_table
-from torchpd.study_axes import (
+from torchpd.study import axes as study_axes
+from torchpd.study import bench as study_bench
+from torchpd.study.axes import (
     baseline_rows,
     contender_rows,
     dense_rows,
@@ -31,7 +31,7 @@ from torchpd.study_axes import (
     paper_rows,
     time_step_rows,
 )
-from torchpd.study_bench import (
+from torchpd.study.bench import (
     Bench,
     Setting,
     Timing,
@@ -41,8 +41,9 @@ from torchpd.study_bench import (
     time_calls,
     verdicts,
 )
-from torchpd.study_plots import STYLES, draw_study, float32_floor, in_words, pareto_front
-from torchpd.subjects import SUBJECTS
+from torchpd.study.plots import STYLES, draw_study, float32_floor, in_words, pareto_front
+from torchpd.study.results_log import Row
+from torchpd.study.scenes import SUBJECTS
 
 CPU = torch.device("cpu")
 

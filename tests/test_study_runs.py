@@ -13,13 +13,13 @@ import pytest
 import torch
 from PIL import Image
 
-from torchpd import study
 from torchpd.__main__ import main
-from torchpd.ledger import Row
-from torchpd.shapes import box
+from torchpd.geometry.shapes import box
 from torchpd.study import AXES, StudyOptions, run_study, study_rows
-from torchpd.study_bench import Bench, Setting
-from torchpd.subjects import subject_of
+from torchpd.study import tasks as study
+from torchpd.study.bench import Bench, Setting
+from torchpd.study.results_log import Row
+from torchpd.study.scenes import subject_of
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 CPU = torch.device("cpu")

@@ -10,12 +10,12 @@ from cases import Case, box
 from runs import moving, same_bits, simulator
 
 import torchpd as pd
-from torchpd import summary
-from torchpd.compiled import CompiledScene
-from torchpd.gpu import Properties
+from torchpd.common.gpu import Properties
+from torchpd.files import summary
+from torchpd.files.summary import workspace_bytes
 from torchpd.plan import Plan
-from torchpd.regimes import choose_plan
-from torchpd.summary import workspace_bytes
+from torchpd.plan.compiled import CompiledScene
+from torchpd.plan.kernel_choice import choose_plan
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

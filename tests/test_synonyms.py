@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import torchpd as pd
-from torchpd.synonyms import SYNONYMS
+from torchpd.common.synonyms import SYNONYMS
 
 MESH = pd.shapes.box((1.0, 0.2, 0.2), (2, 1, 1))
 SIM = pd.Simulator(pd.Scene(pd.Solid(MESH, youngs=1e5)), iterations=1)
@@ -65,4 +65,4 @@ def test_other_unknown_arguments_get_the_list() -> None:
 def test_dir_shows_what_is_public() -> None:
     shown = {name for name in dir(pd) if not name.startswith("__")}
     assert shown == {name for name in pd.__all__ if not name.startswith("__")}
-    assert inspect.ismodule(importlib.import_module("torchpd.render"))  # others can be imported all the same
+    assert inspect.ismodule(importlib.import_module("torchpd.viewing.render"))  # others can be imported all the same

@@ -16,10 +16,11 @@ from hypothesis import strategies as st
 from mesh_cases import jittered_box
 from scipy.optimize import linprog
 
-from torchpd import Embedding, MeshWarning, TetMesh, TriMesh, embed, shapes
-from torchpd.embedding import _outside
-from torchpd.lattice import Lattice, _overlaps
-from torchpd.tetrahedralize import _split_hinges, tetrahedralize
+from torchpd import Embedding, MeshWarning, TetMesh, TriMesh, embed
+from torchpd.geometry import shapes
+from torchpd.geometry.bcc_lattice import Lattice, _overlaps
+from torchpd.geometry.embedding import _outside
+from torchpd.geometry.tetrahedralize import _split_hinges, tetrahedralize
 
 
 def ball(subdivisions: int = 3) -> TriMesh:

@@ -14,7 +14,7 @@ from runs import simulator, state_of
 
 import torchpd as pd
 from torchpd.reference import step_problem
-from torchpd.reference_solvers import guarded_chebyshev
+from torchpd.reference.solvers import guarded_chebyshev
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

@@ -14,7 +14,7 @@ from runs import displacement, simulator, state_of
 
 import torchpd as pd
 from torchpd.reference import StepProblem, step_problem
-from torchpd.reference_solvers import classic_omegas, guarded_chebyshev, newton
+from torchpd.reference.solvers import classic_omegas, guarded_chebyshev, newton
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from torchpd.ledger import Trajectory
-from torchpd.study_bench import Bench, Setting
-from torchpd.subjects import SUBJECTS
-from torchpd.trajectory import compare_trajectories, first_turn, tolerance_rows, trajectory_rows
+from torchpd.study.bench import Bench, Setting
+from torchpd.study.results_log import Trajectory
+from torchpd.study.scenes import SUBJECTS
+from torchpd.study.trajectory import compare_trajectories, first_turn, tolerance_rows, trajectory_rows
 
 TIME_STEP = 0.01  # s
 

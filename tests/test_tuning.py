@@ -10,11 +10,10 @@ import torch
 from tuning_cases import CANDIDATES, bar, swinging, worst_error
 
 import torchpd as pd
-from torchpd import tuning
-from torchpd.accuracy import ExactStep, exact_steps, settled_steps
-from torchpd.contenders import safe_candidates
-from torchpd.promise import Trial
-from torchpd.tuning import TuningWarning
+from torchpd.accuracy import ExactStep, exact_steps, settled_steps, tuning
+from torchpd.accuracy.candidates import safe_candidates
+from torchpd.accuracy.tuning import TuningWarning
+from torchpd.accuracy.tuning_result import Trial
 
 
 @pytest.mark.parametrize("error", [1e-1, 1e-3])

@@ -13,7 +13,7 @@ from runs import ULP, material_with, noise, plan_of, settings_of, small
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.tables import MATERIAL_TABLE
+from torchpd.common.tables import MATERIAL_TABLE
 
 ops = torch.ops.torchpd
 BATCH = 3

@@ -62,7 +62,7 @@ def include_folders() -> list[str]:
 
 def nvcc_flags() -> tuple[str, ...]:
     """Those that a build has."""
-    flags: tuple[str, ...] = runpy.run_path(str(ROOT / "torchpd" / "toolkit.py"))["NVCC_FLAGS"]
+    flags: tuple[str, ...] = runpy.run_path(str(ROOT / "torchpd" / "common" / "toolkit.py"))["NVCC_FLAGS"]
     return flags
 
 

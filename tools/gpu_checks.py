@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import torch
 from sanitize import RUNS
 
-from torchpd.provenance import describe_run
+from torchpd.common.provenance import describe_run
 
 ROOT = Path(__file__).resolve().parent.parent
 KINDS = ("suite", "list", "clean", "plants")

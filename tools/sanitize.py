@@ -58,13 +58,13 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 import torchpd as pd
-from torchpd import multilevel
-from torchpd.device_plan import compile_device_plan
-from torchpd.gpu import properties_of
+from torchpd.common.gpu import properties_of
+from torchpd.common.tables import DEVICE_PLAN_TABLE, MATERIAL_TABLE
 from torchpd.plan import KERNELS as PLAN_KERNELS
 from torchpd.plan import Plan
-from torchpd.render import Camera
-from torchpd.tables import DEVICE_PLAN_TABLE, MATERIAL_TABLE
+from torchpd.plan import preconditioner as multilevel
+from torchpd.plan.gpu_plan import compile_device_plan
+from torchpd.viewing.render import Camera
 
 TABLE = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "cuda-registers.csv"
 SOLVERS = (pd.Chebyshev(), pd.Jacobi(), pd.Chebyshev("classic", rho=0.9, delay=1))

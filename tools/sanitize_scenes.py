@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 import torchpd as pd
-from torchpd import regimes
+from torchpd.plan import kernel_choice as regimes
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -37,7 +37,7 @@ def crumbs(count: int) -> pd.TetMesh:
 
 
 class Way(NamedTuple):
-    """What a kernel runs with: a mesh, and constants of torchpd.regimes that decide how many patches there are."""
+    """What a kernel runs with: a mesh, and constants of kernel_choice that decide how many patches there are."""
 
     mesh: pd.TetMesh
     constants: dict[str, Any]

@@ -103,7 +103,7 @@ def measure(name: str, scene_name: str, tets: int | None, plans: Path) -> None:
     from scenes import TIME_STEP
 
     import torchpd as pd
-    from torchpd import regimes
+    from torchpd.plan import kernel_choice as regimes
 
     if tets is not None:
         regimes._STREAM_TETS, regimes._PIPED_MORE = dict.fromkeys(regimes._STREAM_TETS, tets), 1.0
@@ -142,7 +142,7 @@ def main() -> None:
         return
     if not torch.cuda.is_available():
         sys.exit("tools/variants.py times kernels, and torch sees no GPU here.")
-    linked, flags = objects(), runpy.run_path(str(ROOT / "torchpd" / "toolkit.py"))["NVCC_FLAGS"]
+    linked, flags = objects(), runpy.run_path(str(ROOT / "torchpd" / "common" / "toolkit.py"))["NVCC_FLAGS"]
     patches: dict[str, Path | None] = {"as it is": None, **{str(patch): patch for patch in options.patch}}
     failed = False
     with tempfile.TemporaryDirectory() as made:

@@ -4,41 +4,41 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from . import shapes
-from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
-from .embedding import Embedding
-from .extension import extension_error, load_extension
-from .mesh import MeshWarning, TetMesh, embed
-from .scene import Scene
-from .solvers import Chebyshev, Jacobi, Multilevel
-from .state import Info, State, Track
-from .synonyms import no_attribute
-from .tetrahedralize import tetrahedralize
-from .tri_mesh import TriMesh
+from .common.extension import extension_error, load_extension
+from .common.synonyms import no_attribute
+from .common.warn import SceneWarning, TuningWarning
+from .geometry import shapes
+from .geometry.embedding import Embedding
+from .geometry.tet_mesh import MeshWarning, TetMesh, embed
+from .geometry.tetrahedralize import tetrahedralize
+from .geometry.tri_mesh import TriMesh
+from .scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from .scene.scene import Scene
+from .scene.solvers import Chebyshev, Jacobi, Multilevel
+from .simulation.state import Info, State, Track
 from .version import __version__
-from .warn import SceneWarning, TuningWarning
 
 if load_extension()[0] is not None:
-    from .capture import CapturedStep
-    from .distributed import keep_material_per_rank
-    from .forecast import UnsolvedWarning
-    from .ops import nearest_rotation
-    from .patch_body import PatchBody
-    from .patch_fit import FitReport
-    from .patch_image import PatchImage
-    from .patch_loss import PatchLoss
-    from .patch_rays import PatchHits
-    from .patch_surface import PatchPose, PatchSamples
-    from .patch_transport import PatchTransport
-    from .patches import FreeFormPatches, PatchFit, PatchRays, fit_patches
-    from .plan import Plan, compile_plan
-    from .quadric_transport import QuadricTransport
-    from .quadrics import Quadrics
-    from .readouts import ContactForces, Reactions
-    from .rigid_pieces import RigidPieces
-    from .simulator import Simulator
-    from .spectrum import estimate_rho
-    from .stress import Stress
+    from .accuracy.spectral_radius import estimate_rho
+    from .api.patches import FreeFormPatches, PatchFit, PatchRays, fit_patches
+    from .api.simulator import Simulator
+    from .estimate.convergence import UnsolvedWarning
+    from .freeform.body import PatchBody
+    from .freeform.fit import FitReport
+    from .freeform.image import PatchImage
+    from .freeform.loss import PatchLoss
+    from .freeform.quadric_transport import QuadricTransport
+    from .freeform.quadrics import Quadrics
+    from .freeform.rays import PatchHits
+    from .freeform.surface import PatchPose, PatchSamples
+    from .freeform.transport import PatchTransport
+    from .ops.registration import nearest_rotation
+    from .plan.cpu_plan import Plan, compile_plan
+    from .simulation.cuda_graph import CapturedStep
+    from .simulation.distributed import keep_material_per_rank
+    from .simulation.readouts import ContactForces, Reactions
+    from .simulation.rigid_pieces import RigidPieces
+    from .simulation.stress import Stress
 __all__ = [
     "CapturedStep",
     "Chebyshev",

@@ -106,7 +106,7 @@ def _add_study(commands: Any) -> None:
 
 
 def _study(arguments: argparse.Namespace) -> str:
-    from .study import AXES, StudyOptions, run_study
+    from .study.tasks import AXES, StudyOptions, run_study
 
     options = {name: value for name, value in vars(arguments).items() if name != "command"}
     chosen = [axis.replace("-", " ") for axis in options.pop("axes") or AXES]
@@ -116,8 +116,8 @@ def _study(arguments: argparse.Namespace) -> str:
 
 
 def _demo(arguments: argparse.Namespace) -> str:
-    from .demo import DemoOptions, run_demo
-    from .patch_demo import run_patch_demo
+    from .cli.demo import DemoOptions, run_demo
+    from .cli.patch_demo import run_patch_demo
 
     options = {name: value for name, value in vars(arguments).items() if name != "command"}
     patches, cells = options.pop("patches"), options.pop("cells")
@@ -135,7 +135,7 @@ def _check_out(out: Path) -> None:
 
 
 def _doctor() -> int:
-    from .doctor import problems, report
+    from .cli.doctor import problems, report
 
     print(report())
     return 1 if problems() else 0

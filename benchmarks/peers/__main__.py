@@ -33,7 +33,7 @@ import torch
 from tqdm.auto import tqdm
 
 import torchpd as pd
-from torchpd.provenance import describe_run
+from torchpd.common.provenance import describe_run
 
 from . import converged, mujoco_flex, newton_physics, ours
 from .problem import Array, Method, MissingPackageError, Problem, beam, from_file

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpd.subjects import DENSITY
+from torchpd.study.scenes import DENSITY
 
 from .problem import GRAVITY, Method, MissingPackageError, Problem
 from .timing import fastest

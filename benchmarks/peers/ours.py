@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 import torchpd as pd
-from torchpd.solvers import Solver
+from torchpd.scene.solvers import Solver
 
 from .problem import Method, Problem
 from .timing import fastest

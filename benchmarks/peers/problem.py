@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import torchpd as pd
-from torchpd.subjects import DENSITY
+from torchpd.study.scenes import DENSITY
 
 Array = NDArray[np.float64]
 GRAVITY = -9.8  # m/s^2 along y

@@ -1,5 +1,5 @@
 // The system of a step's adjoint, H l = dL/dx' + dL/dv' / h on what moves, and what its solution says of the state before; see
-// torchpd/adjoint.py. A vertex at a time, no neighbours.
+// torchpd/ops/adjoint.py. A vertex at a time, no neighbours.
 #pragma once
 #include "effects/contact.h"
 #include "math/mat.h"

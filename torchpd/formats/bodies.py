@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..units import Unit
+from ..common.units import Unit
 from . import split
 from .content import CELLS, Array, Index, MeshContent
 from .guard import PathLike, read
@@ -51,7 +51,7 @@ def holds_body(owner: str, path: PathLike) -> bool:
 
 
 def read_body(owner: str, path: PathLike, unit: Unit | None = None) -> Body:
-    """Read a body of tets; a `ValueError` where the file holds none. `unit`: see `torchpd.units`."""
+    """Read a body of tets; a `ValueError` where the file holds none. `unit`: see `torchpd.common.units`."""
     content = read(owner, path, unit)
     solid = split.tets_of(content)
     name = Path(path).name
@@ -74,7 +74,7 @@ def read_body(owner: str, path: PathLike, unit: Unit | None = None) -> Body:
 
 
 def read_surface(owner: str, path: PathLike, unit: Unit | None = None) -> Surface:
-    """Read a surface; a `ValueError` where the file holds no triangle, quad or polygon. `unit`: see `torchpd.units`."""
+    """Read a surface; a `ValueError` where the file holds no triangle, quad or polygon. `unit`: see `units`."""
     content = read(owner, path, unit)
     flat = split.triangles_of(content)
     if not len(flat.elements):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..units import Unit, metres
+from ..common.units import Unit, metres
 from .content import CELLS, MeshContent
 from .registry import FORMATS, Format
 
@@ -38,7 +38,7 @@ def read(owner: str, path: PathLike, unit: Unit | None = None) -> MeshContent:
     Args:
         owner: who asks, with which the errors begin.
         path: the file; the suffix of its name says in which format it is.
-        unit: of its numbers, see `torchpd.units`.
+        unit: of its numbers, see `torchpd.common.units`.
 
     Raises:
         FileNotFoundError: there is no such file, or one that belongs to it is missing.

@@ -1,0 +1,56 @@
+"""Candidate solvers of studies and of `Simulator.tune`; add an entry for a new solver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ..estimate.solver_choice import runs
+from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Jacobi, Multilevel, Solver
+from ..simulation.state import State
+from .spectral_radius import estimate_rho
+
+if TYPE_CHECKING:
+    from ..simulation.stepper import Stepper
+
+__all__ = ["CANDIDATES", "DEFAULT", "DEFAULT_ITERATIONS", "Candidate", "safe_candidates"]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A solver by its name in figures.
+
+    `make(sim, state)` may run trials from the state. `safe` solvers cannot diverge, on any mesh and at any stiffness.
+    """
+
+    make: Callable[[Stepper, State], Solver]
+    safe: bool
+    devices: tuple[str, ...] = ("cpu", "cuda")  # where it runs
+
+
+def _classic(sim: Stepper, state: State) -> Solver:
+    """The schedule of the papers, with their two-stage estimate of rho."""
+    own = sim.solver
+    sim.solver = Jacobi(diagonal="plain")
+    try:
+        return Chebyshev("classic", rho=estimate_rho(sim, state))
+    finally:
+        sim.solver = own
+
+
+CANDIDATES: dict[str, Candidate] = {
+    "Jacobi": Candidate(lambda sim, state: Jacobi(diagonal="plain"), safe=False),
+    "damped Jacobi": Candidate(lambda sim, state: Jacobi(relaxation=1.9), safe=True),
+    "classic Chebyshev": Candidate(_classic, safe=False),
+    "guarded Chebyshev": Candidate(lambda sim, state: Chebyshev(), safe=True),
+    "Multilevel": Candidate(lambda sim, state: Multilevel(), safe=True),
+}
+DEFAULT = "guarded Chebyshev"  # the solver of `Simulator(scene)`
+
+
+def safe_candidates(sim: Stepper, state: State) -> dict[str, Solver]:
+    """Solvers that cannot diverge and run on the simulator's device, the default first."""
+    here = {name: c for name, c in CANDIDATES.items() if c.safe and sim.device.type in c.devices}
+    made = {name: here[name].make(sim, state) for name in sorted(here, key=lambda name: name != DEFAULT)}
+    return {name: solver for name, solver in made.items() if runs(solver, sim.compiled)}

@@ -1,0 +1,360 @@
+"""Errors of a step, relative to its converged solution in float64.
+
+Errors are 1 at the unsolved step u_0, which is h v with hard pins at their targets and out of contacts. They are 0 at
+the converged step u*:
+
+    position   |u - u*| / |u_0 - u*|                over all vertices, u = x_{t+1} - x_t
+    energy     (E(u) - E(u*)) / (E(u_0) - E(u*))    of the objective of the step
+    residual   share of the forces that is not balanced: `StepProblem.relative_residual`, `Info.residual`
+
+`exact_steps` solves without friction, which has no energy to minimise; `settled_steps` has friction.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..baselines.contact_newton import ContactNewton
+from ..common.checks import expand_shared
+from ..common.tables import PLANES, SPHERES
+from ..plan.material import MATERIAL_ROWS
+from ..reference.problem import StepProblem, step_problem
+from ..scene.effects import Ground, Sphere
+from ..scene.scene import Part, Scene
+from ..scene.solvers import Chebyshev, Multilevel, Solver
+from ..scene.targets import Targets
+from ..simulation.parametrization import plain_copy
+from ..simulation.state import State
+
+if TYPE_CHECKING:
+    from ..simulation.stepper import Stepper
+
+__all__ = [
+    "Errors",
+    "ExactStep",
+    "exact_steps",
+    "frictionless",
+    "problem_of",
+    "scene_without_friction",
+    "settled_steps",
+]
+
+Array = NDArray[np.float64]
+
+# Solvers of exact steps, with iterations between checks of the residual. The first is the best by far without contacts.
+# With contacts, each solves scenes on which the others stagnate.
+_SOLVERS: tuple[tuple[Solver, int], ...] = ((Multilevel(), 50), (Multilevel("momentum"), 100), (Chebyshev(), 500))
+_SOLVED = 1e-13  # residual at which a solver ends
+_NEARLY = 1e-9  # residual that may be the lowest that rounding allows
+_PATIENCE = 3  # checks without a halved residual before a solver ends; one if all are below _NEARLY
+_SURE = 1e-8  # uncertainty of a converged step that ends the search for a better one
+# uncertainty, by precision, that rounding hides: no Newton's method is needed
+_FINE = {torch.float32: 1e-8, torch.float64: 1e-14}
+# steps with friction: iterations of Multilevel, then of successive runs of Chebyshev
+_LEADING, _SETTLING = 64, (256, 512, 1024, 2048, 4096, 8192)
+# machine epsilons of positions: rounding error of a body in free fall, and scatter of a stiff one
+ROUNDINGS = 10.0
+
+
+class Errors(NamedTuple):
+    """Errors of one solution of one step; see the module for the definitions."""
+
+    position: float
+    energy: float
+    residual: float
+    metres: float  # largest distance of a vertex from its converged position
+
+
+@dataclasses.dataclass(frozen=True)
+class ExactStep:
+    """A step in float64 with its converged solution."""
+
+    problem: StepProblem
+    first: Array  # [V, 3] m: u_0, the unsolved step
+    solution: Array  # [V, 3] m: u*
+    uncertainty: float  # bound on the relative error of u* itself
+
+    @property
+    def scale(self) -> float:
+        """|u_0 - u*| [m]."""
+        return float(np.linalg.norm(self.first - self.solution))
+
+    def rounding(self, dtype: torch.dtype, roundings: float = ROUNDINGS) -> float:
+        """`roundings` eps |x_t| [m]; by default the error floor of any number of iterations in `dtype`."""
+        return roundings * torch.finfo(dtype).eps * float(np.linalg.norm(self.problem.positions))
+
+    def moves(self, dtype: torch.dtype) -> bool:
+        """Whether solving this step changes more than rounding does, compared with rigid motions."""
+        change = min(self.scale, float(np.linalg.norm(self.problem.first_iterate() - self.solution)))
+        return change > self.rounding(dtype)
+
+    def error_beyond_rounding(self, displacement: Array, dtype: torch.dtype, roundings: float = ROUNDINGS) -> float:
+        """The least e >= 0 with |u - u*| <= e |u_0 - u*| + `rounding`."""
+        return max(self.position_error(displacement) - self.rounding(dtype, roundings) / self.scale, 0.0)
+
+    def position_error(self, displacement: Array) -> float:
+        """|u - u*| / |u_0 - u*| of u [V, 3] m, far cheaper than all `Errors`; inf for NaN."""
+        with np.errstate(all="ignore"):
+            error = float(np.linalg.norm(displacement - self.solution)) / self.scale
+        return error if np.isfinite(error) else np.inf
+
+    def errors_of(self, displacement: Array) -> Errors:
+        """The errors of u [V, 3] m; inf if it is not finite."""
+        if not np.isfinite(displacement).all():
+            return Errors(np.inf, np.inf, np.inf, np.inf)
+        problem = self.problem
+        error = displacement - self.solution
+        with np.errstate(all="ignore"):
+            energies = [problem.energy(u) for u in (displacement, self.first, self.solution)]
+            gain = energies[1] - energies[2]
+            found = Errors(
+                self.position_error(displacement),
+                (energies[0] - energies[2]) / gain if gain > 0.0 else 0.0,
+                problem.relative_residual(displacement),
+                float(np.linalg.norm(error, axis=1).max()),
+            )
+        return Errors(*(value if np.isfinite(value) else np.inf for value in found))
+
+
+def scene_without_friction(scene: Scene) -> Scene:
+    """The same parts, with frictionless planes and spheres."""
+    parts: list[Part] = []
+    for part in scene.parts:
+        if isinstance(part, Ground):
+            parts.append(Ground(part.height, part.normal))
+        elif isinstance(part, Sphere):
+            parts.append(Sphere(part.center, part.radius))
+        else:
+            parts.append(part)
+    return Scene(*parts)
+
+
+def frictionless(sim: Stepper, dtype: torch.dtype | None = None) -> Stepper:
+    """A copy of the simulator with its present material, frictionless contacts and no tolerance."""
+    with torch.inference_mode(False), torch.no_grad():
+        twin = plain_copy(sim)
+        if dtype is not None:
+            twin = twin.to(dtype)
+        twin.tolerance = 0.0
+        smooth = {name: getattr(twin, name).detach().clone() for name in ("planes", "spheres")}
+        smooth["planes"][..., PLANES["friction"]] = smooth["spheres"][..., SPHERES["friction"]] = 0.0
+        twin.set_material(**smooth)
+    return twin
+
+
+def problem_of(
+    sim: Stepper, state: State, item: int = 0, *, forces: Tensor | None = None, targets: Targets | None = None
+) -> StepProblem:
+    """One environment's step in the reference, with the simulator's present material and without friction."""
+    arrays = sim.material_at(targets, state[0].shape[0])
+    forces = expand_shared(forces, state[0].shape)
+    material = {}
+    for name, array in zip(MATERIAL_ROWS, arrays, strict=True):
+        shared = array.dim() == MATERIAL_ROWS[name].dims
+        material[name] = _double(array if shared else array[item if len(array) > 1 else 0])
+    planes, spheres = material["planes"], material["spheres"]
+    planes[:, PLANES["friction"]] = 0.0
+    spheres[:, SPHERES["friction"]] = 0.0
+    motion = SPHERES["motion"]
+    values = dataclasses.replace(
+        sim.scene.values(),
+        stiffness=material["stiffness"],
+        masses=material["masses"],
+        gravity=material["gravity"],
+        pin_stiffness=material["pin_stiffness"],
+        pin_targets=material["pin_targets"],
+        planes=planes,
+        spheres=spheres[:, : motion.start],
+        damping=float(material["damping"]),
+    )
+    return step_problem(
+        values,
+        _double(state[0][item]),
+        _double(state[1][item]),
+        sim.time_step,
+        forces=None if forces is None else _double(forces[item]),
+        sphere_centers=spheres[:, SPHERES["center"]],
+        sphere_starts=spheres[:, SPHERES["center"]] - sim.time_step * spheres[:, motion],
+    )
+
+
+def _widened(targets: Mapping[Part, Tensor] | None) -> Mapping[Part, Tensor] | None:
+    return None if targets is None else {part: _wide(place) for part, place in targets.items()}
+
+
+def _wide(tensor: Tensor) -> Tensor:
+    return tensor.detach().to("cpu", torch.float64)
+
+
+def _double(tensor: Tensor) -> Array:
+    return tensor.detach().double().cpu().numpy().copy()
+
+
+@torch.no_grad()
+def exact_steps(
+    sim: Stepper,
+    state: State,
+    *,
+    forces: Tensor | None = None,
+    targets: Targets | None = None,
+    start: str = "velocity",
+    iterations: int = 5000,
+) -> list[ExactStep]:
+    """The converged frictionless step of every environment, for the state and material as rounded in `sim`.
+
+    `Multilevel` runs in float64 on the CPU until the residual stops falling. Newton's method follows if the result is
+    uncertain, with contacts or without. Other solvers then continue from the best result so far.
+
+    `ExactStep.uncertainty` bounds the remaining error: |grad E| / min m/h^2 >= |u - u*| where the elements are stable,
+    or twice the next step of Newton's method, which is far shorter for stiff bodies. If it is large, there is no
+    converged step to compare with.
+
+    Args:
+        sim: scene, time step and material; its solver and device do not matter. float32 needs less certainty.
+        state: start of the steps [B, V, 3].
+        forces: [B, V, 3] N.
+        targets: of pins and spheres, as in `Simulator.forward`.
+        start: u_0 of the errors: "velocity", h v, or the "inertial" first iterate.
+        iterations: most of each solver.
+    """
+    # independent of torch's default device
+    with torch.device("cpu"):
+        search = _Search(sim, state, forces, targets, start)
+        for solver, chunk in _SOLVERS:
+            search.iterate(solver, chunk, iterations)
+            search.polish(_FINE[sim.dtype])
+            if search.sure:
+                break
+    return [step for step in search.found if step is not None]
+
+
+@torch.no_grad()
+def settled_steps(
+    sim: Stepper, state: State, *, forces: Tensor | None = None, enough: float = _SURE
+) -> list[ExactStep]:
+    """The step of every environment with its friction, if iterations from "velocity" settle.
+
+    There is no energy for Newton's method to minimise. So `Multilevel` in float64 on the CPU is followed by longer and
+    longer runs of Chebyshev. `ExactStep.uncertainty` is the change by the last two runs. It stays large if the
+    iterations cycle, for example between sticking and slipping. `ExactStep.errors_of` ignores friction.
+
+    Args:
+        sim: scene, time step and material; its solver and device do not matter.
+        state: start of the steps [B, V, 3].
+        forces: [B, V, 3] N.
+        enough: uncertainty at which to stop.
+    """
+    with torch.device("cpu"):
+        twin = plain_copy(sim)
+        twin.solver, twin.tolerance = Chebyshev(), 0.0
+        twin = twin.to("cpu", torch.float64)
+        wide, pushed = State(_wide(state[0]), _wide(state[1])), None if forces is None else _wide(forces)
+
+        def run(solver: Solver, iterations: int, start: str | Tensor = "velocity") -> State:
+            twin.solver, twin.iterations = solver, iterations
+            return twin(wide, pushed, start=start)
+
+        problems = [problem_of(sim, state, item, forces=forces) for item in range(len(wide.positions))]
+        first = torch.from_numpy(np.stack([problem.course() for problem in problems]))
+        after, moves = run(Multilevel(), _LEADING), [torch.inf * torch.ones(len(first), dtype=torch.float64)]
+        for iterations in _SETTLING:
+            before, after = after, run(Chebyshev(), iterations, after.positions)
+            # from velocities, because a difference of positions loses digits
+            moves.append((after.velocities - before.velocities).flatten(1).norm(dim=1) * twin.time_step)
+            scale = (first - after.velocities * twin.time_step).flatten(1).norm(dim=1)
+            rounding = ROUNDINGS * torch.finfo(torch.float64).eps * wide.positions.flatten(1).norm(dim=1)
+            left = torch.maximum(moves[-2], moves[-1])
+            if bool((left <= torch.maximum(enough * scale, rounding)).all()):
+                break
+    shares = left / scale.clamp(min=torch.finfo(torch.float64).tiny)
+    found = zip(first.numpy(), (after.velocities * twin.time_step).numpy(), shares.tolist(), strict=True)
+    return [
+        ExactStep(problem, start, solution, share)
+        for problem, (start, solution, share) in zip(problems, found, strict=True)
+    ]
+
+
+class _Search:
+    """Search for the converged steps of a batch; keeps the best result of each environment."""
+
+    def __init__(self, sim: Stepper, state: State, forces: Tensor | None, targets: Targets | None, start: str) -> None:
+        # the CPU runs all solvers; a GPU's kernel may not
+        self.twin = frictionless(sim)
+        self.twin.solver = Chebyshev()
+        self.twin = self.twin.to("cpu", torch.float64)
+        self.state = State(_wide(state[0]), _wide(state[1]))
+        self.forces = None if forces is None else _wide(forces)
+        self.targets = _wide(targets) if isinstance(targets, Tensor) else _widened(targets)
+        self.problems = [problem_of(sim, state, item, forces=forces, targets=targets) for item in range(len(state[0]))]
+        self.firsts = [
+            problem.course() if start == "velocity" else problem.first_iterate(start) for problem in self.problems
+        ]
+        near = [problem.first_iterate(start) for problem in self.problems]
+        self.best: Tensor = torch.from_numpy(np.array(near))  # displacements [B, V, 3] m
+        self.lowest = torch.full((len(self.problems),), torch.inf, dtype=torch.float64)
+        self.found: list[ExactStep | None] = [None] * len(self.problems)
+
+    @property
+    def sure(self) -> bool:
+        """Whether the uncertainty of every step is small enough."""
+        return all(step is not None and step.uncertainty <= _SURE for step in self.found)
+
+    def iterate(self, solver: Solver, chunk: int, most: int) -> None:
+        """Continue from the best result with a solver until no residual falls any more."""
+        self.twin.solver, self.twin.iterations = solver, chunk
+        guess, idle = self.state.positions + self.best, 0
+        for _ in range(0, most, chunk):
+            after, info = self.twin(self.state, self.forces, self.targets, guess, return_info=True)
+            # from velocities, because a difference of positions loses digits
+            reached = after.velocities * self.twin.time_step
+            better = info.residual < self.lowest
+            halved = bool((info.residual < 0.5 * self.lowest).any())
+            self.best = torch.where(better[:, None, None], reached, self.best)
+            self.lowest = torch.where(better, info.residual, self.lowest)
+            idle = 0 if halved else idle + 1
+            least = _PATIENCE if bool((self.lowest > _NEARLY).any()) else 1
+            if idle >= least or not bool((self.lowest > _SOLVED).any()):
+                break
+            guess = after.positions
+
+    def polish(self, fine: float) -> None:
+        """Bound the error of uncertain environments, by Newton's method where the residual does not suffice."""
+        for item, (problem, first) in enumerate(zip(self.problems, self.firsts, strict=True)):
+            known = self.found[item]
+            if known is not None and known.uncertainty <= _SURE:
+                continue
+            step = _certified(problem, first, self.best[item].numpy(), fine)
+            if known is None or step.uncertainty < known.uncertainty:
+                self.found[item] = step
+                self.best[item] = torch.from_numpy(step.solution)
+
+
+def _certified(problem: StepProblem, first: Array, near: Array, fine: float) -> ExactStep:
+    """The solution next to an almost converged displacement, with its uncertainty."""
+    step = ExactStep(problem, first, near, _uncertainty(problem, first, near))
+    if step.uncertainty <= fine:
+        return step
+    newton = ContactNewton(problem)
+    solution = newton.minimise(near)
+    direction, stable = newton.step(solution)
+    bound = _relative_norm(2.0 * direction, first - solution) if stable else np.inf
+    bound = min(_uncertainty(problem, first, solution), bound)
+    return min(step, ExactStep(problem, first, solution, bound), key=lambda found: found.uncertainty)
+
+
+def _uncertainty(problem: StepProblem, first: Array, displacement: Array) -> float:
+    """|grad E| / min m/h^2 over |u_0 - u|."""
+    weakest = float(problem.weight[problem.free].min(initial=np.inf))
+    return _relative_norm(problem.residual(displacement) / weakest, first - displacement)
+
+
+def _relative_norm(part: Array, whole: Array) -> float:
+    size = float(np.linalg.norm(whole))
+    return float(np.linalg.norm(part)) / size if size > 0.0 else 0.0

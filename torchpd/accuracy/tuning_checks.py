@@ -1,0 +1,75 @@
+"""Checks of the arguments of `Simulator.tune`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from ..common.checks import check_like
+from ..ops.diagonal import step_diagonal
+from ..plan.material import MATERIAL_ROWS, environments_of_material, named_arrays
+from ..simulation.state import State
+from .error import ExactStep
+
+if TYPE_CHECKING:
+    from ..simulation.stepper import Stepper
+
+__all__ = ["check_known", "check_request", "check_start"]
+
+
+def check_request(error: float | None, milliseconds: float | None) -> None:
+    """Check that one target is given, within its range."""
+    if (error is None) == (milliseconds is None):
+        raise ValueError(
+            f"tune: exactly one of error and milliseconds must be given, got error={error} and "
+            f"milliseconds={milliseconds}; "
+            "for example sim.tune(error=1e-2)"
+        )
+    if error is not None and not 0.0 < error < 1.0:
+        raise ValueError(f"tune: error must lie in (0, 1), where 1 is the unsolved step x + h v; got {error}")
+    if milliseconds is not None and not 0.0 < milliseconds < math.inf:
+        raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
+
+
+def check_start(sim: Stepper, state: State, forces: Tensor | None) -> None:
+    """Check that states, forces and material are finite and the system is not singular."""
+    sim.check_state(state, forces=forces)
+    if forces is not None:
+        check_like("forces", forces, state[0], "N")
+    if state[0].dim() != 3 or not len(state[0]):
+        raise ValueError(f"tune: state must hold environments [B, V, 3], at least one, got {list(state[0].shape)}")
+    count = environments_of_material(named_arrays(sim))
+    if count not in (1, len(state[0])):
+        raise ValueError(f"tune: state must have the {count} environments of the material, got {len(state[0])}")
+    for name, part in zip(State._fields, state, strict=True):
+        bad = (~part.isfinite()).flatten(1).any(1).nonzero()
+        if len(bad):
+            raise ValueError(f"tune: state.{name} must be finite, got NaN or infinity in environment {int(bad[0])}")
+    values = {"forces": forces} if forces is not None else {}
+    for name, array in (values | dict(zip(MATERIAL_ROWS, sim.material(), strict=True))).items():
+        # hard pins have infinite springs
+        bad = (array.isnan() if name == "pin_stiffness" else ~array.isfinite()).nonzero()
+        if len(bad):
+            raise ValueError(f"tune: {name} must be finite, got NaN or infinity at {bad[0].tolist()}")
+    inertia, diagonal = step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)
+    bad = ~((inertia > 0) & (diagonal > 0)).reshape(-1, sim.vertices).all(0)
+    if bool(bad.any()):
+        vertex = int(bad.nonzero()[0])
+        raise ValueError(
+            f"tune: the system is singular: vertex {vertex} has inertia {float(inertia[..., vertex].min()):g} N/m and "
+            f"diagonal {float(diagonal[..., vertex].min()):g} N/m, which must be positive; check masses and stiffness"
+        )
+
+
+def check_known(steps: Sequence[ExactStep], allowed: float) -> None:
+    """Refuse a study without converged steps to compare with."""
+    uncertainty = max(step.uncertainty for step in steps)
+    if not uncertainty <= allowed:
+        raise RuntimeError(
+            f"tune: no converged step to compare with: the best float64 solution of one of the {len(steps)} studied "
+            f"steps may itself be wrong by {uncertainty:.1e}, which must be at most {allowed:.1e}; solver and "
+            "iterations are unchanged. Look for slivers in the mesh (quality()), or request a larger error"
+        )

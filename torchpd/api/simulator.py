@@ -1,0 +1,206 @@
+"""The simulator: a compiled scene as an `nn.Module` that steps states, tunes its solver and saves itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..accuracy.tuning_result import TuningResult
+from ..common.checks import check_has_values
+from ..common.synonyms import Renamed, no_attribute
+from ..files.simulation_file import SavedSimulation, load_simulation, reading, save_simulation
+from ..files.summary import describe
+from ..plan.material import named_arrays
+from ..plan.preconditioner import has_levels, precondition_plan, reference_of_levels
+from ..scene.solvers import Solver
+from ..scene.targets import Targets
+from ..simulation.cuda_graph import CapturedStep
+from ..simulation.state import State
+from ..simulation.stepper import Stepper
+
+__all__ = ["Simulator", "Targets"]
+
+_SETTINGS = ("time_step", "iterations", "solver", "dtype", "tolerance", "kernel", "batch", "adjoint")
+
+
+class Simulator(Stepper):
+    """Steps a scene by implicit Euler, each step solved approximately by projective dynamics.
+
+    Material and effects are parameters, without gradient until you ask for one. Each is shared by all environments or,
+    with a leading batch, has one value for each:
+
+        stiffness      [E] Pa, Young's modulus          masses         [V] kg
+        gravity        [3] m/s^2                        damping        [] 1/s
+        pin_stiffness  [P] N/m                          pin_targets    [P, 3] m
+        planes         [C, 5] normal, height, friction  spheres        [S, 8] centre, radius, friction, motion of a step
+
+    The buffer `pin_hard` [P] or [B, P] says which pins hold exactly; change it to release and to grasp. `set_material`
+    checks and replaces all of these. The rest shape is compiled and has no gradient.
+
+    A step checks no values, because that would wait for a GPU. Where an optimiser or `torch.func.functional_call`
+    brings NaN, or negative stiffness, masses or springs, `Info.residual` is NaN (`Info` names the exceptions). So let
+    an optimiser learn the logarithm of positive quantities.
+
+    Guides: docs/quickstart.md, docs/solvers.md (solver, iterations, tolerance), docs/gpu.md (kernel, batch).
+
+    Args:
+        scene: bodies and effects.
+        time_step: h [s], positive.
+        iterations: most local and global steps in a time step. None: 64, or the choice of "auto". An `UnsolvedWarning`
+            comes once if the default number is expected to leave an error of 0.1 or more; `print(sim)` has the
+            estimate.
+        solver: `Chebyshev()` (None), `Jacobi()`, `Multilevel()`, or one of their names in lower case. "auto" chooses a
+            solver, and iterations if none are given, for an error of 1e-3: docs/solvers.md. May be set later.
+        dtype: torch.float32 or torch.float64. A warning comes if float32 resolves rest positions more coarsely than
+            1e-4 of an edge. Positions of later states are not checked.
+        tolerance: an environment stops iterating when its estimated relative displacement error falls below this; 0:
+            never. Relative to the displacement that elasticity and contacts (or gravity, if more) cause:
+            docs/limits.md.
+        kernel: of a GPU: "block", "cluster", "grid" or "stream"; "auto" takes the first that fits or, with `batch`, the
+            one expected to be fastest; "benchmark" times each that fits. See docs/gpu.md. May be set later.
+        batch: expected environments of a step, for which a GPU's plan, `Multilevel` and "auto" are chosen. Other
+            batches run with the same bits, possibly slower. None: unknown. May be set later. No effect on the CPU.
+        adjoint: preconditioner of gradients: "solver" has that of the solver, "multilevel" the matrix of `Multilevel`
+            beside any solver (on a GPU with kernel="stream"): docs/solvers.md. May be set later.
+        device: target of `.to(device)`, "cuda" for example. None: the CPU, whatever torch's default device.
+        progress: show a bar while a large scene compiles, also for another device.
+    """
+
+    tuning_result: TuningResult | None
+    promise = Renamed("tuning_result")
+
+    def extra_repr(self) -> str:
+        return describe(self, self.tuning_result)
+
+    def __getattr__(self, name: str) -> Any:
+        parameters = self.__dict__.get("_parameters", ())
+        if name in parameters:
+            return parameters[name]
+        try:
+            return super().__getattr__(name)
+        except AttributeError as error:
+            raise no_attribute("Simulator", name, self) from error
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(\n  {self.extra_repr()}\n)"
+
+    def capture(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        *,
+        return_info: bool = False,
+    ) -> CapturedStep:
+        """Record `step_` as a CUDA graph, which costs the host less to start: see `CapturedStep`.
+
+        Args:
+            state: every replay overwrites this state; recording leaves it unchanged.
+            forces: as in `forward`; change them in place between replays.
+            targets: as in `forward`; change them in place between replays.
+            start: as in `forward`; positions may be changed in place between replays.
+            return_info: fill in `CapturedStep.info`.
+        """
+        return CapturedStep(self, state, forces, targets, start, report=return_info)
+
+    def tune(
+        self,
+        state: State | None = None,
+        *,
+        error: float | None = None,
+        milliseconds: float | None = None,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        candidates: Sequence[Solver] | None = None,
+        most: int = 2048,
+        progress: bool = False,
+    ) -> TuningResult:
+        """Choose and set solver and iterations for an error or a time, from a short study on this scene.
+
+        Sets `tolerance` to 0, so that no step stops early. Errors exclude 10 eps |x| of rounding, see `TuningResult`.
+
+        The result is also kept in `self.tuning_result`, for the present material. Check steps of a run with
+        `result.is_valid(info)`. If the target cannot be reached, the best setting is taken, with `attained=False` and a
+        `TuningWarning`. Files do not keep the result, because times depend on the machine.
+
+        The study solves nine steps of each studied environment to convergence, in float64 on the CPU. That takes about
+        a second for a thousand vertices; docs/solvers.md has a table. Friction triples it at most. Where steps with
+        friction do not converge, as for stiff bodies that stick and slip, the target counts as not reached.
+
+        Args:
+            state: start of typical motions [B, V, 3]; by default the rest state, once for each environment of the
+                material. At most four environments are studied, over 30 steps. Times are for the batch of this state.
+            error: target of |x - x*| / |x_0 - x*| in (0, 1); x* is the converged step, x_0 = x + h v.
+            milliseconds: target of `sim(state)` on this machine. The error is then the lowest for that time, with no
+                more iterations than it takes to get below rounding.
+            forces: on the vertices during these steps [B, V, 3] [N].
+            targets: of pins and spheres during these steps, as in `forward`; by default their places in the scene.
+            candidates: solvers to choose from, not "auto"; by default those that cannot diverge, with friction without
+                `Multilevel` (docs/limits.md#multilevel-with-friction).
+            most: upper bound of the iterations.
+            progress: show a bar.
+
+        Raises:
+            ValueError: non-finite states, forces or material; a singular system; a scene without motion.
+            RuntimeError: no converged step to compare with; solver and iterations stay.
+        """
+        from ..accuracy.tuning import tune  # its methods of comparison take a tenth of a second to import
+
+        return tune(
+            self,
+            state,
+            error=error,
+            milliseconds=milliseconds,
+            forces=forces,
+            targets=targets,
+            candidates=candidates,
+            most=most,
+            progress=progress,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write scene, settings and material to one file: safetensors with JSON metadata, no pickle."""
+        check_has_values("save", self.device)
+        save_simulation(self._saved(), path)
+
+    @staticmethod
+    def load(path: str | Path) -> Simulator:
+        """Read a file of `save` onto the CPU and compile its scene.
+
+        Pins and spheres are new objects: `sim.scene.pins` and `sim.scene.spheres`, in their original order.
+        """
+        saved = load_simulation(path)
+        with reading(path):
+            return _restored(saved)
+
+    def _saved(self) -> SavedSimulation:
+        material = named_arrays(self)
+        return SavedSimulation(
+            scene=self.scene,
+            settings={name: getattr(self, name) for name in _SETTINGS},
+            named_iterations=self.named_iterations,
+            choice=self.choice,
+            material=material,
+            trained=[name for name, value in material.items() if value.requires_grad],
+            reference=reference_of_levels(self.plan.arrays) if has_levels(self.plan.arrays) else None,
+        )
+
+
+def _restored(saved: SavedSimulation) -> Simulator:
+    sim = Simulator(saved.scene, **saved.settings)
+    sim.set_material(**saved.material)
+    for name in saved.trained:
+        getattr(sim, name).requires_grad_()
+    reference = saved.reference
+    # the bits of a preconditioner follow from mesh, stiffness and inertia
+    if reference is not None and not all(map(torch.equal, reference, reference_of_levels(sim.plan.arrays))):
+        sim.plan = precondition_plan(sim.plan, sim.scene.values(), *reference)
+    sim.choice = saved.choice
+    sim.named_iterations = saved.named_iterations
+    sim.check_iterations("Simulator.load")
+    return sim

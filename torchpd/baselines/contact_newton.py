@@ -1,0 +1,164 @@
+"""Newton's method for a step with smooth contacts, in float64: to rounding, where the methods of first order creep.
+
+Which vertices touch is guessed anew in every iteration, from where a projected step of the Jacobi iteration would end:
+those move within their surfaces only, all others freely. This is a semismooth Newton method for the fixed point of the
+iteration, quadratic once the guess is right. Source: Hintermueller, Ito and Kunisch 2003 (primal-dual active sets).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from ..common.tables import PLANES, SPHERES
+from ..reference.problem import StepProblem
+from .newton_krylov import NewtonKrylov, Observer
+
+__all__ = ["ContactNewton"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_INNER = 1000  # iterations of conjugate gradients, at most
+_LINEAR = 1e-3  # relative residual that they end at
+_SHORTEST = 2.0**-12  # of the line search
+_SWEEPS = 50  # over the contacts of a vertex
+_LEVEL = 1e-12  # of energies: what differs by less differs by rounding
+
+
+@dataclass(frozen=True)
+class _Touching:
+    """What a displacement meets: n directions are left to it."""
+
+    gradient: Array  # [V, 3] N
+    landing: Array  # [V, 3] m: the way of touching vertices onto their surfaces
+    tangents: csr_array  # [3 V, n], orthonormal
+    bending: Array  # [V] N/m: force of a ball over its radius, by which its curvature softens the tangents
+
+    def project(self, vectors: Array) -> Array:
+        """What of vectors [V, 3] the contacts leave."""
+        return np.asarray(self.tangents @ (self.tangents.T @ vectors.reshape(-1))).reshape(-1, 3)
+
+
+def _touching(problem: StepProblem, displacement: Array) -> _Touching:
+    gradient, diagonal = problem.gradient(displacement), problem.weighted_diagonal
+    places, count = problem.positions + displacement, len(problem.positions)
+    stepped = places - gradient / diagonal[:, None]
+    planes, spheres = problem.values.planes, problem.values.spheres
+    normals, radii = np.zeros((len(planes) + len(spheres), count, 3)), np.full((len(spheres), count), np.inf)
+    gaps, depths = np.zeros(normals.shape[:2]), np.zeros(normals.shape[:2])
+    for k, plane in enumerate(planes):
+        normals[k] = normal = plane[PLANES["normal"]]
+        gaps[k] = places @ normal - plane[PLANES["height"]]
+        depths[k] = plane[PLANES["height"]] - stepped @ normal
+    for k, (center, sphere) in enumerate(zip(problem.sphere_centers, spheres, strict=True)):
+        arms = places - center
+        radii[k] = np.maximum(np.linalg.norm(arms, axis=1), 1e-300)
+        normals[len(planes) + k] = outwards = arms / radii[k][:, None]
+        gaps[len(planes) + k] = radii[k] - sphere[SPHERES["radius"]]
+        depths[len(planes) + k] = sphere[SPHERES["radius"]] - ((stepped - center) * outwards).sum(axis=1)
+    pushes = _pushes(normals, depths) * problem.free
+    bending = (diagonal * pushes[len(planes) :] / radii).sum(axis=0)
+    return _Touching(gradient, *_tangents(pushes > 0.0, normals, gaps, problem.free), bending)
+
+
+def _pushes(normals: Array, depths: Array) -> Array:
+    """How far each contact pushes each vertex [C, V] m for it to be out of all of them, by the shortest way (Hildreth).
+
+    A contact that others keep a vertex out of does not push it.
+    """
+    pushes = np.zeros_like(depths)
+    for _ in range(_SWEEPS if len(depths) > 1 else 1):
+        for k, normal in enumerate(normals):
+            others = np.einsum("cv,cvi->vi", pushes, normals) - pushes[k][:, None] * normal
+            pushes[k] = np.maximum(depths[k] - (others * normal).sum(axis=1), 0.0)
+    return pushes
+
+
+def _tangents(held: Mask, normals: Array, gaps: Array, free: Mask) -> tuple[Array, csr_array]:
+    """The ways onto the surfaces of vertices that some contacts hold, and the directions that all of them leave."""
+    landing = np.zeros((len(free), 3))
+    rows, entries = [], []
+    for vertex in np.flatnonzero(held.any(axis=0)):
+        own = np.flatnonzero(held[:, vertex])
+        across = normals[own, vertex]
+        landing[vertex] = -np.linalg.pinv(across) @ gaps[own, vertex]
+        _, sizes, axes = np.linalg.svd(across)
+        for tangent in axes[int((sizes > 1e-9).sum()) :]:
+            rows.append(3 * vertex + np.arange(3))
+            entries.append(tangent)
+    loose = np.flatnonzero(np.repeat(free & ~held.any(axis=0), 3))
+    columns = np.concatenate([np.repeat(np.arange(len(rows)), 3), len(rows) + np.arange(len(loose))])
+    values = np.concatenate([*entries, np.ones(len(loose))])
+    shape = (3 * len(free), len(rows) + len(loose))
+    return landing, csr_array((values, (np.concatenate([*rows, loose]), columns)), shape=shape)
+
+
+class ContactNewton:
+    """Newton's method for one step, with contacts or without; its linear systems are solved by conjugate gradients.
+
+    Args:
+        problem: the step; friction is left out.
+        passes: a counter [1] that goes up with every product with the Hessian.
+    """
+
+    def __init__(self, problem: StepProblem, passes: list[int] | None = None) -> None:
+        self.problem = problem
+        self.krylov = NewtonKrylov(problem, [0] if passes is None else passes)
+
+    def step(self, displacement: Array) -> tuple[Array, bool]:
+        """From u [V, 3] m to the minimum of the quadratic of E around it, among what the contacts leave.
+
+        False with a step that is some way down only: no minimum is there, or it was not reached.
+        """
+        found = _touching(self.problem, displacement)
+        here = torch.from_numpy(displacement)
+
+        def multiply(p: Array) -> Array:
+            return np.asarray(self.krylov.product(here, torch.from_numpy(p)).numpy() - found.bending[:, None] * p)
+
+        residual = -found.project(found.gradient + multiply(found.landing))
+        goal = _LINEAR * float(np.linalg.norm(residual))
+        way, search, rho = np.zeros_like(residual), residual, 0.0
+        for inner in range(_INNER):
+            if float(np.linalg.norm(residual)) <= goal:
+                return found.landing + way, True
+            smooth = found.project(self.krylov.precondition(torch.from_numpy(residual)).numpy())
+            last, rho = rho, float((residual * smooth).sum())
+            search = smooth + (rho / last) * search if inner else smooth
+            image = found.project(multiply(search))
+            curvature = float((search * image).sum())
+            if curvature <= 0.0:
+                return found.landing + (way if inner else search), False
+            way = way + (rho / curvature) * search
+            residual = residual - (rho / curvature) * image
+        return found.landing + way, False
+
+    def minimise(self, displacement: Array, *, iterations: int = 50, observe: Observer | None = None) -> Array:
+        """Steps from u [V, 3] m while energy falls, and residuals once energies differ by rounding only."""
+        u, energy = displacement, self.problem.energy(displacement)
+        size = float(np.linalg.norm(self.problem.residual(u)))
+        for k in range(iterations):
+            found = self._descend(u, energy, size, self.step(u)[0])
+            if found is None:
+                break
+            u, energy, size = found
+            if observe is not None:
+                observe(k + 1, u)
+        return u
+
+    def _descend(self, u: Array, energy: float, size: float, way: Array) -> tuple[Array, float, float] | None:
+        """Backtracking; None without any descent."""
+        length = 1.0
+        while length >= _SHORTEST:
+            trial = self.problem.project(u + length * way)
+            reached, left = self.problem.energy(trial), float(np.linalg.norm(self.problem.residual(trial)))
+            level = abs(reached - energy) <= _LEVEL * abs(energy)
+            if left < 0.9 * size if level else reached < energy:
+                return trial, reached, left
+            length *= 0.5
+        return None

@@ -1,0 +1,125 @@
+"""Inexact Newton with the preconditioner of `Multilevel`: conjugate gradients on the true Hessian, float64, on the CPU.
+
+What a second-order method gains over L-BFGS on the same M, for comparison: elements, Hessian products and M are the
+compiled ones, the vectors between them torch's. Sources: Dembo, Eisenstat and Steihaug 1982 (inexact Newton); Steihaug
+1983 (stop where the curvature is not positive).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..plan.cpu_plan import compile_plan
+from ..plan.material import in_order, material_of
+from ..plan.preconditioner import precondition_plan
+from ..reference.problem import StepProblem
+
+__all__ = ["NewtonKrylov", "Observer"]
+
+Array = NDArray[np.float64]
+Observer = Callable[[int, Array], None]
+
+_ops = torch.ops.torchpd
+_LOOSEST = 0.5  # relative residual that the first linear solves stop at; later ones at sqrt |g| / |g_0|
+_INNER = 200  # iterations of a linear solve, at most
+_SHORTEST = 2.0**-20  # of the line search
+
+
+class NewtonKrylov:
+    """The step of `problem`, and its minimisation from a first iterate.
+
+    Args:
+        problem: without contacts.
+        passes: a counter [1] that goes up with every pass over the elements: E and grad E together, or one H p.
+    """
+
+    def __init__(self, problem: StepProblem, passes: list[int]) -> None:
+        values = problem.values
+        plan = compile_plan(values, dtype=torch.float64, progress=False)
+        self.material = in_order(material_of(values, torch.float64))
+        inertia = torch.from_numpy(np.where(problem.free, problem.weight, np.inf))
+        levels = precondition_plan(plan, values, torch.from_numpy(values.stiffness.copy()), inertia)
+        self.elements, self.levels = list(plan.arrays), list(levels.arrays)
+        self.free = torch.from_numpy(problem.free.copy())[:, None]
+        self.weight = torch.from_numpy(problem.weight.copy())[:, None]
+        self.target = torch.from_numpy(problem.target.copy())
+        self.start = torch.from_numpy(problem.positions.copy())
+        self.passes = passes
+
+    def evaluate(self, u: Tensor) -> tuple[float, Tensor]:
+        """E(u) [J] and grad E(u) [V, 3] N, zero at hard pins."""
+        self.passes[0] += 1
+        x = (self.start + u)[None]
+        pull = torch.where(self.free, u - self.target, 0.0)
+        energy = 0.5 * (self.weight * pull.square()).sum()
+        energy = energy + _ops.element_energy(x, self.material, self.elements).sum()
+        gradient = self.weight * pull + _ops.gradient(x, self.material, self.elements)[0]
+        return float(energy), torch.where(self.free, gradient, 0.0)
+
+    def product(self, u: Tensor, p: Tensor) -> Tensor:
+        """H(u) p, the derivative of the rotations in it."""
+        self.passes[0] += 1
+        elastic = _ops.hessian_product((self.start + u)[None], p[None], self.material, self.elements)[0]
+        return torch.where(self.free, self.weight * p + elastic, 0.0)
+
+    def precondition(self, g: Tensor) -> Tensor:
+        """M g."""
+        out: Tensor = _ops.precondition(g[None], self.levels)[0]
+        return out
+
+    def direction(self, u: Tensor, gradient: Tensor, tolerance: float) -> Tensor:
+        """About -H^-1 grad E: what conjugate gradients have when the residual or the curvature ends them."""
+        p = torch.zeros_like(u)
+        residual, z = -gradient, self.precondition(-gradient)
+        search, rho, goal = z, float((residual * z).sum()), tolerance * float(gradient.norm())
+        for inner in range(_INNER):
+            image = self.product(u, search)
+            curvature = float((search * image).sum())
+            if curvature <= 0.0:
+                return search if inner == 0 else p
+            p = p + (rho / curvature) * search
+            residual = residual - (rho / curvature) * image
+            if float(residual.norm()) <= goal:
+                break
+            z = self.precondition(residual)
+            last, rho = rho, float((residual * z).sum())
+            search = z + (rho / last) * search
+        return p
+
+    def minimise(self, first: Array, iterations: int, observe: Observer) -> None:
+        """Newton's iterations from `first` [V, 3] m until nothing falls any more; each is observed."""
+        u = torch.from_numpy(first.copy())
+        energy, gradient = self.evaluate(u)
+        largest = size = float(gradient.norm())
+        for k in range(iterations):
+            if size == 0.0:
+                return
+            step = self.direction(u, gradient, min(_LOOSEST, math.sqrt(size / largest)))
+            found = self._descend(u, energy, gradient, step)
+            if found is None:
+                return
+            u, energy, gradient = found
+            size = float(gradient.norm())
+            largest = max(largest, size)
+            observe(k + 1, u.numpy())
+
+    def _descend(self, u: Tensor, energy: float, gradient: Tensor, step: Tensor) -> tuple[Tensor, float, Tensor] | None:
+        """Backtracking on the energy, on |grad E| once energies differ by rounding only; None without any descent."""
+        slope, size, length = float((step * gradient).sum()), float(gradient.norm()), 1.0
+        while length >= _SHORTEST:
+            trial = u + length * step
+            reached, there = self.evaluate(trial)
+            if abs(reached - energy) <= 1e-12 * abs(energy):
+                descends = float(there.norm()) < size
+            else:
+                descends = reached <= energy + 1e-4 * length * slope
+            if descends:
+                return trial, reached, there
+            length *= 0.5
+        return None

@@ -1,0 +1,3 @@
+"""Commands of `python -m torchpd`."""
+
+__all__: list[str] = []

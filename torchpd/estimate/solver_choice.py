@@ -1,0 +1,255 @@
+"""`solver="auto"`: guarded Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner.
+
+Decided when the simulator is made, when it moves to another device and by `Simulator.prepare_solver`, from the weights
+of the step (`forecast`) and what an iteration costs on the device, for the batch that the simulator was told. Nothing
+is run or timed, so the choice is the same every time. The batch of a state does not enter: an environment gives the
+same bits alone and in any batch.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+
+from ..common.gpu import H100
+from ..common.warn import warn_user
+from ..plan.compiled import CompiledScene
+from ..plan.kernel_costs import iteration_microseconds
+from ..plan.preconditioner import MOST_DIRECT
+from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
+from .convergence import (
+    FAR_TOO_FEW,
+    LANDING_ROOTS,
+    MOST_OF_LEVELS,
+    Forecast,
+    Spectrum,
+    UnsolvedWarning,
+    forecast,
+    has_contacts,
+    held_up_by,
+    is_bound,
+    is_uneven,
+    spectrum_of,
+)
+
+__all__ = [
+    "AIM",
+    "CPU_CHEBYSHEV",
+    "Choice",
+    "Cost",
+    "choose_solver",
+    "multilevel_cost",
+    "runs",
+    "warn_of_few_iterations",
+]
+
+AIM = 1e-3  # error of a step that "auto" sets its iterations for
+MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes, and 99 of 100 steps in which a body lands
+PATIENCE = 4  # times that where a tolerance ends easy steps: hard ones, which no forecast sees, need as many
+# iterations at most, times `PATIENCE` where there is a tolerance: beyond them float32 ends, and a step must end, too
+MOST_OF_CHEBYSHEV = 10_000
+# times that an iteration of Multilevel is as long where something may touch: boxes of 125 to 9,261 vertices that rest
+# took 1.1 to 1.7 times what those that swing do on an H100, 1.1 to 1.4 times on the CPU
+ON_CONTACTS = 1.4
+MAKING = 3  # iterations of "lbfgs" that "corotated" must save to be worth its time
+
+
+_LEVELS = (Multilevel(), Multilevel("lbfgs"))
+
+
+class Cost(NamedTuple):
+    """Time of an iteration in microseconds, n thousand vertices an environment.
+
+    `latency` + `each` n of the first environment, `more` n + `square` n^2 of every other one, but no longer than the
+    first: they can take turns.
+    """
+
+    latency: float
+    each: float
+    more: float = math.inf
+    square: float = 0.0
+
+    def iteration(self, vertices: int, batch: int = 1) -> float:
+        """Microseconds, all environments together."""
+        return self.first(vertices) + (batch - 1) * self.other(vertices)
+
+    def first(self, vertices: int) -> float:
+        """Microseconds of an environment alone."""
+        return self.latency + self.each * vertices / 1000.0
+
+    def other(self, vertices: int) -> float:
+        """Microseconds that every further environment adds."""
+        thousands = vertices / 1000.0
+        return min(self.first(vertices), self.more * thousands + self.square * thousands**2)
+
+
+# Float32. `benchmarks/time_to_error.py` measures these numbers, those of further environments with --batch. The CPU's
+# are of one AVX-512 core, the GPU's of an H100, where Chebyshev's are those of `torchpd.plan.kernel_costs`.
+CPU_CHEBYSHEV, CPU_MULTILEVEL = Cost(0.5, 45.0), Cost(2.0, 170.0)
+# Batches were measured with 1024 environments of 256 and 936 vertices, and with 16 of 3,321 and 10,309; the squares fit
+# these sizes. Up to MOST_DIRECT vertices M is an inverse, without levels; from some 12 thousand on it has three.
+_DIRECT = Cost(30.0, 3.0, 0.73, 0.49)
+_TWO_LEVELS, _THREE_LEVELS = Cost(37.0, 0.9, 0.5, 0.098), Cost(49.0, 2.05, 0.5, 0.098)
+_MOST_OF_TWO_LEVELS = 12_000
+
+
+def multilevel_cost(vertices: int, *, on_gpu: bool) -> Cost:
+    """Of an iteration of `Multilevel`."""
+    if not on_gpu:
+        return CPU_MULTILEVEL
+    if vertices <= MOST_DIRECT:
+        return _DIRECT
+    return _TWO_LEVELS if vertices <= _MOST_OF_TWO_LEVELS else _THREE_LEVELS
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What "auto" decided."""
+
+    iterations: int
+    sets_iterations: bool  # the user gave none
+    why: str  # follows "chosen because"
+    capped: bool = False  # more would be wanted, but a step is to end
+
+
+def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solver, Choice]:
+    """The solver for this scene and device, and why.
+
+    Chebyshev gets a relaxation of min(1.9, 2 / (1 + mu)), which is best for a spectrum of [mu, 1].
+
+    Args:
+        compiled: with time step, material, device, and the batch to choose for.
+        iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error, but
+            Chebyshev with friction and balls. None sets as many as are expected to reach an error of `AIM`, times
+            `MARGIN`, up to `MOST_OF_CHEBYSHEV` or `MOST_OF_LEVELS`, and with a tolerance `PATIENCE` times that. On
+            smooth planes those of Multilevel are for a landing, a hard one where a body has slivers or parts of very
+            different stiffness; with a tolerance, and unless you give them, it is compared by what others take.
+    """
+
+    def chosen(enough: int, why: str, most: int = MOST_OF_CHEBYSHEV) -> Choice:
+        if iterations is not None:
+            return Choice(iterations, False, why)
+        times, capped = PATIENCE if compiled.tolerance > 0.0 else 1, enough > most
+        why += f'; "auto" takes no more than {most * times:,}' if capped else ""
+        return Choice(min(enough, most) * times, True, why, capped)
+
+    spectrum = spectrum_of(compiled)
+    chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
+    if spectrum is None:
+        return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
+    if cause := held_up_by(compiled):
+        plain = _known(forecast(compiled, chebyshev, spectrum))
+        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and {cause} may keep Multilevel from working"
+        return chebyshev, chosen(_enough(plain), why)
+    plain, lasting, short = (_known(forecast(compiled, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
+    # the others know nothing of contacts
+    saves = has_contacts(compiled) or short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
+    multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
+    counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
+    if not runs(multilevel, compiled):
+        where = (
+            f"{compiled.device} with kernel={compiled.kernel!r}"
+            if compiled.device.type == "cuda"
+            else str(compiled.device)
+        )
+        return chebyshev, chosen(_enough(plain), f"{counts}, and Multilevel does not run on {where}")
+    batch = compiled.batch or 1
+    ratio = _multilevel_time(compiled, batch) / _chebyshev_time(compiled, batch)
+    both = f"{counts}, or {levels.words(AIM)} of Multilevel, each as long as {ratio:.2g}"
+    both += f" in a batch of {batch}" if batch > 1 else ""
+    if iterations is None:
+        count = float(levels.iterations(AIM))
+        usual = LANDING_ROOTS * math.sqrt(plain.iterations(AIM))
+        if has_contacts(compiled) and compiled.tolerance > 0.0 and is_uneven(compiled) and usual < count:
+            count = usual
+            both += f"; with a tolerance about {round(usual)} where no sliver or soft part lands"
+        better = count * ratio < plain.iterations(AIM)
+    else:
+        better = iterations < _enough(plain) and levels.rate > plain.rate
+        both += f"; {iterations} leave about {plain.error(iterations):.1g} or {levels.error(iterations):.1g}"
+    if better:
+        return multilevel, chosen(_enough(levels), both, MOST_OF_LEVELS)
+    return chebyshev, chosen(_enough(plain), both)
+
+
+def _chebyshev_time(compiled: CompiledScene, batch: int) -> float:
+    """Microseconds of an iteration of so many environments, in float32, on a GPU with its own plan on an H100.
+
+    So are those of Multilevel, whatever the GPU and precision are: only their ratio matters.
+    """
+    if compiled.plan.kernel is None:
+        return CPU_CHEBYSHEV.iteration(compiled.vertices, batch)
+    return iteration_microseconds(compiled.plan, compiled.named["stiffness"].shape[-1], batch, H100, torch.float32)
+
+
+def _multilevel_time(compiled: CompiledScene, batch: int) -> float:
+    """The same of `Multilevel`."""
+    free = multilevel_cost(compiled.vertices, on_gpu=compiled.plan.kernel is not None).iteration(
+        compiled.vertices, batch
+    )
+    return free * (ON_CONTACTS if has_contacts(compiled) else 1.0)
+
+
+def _known(expected: Forecast | None) -> Forecast:
+    assert expected is not None  # both have the weighted diagonal
+    return expected
+
+
+def _enough(expected: Forecast) -> int:
+    return round(MARGIN * expected.iterations(AIM))
+
+
+def _relaxation(spectrum: Spectrum | None) -> float | None:
+    """Of Chebyshev; None keeps its default, 1.9, which is best for ill-conditioned steps."""
+    if spectrum is None:
+        return None
+    best = 2.0 / (1.0 + spectrum.least)
+    return best if best < Chebyshev().settings()["relaxation"] else None
+
+
+def runs(solver: Solver, compiled: CompiledScene) -> bool:
+    """Whether there are kernels for the solver where the scene is."""
+    try:
+        check_solver(solver, compiled.device)
+    except RuntimeError:
+        return False
+    return compiled.device.type != "cuda" or not isinstance(solver, Multilevel) or compiled.kernel in ("auto", "stream")
+
+
+def warn_of_few_iterations(compiled: CompiledScene, choice: Choice | None, changed: str | None = None) -> bool:
+    """Say so when iterations that nobody named leave more than enough: who gave none may not know of them.
+
+    Args:
+        compiled: with the default number of iterations, or that of "auto".
+        choice: of "auto", which was to leave `AIM`; ten times that may be left.
+        changed: what brought another material or time step; None when the simulator is made, or "auto" has chosen.
+
+    Returns:
+        Whether it was said.
+    """
+    enough, capped = (FAR_TOO_FEW, False) if choice is None else (10.0 * AIM, choice.capped)
+    if is_bound(compiled) and (choice is None or capped):
+        return False  # most steps need far fewer
+    expected = forecast(compiled)
+    if expected is None or expected.error(compiled.iterations) <= enough:
+        return False
+    count, left = compiled.iterations, expected.error(compiled.iterations)
+    what, verb, ways = f"the default of {count} iterations", "leaves", "Give iterations=..., or take"
+    if changed is not None:
+        what, verb, ways = f"{count} iterations", "now leave", "Set sim.iterations, or take"
+    ways += ' solver="auto", or ask sim.tune(error=1e-2)'
+    if capped:
+        what, verb = f'the {count:,} iterations that "auto" takes at most', "leave"
+        ways = "Take a shorter time_step, or give iterations=..."
+    elif choice is not None:
+        what += ' that "auto" chose before'
+        ways = "sim.prepare_solver() chooses anew"
+    warn_user(
+        f"{changed or 'Simulator'}: {what} {verb} an error of about {left:.1g} of a step here (1: nothing solved); "
+        f"{expected.words(1e-2)} reach 1e-2. {ways}",
+        UnsolvedWarning,
+    )
+    return True

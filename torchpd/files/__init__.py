@@ -1,0 +1,3 @@
+"""Simulations written and read, and their description."""
+
+__all__: list[str] = []

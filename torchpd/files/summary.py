@@ -1,0 +1,216 @@
+"""Text of `print(sim)`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from .. import _C
+from ..common.checks import NO_VALUES
+from ..common.tables import MULTILEVEL_TABLE
+from ..estimate.convergence import FAR_TOO_FEW, forecast, is_bound
+from ..plan.cpu_plan import any_of
+from ..plan.kernel_choice import shared_bytes
+from ..plan.placement import step_bytes
+from ..plan.preconditioner import has_levels
+from ..scene.solvers import Chebyshev, Multilevel, Solver
+
+if TYPE_CHECKING:
+    from ..accuracy.tuning_result import TuningResult
+    from ..plan.cpu_plan import Plan
+    from ..simulation.stepper import Stepper
+
+__all__ = ["describe", "workspace_bytes"]
+
+# cost of an effect that only changes the weights and targets, which every vertex has anyway
+_FOLDED = "folded into the inertia of a vertex: nothing per iteration"
+
+_ANY_BATCH = 2**31 - 1
+_TURNING_MODES = 24  # of the coarse problem of Multilevel("corotated"), see csrc/solver/corotation.h
+
+
+def _solver_line(sim: Stepper) -> str:
+    settings = sim.solver.settings()
+    name = "Jacobi"
+    if isinstance(sim.solver, Chebyshev):
+        name = f"Chebyshev {sim.solver.schedule}"
+    if isinstance(sim.solver, Multilevel):
+        name = f"Multilevel {sim.solver.outer}"
+    stop = f"at most {sim.iterations}" if sim.tolerance else f"{sim.iterations}"
+    rho = f", rho {settings['rho']:g}" if settings["rho"] else ""
+    diagonal = "weighted" if settings["weighted"] else "plain"
+    tolerance = f", tolerance {sim.tolerance:g}" if sim.tolerance else ""
+    return (
+        f"solver: {name}: {stop} iterations, relaxation {settings['relaxation']:g}, {diagonal} diagonal{rho}{tolerance}"
+    )
+
+
+def _expectation_lines(sim: Stepper) -> list[str]:
+    """The reason for the choice of "auto", and the error expected of the iterations."""
+    lines = [] if sim.choice is None else [f"chosen because {sim.choice.why}"]
+    scene = sim.compiled
+    expected = forecast(scene)
+    if expected is not None:
+        left = expected.error(sim.iterations)
+        verdict = f"; {sim.iterations} leave about {left:.1g}: far too few" if left > FAR_TOO_FEW else ""
+        hardest = " when a stiff body lands" if is_bound(scene) else ""
+        counts = " and ".join(f"{error:g} after {expected.words(error)}" for error in (1e-2, 1e-3))
+        lines.append(f"expected{hardest}: an error of {counts} iterations, estimated from the weights{verdict}")
+        if sim.tolerance and expected.iterations(sim.tolerance) > sim.iterations:
+            words = expected.words(sim.tolerance)
+            lines.append(
+                f"tolerance {sim.tolerance:g} needs {words} iterations: few steps will reach it in {sim.iterations}"
+            )
+    return lines
+
+
+def _tuning_lines(sim: Stepper, result: TuningResult | None) -> list[str]:
+    if result is None:
+        return []
+    stale = "" if result.matches(sim) else "; no longer valid, since settings have changed"
+    return [f"tuned: {result}{stale}"]
+
+
+def _preconditioner_lines(sim: Stepper) -> list[str]:
+    """Levels and bytes of the matrix of `Multilevel`, or of gradients."""
+    plan = sim.plan
+    if not has_levels(plan.arrays):
+        return []
+    whose = "" if isinstance(sim.solver, Multilevel) else " of gradients"
+    _, _, nodes, _, _, below, direct = plan.level_sizes.tolist()
+    steps = [f"{plan.vertices} vertices", *(f"{count} nodes" for count in (nodes, below) if count)]
+    solved = "solved directly" if direct else "the last solved directly"
+    own = sum(array.numel() * array.element_size() for array in plan.arrays[-len(MULTILEVEL_TABLE) :])
+    return [f"preconditioner{whose}: {' > '.join(steps)}, {solved}; {own:,} B of the plan"]
+
+
+def _effect_lines(sim: Stepper) -> list[str]:
+    scene = sim.scene
+    tets = sum(len(solid.mesh.tets) for solid in scene.solids)
+    lines = [f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step an iteration"]
+    if any(solid.mesh.fill is not None for solid in scene.solids):
+        lines.append(
+            "fill: stiffness and masses are multiplied by the fill of each tetrahedron (mesh.fill), unless set"
+        )
+    lines += _pin_lines(sim)
+    if bool((sim.gravity != 0).any()):
+        lines.append(f"gravity: {_FOLDED}")
+    if bool((sim.damping != 0).any()):
+        lines.append(f"damping: {_FOLDED}")
+    if scene.grounds:
+        lines.append(f"grounds: {len(scene.grounds)}, one projection a vertex and iteration each")
+    if scene.spheres:
+        lines.append(f"spheres: {len(scene.spheres)}, one projection a vertex and iteration each")
+    return lines
+
+
+def _pin_lines(sim: Stepper) -> list[str]:
+    """Hard pins and springs, those of every environment first."""
+    rows = sim.pin_hard.expand(1, -1) if sim.pin_hard.dim() == 1 else sim.pin_hard
+    always, ever = int(rows.all(0).sum()), int(rows.any(0).sum())
+    lines = []
+    if always:
+        lines.append(f"hard pins: {always} fixed vertices: nothing per iteration")
+    if ever > always:
+        lines.append(f"pins that are hard in some environments only: {ever - always}, springs in the others")
+    if soft := rows.shape[1] - ever:
+        lines.append(f"soft pins: {soft} springs, {_FOLDED}")
+    return lines
+
+
+def _pass_line(sim: Stepper) -> str:
+    plan = sim.plan
+    shared = len(plan.shared_start) - 1
+    second = f" and one over {shared} vertices that patches share" if shared else ""
+    return (
+        f"an iteration is one pass over {plan.patches} patches{second}; "
+        "with 8 or more environments, SIMD lanes run over environments"
+    )
+
+
+_LAUNCHES = {
+    "block": "one thread block an environment, or several small ones, all iterations in one launch",
+    "cluster": "a cluster of thread blocks, one for each patch, all iterations in one launch",
+    "grid": "a thread block for each patch, all iterations in one launch",
+    "stream": "a thread block for each patch, launches for every iteration",
+}
+_LEVEL_LAUNCHES = "some thread blocks an environment, all iterations in one launch"
+
+
+def _kernel_lines(sim: Stepper) -> list[str]:
+    plan = sim.plan
+    kernel = str(plan.kernel)
+    block = shared_bytes(plan, sim.planes.shape[-2], sim.spheres.shape[-2])
+    patches = f"{plan.patches} patch{'es' * (plan.patches > 1)}, {int(plan.patch_pairs.sum())} pairs of tetrahedra"
+    shared = f"{plan.size('shared')} vertices that patches share"
+    if kernel == "cluster":
+        copies = int((plan.pair_tet < -1).sum()), plan.size("slots") - plan.vertices
+        shared = "{} copies of tetrahedra and {} of vertices".format(*copies)
+    launches = _LEVEL_LAUNCHES if plan.for_levels else _LAUNCHES[kernel]
+    others = any_of([name for name in _LAUNCHES if name != kernel])
+    if kernel == "block" and sim.batch is None:
+        others = others.replace('"cluster"', '"cluster", faster for a few environments (batch=1)')
+    # kernels whose plan is the same for every batch
+    fixed = sim.kernel in ("cluster", "stream") and not plan.for_levels
+    batch = f"; for a batch of {sim.batch}" if sim.batch and not fixed else ""
+    asked = "" if has_levels(plan.arrays) else f"; Simulator(..., kernel=...) can select {others}"
+    return [
+        f"kernel {kernel}: {launches}",
+        f"mesh: {patches}, {shared}, {block:,} B of shared memory a thread block",
+        f"why {kernel}: {plan.why}{batch}{asked}",
+    ]
+
+
+def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
+    """Memory of a CPU step for one environment [B], besides plan, material and states; `real` bytes a number."""
+    # five vectors of four numbers, two weights, and the slots of the patches
+    numbers = 22 * plan.vertices + 8 * len(plan.slot_vertex)
+    if not isinstance(solver, Multilevel):
+        return real * numbers
+    # four vectors of the outer iteration, four of a cycle, and eight pairs
+    numbers += 4 * plan.vertices * (8 + (16 if solver.outer != "momentum" else 0))
+    if solver.outer != "corotated":
+        return real * numbers
+    # of each vertex sixteen numbers, and A times them; sums of every 256 vertices and of every patch; and two inverses
+    products, pairs = 2 * 16 * 16, _TURNING_MODES * (_TURNING_MODES + 1) // 2
+    sums = products * -(-plan.vertices // 256) + pairs * plan.patches
+    return real * (numbers + 32 * plan.vertices) + 8 * (sums + 2 * _TURNING_MODES**2)
+
+
+def _step_bytes(sim: Stepper, real: int) -> str:
+    """Text about the memory of a step, besides plan, material and states."""
+    plan = sim.plan
+    if plan.kernel is None:
+        return f"{workspace_bytes(plan, real, sim.solver):,} B an environment during a step"
+    scene = sim.compiled
+    batch = scene.environments
+    each = -(-step_bytes(scene, plan, batch, sim.device) // batch)
+    taken = f"{each:,} B an environment during a step{f' of {batch:,}' if batch > 1 else ''}"
+    if plan.kernel == "stream":
+        return taken
+    # only environments that run at the same time take memory
+    return f"{taken}, at most {step_bytes(scene, plan, _ANY_BATCH, sim.device):,} B in all"
+
+
+def describe(sim: Stepper, result: TuningResult | None) -> str:
+    """Lines of `print(sim)`: sizes, solver, effects, passes, memory."""
+    plan = sim.plan
+    material = sum(array.numel() * array.element_size() for array in sim.material())
+    real = torch.finfo(sim.dtype).bits // 8
+    where = f"{sim.device} ({_C.build_info()['simd']})" if sim.device.type == "cpu" else str(sim.device)
+    lines = [
+        f"{plan.vertices} vertices, time step {sim.time_step:.6g} s, {sim.dtype} on {where}",
+        _solver_line(sim),
+    ]
+    if sim.device.type == "meta":
+        return "\n  ".join([*lines, NO_VALUES])
+    lines += [
+        *_expectation_lines(sim),
+        *_tuning_lines(sim, result),
+        *_preconditioner_lines(sim),
+        *_effect_lines(sim),
+        *([_pass_line(sim)] if plan.kernel is None else _kernel_lines(sim)),
+        f"memory: plan {plan.bytes:,} B, material {material:,} B, {_step_bytes(sim, real)}",
+    ]
+    return "\n  ".join(lines)

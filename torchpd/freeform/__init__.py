@@ -1,0 +1,3 @@
+"""Free-form patches: surfaces, fit, rays, transport."""
+
+__all__: list[str] = []

@@ -1,0 +1,206 @@
+"""A body of free-form patches: a `Solid` whose tetrahedra are the constraints of the patches, and the pose it gives."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..common.checks import as_array, check_finite, check_positive, check_scalar, check_shape
+from ..geometry.mesh_checks import store
+from ..geometry.tet_mesh import trusted
+from ..scene.effects import ArrayLike, Solid
+from .constraints import Constraints, prisms, skeleton
+from .surface import PatchPose, PatchSurface
+from .transport import FrameMode, PatchTransport
+
+__all__ = ["PatchBody"]
+
+Index = NDArray[np.int64]
+
+ApexKind: TypeAlias = Literal["skeleton", "prism"]
+
+
+class PatchBody(Solid):
+    """An elastic body that free-form patches bound; a part of a `Scene` like any other `Solid`.
+
+    Energy per constraint of four vertices, with G = Ds Dm^-1 and R its nearest rotation: st v |G - R|^2, v its volume
+    at rest (Vyatkin and Dolgovesov 2023; st = w / 2 of `Solid`). The vertices of the body are those of the patches, in
+    their order, then the apexes: what is said of vertices 0..V-1 (pins, forces, targets) is said of the patches.
+    Contacts hold for these vertices, not for what quadrics raise above them.
+
+    "skeleton", for closed bodies: every patch and an apex inside. Apexes are shared by patches that see them, and the
+    space between is filled, so that the constraints resist bending and change of volume. "prism", for open sheets, or
+    for a shell without a filling: a second layer under the patches, three constraints a patch. The layer takes part in
+    contacts and in the mass. Being one element thick, it stretches as a plate of its thickness would, but bends less:
+    3.1 + 1.24 (c / thickness)^2 times less, where c is the leg of right-angled patches. A stiffness smaller by as much
+    bends right and stretches too far. A thinner layer is no way out: at the same stretching it still resists bending
+    by 1.24 times what a plate of thickness c would.
+
+    `Simulator.save` writes the Solid that it is; `patches.save` keeps the surface, which the same body is made of anew.
+
+    Args:
+        patches: at rest. Their shape and quadrics are constants of the body; `pose` works on their device and in
+            their precision, which are to be the simulator's.
+        stiffness: st [Pa], half of Young's modulus, a scalar or one value per patch, positive. What fills the space
+            between apexes takes the mean.
+        density: [kg/m^3], positive. The mass is that of the enclosed volume, or of the layer.
+        apex: "skeleton" or "prism".
+        thickness: of the layer of prisms along the directors [m], positive; half the mean edge when left out.
+        mode, stretch: of the frames, see `PatchTransport`.
+
+    Raises:
+        ValueError: a skeleton for a surface that is open or inside out, or constraints that would be flat or inverted
+            (less than 1e-3 of the mean volume, or of their longest edge high).
+    """
+
+    patches: PatchSurface
+    apex: ApexKind
+    apexes: int  # K
+    patch_of: Index  # [E] patch of each constraint, -1 between apexes
+    transport: PatchTransport
+    _layer: _Layer | None
+
+    def __init__(
+        self,
+        patches: PatchSurface,
+        stiffness: ArrayLike,
+        density: float = 1000.0,
+        *,
+        apex: ApexKind = "skeleton",
+        thickness: float | None = None,
+        mode: FrameMode = "transport",
+        stretch: tuple[float, float] = (0.3, 3.0),
+    ) -> None:
+        if not isinstance(patches, PatchSurface):
+            raise TypeError(
+                f"PatchBody: patches must be FreeFormPatches, got {type(patches).__name__}; "
+                "make them with torchpd.FreeFormPatches.from_mesh(surface, quadrics)"
+            )
+        count = len(patches.triangles)
+        constants = _per_patch(stiffness, count)
+        mass = check_scalar("PatchBody.density", density)
+        check_positive("PatchBody.density", np.array([mass]), unit="kg/m^3")
+        made = _constraints(patches, apex, thickness)
+        own = made.patch >= 0
+        st = np.where(own, constants[np.where(own, made.patch, 0)], constants.mean())
+        # overlaps and gaps between the constraints of a skeleton are no matter of mass
+        super().__init__(trusted(made.points, made.tets), 2.0 * st, mass / made.share)
+        rest = torch.as_tensor(made.points, dtype=patches.vertices.dtype, device=patches.vertices.device)
+        store(self, patches=patches, apex=apex, apexes=len(made.points) - len(patches.vertices), patch_of=made.patch)
+        chosen = None if apex == "prism" else torch.as_tensor(made.tets[:count, 3] - len(patches.vertices))
+        layer = _Layer(patches.triangles, self.apexes) if apex == "prism" else None
+        store(self, _layer=layer)
+        transport = PatchTransport(patches, self._apexes(rest[None])[0], chosen, mode=mode, stretch=stretch)
+        store(self, transport=transport)
+
+    def pose(self, positions: Tensor, fallback: Tensor | None = None) -> PatchPose:
+        """How the patches follow the body, for `patches.surface` and `patches.mesh`. Differentiable.
+
+        Args:
+            positions: of the vertices of this body [B, V + K, 3] [m]: those of a state, or with several bodies in the
+                scene `state.positions[:, scene.vertex_range(body)]`.
+            fallback: see `PatchTransport.gradients`.
+        """
+        pose: PatchPose = self.transport(self.points(positions), fallback)
+        return pose
+
+    def points(self, positions: Tensor) -> Tensor:
+        """Vertices of the patches and their apexes, as `transport` takes them, from positions as for `pose`."""
+        want = self.patches.vertices
+        count = len(self.mesh.vertices)
+        if not isinstance(positions, Tensor):
+            raise TypeError(
+                f"PatchBody.pose: positions must be a tensor [B, {count}, 3], got {type(positions).__name__}; take "
+                "state.positions"
+            )
+        if positions.dim() != 3 or tuple(positions.shape[1:]) != (count, 3):
+            raise ValueError(
+                f"PatchBody.pose: positions must be [B, {count}, 3], the vertices of this body alone, got "
+                f"{list(positions.shape)}; take positions[:, scene.vertex_range(body)], and flatten(0, 1) a track"
+            )
+        if positions.dtype != want.dtype or positions.device != want.device:
+            raise TypeError(
+                f"PatchBody.pose: positions must be {want.dtype} on {want.device} like the patches, got "
+                f"{positions.dtype} on {positions.device}; make the body of patches.to(...)"
+            )
+        return torch.cat([positions[:, : len(want)], self._apexes(positions)], dim=1)
+
+    def _apexes(self, positions: Tensor) -> Tensor:
+        """What the frames take for apexes: those of the skeleton, or the middle of the layer under each patch."""
+        rest = positions[:, len(self.patches.vertices) :]
+        return rest if self._layer is None else self._layer(rest)
+
+    def __repr__(self) -> str:
+        return (
+            f"PatchBody({self.patches}, {len(self.mesh.tets)} constraints with {self.apexes} apexes, "
+            f"apex={self.apex!r})"
+        )
+
+
+class _Layer:
+    """Middles of the triangles of a layer, and the adjoint as a gather in a fixed order: the same bits every time."""
+
+    def __init__(self, triangles: Tensor, vertices: int) -> None:
+        corners = triangles.cpu().numpy().reshape(-1)
+        order = np.argsort(corners, kind="stable")
+        times = np.bincount(corners, minlength=vertices)
+        rank = np.arange(len(order)) - np.repeat(np.cumsum(times) - times, times)
+        around = np.full((vertices, int(times.max())), len(triangles), dtype=np.int64)  # the row of zeros behind
+        around[corners[order], rank] = order // 3
+        self.triangles = triangles.long()
+        self.around = torch.as_tensor(around, device=triangles.device)
+
+    def __call__(self, positions: Tensor) -> Tensor:
+        middles: Tensor = _Middles.apply(positions, self.triangles, self.around)  # type: ignore[no-untyped-call]
+        return middles
+
+
+class _Middles(torch.autograd.Function):
+    """Means over the corners of triangles: [B, V, 3] to [B, P, 3]."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(positions: Tensor, triangles: Tensor, around: Tensor) -> Tensor:
+        return positions[:, triangles].mean(2)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[2])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (around,) = ctx.saved_tensors
+        padded = torch.cat([gradient, torch.zeros_like(gradient[:, :1])], dim=1)
+        return padded[:, around].sum(2) / 3.0, None, None
+
+
+def _per_patch(stiffness: ArrayLike, count: int) -> NDArray[np.float64]:
+    name = "PatchBody.stiffness"
+    array = as_array(name, stiffness, np.float64)
+    array = np.full(count, float(array)) if array.ndim == 0 else array
+    check_shape(name, array, (count,), "one value per patch or a scalar [Pa]")
+    check_finite(name, array)
+    check_positive(name, array, unit="Pa")
+    return array
+
+
+def _constraints(patches: PatchSurface, apex: Any, thickness: float | None) -> Constraints:
+    vertices, directors = (t.detach().cpu().double().numpy() for t in (patches.vertices, patches.directors))
+    triangles = patches.triangles.cpu().numpy().astype(np.int64)
+    if not isinstance(apex, str) or apex not in ("skeleton", "prism"):
+        raise ValueError(f"PatchBody.apex must be skeleton or prism, got {apex!r}")
+    if apex == "skeleton":
+        if thickness is not None:
+            raise ValueError(f"PatchBody.thickness is for apex='prism', a skeleton has none, got {thickness}")
+        return skeleton(vertices, triangles)
+    if thickness is None:
+        sides = vertices[triangles] - vertices[np.roll(triangles, -1, axis=1)]
+        thickness = 0.5 * float(np.linalg.norm(sides, axis=2).mean())
+    height = check_scalar("PatchBody.thickness", thickness)
+    check_positive("PatchBody.thickness", np.array([height]), unit="m")
+    return prisms(vertices, triangles, directors, height)

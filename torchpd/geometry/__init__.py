@@ -1,0 +1,3 @@
+"""Meshes, their quality, shapes, tetrahedralization, embedding."""
+
+__all__: list[str] = []

@@ -1,0 +1,196 @@
+"""A surface that rides in a tetrahedral mesh: every surface vertex is a fixed combination of one tet's corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain, combinations
+from typing import Any, overload
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .mesh_checks import warn
+from .mesh_faces import TET_FACES
+from .mesh_quality import shape_gradients
+from .tri_mesh import TriMesh
+
+__all__ = ["Embedding", "embed_surface", "embed_triangles"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# How many of the nearest tets compete for a point that lies in none.
+_NEAREST = 32
+# Points in work at a time, to bound memory.
+_CHUNK = 100_000
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Embedding:
+    """Carries a surface with a tetrahedral mesh: surface vertex i is sum_a weights[i, a] x[corners[i, a]].
+
+    Weights add up to 1, so every affine motion of the mesh is carried exactly.
+    """
+
+    surface: TriMesh  # the surface at rest: its triangles and texture coordinates stay valid for `apply`
+    tets: Index  # [n] the tet that carries each surface vertex
+    weights: Array  # [n, 4] barycentric; not negative where the vertex lies inside its tet
+    corners: Index  # [n, 4] rows `tets` of the mesh: the vertices that the weights belong to
+    vertex_count: int  # vertices of the mesh
+
+    def __post_init__(self) -> None:
+        count = len(self.surface.vertices)
+        for name, shape in (("tets", (count,)), ("weights", (count, 4)), ("corners", (count, 4))):
+            array = np.array(getattr(self, name))
+            if array.shape != shape:
+                raise ValueError(f"Embedding.{name} must be {list(shape)} (surface vertices), got {list(array.shape)}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @overload
+    def apply(self, positions: NDArray[Any]) -> NDArray[Any]: ...
+    @overload
+    def apply(self, positions: torch.Tensor) -> torch.Tensor: ...
+
+    def apply(self, positions: NDArray[Any] | torch.Tensor) -> NDArray[Any] | torch.Tensor:
+        """Positions of the surface vertices [..., n, 3] for mesh positions [..., V, 3].
+
+        Arrays and tensors keep their precision; tensors keep their device and are differentiated through.
+        """
+        if not isinstance(positions, (np.ndarray, torch.Tensor)):
+            raise TypeError(f"Embedding.apply: positions must be a tensor or an array, got {type(positions).__name__}")
+        if tuple(positions.shape[-2:]) != (self.vertex_count, 3):
+            raise ValueError(
+                f"Embedding.apply: positions must be [..., {self.vertex_count}, 3] (the vertices of the mesh), "
+                f"got {list(positions.shape)}; one body of a scene is positions[..., scene.vertex_range(solid), :]"
+            )
+        if isinstance(positions, torch.Tensor):
+            return self._apply_tensor(positions)
+        array = np.asarray(positions)
+        weights = self.weights.astype(array.dtype if array.dtype.kind == "f" else np.float64)
+        parts = (array[..., self.corners[:, a], :] * weights[:, a, None] for a in range(4))
+        return np.asarray(sum(parts))
+
+    def _apply_tensor(self, positions: torch.Tensor) -> torch.Tensor:
+        if not positions.is_floating_point():
+            raise TypeError(f"Embedding.apply: positions must be floating point, got {positions.dtype}")
+        weights = torch.tensor(self.weights, dtype=positions.dtype, device=positions.device)
+        corners = torch.tensor(self.corners, device=positions.device)
+        carried = positions.index_select(-2, corners[:, 0]) * weights[:, 0, None]
+        for a in range(1, 4):
+            carried = carried + positions.index_select(-2, corners[:, a]) * weights[:, a, None]
+        return carried
+
+    def transformed(self, matrix: Any, corners: Sequence[int] = (0, 1, 2, 3)) -> Embedding:
+        """The embedding in the transformed mesh, whose tets list their corners in another order."""
+        order = list(corners)
+        return Embedding(
+            surface=self.surface.transformed(matrix),
+            tets=self.tets,
+            weights=self.weights[:, order],
+            corners=self.corners[:, order],
+            vertex_count=self.vertex_count,
+        )
+
+    def renumbered(self, tets: Index, vertex_count: int) -> Embedding:
+        """The embedding in a mesh of the same tets [E, 4], with other vertex numbers."""
+        return Embedding(self.surface, self.tets, self.weights, tets[self.tets], vertex_count)
+
+    def __repr__(self) -> str:
+        return f"Embedding({self.surface} in {self.vertex_count} mesh vertices)"
+
+
+def _weights(points: Array, origins: Array, gradients: Array) -> Array:
+    """Barycentric coordinates [P, 4] of points, each in its own tet: w_a = grad N_a . (p - x_0), w_0 the rest to 1."""
+    weights = np.einsum("pak,pk->pa", gradients, points - origins)
+    weights[:, 0] = 1.0 - weights[:, 1:].sum(axis=1)
+    return np.asarray(weights)
+
+
+def embed_surface(surface: TriMesh, vertices: Array, tets: Index) -> Embedding:
+    """`embed` for a mesh of vertices [V, 3] and tets [E, 4]."""
+    points, corners = surface.vertices, vertices[tets]
+    gradients, _ = shape_gradients(vertices, tets)
+    centres = corners.mean(axis=1)
+    radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+    # A tet contains only points of the ball around its centre through its farthest corner (widened for rounding).
+    found = cKDTree(points).query_ball_point(centres, radii * (1.0 + 1e-9))
+    sizes = np.fromiter(map(len, found), dtype=np.int64, count=len(found))
+    which = np.fromiter(chain.from_iterable(found), dtype=np.int64, count=int(sizes.sum()))
+    carriers = np.repeat(np.arange(len(centres)), sizes)
+    # Points outside of every tet compete among their nearest tets.
+    near = cKDTree(centres).query(points, k=min(_NEAREST, len(centres)))[1].reshape(len(points), -1)
+    which = np.concatenate([which, np.repeat(np.arange(len(points)), near.shape[1])])
+    carriers = np.concatenate([carriers, near.reshape(-1)])
+    # The signed distance to the plane of face a is w_a / |grad N_a|. A tet contains the point where the least over a is
+    # not negative, and else is at least as far away as that.
+    weights = _weights(points[which], corners[carriers, 0], gradients[carriers])
+    depth = (weights / np.linalg.norm(gradients[carriers], axis=2)).min(axis=1)
+    distance = _distances(points, which, corners, carriers, weights, depth)
+    order = np.lexsort((carriers, -depth, distance, which))
+    best = order[np.unique(which[order], return_index=True)[1]]
+    chosen = carriers[best]
+    _report_far(corners[chosen], distance[best])
+    return Embedding(surface, chosen, weights[best], tets[chosen], len(vertices))
+
+
+def _distances(points: Array, which: Index, corners: Array, tets: Index, weights: Array, depth: Array) -> Array:
+    """Distance [P] of points `which` to `tets`, 0 inside; inf where another tet is sure to be nearer to the point."""
+    inside = np.clip(weights, 0.0, None)
+    inside /= inside.sum(axis=1, keepdims=True)
+    most = np.linalg.norm(points[which] - np.einsum("pa,pak->pk", inside, corners[tets]), axis=1)
+    nearest = np.full(len(points), np.inf)
+    np.minimum.at(nearest, which, np.where(depth >= 0.0, 0.0, most))
+    distance = np.where(depth >= 0.0, 0.0, np.inf)
+    open_to = np.flatnonzero((depth < 0.0) & (-depth <= nearest[which] * (1.0 + 1e-9)))
+    for start in range(0, len(open_to), _CHUNK):
+        pairs = open_to[start : start + _CHUNK]
+        distance[pairs] = _outside(points[which[pairs]], corners[tets[pairs]])
+    return distance
+
+
+def _outside(points: Array, corners: Array) -> Array:
+    """Distance of points [P, 3] to the surfaces of tets [P, 4, 3]: to an edge, or to a face straight below."""
+    distance = np.full(len(points), np.inf)
+    for a, b in combinations(range(4), 2):
+        edge, away = corners[:, b] - corners[:, a], points - corners[:, a]
+        along = np.clip(_dot(edge, away) / _dot(edge, edge), 0.0, 1.0)
+        np.minimum(distance, np.linalg.norm(away - along[:, None] * edge, axis=1), out=distance)
+    for face in TET_FACES:
+        p, q, r = (corners[:, corner] for corner in face)
+        normal = np.cross(q - p, r - p)
+        above = np.ones(len(points), dtype=bool)
+        for start, end in ((p, q), (q, r), (r, p)):
+            above &= _dot(np.cross(normal, end - start), points - start) >= 0.0
+        height = np.abs(_dot(points - p, normal)) / np.linalg.norm(normal, axis=1)
+        np.minimum(distance, height, out=distance, where=above)
+    return distance
+
+
+def _dot(one: Array, other: Array) -> Array:
+    return np.asarray(np.einsum("pk,pk->p", one, other))
+
+
+def _report_far(corners: Array, distance: Array) -> None:
+    """Warn of surface vertices that lie farther outside of their tets [n, 4, 3] than these are long."""
+    ends = np.array(list(combinations(range(4), 2)))
+    cells = distance / np.linalg.norm(corners[:, ends[:, 0]] - corners[:, ends[:, 1]], axis=2).max(axis=1)
+    far = int((cells > 1.0).sum())
+    if far:
+        worst = int(cells.argmax())
+        warn(
+            f"embed: {far} of {len(cells)} surface vertices lie farther outside of the mesh than a cell is long, up to "
+            f"{cells[worst]:.3g} cells ({distance[worst]:.3g} m): their motion is extrapolated. Move or scale the "
+            "surface onto the mesh, surface.transformed(matrix), or use a mesh that reaches around it"
+        )
+
+
+def embed_triangles(vertices: Array, tets: Index, triangles: Index) -> Embedding:
+    """A surface of mesh vertices, given by their numbers [T, 3]: each has weight 1 at that vertex, in its first tet."""
+    used, numbers = np.unique(triangles, return_inverse=True)
+    surface = TriMesh(vertices[used], numbers.reshape(-1, 3))
+    carriers, corner = np.divmod(np.unique(tets.reshape(-1), return_index=True)[1][used], 4)
+    return Embedding(surface, carriers, np.eye(4)[corner], tets[carriers], len(vertices))

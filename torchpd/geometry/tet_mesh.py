@@ -1,0 +1,242 @@
+"""Tetrahedral meshes, of which bodies are made: frozen, and checked once, so that nothing behind them checks again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.checks import check_scalar
+from ..common.synonyms import check_arguments
+from ..common.units import Unit
+from ..formats.bodies import read_body
+from ..formats.guard import naming
+from .embedding import Embedding, embed_surface, embed_triangles
+from .mesh_checks import (
+    MeshWarning,
+    Numbers,
+    affine,
+    clean_tets,
+    determinants,
+    has_repeated_corner,
+    scaling,
+    store,
+    translation,
+    warn,
+)
+from .mesh_faces import ROUNDING, TET_FACES, match_faces, merge_near, report_faces
+from .mesh_files import write_tets
+from .mesh_quality import MeshQuality, measure_quality
+from .tri_mesh import PathLike, TriMesh
+
+__all__ = ["MeshWarning", "TetMesh", "embed", "trusted"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TetMesh:
+    """A tetrahedral mesh. Every tet has positive volume: det(x1 - x0, x2 - x0, x3 - x0) > 0.
+
+    Tets that come with the opposite winding are turned (their last two corners change places), which is reported by a
+    `MeshWarning` and counted in `flipped`. Others tell of tets that meet as hardly any body does: inner faces with both
+    tets on one side (a folded mesh), faces of three tets, faces that lie on one another without common vertices, see
+    `merged`, and faces that lie on faces with other corners. Pieces that lie apart are no fault: `quality()` counts
+    them.
+
+    Arrays are NumPy's and read-only: `torch.tensor(mesh.vertices)` copies them without a warning, where
+    `torch.from_numpy` gives one.
+
+    Args:
+        vertices: positions [V, 3] in m.
+        tets: vertex numbers [E, 4].
+        fill: how much of each tet is material, in (0, 1] [E], or None for all of it: the lattice of `tetrahedralize`
+            reaches beyond its surface. `Solid` multiplies density and Young's modulus by it.
+        regions: a whole number for each tet [E], what it belongs to, or None. A material of each is
+            `Solid(mesh, youngs=np.where(mesh.regions == 2, 1e6, 1e5))`.
+        drop_unreferenced: leave out vertices that no tet uses (otherwise an error).
+        drop_degenerate: leave out tets whose volume is zero within rounding, that name a vertex twice, or that came
+            before (otherwise an error).
+    """
+
+    vertices: Array
+    tets: Index
+    fill: Array | None
+    regions: Index | None
+    embedding: Embedding | None
+    flipped: int
+
+    @check_arguments("TetMesh")
+    def __init__(
+        self,
+        vertices: Numbers,
+        tets: Numbers,
+        *,
+        fill: Numbers | None = None,
+        regions: Numbers | None = None,
+        drop_unreferenced: bool = False,
+        drop_degenerate: bool = False,
+    ) -> None:
+        fields = clean_tets(
+            vertices, tets, fill, regions, drop_unreferenced=drop_unreferenced, drop_degenerate=drop_degenerate
+        )
+        store(self, **fields, embedding=None)
+        report_faces(self.vertices, self.tets)
+
+    @classmethod
+    def from_file(cls, path: PathLike, *, unit: Unit | None = None, drop_degenerate: bool = False) -> TetMesh:
+        """Read a volume mesh (.mesh, .msh, .vtk, .vtu, .inp, ...).
+
+        Hexahedra, wedges and pyramids are split into tets that fill them and match across faces; of cells of higher
+        order the corners are kept. Triangles of the file, the outer surface or another one inside, are carried along as
+        `embedding`; quads and polygons are split. Physical groups, references, element sets and attributes become
+        `regions`. What is left out, split or assumed a `MeshWarning` says.
+
+        Args:
+            path: the file; the suffix of its name says in which format it is.
+            unit: "m", "cm", "mm", "in" or "ft", of the numbers in the file; they become metres. None: what the file
+                declares, or metres.
+            drop_degenerate: as for a new mesh.
+
+        Raises:
+            ValueError: the file cannot be read, or holds no such cells; with its name, its format and what was met.
+        """
+        body = read_body("TetMesh.from_file", path, unit)
+        if body.notes:
+            warn(f"TetMesh.from_file: {Path(path).name}: {'; '.join(body.notes)}")
+        with naming("TetMesh.from_file", path):
+            mesh = cls(
+                body.points, body.tets, regions=body.regions, drop_unreferenced=True, drop_degenerate=drop_degenerate
+            )
+        triangles = body.triangles[~has_repeated_corner(body.triangles)]
+        if not len(triangles):
+            return mesh
+        used = np.unique(body.tets)
+        if len(mesh.vertices) == len(used):
+            return mesh.with_embedding(embed_triangles(mesh.vertices, mesh.tets, np.searchsorted(used, triangles)))
+        # tets without volume went, and vertices with them, so that some triangles hang on others
+        return mesh.with_embedding(embed(TriMesh(body.points, triangles, drop_unreferenced=True), mesh))
+
+    def to_file(self, path: PathLike) -> None:
+        """Write in the format of the file's suffix (.mesh, .msh, .vtk, .vtu, ...) through meshio.
+
+        Vertices and tets, and regions where the format has room for them, as those four do. What is left out a
+        `MeshWarning` says: regions elsewhere, an embedded surface and the fill.
+        """
+        file, with_regions = write_tets(path, self.vertices, self.tets, self.regions)
+        parts = {"the embedded surface": self.embedding, "the fill": self.fill}
+        lost = [name for name, part in parts.items() if part is not None]
+        if lost:
+            warn(
+                f"TetMesh.to_file: {file.name} is without {' and '.join(lost)}, for which mesh files have no place; "
+                "Simulator.save keeps them, and mesh.embedding.surface.to_file(...) writes a surface"
+            )
+        if self.regions is not None and not with_regions:
+            warn(f"TetMesh.to_file: {file.name} is without the regions; .mesh, .msh, .vtk and .vtu keep them")
+
+    @property
+    def bounds(self) -> Array:
+        """Lower and upper corner of the bounding box [2, 3]."""
+        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def boundary(self) -> Index:
+        """The faces that belong to one tet only, int64 [T, 3] into `vertices`, counter-clockwise seen from outside."""
+        order, begins = match_faces(self.tets)
+        ends = np.append(begins[1:], True)
+        return np.asarray(self.tets[:, TET_FACES].reshape(-1, 3)[np.sort(order[begins & ends])])
+
+    def quality(self) -> MeshQuality:
+        """Volumes, dihedral angles and element bounds l_e of every tet; print it for a summary."""
+        return measure_quality(self.vertices, self.tets, self.fill)
+
+    def with_embedding(self, embedding: Embedding | None) -> TetMesh:
+        """The same mesh carrying another surface along (or none)."""
+        if embedding is not None and not (
+            embedding.vertex_count == len(self.vertices)
+            and embedding.tets.max(initial=-1) < len(self.tets)
+            and np.array_equal(embedding.corners, self.tets[embedding.tets])
+        ):
+            raise ValueError(
+                "TetMesh.with_embedding: the embedding must belong to this mesh (its corners are the rows of tets that "
+                "it names); make one with torchpd.embed(surface, mesh)"
+            )
+        mesh: TetMesh = object.__new__(TetMesh)
+        store(mesh, **(vars(self) | {"embedding": embedding}))
+        return mesh
+
+    def merged(self, tolerance: float | None = None, *, drop_degenerate: bool = False) -> TetMesh:
+        """The mesh with vertices at the same place made one, the first of them, so that tets that meet there share it.
+
+        Args:
+            tolerance: vertices that hang together by distances up to this [m] become one; None is 4.8e-7 of the
+                diagonal of the bounding box, a few roundings of float32.
+            drop_degenerate: as for a new mesh: leave out tets that lose their volume, or that come twice.
+
+        Raises:
+            ValueError: tets that lose their volume, or that come twice.
+        """
+        reach = ROUNDING * float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+        if tolerance is not None:
+            reach = check_scalar("TetMesh.merged: tolerance", tolerance, minimum=0.0)
+        kept, numbers = np.unique(merge_near(self.vertices, reach), return_inverse=True)
+        mesh = TetMesh(
+            self.vertices[kept],
+            numbers[self.tets],
+            fill=self.fill,
+            regions=self.regions,
+            drop_unreferenced=True,
+            drop_degenerate=drop_degenerate,
+        )
+        if self.embedding is None:
+            return mesh
+        if len(mesh.tets) == len(self.tets) and not mesh.flipped:
+            return mesh.with_embedding(self.embedding.renumbered(mesh.tets, len(mesh.vertices)))
+        return mesh.with_embedding(embed(self.embedding.surface, mesh))
+
+    def transformed(self, matrix: Numbers) -> TetMesh:
+        """The mesh and its embedded surface under x -> A x + b, from a 3x3 or 4x4 matrix; it may reflect."""
+        linear, offset = affine("TetMesh.transformed: matrix", matrix)
+        # A reflection inverts every tet: two corners change places, and with them their weights.
+        corners = [0, 1, 3, 2] if np.linalg.det(linear) < 0 else [0, 1, 2, 3]
+        mesh = trusted(self.vertices @ linear.T + offset, self.tets[:, corners], self.fill, self.regions)
+        if self.embedding is None:
+            return mesh
+        return mesh.with_embedding(self.embedding.transformed(matrix, corners))
+
+    def translated(self, offset: Numbers) -> TetMesh:
+        """The mesh and its embedded surface moved by a vector [m]."""
+        return self.transformed(translation("TetMesh.translated: offset", offset))
+
+    def scaled(self, factor: float | Numbers) -> TetMesh:
+        """The mesh and its embedded surface scaled about the origin, by one positive factor or one per axis."""
+        return self.transformed(scaling("TetMesh.scaled: factor", factor))
+
+    def __repr__(self) -> str:
+        carried = "" if self.embedding is None else f", carrying {self.embedding.surface}"
+        filled = ""
+        if self.fill is not None:
+            volumes = determinants(self.vertices, self.tets)
+            filled = f", {float((self.fill * volumes).sum() / volumes.sum()):.0%} filled"
+        return f"TetMesh({len(self.vertices)} vertices, {len(self.tets)} tets{filled}{carried})"
+
+
+def trusted(vertices: Numbers, tets: Numbers, fill: Numbers | None = None, regions: Numbers | None = None) -> TetMesh:
+    """A mesh whose tets may meet as they do: of those that were looked at before, or that torchpd lets overlap."""
+    mesh: TetMesh = object.__new__(TetMesh)
+    store(mesh, **clean_tets(vertices, tets, fill, regions), embedding=None)
+    return mesh
+
+
+def embed(surface: TriMesh, mesh: TetMesh) -> Embedding:
+    """Embed a surface in any tetrahedral mesh: each vertex in the tet that contains it, or else the least distant one.
+
+    A vertex outside of the mesh is extrapolated, with negative weights. Where one is farther outside than its tet is
+    long, a `MeshWarning` says how far: a small strain of that tet moves it by more than the strain.
+    """
+    for name, value, kind in (("surface", surface, TriMesh), ("mesh", mesh, TetMesh)):
+        if not isinstance(value, kind):
+            raise TypeError(f"embed: {name} must be a {kind.__name__}, got {type(value).__name__}")
+    return embed_surface(surface, mesh.vertices, mesh.tets)

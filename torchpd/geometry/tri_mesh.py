@@ -1,0 +1,180 @@
+"""Triangle surfaces: frozen vertices and indices that have been checked, to be carried along, drawn or filled."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.checks import as_array, check_finite, check_shape
+from ..common.synonyms import check_arguments
+from ..common.units import Unit, metres
+from ..formats.bodies import read_surface
+from ..formats.guard import naming
+from .mesh_checks import (
+    Numbers,
+    affine,
+    check_elements,
+    check_points,
+    compact,
+    has_repeated_corner,
+    refuse,
+    scaling,
+    store,
+    translation,
+    warn,
+)
+
+__all__ = ["PathLike", "TriMesh"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+PathLike = str | os.PathLike[str]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TriMesh:
+    """A triangle surface, open or closed, of one or many pieces. Triangles without area are accepted.
+
+    Args:
+        vertices: positions [V, 3] in m.
+        triangles: vertex numbers [T, 3], counter-clockwise seen from outside.
+        uvs: texture coordinates [V, 2], or None.
+        drop_unreferenced: leave out vertices that no triangle uses (otherwise an error).
+        drop_degenerate: leave out triangles that name a vertex twice (otherwise an error).
+    """
+
+    vertices: Array
+    triangles: Index
+    uvs: Array | None
+
+    @check_arguments("TriMesh")
+    def __init__(
+        self,
+        vertices: Numbers,
+        triangles: Numbers,
+        *,
+        uvs: Numbers | None = None,
+        drop_unreferenced: bool = False,
+        drop_degenerate: bool = False,
+    ) -> None:
+        points = check_points("TriMesh.vertices", vertices)
+        elements = check_elements("TriMesh.triangles", triangles, 3, len(points))
+        bad = has_repeated_corner(elements)
+        if drop_degenerate and bad.any():
+            warn(f"TriMesh: {int(bad.sum())} of {len(bad)} triangles name a vertex twice and were left out")
+            elements, bad = elements[~bad], bad[~bad]
+            if not len(elements):
+                raise ValueError("TriMesh.triangles: no triangle has three different corners")
+        refuse("TriMesh.triangles", bad, elements, "corners must differ", "pass drop_degenerate=True to leave them out")
+        coordinates = None
+        if uvs is not None:
+            coordinates = as_array("TriMesh.uvs", uvs, np.float64)
+            check_shape("TriMesh.uvs", coordinates, (len(points), 2), "texture coordinates of every vertex")
+            check_finite("TriMesh.uvs", coordinates)
+        kept, elements = compact("TriMesh", elements, len(points), drop=drop_unreferenced)
+        store(
+            self,
+            vertices=points[kept],
+            triangles=elements,
+            uvs=None if coordinates is None else coordinates[kept],
+        )
+
+    @classmethod
+    def from_trimesh(cls, surface: Any, *, unit: Unit | None = None) -> TriMesh:
+        """From a trimesh.Trimesh, or from a trimesh.Scene with all its geometry in place.
+
+        `unit`, as in `from_file`, is that of its numbers; what `surface.units` says is not looked at.
+        """
+        import trimesh
+
+        if isinstance(surface, trimesh.Scene):
+            others = [
+                type(part).__name__ for part in surface.geometry.values() if not isinstance(part, trimesh.Trimesh)
+            ]
+            if others:
+                warn(f"TriMesh.from_trimesh: left out, for they have no triangles: {', '.join(sorted(others))}")
+            surface = surface.to_mesh()
+        if not isinstance(surface, trimesh.Trimesh):
+            raise TypeError(f"TriMesh.from_trimesh: surface must be a Trimesh or a Scene, got {type(surface).__name__}")
+        return cls(
+            metres("TriMesh.from_trimesh", unit) * surface.vertices,
+            surface.faces,
+            uvs=getattr(surface.visual, "uv", None),
+            drop_unreferenced=True,
+            drop_degenerate=True,
+        )
+
+    @classmethod
+    def from_file(cls, path: PathLike, *, unit: Unit | None = None) -> TriMesh:
+        """Read the triangles of a mesh file; quads and polygons become triangles.
+
+        Surfaces: .obj, .ply, .stl, .off, .gltf, .glb, .dae, .3mf, and through usd-core .usd, .usda, .usdc, .usdz. Of a
+        volume mesh the triangles that it lists are read. What is left out, or assumed, a `MeshWarning` says.
+
+        All objects of a file are read, and parts of a scene where its transforms put them. Declared units become
+        metres, and a declared axis that is up becomes y (.usd, .dae; of .3mf the unit only, where it is a millimetre
+        unless it says otherwise). Vertices keep the order of the file; one with several texture coordinates is doubled,
+        and equal corners of an .stl become one vertex.
+
+        Args:
+            path: the file; the suffix of its name says in which format it is.
+            unit: "m", "cm", "mm", "in" or "ft", of the numbers in the file; they become metres. None: what the file
+                declares, or metres.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ModuleNotFoundError: the format needs a package that is not installed, which is named.
+            ValueError: the file cannot be read, or holds no triangles; with its name, its format and what was met.
+        """
+        surface = read_surface("TriMesh.from_file", path, unit)
+        if surface.notes:
+            warn(f"TriMesh.from_file: {Path(path).name}: {'; '.join(surface.notes)}")
+        with naming("TriMesh.from_file", path):
+            return cls(surface.points, surface.triangles, uvs=surface.uvs, drop_unreferenced=True, drop_degenerate=True)
+
+    def to_trimesh(self) -> Any:
+        """A trimesh.Trimesh with the same vertices, faces and texture coordinates."""
+        import trimesh
+
+        surface: Any = trimesh.Trimesh(self.vertices, self.triangles, process=False)
+        if self.uvs is not None:
+            visual: Any = trimesh.visual.TextureVisuals
+            surface.visual = visual(uv=self.uvs)
+        return surface
+
+    def to_file(self, path: PathLike) -> None:
+        """Write in the format of the file's suffix, through trimesh."""
+        self.to_trimesh().export(Path(path))
+
+    @property
+    def bounds(self) -> Array:
+        """Lower and upper corner of the bounding box [2, 3]."""
+        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def volume(self) -> float:
+        """Enclosed volume by the divergence theorem; meaningful when the surface is closed."""
+        corners = self.vertices[self.triangles]
+        return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
+
+    def transformed(self, matrix: Numbers) -> TriMesh:
+        """The surface under x -> A x + b, from a 3x3 or 4x4 matrix; a reflection turns the triangles round."""
+        linear, offset = affine("TriMesh.transformed: matrix", matrix)
+        triangles = self.triangles[:, ::-1] if np.linalg.det(linear) < 0 else self.triangles
+        return TriMesh(self.vertices @ linear.T + offset, triangles, uvs=self.uvs)
+
+    def translated(self, offset: Numbers) -> TriMesh:
+        """The surface moved by a vector [m]."""
+        return self.transformed(translation("TriMesh.translated: offset", offset))
+
+    def scaled(self, factor: float | Numbers) -> TriMesh:
+        """The surface scaled about the origin, by one positive factor or one per axis."""
+        return self.transformed(scaling("TriMesh.scaled: factor", factor))
+
+    def __repr__(self) -> str:
+        uvs = "" if self.uvs is None else ", uvs"
+        return f"TriMesh({len(self.vertices)} vertices, {len(self.triangles)} triangles{uvs})"

@@ -1,0 +1,38 @@
+"""Inertia and diagonal of every vertex, for estimates and preconditioners: a step computes its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..common.tables import MATERIAL_TABLE
+
+__all__ = ["named_material", "pinned_vertices", "step_diagonal"]
+
+
+def named_material(arrays: Sequence[Tensor]) -> dict[str, Tensor]:
+    """The material's arrays by name."""
+    return {row.name: array for row, array in zip(MATERIAL_TABLE, arrays, strict=True)}
+
+
+def pinned_vertices(plan: Sequence[Tensor]) -> Tensor:
+    """User's number of each pinned vertex [P]."""
+    _, vertex_order, pin_vertex, *_ = plan
+    return vertex_order[pin_vertex.long()].long()
+
+
+def step_diagonal(
+    plan: Sequence[Tensor], material_arrays: Sequence[Tensor], time_step: float, *, weighted: bool = True
+) -> tuple[Tensor, Tensor]:
+    """Inertia a and diagonal D of every vertex, [V] or [B, V], in N/m; infinite on hard pins.
+
+    a_i = m_i / h^2 (1 + damping h) + k_i;  D_i = a_i + sum_e l_e w_e V_e |grad N_i|^2, l_e = 1 when not weighted.
+    """
+    material = named_material(material_arrays)
+    masses, springs = material["masses"], material["pin_stiffness"]
+    held = masses.new_zeros((*springs.shape[:-1], masses.shape[-1]))
+    held = held.index_copy(-1, pinned_vertices(plan), springs)
+    inertia = masses / time_step**2 * (1 + material["damping"].unsqueeze(-1) * time_step) + held
+    return inertia, inertia + torch.ops.torchpd.elastic_diagonal(list(material_arrays), list(plan), weighted=weighted)

@@ -1,0 +1,359 @@
+"""Python side of the ops: fake kernels and derivatives. Importing this module loads the extension."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+from torch.utils._pytree import tree_leaves
+
+from .. import _C
+from ..common.tables import MATERIAL_TABLE
+from .adjoint import mend_adjoint
+from .diagonal import named_material
+from .vmap import register_rule
+from .vmap_step import rollout_vjp_rule, step_vjp_rule
+
+__all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_tangents"]
+
+INFO_WIDTH = _C.info_numbers
+
+_ops = torch.ops.torchpd
+_STIFFNESS = [row.name for row in MATERIAL_TABLE].index("stiffness")
+
+
+def nearest_rotation(F: Tensor) -> Tensor:
+    """The rotation R nearest to each matrix: argmax of tr(R^T F) over det R = +1.
+
+    Safe for inverted, rank-deficient, huge and tiny matrices: zero gives the identity, a matrix with NaN or infinity
+    gives NaN. Differentiable, of matrices of 1e-12 to 1e12 (in float64 1e-101 to 1e101), infinitely steep where the two
+    smallest singular values cancel (with the sign of det F on the smallest): there the nearest rotation jumps.
+
+    Largest root of Davenport's quartic (Markley 1993), closed form, one Newton polish; signed SVD where roots meet.
+
+    Args:
+        F: float32 or float64 [..., 3, 3].
+
+    Returns:
+        [..., 3, 3].
+    """
+    if not isinstance(F, Tensor):
+        raise TypeError(f"nearest_rotation: F must be a tensor [..., 3, 3], got {type(F).__name__}")
+    refuse_tangents(F)
+    result: Tensor = _ops.nearest_rotation(F)
+    return result
+
+
+def refuse_tangents(*tensors: Tensor | None) -> None:
+    """The ops have no forward-mode derivatives, and torch would take them to be zero."""
+    if forward_ad._current_level < 0:
+        return
+    for tensor in tensors:
+        if tensor is not None and forward_ad.unpack_dual(tensor).tangent is not None:
+            raise RuntimeError(
+                "torchpd: forward-mode derivatives are not provided; use reverse mode (backward, torch.autograd.grad)"
+            )
+
+
+# ---- fake kernels: shapes, types and devices only
+
+
+def _register_fake(name: str) -> Callable[[Callable[..., Any]], None]:
+    """Torch also takes a fake kernel where one argument of several is on "meta", and would return unwritten memory."""
+
+    def register(kernel: Callable[..., Any]) -> None:
+        def checked(*given: Any, **settings: Any) -> Any:
+            first, *others = (leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor))
+            if first.device.type != "meta" and any(other.device.type == "meta" for other in others):
+                raise RuntimeError(
+                    f"torchpd::{name}: arguments must be on one device, got some on {first.device} and some on "
+                    '"meta", where tensors have no values'
+                )
+            return kernel(*given, **settings)
+
+        torch.library.register_fake(f"torchpd::{name}", checked)
+
+    return register
+
+
+@_register_fake("step")
+def _(positions: Tensor, velocities: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
+    info = positions.new_empty((positions.shape[0], INFO_WIDTH), dtype=torch.float64)
+    return positions.new_empty(positions.shape), positions.new_empty(velocities.shape), info
+
+
+@_register_fake("step_")
+def _(*_: Any, **__: Any) -> None:
+    return None
+
+
+@_register_fake("rollout")
+def _(positions: Tensor, *_: Any, steps: int, every: int, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
+    shape = (steps // every, *positions.shape)
+    info = positions.new_empty((*shape[:2], INFO_WIDTH), dtype=torch.float64)
+    return positions.new_empty(shape), positions.new_empty(shape), info
+
+
+@_register_fake("gradient")
+def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty(positions.shape)
+
+
+@_register_fake("hessian_product")
+def _(positions: Tensor, direction: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty(positions.shape)
+
+
+@_register_fake("element_energy")
+def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty((positions.shape[0], material[_STIFFNESS].shape[-1]))
+
+
+@_register_fake("element_energy_product")
+def _(positions: Tensor, direction: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty((positions.shape[0], material[_STIFFNESS].shape[-1]))
+
+
+@_register_fake("elastic_diagonal")
+def _(material: Sequence[Tensor], plan: Sequence[Tensor], *, weighted: bool) -> Tensor:
+    stiffness, (_, vertex_order, *_) = material[_STIFFNESS], plan
+    return stiffness.new_empty((*stiffness.shape[:-1], vertex_order.shape[0]))
+
+
+@_register_fake("precondition")
+def _(field: Tensor, plan: Sequence[Tensor]) -> Tensor:
+    return field.new_empty(field.shape)
+
+
+@_register_fake("adjoint_system")
+def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    _, _, _, positions, _, _, material, _ = step
+    batch, vertices, _ = positions.shape
+    rows = list(zip(MATERIAL_TABLE, material, strict=True))
+    touching = any(row.name in ("planes", "spheres") and array.shape[-2] > 0 for row, array in rows)
+    # those that inertia and diagonal come from
+    own = touching or any(
+        row.name in ("stiffness", "masses", "damping", "pin_stiffness")
+        and array.dim() > row.dims
+        and len(array) != 1
+        and array.shape[1:].numel() > 0
+        for row, array in rows
+    )
+    inertia, inverse = (positions.new_empty((batch if own else 1, vertices)) for _ in range(2))
+    held = batch if touching else 0
+    projector = positions.new_empty((held, vertices, 3, 3))
+    stuck = positions.new_empty((held, vertices), dtype=torch.bool)
+    sliding = positions.new_empty((held, vertices, _C.slide_vectors, 3))
+    return positions.new_empty(positions.shape), inertia, inverse, projector, stuck, sliding
+
+
+@_register_fake("contact_gradients")
+def _(multiplier: Tensor, *step: Any, time_step: float) -> tuple[Tensor, Tensor]:
+    material = named_material(step[-2])
+    planes, spheres = (
+        multiplier.new_empty((len(multiplier), *material[name].shape[-2:])) for name in ("planes", "spheres")
+    )
+    return planes, spheres
+
+
+@_register_fake("conjugate_gradients")
+def _(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+    return positions.new_empty(positions.shape), positions.new_empty(positions.shape[:1], dtype=torch.float64)
+
+
+@_register_fake("mend_adjoint")
+def _(solution: Tensor, *_: Any, **__: Any) -> Tensor:
+    return solution.new_empty(solution.shape)
+
+
+def _fake_vjp(*call: Any, time_step: float, wanted: Sequence[bool] | None = None) -> list[Tensor]:
+    *_, positions, _, _, material, _ = call
+    state = [positions.new_empty(positions.shape) for _ in range(3)]
+    asked = zip(material, [True] * len(material) if wanted is None else wanted, strict=True)
+    return [*state, *(array.new_empty(array.shape) for array, own in asked if own)]
+
+
+for _name in ("step_vjp", "rollout_vjp"):
+    _register_fake(_name)(_fake_vjp)
+
+
+@_register_fake("adjoint_result")
+def _(multiplier: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
+    x, v, out = (multiplier.new_empty(multiplier.shape) for _ in range(3))
+    return x, v, out
+
+
+@_register_fake("conjugate_gradients_")
+def _(*_: Any, **__: Any) -> None:
+    return None
+
+
+@_register_fake("nearest_rotation")
+def _(matrices: Tensor) -> Tensor:
+    return matrices.new_empty(matrices.shape)
+
+
+@_register_fake("rotation_differential")
+def _(matrices: Tensor, direction: Tensor) -> Tensor:
+    return matrices.new_empty(matrices.shape)
+
+
+# ---- kernels
+
+
+@torch.library.impl("torchpd::mend_adjoint", ("cpu", "cuda"))
+def _(*args: Any, time_step: float) -> Tensor:
+    return mend_adjoint(*args, time_step=time_step)
+
+
+# ---- derivatives: each is another op
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+    ctx.save_for_backward(*inputs)
+
+
+def _save_elastic(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+    """Of an op of a state, a material and a plan."""
+    *state, material, ctx.plan = inputs
+    ctx.save_for_backward(*state, *material)
+
+
+def _like_stiffness(per_environment: Tensor, stiffness: Tensor) -> Tensor:
+    """The derivative for a stiffness that all environments share is the sum over them."""
+    return per_environment.sum(0) if stiffness.dim() == 1 else per_environment.sum_to_size(stiffness.shape)
+
+
+def _with_stiffness(material: Sequence[Tensor], stiffness: Tensor) -> list[Tensor]:
+    return [stiffness if place == _STIFFNESS else array for place, array in enumerate(material)]
+
+
+def _for_material(stiffness: Tensor | None) -> list[Tensor | None]:
+    """The other arrays have no part in elastic energy."""
+    return [stiffness if row.name == "stiffness" else None for row in MATERIAL_TABLE]
+
+
+def _for_plan(ctx: Any) -> list[None]:
+    """The plan has no derivative; autograd wants to hear so for every array of it."""
+    return [None] * len(ctx.plan)
+
+
+def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
+    positions, *material = ctx.saved_tensors
+    stiffness, x, w = material[_STIFFNESS], None, None
+    if ctx.needs_input_grad[0]:
+        x = _ops.gradient(positions, _with_stiffness(material, grad * stiffness), ctx.plan)
+    if ctx.needs_input_grad[1][_STIFFNESS]:
+        unit = _with_stiffness(material, torch.ones_like(stiffness))
+        w = _like_stiffness(grad * _ops.element_energy(positions, unit, ctx.plan), stiffness)
+    return x, _for_material(w), _for_plan(ctx)
+
+
+def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
+    positions, *material = ctx.saved_tensors
+    stiffness, x, w = material[_STIFFNESS], None, None
+    if ctx.needs_input_grad[0]:
+        x = _ops.hessian_product(positions, grad, material, ctx.plan)
+    if ctx.needs_input_grad[1][_STIFFNESS]:
+        unit = _with_stiffness(material, torch.ones_like(stiffness))
+        w = _like_stiffness(_ops.element_energy_product(positions, grad, unit, ctx.plan), stiffness)
+    return x, _for_material(w), _for_plan(ctx)
+
+
+def _element_energy_product_backward(
+    ctx: Any, grad: Tensor
+) -> tuple[Tensor | None, Tensor | None, list[Tensor | None], list[None]]:
+    positions, direction, *material = ctx.saved_tensors
+    stiffness, x, d, w = material[_STIFFNESS], None, None, None
+    scaled = _with_stiffness(material, grad * stiffness)
+    if ctx.needs_input_grad[0]:
+        x = _ops.hessian_product(positions, direction, scaled, ctx.plan)
+    if ctx.needs_input_grad[1]:
+        d = _ops.gradient(positions, scaled, ctx.plan)
+    if ctx.needs_input_grad[2][_STIFFNESS]:
+        unit = _with_stiffness(material, torch.ones_like(stiffness))
+        w = _like_stiffness(grad * _ops.element_energy_product(positions, direction, unit, ctx.plan), stiffness)
+    return x, d, _for_material(w), _for_plan(ctx)
+
+
+def _hessian_product_backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor | None, list[Tensor | None], list[None]]:
+    if ctx.needs_input_grad[0] or ctx.needs_input_grad[2][_STIFFNESS]:
+        raise RuntimeError(
+            "torchpd: third derivatives of the elastic energy are not provided; detach positions and stiffness before "
+            "differentiating a Hessian-vector product"
+        )
+    positions, _, *material = ctx.saved_tensors
+    d = _ops.hessian_product(positions, grad, material, ctx.plan) if ctx.needs_input_grad[1] else None
+    return None, d, _for_material(None), _for_plan(ctx)
+
+
+def _save_nothing(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
+    """Nothing to save."""
+
+
+def _diagonal_backward(ctx: Any, grad: Tensor) -> tuple[list[Tensor | None], list[None]]:
+    wanted, of_plan = ctx.needs_input_grad
+    if wanted[_STIFFNESS]:
+        raise RuntimeError("torchpd: the elastic diagonal, a preconditioner, has no derivative; detach stiffness")
+    return _for_material(None), [None] * len(of_plan)
+
+
+def _precondition_setup(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+    ctx.plan = inputs[1]
+
+
+def _precondition_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, list[None]]:
+    # it is linear and symmetric
+    return _ops.precondition(grad, ctx.plan), _for_plan(ctx)
+
+
+def _rotation_differential(F: Tensor, direction: Tensor) -> Tensor:
+    """dR along dF from torch operations, R [h]_x with (tr(S) I - S) h = axis(R^T dF): differentiable once more."""
+    R = nearest_rotation(F)
+    S = R.mT @ F
+    A = R.mT @ direction
+    axis = torch.stack((A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]), dim=-1)
+    S = 0.5 * (S + S.mT)
+    trace = S.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    # a singular matrix has no derivative, and says so in its own result: nothing is checked, which would wait for a GPU
+    turning = trace * torch.eye(3, dtype=F.dtype, device=F.device) - S
+    x, y, z = torch.linalg.solve_ex(turning, axis)[0].unbind(-1)
+    zero = torch.zeros_like(x)
+    turn = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
+    result: Tensor = R @ turn
+    return result
+
+
+def _rotation_backward(ctx: Any, grad: Tensor) -> Tensor:
+    (F,) = ctx.saved_tensors
+    result: Tensor = _ops.rotation_differential(F, grad)
+    return result
+
+
+def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+    # in the precision of F, also where autocast asks for less
+    with torch.enable_grad(), torch.autocast(grad.device.type, enabled=False):
+        inputs = [saved.detach().requires_grad_() for saved in ctx.saved_tensors]
+        grads: tuple[Tensor | None, ...] = torch.autograd.grad(_rotation_differential(*inputs), inputs, grad)
+    return grads
+
+
+register_rule("step_vjp", step_vjp_rule)
+register_rule("rollout_vjp", rollout_vjp_rule)
+
+
+torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_save_nothing)
+torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)
+
+for _name, _backward, _setup in (
+    ("element_energy", _element_energy_backward, _save_elastic),
+    ("gradient", _gradient_backward, _save_elastic),
+    ("element_energy_product", _element_energy_product_backward, _save_elastic),
+    ("hessian_product", _hessian_product_backward, _save_elastic),
+    ("nearest_rotation", _rotation_backward, _save),
+    ("rotation_differential", _rotation_differential_backward, _save),
+):
+    torch.library.register_autograd(f"torchpd::{_name}", _backward, setup_context=_setup)

@@ -1,0 +1,219 @@
+"""The plan: everything about a scene that does not change from step to step, compiled once into flat tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from .. import _C
+from ..common.checks import tensor_of
+from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, PLAN_TABLE, PlanRow
+from ..scene.scene import SceneValues
+
+__all__ = [
+    "KERNELS",
+    "Plan",
+    "any_of",
+    "compile_plan",
+    "compiling",
+    "internal_numbers",
+    "kernel_of",
+    "loose_pieces",
+    "with_loose_pieces",
+]
+
+_WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
+# by their number in the `sizes` of a GPU's plan
+KERNELS = ("block", "cluster", "grid", "stream")
+_SIZE_GROUPS = 3  # as in csrc/plan/views.h
+
+
+def kernel_of(arrays: Sequence[Tensor]) -> str:
+    """Which kernel the arrays of a GPU's plan are for."""
+    sizes, *_ = arrays
+    return KERNELS[int(sizes[DEVICE_SIZES.index("kernel")])]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Constant arrays of a scene in the order of a table that C++ declares, also by name: `plan.vertex_order`.
+
+    The CPU and GPUs have a table each, which that of a multilevel preconditioner may follow. `why` says in words why a
+    GPU's plan is for the kernel that it is for; `for_levels`: its patches are those of a multilevel solver, and `many`
+    those for so many environments that each has few multiprocessors. `loose`: whether each connected piece of the scene
+    is one that a step moves rigidly, None where nobody says; what hard pins clamp is not.
+    """
+
+    arrays: tuple[Tensor, ...]
+    table: tuple[PlanRow, ...] = PLAN_TABLE
+    why: str = ""
+    for_levels: bool = False
+    many: bool = False
+    loose: NDArray[np.bool_] | None = None
+
+    def __getattr__(self, name: str) -> Tensor:
+        for number, row in enumerate(self.table):
+            if row.name == name:
+                return self.arrays[number]
+        names = ", ".join(row.name for row in self.table)
+        raise AttributeError(f"Plan has no array {name!r}; it has {names}")
+
+    def __repr__(self) -> str:
+        kernel = "" if self.kernel is None else f", kernel {self.kernel}"
+        sizes = f"{self.vertices} vertices, {self.patches} patches{kernel}, {self.bytes:,} B"
+        return f"Plan({sizes}, {str(self.dtype).removeprefix('torch.')}, {self.device})"
+
+    @property
+    def kernel(self) -> str | None:
+        """Which kernel of a GPU the plan is for: "block", "cluster", "grid" or "stream"; None for the CPU."""
+        return kernel_of(self.arrays) if self.table[: len(DEVICE_PLAN_TABLE)] == DEVICE_PLAN_TABLE else None
+
+    def size(self, name: str) -> int:
+        """A number of a GPU's plan by its name in DEVICE_SIZES."""
+        return int(self.sizes[DEVICE_SIZES.index(name)])
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the real arrays."""
+        return next(array.dtype for array in self.arrays if array.is_floating_point())
+
+    @property
+    def device(self) -> torch.device:
+        """Where the arrays are."""
+        return self.vertex_order.device
+
+    @property
+    def vertices(self) -> int:
+        """Vertices of all bodies."""
+        return len(self.vertex_order)
+
+    @property
+    def patches(self) -> int:
+        """Pieces of the mesh: the CPU works on one at a time, a GPU has a thread block for each."""
+        return len(self.patch_block) - 1
+
+    @property
+    def bytes(self) -> int:
+        """Memory of all arrays."""
+        return sum(array.numel() * array.element_size() for array in self.arrays)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Plan:
+        """A copy on another device or, of a plan for the CPU, in another precision. Widening brings no digits back.
+
+        The kernels of a GPU and of the CPU need different plans: `Simulator.to` compiles the right one. `sizes` stay on
+        the CPU: the host reads them, and must not wait for a device.
+        """
+        if self.kernel is not None and dtype not in (None, self.dtype):
+            raise ValueError(
+                f"Plan.to: the plan of a GPU has other arrays in another precision: compile it for {dtype}, "
+                f"as sim.to({dtype}) does; got a plan in {self.dtype}"
+            )
+
+        def moved(row: PlanRow, array: Tensor) -> Tensor:
+            if row.rows.endswith("size"):
+                return array
+            return array.to(device=device, dtype=dtype if array.is_floating_point() else None)
+
+        return replace(self, arrays=tuple(map(moved, self.table, self.arrays)))
+
+
+@contextmanager
+def compiling(tets: int, progress: bool) -> Iterator[Callable[[float], None]]:
+    """Shows a bar when the mesh is large; gives the function that hears the fraction done."""
+    with tqdm(total=100, desc="compiling the scene", leave=False, disable=not progress or tets < _WORTH_A_BAR) as bar:
+        yield lambda done: _advance(bar, done)
+
+
+def _advance(bar: tqdm[Any], done: float) -> None:
+    bar.update(int(100 * done) - bar.n)
+
+
+def _patch_size(tets: int) -> int:
+    """Tetrahedra a patch: what fits the cache, in a number of patches that two or four threads can share evenly.
+
+    Larger patches share fewer vertices (1.6 slots a vertex at 1024, 1.4 at 2048).
+    """
+    patches = max(1, -(-tets // 2048))
+    patches = -(-patches // 4) * 4 if tets >= 1024 else min(2, max(1, tets // 256))
+    return max(16, -(-tets // patches))
+
+
+def any_of(names: Sequence[str]) -> str:
+    """Names of kernels as a sentence has them: "block", "grid" or "stream"."""
+    *before, last = (f'"{name}"' for name in names)
+    return f"{', '.join(before)} or {last}" if before else last
+
+
+def loose_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Number of the piece that each vertex moves rigidly with (-1: none), and how many vertices each one has."""
+    number = np.where(values.loose, np.cumsum(values.loose) - 1, -1)
+    group = number[values.component].astype(np.int32)
+    return group, np.bincount(group[group >= 0], minlength=int(values.loose.sum())).astype(np.int32)
+
+
+def with_loose_pieces(plan: Plan, values: SceneValues) -> Plan:
+    """The plan of a CPU where other pieces of the scene can move rigidly."""
+    if plan.kernel is not None:
+        raise ValueError("with_loose_pieces: a GPU's plan has its pieces in other arrays; compile it anew")
+    group, group_size = (tensor_of(array) for array in loose_pieces(values))
+    sizes = plan.sizes.clone()
+    sizes[_SIZE_GROUPS] = len(group_size)
+    new = {"vertex_group": group[plan.vertex_order.long()], "group_size": group_size, "sizes": sizes}
+    arrays = tuple(new.get(row.name, array) for row, array in zip(plan.table, plan.arrays, strict=True))
+    return replace(plan, arrays=arrays, loose=values.loose)
+
+
+def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
+    """Counts in the order of PlanSize in csrc/plan/views.h."""
+    slots = np.diff(arrays["patch_slot"])
+    counts = (
+        len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), len(arrays["group_size"]),
+        len(arrays["tet_order"]), len(slots), len(arrays["slot_vertex"]), len(arrays["shared_start"]) - 1, slots.max(),
+    )  # fmt: skip
+    return np.array(counts, dtype=np.int32)
+
+
+def internal_numbers(vertex_order: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Internal number of each of the user's vertices."""
+    internal = np.empty_like(vertex_order)
+    internal[vertex_order] = np.arange(len(vertex_order), dtype=vertex_order.dtype)
+    return internal
+
+
+def compile_plan(
+    values: SceneValues, *, dtype: torch.dtype = torch.float32, patch_size: int | None = None, progress: bool = True
+) -> Plan:
+    """Order, partition and weigh a scene for the kernels. On the CPU; move it with `Plan.to`.
+
+    Args:
+        values: the flat arrays of `Scene.values`.
+        dtype: torch.float32 or torch.float64.
+        patch_size: tetrahedra a patch, 16 to 8192; None chooses by the size of the mesh.
+        progress: show a bar when the mesh is large.
+    """
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}")
+    tets = len(values.tets)
+    with compiling(tets, progress) as advance:
+        arrays: dict[str, NDArray[Any]] = _C.build_plan(
+            values.rest_positions,
+            values.tets,
+            patch_size or _patch_size(tets),
+            advance,
+        )
+    internal = internal_numbers(arrays["vertex_order"])
+    group, group_size = loose_pieces(values)
+    arrays["vertex_group"] = group[arrays["vertex_order"]]
+    arrays["group_size"] = group_size
+    arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
+    arrays["sizes"] = _sizes(arrays, tets)
+    tensors = (tensor_of(arrays[row.name]) for row in PLAN_TABLE)
+    return Plan(tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors), loose=values.loose)

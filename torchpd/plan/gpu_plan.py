@@ -1,0 +1,57 @@
+"""The plan of a GPU: the constant arrays of a scene in the form that its kernels read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .. import _C
+from ..common.checks import tensor_of
+from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
+from ..scene.scene import SceneValues
+from .cpu_plan import KERNELS, compiling, internal_numbers, loose_pieces
+
+__all__ = ["compile_device_plan"]
+
+_SIZE_PINS = DEVICE_SIZES.index("pins")
+
+
+def compile_device_plan(
+    values: SceneValues, patches: int, kernel: int, dtype: torch.dtype, progress: bool = True
+) -> tuple[Tensor, ...]:
+    """Order, partition and weigh a scene for the kernels of a GPU.
+
+    Args:
+        values: the flat arrays of `Scene.values`.
+        patches: parts of the mesh that one thread block each works on, 1 to the number of tetrahedra, of a cluster to
+            that of vertices and to 16; more are needed when a patch has more numbers than 16 bits count, from about
+            20 000 tetrahedra on.
+        kernel: 0 when one thread block steps a whole environment, 1 when a cluster of them does, 2 when a grid does,
+            3 for kernels per iteration.
+        dtype: torch.float32 or torch.float64.
+        progress: show a bar when the mesh is large.
+
+    Returns:
+        The arrays of csrc/plan/device.def in its order, on the CPU.
+    """
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+    if kernel not in range(len(KERNELS)):
+        raise ValueError(f"kernel must be 0, 1, 2 or 3, got {kernel}")
+    piece, _ = loose_pieces(values)
+    with compiling(len(values.tets), progress) as advance:
+        arrays: dict[str, NDArray[Any]] = _C.build_device_plan(
+            values.rest_positions, values.tets, patches, kernel, dtype == torch.float32, piece, advance
+        )
+    pins = len(values.pin_vertices)
+    arrays["sizes"][_SIZE_PINS] = pins
+    if pins:
+        arrays["pin_vertex"] = internal_numbers(arrays["vertex_order"])[values.pin_vertices]
+        arrays["vertex_pin"] = np.full(len(values.rest_positions), -1, dtype=np.int32)
+        arrays["vertex_pin"][arrays["pin_vertex"]] = np.arange(pins)
+    tensors = (tensor_of(arrays[row.name]) for row in DEVICE_PLAN_TABLE)
+    return tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors)

@@ -1,0 +1,86 @@
+"""`kernel="benchmark"`: every kernel that fits takes a few steps, once, and the quickest is kept.
+
+Times are kept while the process lives, by GPU, sizes of the scene, batch and iterations, as cuDNN's benchmark mode
+keeps its own. Kernels add up forces in different orders: bits depend on which of them is chosen, and so on the clock.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import replace
+
+import torch
+
+from .compiled import CompiledScene
+from .cpu_plan import Plan
+
+__all__ = ["quickest_plan", "steps_of"]
+
+_REPETITIONS = 5
+_TIMES: dict[Hashable, dict[str, float]] = {}  # milliseconds of a step by kernel
+
+
+def steps_of(
+    scene: CompiledScene, dtype: torch.dtype, device: torch.device
+) -> tuple[Hashable, Callable[[Plan], Callable[[], object]]]:
+    """`key` and `step` of `quickest_plan` for a scene on a GPU: what times depend on, and steps from rest."""
+    values, batch = scene.scene.values(), scene.environments
+    numbers = {
+        **scene.solver.settings(),
+        "iterations": scene.iterations,
+        "time_step": scene.time_step,
+        "tolerance": 0.0,
+        "inertial": False,
+        "report": False,
+    }
+    key = (
+        torch.cuda.get_device_name(device), dtype, len(values.tets), len(values.rest_positions), len(values.planes),
+        len(values.spheres), len(values.pin_vertices), batch, scene.iterations, scene.solver,
+    )  # fmt: skip
+
+    def step(plan: Plan) -> Callable[[], object]:
+        rest = torch.as_tensor(values.rest_positions).to(device, dtype).expand(batch, -1, -1).contiguous()
+        material = [array.detach().to(device, dtype) for array in scene.material]
+        arrays = list(plan.to(device).arrays)
+        still = torch.zeros_like(rest)
+        return lambda: torch.ops.torchpd.step(rest, still, None, None, material, arrays, **numbers)
+
+    return key, step
+
+
+def quickest_plan(plans: Iterator[Plan], key: Hashable, step: Callable[[Plan], Callable[[], object]]) -> Plan:
+    """The plan with the quickest steps.
+
+    Args:
+        plans: one for every kernel that fits, on the CPU.
+        key: what the times depend on.
+        step: moves a plan to its GPU and returns what takes a step with it there; may raise
+            `torch.cuda.OutOfMemoryError`.
+    """
+    offers = list(plans)
+    if key not in _TIMES:
+        _TIMES[key] = {str(plan.kernel): _milliseconds(step, plan) for plan in offers}
+    times = _TIMES[key]
+    best = min(offers, key=lambda plan: times[str(plan.kernel)])
+    words = ", ".join(f"{kernel} {time:.3g} ms" for kernel, time in sorted(times.items(), key=lambda item: item[1]))
+    return replace(best, why=f"the quickest of those timed, milliseconds of a step: {words}")
+
+
+def _milliseconds(step: Callable[[Plan], Callable[[], object]], plan: Plan) -> float:
+    """Of a step, median; inf where memory does not do."""
+    try:
+        run = step(plan)
+        run()  # a first one loads the kernel
+        return statistics.median(_timed(run) for _ in range(_REPETITIONS))
+    except torch.cuda.OutOfMemoryError:
+        return float("inf")
+
+
+def _timed(run: Callable[[], object]) -> float:
+    start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+    start.record()
+    run()
+    end.record()
+    end.synchronize()
+    return float(start.elapsed_time(end))

@@ -1,0 +1,359 @@
+"""Which kernel of a GPU steps a scene, and the plan for it.
+
+    block    one thread block an environment, or several small ones, all iterations in one launch: the mesh fits a
+             block's shared memory
+    cluster  up to 16 blocks that reach each other's shared memory (compute capability 9.0), a patch each, all
+             iterations in one launch: a small mesh
+    grid     a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
+    stream   launches for every iteration: any mesh
+
+Where the number of environments is known (`Simulator(batch=...)`), the kernel that fits and should take least is taken,
+by `kernel_costs`: a cluster for a few environments of a small mesh, launches for many of a large one, and between them
+a grid, of fewer and larger patches the more environments are to run at a time. "benchmark" times each that fits.
+Every vertex belongs to one patch of a cluster, and a patch has every tetrahedron that touches one of its own vertices:
+those at the borders are worked out by several. So no forces are exchanged, and once an iteration the new position of a
+vertex is sent into the shared memory of the patches that have a copy of it. Patches of the others share no tetrahedra,
+and exchange the forces on vertices that they share.
+
+The batch of a state does not enter: an environment gives the same bits alone and in any batch.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+
+from .. import _C
+from ..common.gpu import Properties
+from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
+from ..scene.scene import SceneValues
+from .cpu_plan import KERNELS, Plan, any_of
+from .gpu_plan import compile_device_plan
+from .kernel_costs import iteration_microseconds, kernel_microseconds
+
+__all__ = ["check_kernel", "choose_plan", "shared_bytes"]
+
+_GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
+# "auto" looks at clusters for meshes of so many at most; where there are blocks, a patch of one for every so many
+_CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
+_CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
+# with a multilevel solver environments are many where they have no more multiprocessors than so many each
+_MANY_SHARE = 4
+# with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block, of a mesh of so many at
+# most, fewer for few environments; many take less with fewer patches
+_LEVEL_TETS, _LEVEL_ALONE, _FEW_ALONE, _MANY_TETS = 384, 1152, 384, 1900
+_LEVELS = ("few", "any", "many")  # how many environments it is for
+# a patch at most, five rounds of its threads where all have partners, and how many patches share a multiprocessor of an
+# H100 (csrc/cuda/stream.h)
+_STREAM_TETS = {torch.float32: 1920, torch.float64: 960}
+_STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
+# so many times as many in a pipeline, of which a multiprocessor works on one at a time and holds two, where there is so
+# much shared memory for them and every multiprocessor has one: their slots are what its threads have in registers at
+# once (csrc/cuda/pipeline.h)
+_PIPED_MORE, _PIPED_BYTES = 1.2, 200_000
+_MOST_FIELDS = 2  # of a pass: the products with a second derivative
+
+
+def check_kernel(kernel: str) -> str:
+    """The name of a kernel, "auto" or "benchmark"."""
+    names = ("auto", "benchmark", *KERNELS)
+    if kernel not in names:
+        raise ValueError(f"Simulator: kernel must be {any_of(names)}, got {kernel!r}")
+    return kernel
+
+
+def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
+    """Shared memory of a block of the kernel that a plan is for."""
+    real = torch.finfo(plan.dtype).bits // 8
+    slots, entries = plan.size("most_slots"), plan.size("most_entries")
+    if plan.for_levels:
+        return _C.outer_shared_bytes(real, slots, entries)
+    if plan.kernel == "stream":
+        return _pass_bytes(plan)
+    if plan.kernel == "cluster":
+        return _C.cluster_shared_bytes(real, slots, entries, plan.size("most_interior"), planes, balls)
+    return _C.fused_shared_bytes(real, plan.kernel == "grid", slots, entries, planes, balls)
+
+
+def most_shared_bytes(plan: Plan, planes: int, balls: int) -> int:
+    """The same of whatever runs with a plan: a step, and the way back through it, which passes over all patches."""
+    return max(shared_bytes(plan, planes, balls), _pass_bytes(plan))
+
+
+def _pass_bytes(plan: Plan) -> int:
+    real = torch.finfo(plan.dtype).bits // 8
+    bytes_of_pass = _C.pass_shared_bytes(real, plan.size("most_slots"), plan.size("most_entries"), _MOST_FIELDS)
+    return bytes_of_pass + _C.pass_static_bytes
+
+
+class _Scene(NamedTuple):
+    values: SceneValues
+    dtype: torch.dtype
+    progress: bool
+
+    @property
+    def tets(self) -> int:
+        return len(self.values.tets)
+
+    @property
+    def vertices(self) -> int:
+        return len(self.values.rest_positions)
+
+    @property
+    def real(self) -> int:
+        """Bytes of a number."""
+        return torch.finfo(self.dtype).bits // 8
+
+    def plan(self, kernel: str, patches: int) -> Plan:
+        number = KERNELS.index(kernel)
+        arrays = compile_device_plan(self.values, patches, number, self.dtype, progress=self.progress)
+        return Plan(arrays, DEVICE_PLAN_TABLE, loose=self.values.loose)
+
+    def shared_bytes(self, plan: Plan) -> int:
+        return most_shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
+
+    def patches(self, kernel: str, gpu: Properties) -> int:
+        """By the name of a kernel, or for a multilevel solver "few", "many" or any other number of environments."""
+        if kernel == "block":
+            return 1
+        if kernel == "cluster":
+            wanted = max(2, self.tets // _CLUSTER_EACH, math.ceil(self.vertices / (_CLUSTER_OWN * self.most_own())))
+            return min(gpu.cluster, gpu.multiprocessors, wanted, self.vertices, self.tets)
+        if kernel == "grid":
+            return self.most_grid_patches(gpu)
+        if kernel in _LEVELS:
+            if self.tets <= (_FEW_ALONE if kernel == "few" else _LEVEL_ALONE):
+                return 1
+            # 2.5 entries and at least a third of a slot a tetrahedron, see pass_shared_bytes
+            each = (4 * 2.5 + 6 / 3) * self.real
+            least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes - _C.corotation_bytes))
+            if kernel == "many":
+                return max(2, int(least), -(-self.tets // _MANY_TETS))
+            rounds = -(-int(least) // gpu.multiprocessors)
+            return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
+        patches = -(-self.tets // _STREAM_TETS[self.dtype])
+        # what does not run at once runs in whole waves, of which the last is full too
+        wave = _STREAM_TOGETHER[self.dtype] * gpu.multiprocessors
+        if self.has_large_halves(gpu) and patches > gpu.multiprocessors:
+            wave = gpu.multiprocessors
+            patches = max(wave, math.ceil(self.tets / (_PIPED_MORE * _STREAM_TETS[self.dtype])))
+        return patches if patches <= wave else -(-patches // wave) * wave
+
+    def has_large_halves(self, gpu: Properties) -> bool:
+        """Whether iterations of kernel "stream" are a pipeline, in float32 and without contacts, with room for more."""
+        touching = len(self.values.planes) + len(self.values.spheres) > 0
+        return self.dtype == torch.float32 and not touching and gpu.shared >= _PIPED_BYTES
+
+    def most_grid_patches(self, gpu: Properties) -> int:
+        """Of a grid: as many as leave each its least number of tetrahedra."""
+        return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
+
+    def grids(self, batch: int, gpu: Properties) -> list[tuple[float, int]]:
+        """Times that an iteration of so many environments should take with numbers of patches, and these; best first.
+
+        Of the numbers with which one environment, two, three... run at a time the largest.
+        """
+        most = self.most_grid_patches(gpu)
+        counts = {min(most, gpu.multiprocessors // together) for together in range(1, gpu.multiprocessors // 2 + 1)}
+        timed = [(self.microseconds("grid", count, batch, gpu), count) for count in counts or {most}]
+        return sorted(timed, key=lambda offer: (offer[0], -offer[1]))
+
+    def microseconds(self, kernel: str, patches: int, batch: int, gpu: Properties) -> float:
+        return kernel_microseconds(kernel, patches, self.tets, batch, self.dtype, gpu)
+
+    def most_own(self) -> int:
+        """Vertices that a block of a cluster has threads for."""
+        return next(count - 1 for count in itertools.count(1) if not _C.fits_cluster(self.real, 1, count))
+
+    def considers(self, kernel: str, gpu: Properties) -> bool:
+        """Whether "auto" looks at a kernel."""
+        return kernel != "cluster" or (gpu.cluster > 1 and self.tets <= _CLUSTER_TETS)
+
+    def refuse_unbuilt(self, kernel: str, patches: int, gpu: Properties) -> str:
+        """What is too much of a kernel whatever the plan, which need not be built then; empty where nothing is."""
+        tets = -(-self.tets // patches)  # one patch has so many, and in a cluster copies of others
+        if kernel == "cluster":
+            return self.refuse_patch(-(-tets // 2), -(-self.vertices // patches))
+        slots = self.vertices if patches == 1 else 4
+        planes, balls = len(self.values.planes), len(self.values.spheres)
+        # two tetrahedra have at least five entries
+        least = _C.fused_shared_bytes(self.real, kernel == "grid", slots, 5 * tets // 2, planes, balls)
+        return f"at least {least:,} B" if least > gpu.shared else ""
+
+    def refuse_patch(self, pairs: int, interior: int) -> str:
+        """Why a patch of a cluster is too large for the threads of a block; empty where it is not."""
+        if _C.fits_cluster(self.real, pairs, interior):
+            return ""
+        return f"patches smaller than {pairs} pairs of tetrahedra and {interior} vertices"
+
+
+def _fused_plan(
+    scene: _Scene, kernel: str, gpu: Properties, batch: int | None = None, patches: int | None = None
+) -> tuple[Plan | None, str]:
+    """The plan, of so many patches if they are given, and what it needs; None where there is not as much."""
+    patches = scene.patches(kernel, gpu) if patches is None else patches
+    refusal = scene.refuse_unbuilt(kernel, patches, gpu)
+    if refusal:
+        return None, refusal
+    try:
+        plan = scene.plan(kernel, patches)
+    except ValueError as error:  # more entries or slots in a patch than 16 bits count
+        return None, f"more than can be counted ({error})"
+    if kernel == "cluster":
+        refusal = scene.refuse_patch(plan.size("most_pairs"), plan.size("most_interior"))
+        if refusal:
+            return None, refusal
+    if kernel == "block" and batch is not None:
+        each = -(-batch // gpu.multiprocessors)
+        plan.sizes[DEVICE_SIZES.index("environments")] = min(each, _C.most_environments)
+    needed = scene.shared_bytes(plan)
+    return (plan if needed <= gpu.shared else None), f"{needed:,} B"
+
+
+def _grid_plan(scene: _Scene, gpu: Properties, batch: int | None) -> tuple[Plan | None, str]:
+    """As `_fused_plan`, of as many patches as are best for so many environments, and fit."""
+    if batch is None:
+        return _fused_plan(scene, "grid", gpu)
+    plan, needed, too_few = None, "", 0
+    for _, patches in scene.grids(batch, gpu):
+        if patches <= too_few:
+            continue
+        plan, needed = _fused_plan(scene, "grid", gpu, patches=patches)
+        if plan is not None:
+            break
+        too_few = patches
+    return plan, needed
+
+
+def _plans_that_fit(scene: _Scene, gpu: Properties, batch: int) -> Iterator[Plan]:
+    """A plan for every kernel that fits, first the one that should take least for so many environments."""
+    cluster = _fused_plan(scene, "cluster", gpu)[0] if scene.considers("cluster", gpu) else None
+    offers = [
+        (scene.microseconds("block", 1, batch, gpu), "block", 1),
+        *((time, "grid", patches) for time, patches in scene.grids(batch, gpu)),
+        (scene.microseconds("stream", 0, batch, gpu), "stream", 0),
+    ]
+    if cluster is not None:
+        offers.append((iteration_microseconds(cluster, scene.tets, batch, gpu), "cluster", cluster.patches))
+    done, too_few = set(), 0  # kernels; patches of a grid
+    for _, kernel, patches in sorted(offers, key=lambda offer: offer[0]):
+        if kernel in done or (kernel == "grid" and patches <= too_few):
+            continue
+        if kernel == "stream":
+            plan: Plan | None = _stream_plan(scene, gpu)
+        else:
+            plan = cluster if kernel == "cluster" else _fused_plan(scene, kernel, gpu, batch, patches)[0]
+        if plan is not None:
+            done.add(kernel)
+            count = f"{batch} environment" + "s" * (batch != 1)
+            yield replace(plan, why=f"of the kernels that fit, expected to be the quickest for {count}")
+        elif kernel == "grid":
+            too_few = patches
+
+
+def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
+    """More patches where many tetrahedra share a vertex, whose forces one patch sums."""
+    return _plan_that_fits(scene, gpu, "stream", lambda patches: 2 * patches)
+
+
+def _level_plan(scene: _Scene, gpu: Properties, name: str) -> Plan:
+    """For a multilevel solver: as many patches for every multiprocessor, where one each is not enough."""
+
+    def more(patches: int) -> int:
+        if name == "many":
+            return patches + 1 + patches // 4
+        rounds = -(-patches // gpu.multiprocessors)
+        return (rounds + 1 + rounds // 4) * gpu.multiprocessors
+
+    plan = _plan_that_fits(scene, gpu, name, more)
+    return replace(plan, many=name == "many", why="what Multilevel runs with")
+
+
+def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
+    """For "stream" or a multilevel solver; `more`: the patches to try after so many with too many slots or forces."""
+    patches = min(scene.patches(name, gpu), scene.tets)
+    while True:
+        try:
+            plan = replace(scene.plan("stream", patches), for_levels=name != "stream")
+        except ValueError:  # more in a patch than can be counted
+            if patches == scene.tets:
+                raise
+        else:
+            if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
+                return plan
+        patches = min(more(patches), scene.tets)
+
+
+def choose_plan(
+    values: SceneValues,
+    dtype: torch.dtype,
+    gpu: Properties,
+    kernel: str = "auto",
+    *,
+    levels: bool = False,
+    batch: int | None = None,
+    progress: bool = True,
+    quickest: Callable[[Iterator[Plan]], Plan] = next,
+) -> Plan:
+    """The plan of a scene for a GPU, on the CPU; move it with `Plan.to`.
+
+    Args:
+        values: the flat arrays of `Scene.values`.
+        dtype: torch.float32 or torch.float64.
+        gpu: what the device has.
+        kernel: "auto" takes the first of "block", "cluster", "grid" and "stream" that fits, and where the batch is
+            known the one that `kernel_costs` expects to be the quickest; a "cluster" where the GPU has them, and for
+            a small mesh alone. "benchmark" takes the one that `quickest` returns.
+        levels: for a multilevel solver, which runs as "stream" does but for its iterations.
+        batch: environments that a step will have; None: not known, which is between few and many.
+        progress: show a bar when the mesh is large.
+        quickest: for "benchmark": takes a plan for every kernel that fits, see `kernel_benchmark`.
+    """
+    check_kernel(kernel)
+    scene = _Scene(values, dtype, progress)
+    size = "any" if batch is None else "many" if _MANY_SHARE * batch >= gpu.multiprocessors else "few"
+    if levels:
+        if kernel not in ("auto", "benchmark", "stream"):
+            raise ValueError(
+                f'Simulator: Multilevel runs with kernel="stream" on a GPU, got kernel={kernel!r}; leave it at "auto"'
+            )
+        return _level_plan(scene, gpu, size)
+    if kernel == "cluster" and gpu.cluster == 1:
+        raise ValueError(
+            'Simulator: kernel="cluster" needs thread blocks that reach each other\'s shared memory (NVIDIA compute '
+            'capability 9.0), and this GPU has none; take "block", "grid" or "stream", or "auto", which takes one '
+            "that fits"
+        )
+    if kernel == "benchmark":
+        return quickest(_plans_that_fit(scene, gpu, 1 if batch is None else batch))
+    if kernel == "auto" and batch is not None:
+        return next(_plans_that_fit(scene, gpu, batch))
+    needs = []
+    for name in ("block", "cluster", "grid"):
+        if kernel != name and not (kernel == "auto" and scene.considers(name, gpu)):
+            continue
+        plan, needed = _grid_plan(scene, gpu, batch) if name == "grid" else _fused_plan(scene, name, gpu, batch)
+        needs.append(f"{name} needs {needed}")
+        if plan is not None:
+            return replace(plan, why=_reason(kernel, needs, gpu))
+        if kernel == name:
+            # those that come later need less
+            others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.considers(other, gpu)]
+            raise ValueError(
+                f"Simulator: kernel={kernel!r} does not fit this GPU: {_facts(needs, gpu)}; take {any_of(others)}, or "
+                '"auto", which takes one that fits'
+            )
+    return replace(_stream_plan(scene, gpu), why=_reason(kernel, needs, gpu))
+
+
+def _reason(kernel: str, needs: list[str], gpu: Properties) -> str:
+    return "asked for" if kernel != "auto" else _facts(needs, gpu)
+
+
+def _facts(needs: list[str], gpu: Properties) -> str:
+    return f"shared memory a thread block: {', '.join(needs)}, {gpu.shared:,} B are there"

@@ -1,0 +1,212 @@
+"""The arrays that training may change: how they start, and what they must be."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..common.tables import MATERIAL_TABLE, PLANES, SPHERES
+from ..scene.pins import PIN_HARD, hold_exactly, split_springs
+from ..scene.scene import SceneValues
+
+__all__ = [
+    "ARRAYS",
+    "MATERIAL_ROWS",
+    "PARTS_OF_ROWS",
+    "check_array",
+    "check_batches",
+    "check_environments",
+    "check_hard",
+    "check_material",
+    "dims_of",
+    "environments_of_material",
+    "fingerprint",
+    "in_order",
+    "material_of",
+    "named_arrays",
+    "one_for_all_rows",
+    "real_tensor",
+]
+
+MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
+ARRAYS = (*MATERIAL_ROWS, PIN_HARD)  # what `set_material` replaces
+# What users look for by the names of scenes.
+PARTS_OF_ROWS = {
+    "density": "masses are of vertices [kg], a density times their share of volume",
+    "youngs": "stiffness is Young's modulus of each tetrahedron [Pa]",
+}
+
+_UNIT_SLACK = 1e-4  # of the length of a plane's normal: float32 rounding and a training step's
+
+
+def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
+    """What `named_arrays` gives, of a scene, in the precision of the simulation, checked after rounding to it."""
+    at_rest = MATERIAL_ROWS["spheres"].width - values.spheres.shape[1]
+    spheres = np.pad(values.spheres, ((0, 0), (0, at_rest)))
+    material = {
+        name: torch.tensor(spheres if name == "spheres" else getattr(values, name), dtype=dtype)
+        for name in MATERIAL_ROWS
+    }
+    soft = torch.isfinite(torch.from_numpy(values.pin_stiffness.copy()))
+    if not bool(torch.isfinite(material["pin_stiffness"])[soft].all()):
+        raise ValueError(
+            f"Pin.stiffness: a spring is too stiff for {dtype}; leave stiffness out to hold vertices exactly"
+        )
+    for name, tensor in material.items():
+        check_material("Simulator", name, tensor)
+    material["pin_stiffness"], material[PIN_HARD] = split_springs(material["pin_stiffness"])
+    return material
+
+
+def dims_of(name: str) -> int:
+    """Dimensions of an array that all environments share."""
+    return 1 if name == PIN_HARD else MATERIAL_ROWS[name].dims
+
+
+def named_arrays(sim: nn.Module) -> dict[str, Tensor]:
+    """The arrays as a simulator keeps them: those that training may change, and which pins are hard."""
+    return {name: getattr(sim, name) for name in ARRAYS}
+
+
+def in_order(arrays: Mapping[str, Tensor]) -> list[Tensor]:
+    """The rows of the material as the ops take them, of what `named_arrays` gives."""
+    held = {"pin_stiffness": hold_exactly(arrays["pin_stiffness"], arrays[PIN_HARD])}
+    return [held.get(name, arrays[name]) for name in MATERIAL_ROWS]
+
+
+def _require(good: Tensor, name: str, contract: str, tensor: Tensor) -> None:
+    if bool(good.all()):
+        return
+    bad = good.logical_not().nonzero()
+    place = bad[0].tolist()
+    where = f" at {place} ({len(bad)} in all)" if place else ""
+    raise ValueError(f"{name} must be {contract} in {tensor.dtype}, got {tensor[tuple(place)].cpu().numpy()}{where}")
+
+
+def check_material(owner: str, name: str, tensor: Tensor) -> None:
+    """Refuse values that no step can work with; shapes are the caller's to check."""
+    full = f"{owner}: {name}"
+    if name == "pin_stiffness":
+        _require(tensor >= 0, full, ">= 0, inf for pins that hold exactly,", tensor)
+        return
+    _require(tensor.isfinite(), full, "finite", tensor)
+    if name in ("stiffness", "masses"):
+        _require(tensor > 0, full, "positive", tensor)
+    elif name == "damping":
+        _require(tensor >= 0, full, ">= 0", tensor)
+    elif name == "planes":
+        lengths = tensor[..., PLANES["normal"]].norm(dim=-1)
+        _require((lengths - 1).abs() <= _UNIT_SLACK, f"{full}: the normal (columns 0 to 2)", "of unit length", tensor)
+        friction = PLANES["friction"]
+        _require(tensor[..., friction] >= 0, f"{full}: friction (column {friction})", ">= 0", tensor)
+    elif name == "spheres":
+        radius, friction = SPHERES["radius"], SPHERES["friction"]
+        _require(tensor[..., radius] > 0, f"{full}: the radius (column {radius})", "positive", tensor)
+        _require(tensor[..., friction] >= 0, f"{full}: friction (column {friction})", ">= 0", tensor)
+
+
+def real_tensor(owner: str, name: str, value: Tensor | float) -> Tensor:
+    """A tensor of real numbers that are there; on the CPU what is none yet."""
+    try:
+        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{owner}: {name} must be a number or a tensor, got {value!r}") from None
+    if tensor.is_complex() or tensor.dtype == torch.bool:
+        raise TypeError(f"{owner}: {name} must hold real numbers, got {tensor.dtype}")
+    if tensor.layout != torch.strided or tensor.is_meta:
+        raise TypeError(f"{owner}: {name} must be dense and have values, got {tensor.layout} on {tensor.device}")
+    return tensor
+
+
+def one_for_all_rows(name: str, tensor: Tensor, rows: int) -> Tensor:
+    """Expand one number for all rows, [] or [1], to [rows], and one for each environment, [B, 1], to [B, rows].
+
+    The last dimension always counts rows: [n] is one number for each of n rows, never for each of n environments.
+    Only an array without rows, `damping`, has one number for each environment: [B], or [B, 1].
+    """
+    if tensor.dim() > 2 or (name in MATERIAL_ROWS and MATERIAL_ROWS[name].width > 1):
+        return tensor
+    if dims_of(name) == 0:
+        return tensor.squeeze(-1) if tensor.dim() == 2 else tensor
+    one = tensor.dim() == 0 or tensor.shape[-1] == 1
+    return tensor.expand(*tensor.shape[:-1], rows) if one else tensor
+
+
+def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Tensor:
+    """What is to replace the array `own` of a simulator, in its precision and on its device."""
+    row, tensor = MATERIAL_ROWS[name], real_tensor(owner, name, value).detach()
+    tensor = tensor.to(dtype=own.dtype, device=own.device)
+    shape = tuple(own.shape[own.dim() - row.dims :])
+    alone = tensor.dim() == 0
+    tensor = one_for_all_rows(name, tensor, shape[0] if shape else 1)
+    if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
+        came = f"one number, {tensor.item():g}" if alone else list(tensor.shape)
+        things = {"tet": "tetrahedra", "vertex": "vertices"}.get(row.rows, f"{row.rows}s")
+        scene = "" if row.rows == "one" else f"; {things} of the scene: {shape[0]}"
+        raise ValueError(f"{owner}: {name} must be {list(shape)}, or with a batch in front, got {came}{scene}")
+    check_material(owner, name, tensor)
+    return tensor.contiguous()
+
+
+def check_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
+    """What is to replace the mask of hard pins `own` of a simulator, on its device."""
+    try:
+        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{owner}: {PIN_HARD} must be a bool or a bool tensor, got {value!r}") from None
+    if tensor.dtype != torch.bool:
+        raise TypeError(f"{owner}: {PIN_HARD} must be bool, whether each pin is hard, got {tensor.dtype}")
+    tensor = tensor.to(own.device)
+    shape = own.shape[-1:]
+    tensor = one_for_all_rows(PIN_HARD, tensor, shape[0])
+    if tensor.dim() > 2 or tensor.shape[-1:] != shape:
+        raise ValueError(
+            f"{owner}: {PIN_HARD} must be one bool, {list(shape)}, [B, 1] or [B, {shape[0]}], got "
+            f"{list(tensor.shape)}; pins of the scene: {shape[0]}"
+        )
+    return tensor.contiguous()
+
+
+def fingerprint(arrays: Iterable[Tensor]) -> str:
+    """Of shapes and bits: another one where any number differs. Brings the arrays to the CPU."""
+    found = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        found.update(repr(tuple(array.shape)).encode())
+        found.update(array.detach().cpu().contiguous().numpy().tobytes())
+    return found.hexdigest()
+
+
+def check_batches(owner: str, new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None:
+    """Refuse arrays of different numbers of environments; those without a batch, or with one of 1, serve any number."""
+    first: tuple[int, str] | None = None
+    for name in ARRAYS:
+        array, stays = new.get(name, kept[name]), "" if name in new else " (kept)"
+        count = len(array) if array.dim() > dims_of(name) else 1
+        if count == 0:
+            raise ValueError(f"{owner}: {name} must be of at least one environment, got {list(array.shape)}")
+        if first is not None and count not in (1, first[0]):
+            raise ValueError(
+                f"{owner}: arrays must be of one number of environments, or of all, got those of {first[0]} "
+                f"environments in {first[1]}, of {count} in {name}{stays}; replace them in one call"
+            )
+        if count != 1:
+            first = count, name + stays
+
+
+def check_environments(name: str, batch: int, arrays: Mapping[str, Tensor]) -> None:
+    """Refuse material of other environments than those of a state, which `name` calls."""
+    for row, array in arrays.items():
+        if array.dim() > dims_of(row) and len(array) not in (1, batch):
+            raise ValueError(
+                f"{name} must have as many environments as the simulator's {row}, {len(array)}, got {batch}; "
+                "set_material takes another batch, or an array that all environments share"
+            )
+
+
+def environments_of_material(arrays: Mapping[str, Tensor]) -> int:
+    """How many environments arrays of the material, by name, have numbers for; 1 where all share them."""
+    return max(len(array) if array.dim() > dims_of(name) else 1 for name, array in arrays.items())

@@ -1,0 +1,227 @@
+"""Moving a simulator: every device needs a plan of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .. import _C
+from ..common.checks import plain_tensor
+from ..common.gpu import free_memory, properties_of, refuse_full_memory, seen_devices, why_not
+from ..ops.diagonal import pinned_vertices
+from ..scene.solvers import Multilevel
+from .compiled import CompiledScene
+from .cpu_plan import Plan, compile_plan, with_loose_pieces
+from .kernel_benchmark import quickest_plan, steps_of
+from .kernel_choice import choose_plan
+from .material import in_order, material_of
+from .preconditioner import Reference, has_levels, precondition_plan, reference_of, reference_of_levels, without_levels
+
+__all__ = [
+    "check_wanted_device",
+    "find_device",
+    "is_recording",
+    "loosened_plan",
+    "move_plan",
+    "plan_anew",
+    "plan_for_solver",
+    "plan_on",
+    "plan_that_holds",
+    "serves",
+    "step_bytes",
+]
+
+Pieces = NDArray[np.bool_]
+
+
+def _reason(device: torch.device | None = None) -> str:
+    capability = None if device is None else torch.cuda.get_device_capability(device)
+    return why_not(bool(_C.build_info()["cuda"]), torch.version.cuda, torch.cuda.device_count(), capability)
+
+
+def find_device(name: str) -> torch.device:
+    """What --device names, if it is there."""
+    kind = name.split(":")[0]
+    if kind not in ("cpu", "cuda"):
+        raise ValueError(f"--device must be cpu or cuda, got {name}")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: torch sees no CUDA device here; python -m torchpd doctor says more")
+    device = torch.device(name)
+    if kind == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise ValueError(f"--device {name} is not there: {seen_devices()}")
+    return device
+
+
+def check_wanted_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor:
+    """What `fn`, which moves or converts, makes of an empty tensor; explains why a GPU cannot be had."""
+    try:
+        wanted = fn(probe)
+    except (AssertionError, RuntimeError) as error:
+        reason = _reason()
+        if not reason and "invalid device ordinal" in str(error):
+            raise RuntimeError(f"Simulator: there is no such GPU: {seen_devices()}") from error
+        if not reason or not any(word in str(error) for word in ("CUDA", "NVIDIA")):
+            raise
+        raise RuntimeError(f"Simulator: no CUDA here: {reason}") from error
+    if wanted.device.type not in ("cpu", "cuda", "meta"):
+        raise RuntimeError(f"Simulator: there are no kernels for {wanted.device.type}; it runs on the CPU and on CUDA")
+    if wanted.device.type == "cuda":
+        reason = _reason(wanted.device)
+        if reason:
+            raise RuntimeError(f"Simulator: {wanted.device} cannot be used: {reason}")
+    return wanted
+
+
+def _same_plan(source: torch.device, target: torch.device) -> bool:
+    """Whether the plan of one device serves the other: nothing runs on "meta"."""
+    if source.type != "cuda" or target.type != "cuda":
+        return target.type in ("meta", source.type)
+    return source == target or properties_of(source) == properties_of(target)
+
+
+def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
+    """The scene's plan for a device and the solver, on the CPU, without what the solver prepares."""
+    values = compiled.scene.values()
+    # "meta" does not know which pins are hard
+    if loose is None and compiled.device.type != "meta":
+        loose = values.pinned.loose(compiled.named["pin_stiffness"].isinf().cpu().numpy())
+    values = values if loose is None else replace(values, loose=loose)
+    if device.type != "cuda":
+        return compile_plan(values, dtype=dtype, progress=compiled.progress)
+    key, step = steps_of(compiled, dtype, device)
+    return choose_plan(
+        values, dtype, properties_of(device), compiled.kernel,
+        levels=isinstance(compiled.solver, Multilevel), batch=compiled.batch, progress=compiled.progress,
+        quickest=partial(quickest_plan, key=key, step=step),
+    )  # fmt: skip
+
+
+def _wants_levels(compiled: CompiledScene) -> bool:
+    """Whether steps or gradients use a multilevel preconditioner."""
+    return isinstance(compiled.solver, Multilevel) or compiled.adjoint == "multilevel"
+
+
+def _has_patches_for(compiled: CompiledScene, plan: Plan) -> bool:
+    """Whether the patches serve the solver: a GPU wants others for a multilevel solver, whatever gradients use."""
+    return plan.kernel is None or plan.for_levels == isinstance(compiled.solver, Multilevel)
+
+
+def serves(compiled: CompiledScene) -> bool:
+    """Whether the plan has what solver and gradients use."""
+    return _has_patches_for(compiled, compiled.plan) and has_levels(compiled.plan.arrays) == _wants_levels(compiled)
+
+
+def _with_levels(compiled: CompiledScene, plan: Plan, reference: Reference) -> Plan:
+    """The plan with a multilevel preconditioner; of a GPU's kernels only one reads it."""
+    if plan.kernel not in (None, "stream"):
+        raise ValueError(
+            f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={compiled.kernel!r}, which is '
+            f'"{plan.kernel}" for this scene; set kernel="stream", or leave adjoint at "solver"'
+        )
+    return precondition_plan(plan, compiled.scene.values(), *reference, progress=compiled.progress)
+
+
+def plan_for_solver(compiled: CompiledScene) -> Plan:
+    """The plan with what solver and gradients use, made of the material."""
+    plan = without_levels(compiled.plan)
+    if not _has_patches_for(compiled, plan):
+        plan = _compile(compiled, compiled.dtype, compiled.device)
+    if _wants_levels(compiled):
+        plan = _with_levels(compiled, plan, reference_of(compiled.plan, compiled.material, compiled.time_step))
+    return move_plan(compiled, plan, compiled.device)
+
+
+def loosened_plan(compiled: CompiledScene, hard: Tensor) -> Plan:
+    """The plan where pieces that a mask [P] or [B, P] lets go move rigidly too; the one that is there if they do."""
+    before = compiled.plan.loose
+    if before is None or bool(before.all()):
+        return compiled.plan
+    loose = before | compiled.pinned.loose(hard.cpu().numpy())
+    if bool((loose == before).all()):
+        return compiled.plan
+    if compiled.plan.kernel is None:
+        return with_loose_pieces(compiled.plan, replace(compiled.scene.values(), loose=loose))
+    return move_plan(compiled, plan_anew(compiled, compiled.dtype, compiled.device, loose), compiled.device)
+
+
+def plan_that_holds(compiled: CompiledScene, plan: Plan, hard: Tensor) -> Plan:
+    """The plan whose preconditioner, if it has one, holds no pin but those that are hard in every environment [P].
+
+    It is made of what the one before was made of, but for the pins that are let go: held by it they would not move.
+    """
+    if not has_levels(plan.arrays):
+        return plan
+    stiffness, inertia = reference_of_levels(plan.arrays)
+    freed = pinned_vertices(plan.arrays)[~hard.to(plan.device)]
+    freed = freed[inertia[freed].isinf()]
+    if not len(freed):
+        return plan
+    masses, damping = (plain_tensor(compiled.named[name].detach()) for name in ("masses", "damping"))
+    drag = 1.0 + damping.max() * compiled.time_step
+    inertia[freed] = masses.reshape(-1, plan.vertices).amax(0)[freed] / compiled.time_step**2 * drag
+    plan = precondition_plan(plan, compiled.scene.values(), stiffness, inertia, progress=compiled.progress)
+    return move_plan(compiled, plan, compiled.device)
+
+
+def move_plan(compiled: CompiledScene, plan: Plan, device: torch.device, material: int = 0) -> Plan:
+    """A plan on its device, where a GPU has room for it, for `material` bytes beside it and for a step."""
+    if plan.device == device:
+        return plan
+    if device.type == "cuda":
+        needed = plan.bytes + material + step_bytes(compiled, plan, compiled.environments, device)
+        refuse_full_memory(needed, free_memory(device))
+    return plan.to(device)
+
+
+def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.device) -> int:
+    """Memory of a step beside plan, material and states, as the op takes it.
+
+    Args:
+        compiled: whose solver and material the step has.
+        plan: of a GPU, with what the solver prepares; it may still be on the CPU.
+        batch: environments.
+        device: the GPU.
+    """
+    real = torch.finfo(plan.dtype).bits // 8
+    levels = plan.level_sizes.numpy() if has_levels(plan.arrays) else np.empty(0, dtype=np.int32)
+    planes, spheres, stiffness = (compiled.named[name] for name in ("planes", "spheres", "stiffness"))
+    own = stiffness.dim() == 2 and len(stiffness) == batch
+    schedule: int = compiled.solver.settings()["schedule"]
+    with torch.cuda.device(device):
+        return _C.step_bytes(
+            real, plan.sizes.numpy(), levels, schedule, batch, planes.shape[-2], spheres.shape[-2], own
+        )
+
+
+def is_recording(device: torch.device) -> bool:
+    """Whether torch.compile or a CUDA graph is looking on, which can wait for no value."""
+    return torch.compiler.is_compiling() or (device.type == "cuda" and torch.cuda.is_current_stream_capturing())
+
+
+def plan_anew(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
+    """The plan for a precision and a device, on the CPU; `loose`: pieces that can move rigidly."""
+    plan = _compile(compiled, dtype, device, loose)
+    if not _wants_levels(compiled):
+        return plan
+    # what M was made of goes along, as into a file; coming from "meta" the values are lost
+    if compiled.device.type == "meta":
+        arrays = in_order(material_of(compiled.scene.values(), compiled.dtype))
+        source = compile_plan(compiled.scene.values(), dtype=compiled.dtype, progress=False)
+        reference = reference_of(source, arrays, compiled.time_step)
+    else:
+        reference = reference_of_levels(compiled.plan.arrays)
+    return _with_levels(compiled, plan, reference)
+
+
+def plan_on(compiled: CompiledScene, dtype: torch.dtype, device: torch.device) -> Plan:
+    """The plan for a precision and a device: the one that is there, moved, where that will do."""
+    same = dtype == compiled.dtype and _same_plan(compiled.device, device)
+    plan = compiled.plan if same else plan_anew(compiled, dtype, device)
+    numbers = sum(array.numel() for array in compiled.material) + 3 * compiled.vertices
+    return move_plan(compiled, plan, device, numbers * (torch.finfo(dtype).bits // 8))

@@ -1,0 +1,154 @@
+"""Warnings about probable mistakes, once each: overlapping bodies, starts inside a contact, inverted elements.
+
+The checks are cheap on a CPU. They do not run on a GPU, where they would synchronise, nor under tracing or vmap. Copies
+of a simulator, of which studies make many, do not warn.
+"""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..common.tables import PLANES, SPHERES
+from ..common.warn import SceneWarning, warn_user
+from ..geometry.overlaps import Overlap, boxes_meet, find_overlaps
+from ..plan.material import MATERIAL_ROWS
+from ..scene.scene import Scene
+from .state import State
+
+__all__ = ["Notices", "warn_of_overlaps"]
+
+_ROUNDINGS = 10.0  # machine epsilons of a position that a contact may be violated by
+_PLANES, _SPHERES, _GRAVITY = (list(MATERIAL_ROWS).index(name) for name in ("planes", "spheres", "gravity"))
+_ALONE = "bodies do not collide with each other: move them apart, or separate them by Ground and Sphere"
+
+
+def warn_of_overlaps(scene: Scene) -> None:
+    """Warn of bodies that overlap at rest."""
+    if len(scene.solids) > 1:
+        _say_overlaps(find_overlaps([solid.mesh for solid in scene.solids]), "at rest")
+
+
+def _say_overlaps(found: list[Overlap], where: str) -> None:
+    if found:
+        pairs = ", ".join(f"{o.first} and {o.second} ({o.points} points of their surfaces)" for o in found[:3])
+        more = f" and {len(found) - 3} pairs more" if len(found) > 3 else ""
+        warn_user(f"Simulator: bodies {pairs}{more} overlap {where}, and {_ALONE}", SceneWarning)
+
+
+class Notices:
+    """Warnings that a simulator, the `owner`, has given about its scene."""
+
+    def __init__(self, owner: object = None, scene: Scene | None = None) -> None:
+        self._owner = None if owner is None else weakref.ref(owner)
+        self._scene = scene
+        self._said: set[str] = set()
+        self._started = False
+        self._reports = self._next = 0  # reports with overlapping boxes, and the next one to check
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Notices:
+        return Notices()
+
+    def __reduce__(self) -> tuple[type[Notices], tuple[()]]:
+        return Notices, ()
+
+    def before(self, owner: object, state: State, material: list[Tensor], time_step: float, *, report: bool) -> None:
+        """Check the start of the first step, and of every step that reports."""
+        # tested first, so that no compiled step depends on past warnings
+        if torch.compiler.is_compiling() or not (report or not self._started) or "inside" in self._said:
+            return
+        scene = self._looked_at(owner, state[0])
+        if scene is None:
+            return
+        planes, spheres, gravity = arrays = [material[row].detach() for row in (_PLANES, _SPHERES, _GRAVITY)]
+        if any(len(a) not in (1, len(state[0])) for a, dims in zip(arrays, (3, 3, 2), strict=True) if a.dim() == dims):
+            return  # the step refuses these
+        self._started = True
+        if not (planes.numel() or spheres.numel()):
+            return
+        positions = state[0].detach()
+        depth = _depth(scene, positions, planes, spheres)
+        if not bool((depth > 0.0).any()):
+            return
+        # tolerated: the fall by gravity in a step, and the rounding of resting positions
+        allowed = time_step**2 * gravity.norm(dim=-1).reshape(-1, 1)
+        size = torch.finfo(positions.dtype).eps * positions.abs().amax(dim=(1, 2)).unsqueeze(1)
+        inside = depth > torch.maximum(allowed, _ROUNDINGS * size)
+        if not bool(inside.any()):
+            return
+        self._said.add("inside")
+        environment = int(inside.any(dim=1).nonzero()[0])
+        deepest = float(depth[environment].max())
+        warn_user(
+            f"Simulator: {int(inside[environment].sum())} vertices of environment {environment} start a step inside a "
+            f"ground or sphere, up to {deepest:.2g} m deep. The step moves them out, which gives them velocities of "
+            f"about {deepest / time_step:.2g} m/s: start outside, or set the velocities after that step to 0. If a "
+            "sphere moved there, give its velocity in targets too",
+            SceneWarning,
+        )
+
+    def after(self, owner: object, positions: Tensor, rows: Tensor) -> None:
+        """Check a step that reports: positions [B, V, 3] and rows [B, 7]."""
+        scene = self._looked_at(owner, positions)
+        if scene is None:
+            return
+        inverted = rows[:, -1]
+        if "inverted" not in self._said and bool((inverted > 0).any()):
+            self._said.add("inverted")
+            worst, tets = int(inverted.argmax()), sum(len(solid.mesh.tets) for solid in scene.solids)
+            warn_user(
+                f"Simulator: {int(inverted[worst])} of {tets} tetrahedra of environment {worst} are inverted or flat "
+                "at the end of a step (info.inverted). A body that is too soft for its load, or starts crushed, may "
+                "stay folded, in a converged step",
+                SceneWarning,
+            )
+        if len(scene.solids) > 1 and "overlap" not in self._said:
+            self._look_for_overlaps(scene, positions.detach())
+
+    def _look_for_overlaps(self, scene: Scene, positions: Tensor) -> None:
+        """Check the first environment in which boxes overlap; at the 1st, 2nd, 4th, 8th ... such report."""
+        ranges = [scene.vertex_range(solid) for solid in scene.solids]
+        starts, corners = [part.start for part in ranges], positions.numpy()
+        lows, highs = (end.reduceat(corners, starts, axis=1) for end in (np.minimum, np.maximum))  # [B, bodies, 3]
+        meet = boxes_meet(lows, highs)
+        if not meet.any():
+            return
+        self._reports += 1
+        if self._reports < self._next:
+            return
+        self._next = 2 * self._reports
+        environment = int(meet.argmax())
+        places = corners[environment].astype(np.float64)
+        if found := find_overlaps([solid.mesh for solid in scene.solids], [places[part] for part in ranges]):
+            self._said.add("overlap")
+            _say_overlaps(found, f"in environment {environment} at the end of a step")
+
+    def _looked_at(self, owner: object, positions: Tensor) -> Scene | None:
+        """The scene, if this state can be checked."""
+        if torch.compiler.is_compiling() or type(positions) not in (Tensor, nn.Parameter):
+            return None
+        if positions.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(positions):
+            return None
+        if self._owner is None or self._owner() is not owner or self._scene is None:
+            return None
+        vertices = sum(len(solid.mesh.vertices) for solid in self._scene.solids)
+        return self._scene if positions.shape[1:] == (vertices, 3) and len(positions) else None
+
+
+def _depth(scene: Scene, positions: Tensor, planes: Tensor, spheres: Tensor) -> Tensor:
+    """Depth of every vertex inside contacts at the start of a step [B, V] m; 0 for pinned ones."""
+    planes, spheres = (array if array.dim() == 3 else array[None] for array in (planes, spheres))
+    depth = positions.new_zeros(positions.shape[:2])
+    for plane in planes.unbind(1):
+        normal = plane[:, None, PLANES["normal"]]
+        depth = torch.maximum(depth, plane[:, PLANES["height"], None] - (positions * normal).sum(dim=-1))
+    for sphere in spheres.unbind(1):
+        start = (sphere[:, SPHERES["center"]] - sphere[:, SPHERES["motion"]])[:, None]
+        depth = torch.maximum(depth, sphere[:, SPHERES["radius"], None] - (positions - start).norm(dim=-1))
+    if scene.pins:
+        depth[:, scene._pinned()] = 0.0
+    return depth

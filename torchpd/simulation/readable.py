@@ -1,0 +1,158 @@
+"""Read-outs of a model: contact forces, reactions, stress, and files for ParaView."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from ..common.checks import check_like
+from ..ops.adjoint import AdjointCall
+from ..ops.diagonal import named_material
+from ..plan.material import check_environments
+from ..scene.targets import Targets
+from .model import Model
+from .readouts import ContactForces, Reactions, contact_forces, reactions
+from .state import State
+from .stress import Stress, stress, vertex_average
+from .vtu import States, write_vtu
+
+__all__ = ["Readable"]
+
+
+class Readable(Model):
+    """Read-outs of steps and states of a `Simulator`; docs/readouts.md is a guide."""
+
+    def checked_call(
+        self, state: State, after: State | Tensor, forces: Tensor | None, targets: Targets | None
+    ) -> AdjointCall:
+        """The step from a state to the positions `after`, with all arguments checked."""
+        forces = self.check_state(state, forces=forces)
+        before, positions = self.positions_of(state), self.positions_of(after, "after")
+        check_like("after", positions, before, "m")
+        material = self.material_at(targets, len(before))
+        check_environments("state", len(before), named_material(material))
+        return AdjointCall(before, state[1], forces, positions, material, list(self.plan.arrays), self.time_step)
+
+    def contact_forces(
+        self,
+        state: State,
+        after: State | Tensor,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        *,
+        about: Tensor | None = None,
+    ) -> ContactForces:
+        """Forces of grounds and spheres on the vertices [N] in the step from `state` to `after`.
+
+        They are the part of the objective's gradient at `after` that contacts can supply: normal forces, and friction
+        up to Coulomb's bound. If several colliders hold a vertex, normal forces are fitted to the gradient, and
+        friction is shared; `torchpd.simulation.readouts` states the rule. `residual` is the part that neither contacts
+        nor pins
+        balance: compare it with the forces to see how far to trust them. Hard pins take the whole gradient at their
+        vertices. Differentiable.
+
+        Args:
+            state: start of the step.
+            after: end of the step, a `State` or positions [B, V, 3].
+            forces: as in `forward`, the same as in that step.
+            targets: as in `forward`, the same as in that step.
+            about: point of torques [3] or [B, 3] [m]; by default the centre of mass of each body at `after`.
+
+        Returns:
+            Forces of all colliders [B, V, 3], and of each: `contacts.colliders[ground].force`. Sums and torques by
+            body: `contacts.bodies[solid].force` [B, 3]. `colliders` is empty if the scene has none.
+
+        Example:
+            >>> after = sim(state)
+            >>> contacts = sim.contact_forces(state, after)
+            >>> contacts.bodies[cube].force  # [B, 3] N, of a cube at rest its weight, upwards
+        """
+        return contact_forces(self.scene, self.checked_call(state, after, forces, targets), about)
+
+    def reactions(
+        self,
+        state: State,
+        after: State | Tensor,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        *,
+        about: Tensor | None = None,
+    ) -> Reactions:
+        """Forces of pins on their vertices [N] in the step from `state` to `after`.
+
+        The force of a hard pin is the gradient of the step's objective without pins, that of a soft one k (target -
+        x'). The force of a hard pin therefore includes contact forces at its vertices, and the residual of the solve
+        there. The residual of other vertices is `ContactForces.residual`. Differentiable.
+
+        Args:
+            state, after, forces, targets, about: as in `contact_forces`.
+
+        Returns:
+            Forces in the order of `pin_targets` [B, P, 3] and on all vertices [B, V, 3], and by pin:
+            `reactions.pins[pin].wrench.force` [B, 3] is its total. `pins` is empty if the scene has none.
+        """
+        return reactions(self.scene, self.checked_call(state, after, forces, targets), about)
+
+    def stress(self, state: State | Tensor) -> Stress:
+        """Cauchy stress [B, E, 3, 3] and von Mises stress [B, E] [Pa] of every tetrahedron, and its strain.
+
+        sigma = w (F - R) F^T / det F, with w Young's modulus, F the deformation gradient and R its nearest rotation.
+        NaN unless det F > 0, see `Stress.inverted`. Differentiable.
+
+        Args:
+            state: a `State`, or positions [B, V, 3].
+        """
+        positions, stiffness = self.positions_of(state), self.stiffness
+        check_environments("state", len(positions), {"stiffness": stiffness})
+        return stress(self.scene, positions, stiffness)
+
+    def vertex_average(self, values: Tensor) -> Tensor:
+        """Average at every vertex of values of its tetrahedra, weighted by their rest volumes. Differentiable.
+
+        For colours and contours of a field that jumps between tetrahedra, such as `stress(state).von_mises`. It is NaN
+        at vertices of inverted tetrahedra, whose stress is NaN.
+
+        Args:
+            values: of tetrahedra [B, E, ...].
+
+        Returns:
+            [B, V, ...], in the unit of the values.
+        """
+        return vertex_average(self.scene, values, self.rest_positions)
+
+    def write_vtu(
+        self,
+        path: str | Path,
+        states: States,
+        *,
+        environment: int | None = None,
+        times: Sequence[float] | None = None,
+        point_data: Mapping[str, Any] | None = None,
+        cell_data: Mapping[str, Any] | None = None,
+    ) -> Path:
+        """Write a state as `.vtu` for ParaView; a track or a list of states as a `.pvd` with one numbered `.vtu` each.
+
+        Files have displacement, velocity, stress, von Mises stress and body, and regions if meshes have them. See
+        `torchpd.simulation.vtu` for the names.
+
+        Args:
+            path: of the .vtu, or of the .pvd, beside which the others go; existing files are replaced.
+            states: a state, a track, or a list of states.
+            environment: number of the environment; needed if states have several.
+            times: of the records [s]; by default h, 2 h, ... as of a rollout that records every step.
+            point_data: further fields of vertices by name: [B, V, ...], of several states [T, B, V, ...], or [V, ...]
+                for all of them. Tensors or arrays.
+            cell_data: further fields of tetrahedra, with E in place of V.
+
+        Returns:
+            The path.
+        """
+
+        def check(state: State) -> None:
+            self.check_state(state)
+            self.positions_of(state)
+
+        return write_vtu(self.compiled, check, path, states, environment, times, point_data, cell_data)

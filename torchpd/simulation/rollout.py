@@ -1,0 +1,156 @@
+"""Many time steps: one call of the op if nothing changes between them, else chunks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NoReturn, Protocol
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from ..common.checks import STEPS_DIFFER
+from ..plan.material import MATERIAL_ROWS
+from ..scene.targets import Anchors, Targets
+from .state import Info, State, Track
+
+__all__ = ["PerStep", "Rollout", "run_rollout"]
+
+PerStep = Callable[[int], Any]
+_CHUNK_SECONDS = 0.1
+_SPHERES = list(MATERIAL_ROWS).index("spheres")
+
+
+class Steps(Protocol):
+    """The parts of a simulator that a rollout uses."""
+
+    anchors: Anchors
+
+    @property
+    def time_step(self) -> float: ...
+
+    @property
+    def device(self) -> torch.device: ...
+
+    def check_state(self, state: State, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None: ...
+
+    def material(self) -> list[Tensor]: ...
+
+    def material_at(self, targets: Targets | None, batch: int, *, fix: str = "") -> list[Tensor]: ...
+
+    def advance(
+        self,
+        state: State,
+        forces: Tensor | None,
+        material: list[Tensor],
+        *,
+        steps: int,
+        every: int,
+        inertial: bool,
+        report: bool,
+    ) -> tuple[Tensor, Tensor, Tensor]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """Arguments of `Simulator.rollout`."""
+
+    state: State
+    steps: int
+    every: int
+    forces: Tensor | PerStep | None
+    targets: Targets | PerStep | None
+    inertial: bool
+    report: bool
+    first: int  # number of the first step
+
+
+def run_rollout(sim: Steps, call: Rollout, *, progress: bool) -> Track:
+    """Run a rollout and return the recorded states."""
+    forces = sim.check_state(call.state, forces=None if callable(call.forces) else call.forces, fix=STEPS_DIFFER)
+    material = _first_material(sim, call)
+    if progress:
+        with tqdm(total=call.steps, desc="simulating", unit="step", leave=False) as bar:
+            found = _in_chunks(sim, call, forces, material, bar)
+    elif callable(call.forces) or callable(call.targets):
+        # without a disabled bar, because torch.compile cannot trace one
+        found = _in_chunks(sim, call, forces, material, None)
+    else:
+        found = sim.advance(
+            call.state, forces, material, steps=call.steps, every=call.every, inertial=call.inertial, report=call.report
+        )
+    positions, velocities, rows = found
+    return Track(positions, velocities, Info.from_rows(rows))
+
+
+def _in_chunks(
+    sim: Steps, call: Rollout, forces: Tensor | None, material: list[Tensor], bar: tqdm[NoReturn] | None
+) -> tuple[Tensor, ...]:
+    """Take single steps if forces or targets are functions, else chunks of about 0.1 s.
+
+    Between chunks the bar moves, and Ctrl-C is noticed on a GPU.
+    """
+    adaptive = not (callable(call.forces) or callable(call.targets))
+    chunks, state, done, steps, size = [], call.state, 0, 0, 1
+    while done < call.steps:
+        if callable(call.targets):
+            material = _material_after(sim, material, call.targets(call.first + done), state[0].shape[0])
+        elif done:
+            material = _moved_on(material, steps)
+        if callable(call.forces):
+            forces = sim.check_state(state, forces=call.forces(call.first + done))
+        # whole intervals between records, or a part of one
+        left = call.every - done % call.every
+        steps = size // call.every * call.every if left == call.every <= size else min(size, left)
+        steps = min(steps, call.steps - done)
+        recorded, every = steps >= left, min(steps, call.every)
+        begin = time.perf_counter() if bar is not None else 0.0
+        chunk = sim.advance(
+            state, forces, material, steps=steps, every=every, inertial=call.inertial, report=call.report and recorded
+        )
+        if recorded:
+            chunks.append(chunk)
+        state, done = State(chunk[0][-1], chunk[1][-1]), done + steps
+        if bar is not None:
+            if adaptive and _finish(sim.device) - begin < _CHUNK_SECONDS:
+                size *= 2
+            bar.update(steps)
+    if not chunks:
+        chunks.append(sim.advance(call.state, None, material, steps=0, every=1, inertial=call.inertial, report=False))
+    return tuple(torch.cat(parts) for parts in zip(*chunks, strict=True))
+
+
+def _finish(device: torch.device) -> float:
+    """Wait for a GPU while noticing signals; return the time [s] when it has finished."""
+    if device.type == "cuda":
+        reached = torch.cuda.Event()
+        reached.record(torch.cuda.current_stream(device))
+        while not reached.query():
+            time.sleep(1e-4)
+    return time.perf_counter()
+
+
+def _first_material(sim: Steps, call: Rollout) -> list[Tensor]:
+    """Material of the first step or, if targets are a function, of the step before it."""
+    batch = call.state[0].shape[0]
+    if callable(call.targets):
+        # for the positions of its spheres only
+        return sim.material_at(call.targets(call.first - 1), batch) if call.first else sim.material()
+    material = sim.material_at(call.targets, batch, fix=STEPS_DIFFER)
+    return _moved_on(material, call.first) if call.first else material
+
+
+def _material_after(sim: Steps, before: list[Tensor], targets: Targets | None, batch: int) -> list[Tensor]:
+    """Material of a step with these targets, after one with the material `before`."""
+    if isinstance(targets, Mapping):
+        targets = sim.anchors.with_velocities(targets, before[_SPHERES], batch=batch, time_step=sim.time_step)
+    return sim.material_at(targets, batch)
+
+
+def _moved_on(material: list[Tensor], steps: int) -> list[Tensor]:
+    """The material with moving spheres advanced by some steps."""
+    moved = list(material)
+    moved[_SPHERES] = Anchors.moved_on(material[_SPHERES], steps)
+    return moved

@@ -1,0 +1,154 @@
+"""Settings of a simulator and their consequences: the plan, a preconditioner, the choice of "auto".
+
+A change computes a new `Configuration` from the present one. The simulator takes over only a complete one, so a refused
+change alters nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+
+from ..common.checks import check_has_values
+from ..estimate.solver_choice import Choice, choose_solver, warn_of_few_iterations
+from ..plan.compiled import CompiledScene
+from ..plan.kernel_choice import check_kernel
+from ..plan.placement import move_plan, plan_anew, plan_for_solver, plan_on, serves
+from ..scene.solvers import Chebyshev, Solver, check_solver
+from .state_checks import check_adjoint, check_batch
+
+__all__ = [
+    "EVERY_STEP",
+    "NO_STEP",
+    "SETTINGS",
+    "Configuration",
+    "check_iterations",
+    "choose",
+    "choose_again",
+    "is_auto",
+    "moved",
+    "prepare",
+    "reconfigure",
+]
+
+# Shortest and longest time step for which the iterations were checked, and suffice between them. Both ends count: long
+# steps converge slowly, and short ones overshoot with a relaxation for long ones.
+EVERY_STEP, NO_STEP = (0.0, math.inf), (math.inf, 0.0)
+# fields of a `Configuration` that a simulator keeps besides plan, choice and material
+SETTINGS = (
+    "time_step", "iterations", "tolerance", "solver", "adjoint", "kernel", "batch", "named_iterations",
+    "checked_time_steps",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Configuration(CompiledScene):
+    """A compiled scene, with the origin of its iterations."""
+
+    choice: Choice | None  # of "auto"
+    named_iterations: bool  # whether the user gave the number of iterations: then no warning about it
+    checked_time_steps: tuple[float, float]  # range of time steps [s] that needs no further check
+
+
+def is_auto(solver: object) -> bool:
+    """Whether a solver is "auto"."""
+    return isinstance(solver, str) and solver == "auto"
+
+
+def reconfigure(now: Configuration, **changes: Any) -> Configuration:
+    """The configuration with another `batch`, `kernel`, `solver` or `adjoint`, and all consequences."""
+    for name, value in changes.items():
+        now = _CHANGES[name](now, value)
+    return now
+
+
+def _with_batch(now: Configuration, batch: int | None) -> Configuration:
+    return _planned_anew(replace(now, batch=check_batch(batch)))
+
+
+def _with_kernel(now: Configuration, kernel: str) -> Configuration:
+    now = replace(now, kernel=check_kernel(kernel))
+    return now if now.plan.kernel is None else _planned_anew(now)
+
+
+def _with_solver(now: Configuration, solver: Any) -> Configuration:
+    return choose(now, None) if is_auto(solver) else _solved_by(now, check_solver(solver, now.device))
+
+
+def _with_adjoint(now: Configuration, adjoint: str) -> Configuration:
+    now = replace(now, adjoint=check_adjoint(adjoint))
+    if serves(now):
+        return now
+    check_has_values("adjoint", now.device)
+    return replace(now, plan=plan_for_solver(now))
+
+
+_CHANGES: dict[str, Callable[[Configuration, Any], Configuration]] = {
+    "batch": _with_batch,
+    "kernel": _with_kernel,
+    "solver": _with_solver,
+    "adjoint": _with_adjoint,
+}
+
+
+def prepare(now: Configuration) -> Configuration:
+    """The configuration with everything that depends on the material made again, see `Simulator.prepare_solver`."""
+    check_has_values("prepare_solver", now.device)
+    new = choose_again(now)
+    return new if new.plan is not now.plan else replace(new, plan=plan_for_solver(new))
+
+
+def moved(now: Configuration, dtype: torch.dtype, device: torch.device) -> Configuration:
+    """The configuration with the plan of another precision or device, where the material will be."""
+    if device.type == "cuda":
+        check_solver(now.solver, device)
+    return replace(now, plan=plan_on(now, dtype, device))
+
+
+def check_iterations(now: Configuration, changed: str | None) -> Configuration:
+    """Warn once if default iterations are too few after a change of `changed`; waits for a GPU until then."""
+    if now.checked_time_steps == EVERY_STEP:
+        return now
+    if warn_of_few_iterations(now, now.choice, changed):
+        return replace(now, checked_time_steps=EVERY_STEP)
+    shortest, longest = NO_STEP if changed != "time_step" else now.checked_time_steps
+    return replace(now, checked_time_steps=(min(shortest, now.time_step), max(longest, now.time_step)))
+
+
+def _planned_anew(now: Configuration) -> Configuration:
+    """Make a GPU's plan and the choice of "auto" again, after a change of their inputs."""
+    # "auto" starts from a plan for Chebyshev
+    if now.plan.kernel is not None and not (now.choice is not None and now.plan.for_levels):
+        now = replace(now, plan=move_plan(now, plan_anew(now, now.dtype, now.device), now.device))
+    return choose_again(now)
+
+
+def _solved_by(now: Configuration, solver: Solver) -> Configuration:
+    # the same number of iterations means another error for another solver
+    checked = EVERY_STEP if now.named_iterations else NO_STEP
+    now = replace(now, solver=solver, choice=None, checked_time_steps=checked)
+    return now if serves(now) else replace(now, plan=plan_for_solver(now))
+
+
+def choose(now: Configuration, iterations: int | None) -> Configuration:
+    """Choose as "auto" does, see `choose_solver`."""
+    if now.plan.for_levels:
+        now = _solved_by(now, Chebyshev())  # the costs are compared with the kernel of Chebyshev
+    solver, choice = choose_solver(now, iterations)
+    now = replace(_solved_by(now, solver), choice=choice, iterations=choice.iterations)
+    named = not choice.sets_iterations
+    return check_iterations(
+        replace(now, named_iterations=named, checked_time_steps=EVERY_STEP if named else NO_STEP), None
+    )
+
+
+def choose_again(now: Configuration) -> Configuration:
+    """Repeat the choice of "auto", if there is one; iterations that were set since stay."""
+    if now.choice is None:
+        return now
+    own = now.choice.sets_iterations and now.iterations == now.choice.iterations
+    return choose(now, None if own else now.iterations)

@@ -1,0 +1,193 @@
+"""States, reports and tracks: named tuples of tensors, hence pytrees."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, overload
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from ..common.reprs import by_sizes
+
+if TYPE_CHECKING:
+    from ..scene.targets import Targets
+
+__all__ = ["Info", "State", "StepCall", "Track"]
+
+
+class State(NamedTuple):
+    """Positions and velocities of all vertices, in the order of the meshes, bodies one after another.
+
+    `torch.save` takes it, alone or in a checkpoint, and `torch.load` returns it where torchpd is imported.
+    """
+
+    positions: Tensor  # [B, V, 3] m
+    velocities: Tensor  # [B, V, 3] m/s
+
+    def to(self, *args: Any, **kwargs: Any) -> State:
+        """The state on another device or in another precision, as `Tensor.to`."""
+        return State(self.positions.to(*args, **kwargs), self.velocities.to(*args, **kwargs))
+
+    def clone(self) -> State:
+        """A contiguous copy, which `step_` may overwrite."""
+        dense = torch.contiguous_format
+        return State(self.positions.clone(memory_format=dense), self.velocities.clone(memory_format=dense))
+
+    def where(self, condition: Tensor, other: State) -> State:
+        """Take environments of this state where `condition` [B] is true, and of `other` elsewhere, for resets.
+
+        Args:
+            condition: bool [B].
+            other: a state with as many environments, or with one for all.
+        """
+        if not isinstance(condition, Tensor):
+            raise TypeError(f"State.where: condition must be a bool tensor, got {type(condition).__name__}")
+        if condition.dtype != torch.bool or condition.shape != self.positions.shape[:1]:
+            raise ValueError(
+                f"State.where: condition must be bool [{len(self.positions)}], one for each environment, got "
+                f"{condition.dtype} {list(condition.shape)}"
+            )
+        self._check_other(other)
+        chosen = condition[:, None, None]
+        pairs = zip(self, other, strict=True)
+        return State(*(torch.where(chosen, mine, theirs) for mine, theirs in pairs))
+
+    def _check_other(self, other: Any) -> None:
+        if not isinstance(other, (tuple, list)) or len(other) != 2:
+            raise TypeError(f"State.where: other must be a State, got {type(other).__name__}")
+        for name, mine, theirs in zip(self._fields, self, other, strict=True):
+            if theirs.dtype != mine.dtype or theirs.device != mine.device:
+                raise TypeError(
+                    f"State.where: other must have {name} {mine.dtype} on {mine.device}, got {theirs.dtype} on "
+                    f"{theirs.device}"
+                )
+            if theirs.shape not in (mine.shape, (1, *mine.shape[1:])):
+                raise ValueError(
+                    f"State.where: other must have {name} {list(mine.shape)}, or those of one environment, got "
+                    f"{list(theirs.shape)}"
+                )
+
+    def detach(self) -> State:
+        """The state without its autograd history, as `Tensor.detach`."""
+        return State(self.positions.detach(), self.velocities.detach())
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.positions, "batch", "vertices")
+
+
+class Info(NamedTuple):
+    """Report of a step's solve, per environment [B] (of a rollout [T, B]). Reading it on a GPU synchronises.
+
+    No field has a gradient; `Simulator.energy` of the next state has one.
+
+    Attributes:
+        residual: share of the step's forces that is not balanced: 0 (solved, to rounding) to 1. NaN unless requested,
+            and where state or material of the step are not finite, or negative. See below.
+        energy: objective E at the last iterate [J], elastic energy + m / (2 h^2) |x - y|^2, which the solve lowers. The
+            mechanical energy is `Simulator.energy`. NaN unless requested.
+        iterations: number that ran.
+        restarts: of the acceleration, because the energy rose. For `Multilevel`: rejected trials.
+        converged: whether the estimated error was within `Simulator.tolerance` before the iterations ran out; False
+            without a tolerance. It is an error of positions, so it may hold while the residual is large.
+        rho: spectral radius used by the schedule. For `Multilevel` the material mismatch 1 - q / s, where q A_0 <= A <=
+            s A_0 and A_0 is the matrix it was prepared for: 0 if it fits, near 1 if not (`prepare_solver`).
+        inverted: tetrahedra with det F <= 0 at the end of the step. A body may rest with some, converged, in a folded
+            minimum of its energy. -1 unless requested.
+
+    The residual is (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)). Here r is the part of grad E [N] that
+    neither pins nor contacts balance. f_i = a_i (u_i - s_i) is the force of inertia, weight and springs on vertex i,
+    and e_i that of its elements. S x is the sum of stiffness times position (csrc/solver/report.h), so 4 eps |S x|
+    bounds the rounding that no iteration removes.
+
+    If all forces are below that bound, the residual is 0 and says nothing: see docs/limits.md and use float64 there.
+    The residual weighs short waves, so the error of positions may be larger or smaller. It ignores a contact that
+    nothing touches, and a negative mass that a spring outweighs.
+    """
+
+    residual: Tensor
+    energy: Tensor
+    iterations: Tensor
+    restarts: Tensor
+    converged: Tensor
+    rho: Tensor
+    inverted: Tensor = torch.tensor(-1)  # for older files, which lack it
+
+    @classmethod
+    def from_rows(cls, rows: Tensor) -> Info:
+        """Build it from rows [..., 7] of the ops; files from before `inverted` have 6 columns."""
+        residual, energy, iterations, restarts, converged, rho, *counted = rows.unbind(-1)
+        inverted = counted[0] if counted else torch.full_like(rho, -1.0)
+        return cls(residual, energy, iterations.long(), restarts.long(), converged.bool(), rho, inverted.long())
+
+    def __repr__(self) -> str:
+        try:
+            worst = f"residual<={float(self.residual.max()):.2g}, iterations<={int(self.iterations.max())}"
+        except RuntimeError:  # no values: an empty batch, a traced step, "meta"
+            worst = ""
+        return by_sizes(self, self.residual, "records", "batch", trailing=0, more=worst)
+
+
+class StepCall(Protocol):
+    """Types of a call of a simulator, for type checkers; `Simulator.forward` documents it."""
+
+    @overload
+    def __call__(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        return_info: Literal[False] = False,
+    ) -> State: ...
+
+    @overload
+    def __call__(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        *,
+        return_info: Literal[True],
+    ) -> tuple[State, Info]: ...
+
+    @overload
+    def __call__(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        return_info: bool = False,
+    ) -> State | tuple[State, Info]: ...
+
+
+class Track(NamedTuple):
+    """Recorded states of a rollout, without its start."""
+
+    positions: Tensor  # [T, B, V, 3] m
+    velocities: Tensor  # [T, B, V, 3] m/s
+    info: Info  # [T, B], of the last step before each record
+
+    def state(self, record: int = -1) -> State:
+        """One record as a state to continue from."""
+        try:
+            return State(self.positions[record], self.velocities[record])
+        except IndexError:
+            count = len(self.positions)
+            there = (
+                f"record must lie in {-count}..{count - 1}" if count else "the track has no record, steps // every is 0"
+            )
+            raise IndexError(f"Track.state: {there}, got {record}") from None
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.positions, "records", "batch", "vertices")
+
+
+for _kind in (Info, State, Track):
+    # pickles name a class by its module: now torchpd, formerly torchpd.state
+    _kind.__module__ = "torchpd"
+    # allow-lists of torch.load and torch.export.save; these classes hold tensors and run nothing
+    torch.serialization.add_safe_globals([_kind, (_kind, f"torchpd.state.{_kind.__name__}")])
+    pytree._register_namedtuple(_kind, serialized_type_name=f"torchpd.{_kind.__name__}")

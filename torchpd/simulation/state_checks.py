@@ -1,0 +1,159 @@
+"""Checks of a simulator's settings and states."""
+
+from __future__ import annotations
+
+import math
+from functools import reduce
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..common.checks import check_like, check_whole, expand_shared, to_full_precision
+from ..common.warn import warn_user
+from ..scene.scene import SceneValues
+from .state import State
+
+__all__ = [
+    "ADJOINTS",
+    "check_adjoint",
+    "check_batch",
+    "check_positive_number",
+    "check_state",
+    "check_time_step",
+    "check_tolerance",
+    "positions_of",
+    "report_resolution",
+]
+
+
+ADJOINTS = ("solver", "multilevel")  # preconditioners of the adjoint of a step
+_COARSEST = 1e-4  # largest spacing of float32 positions, in shortest edges, without a warning
+_LONGEST_STEP = {torch.float32: 1e12, torch.float64: 1e100}  # s
+
+
+def check_adjoint(adjoint: str) -> str:
+    """Check the preconditioner of gradients, one of `ADJOINTS`."""
+    if adjoint not in ADJOINTS:
+        names = " or ".join(f'"{name}"' for name in ADJOINTS)
+        raise ValueError(f"Simulator: adjoint must be {names}, got {adjoint!r}")
+    return adjoint
+
+
+def check_batch(batch: int | None) -> int | None:
+    """Check the expected environments of a step."""
+    return None if batch is None else check_whole("batch", batch, minimum=1)
+
+
+def report_resolution(values: SceneValues, dtype: torch.dtype) -> None:
+    """Warn of tets so far from the origin that float32 spacing exceeds 1e-4 of their shortest edge.
+
+    Rest shapes are compiled in float64, so rounded positions have strains of that size, which push a body at rest.
+    """
+    if dtype != torch.float32:
+        return
+    corners = [values.rest_positions[values.tets[:, a]] for a in range(4)]
+    edges = (one - other for one, other in combinations(corners, 2))
+    shortest = np.sqrt(reduce(np.minimum, (np.einsum("ij,ij->i", edge, edge) for edge in edges)))
+    farthest = np.abs(values.rest_positions).max(axis=1)[values.tets].max(axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows has no resolution
+        steps = np.nan_to_num(np.spacing(farthest.astype(np.float32)) / shortest, nan=np.inf)
+    worst = int(steps.argmax())
+    if steps[worst] > _COARSEST:
+        warn_user(
+            f"Simulator: {farthest[worst]:.4g} m from the origin float32 resolves positions to "
+            f"{steps[worst] * shortest[worst]:.2g} m, {steps[worst]:.2g} of the shortest edge of a tet there "
+            f"({int((steps > _COARSEST).sum())} of {len(steps)} tets have more than {_COARSEST:g}), so bodies at rest "
+            "will move. Move the scene to the origin with mesh.translated(...), or pass dtype=torch.float64"
+        )
+
+
+def check_positive_number(name: str, value: float, unit: str) -> float:
+    """Check a number of any numeric type, and return a float."""
+    number = _number_or_nan(value)
+    if not 0.0 < number < float("inf"):
+        raise ValueError(f"{name} must be positive and finite [{unit}], got {value!r}")
+    return number
+
+
+def check_time_step(time_step: float, dtype: torch.dtype) -> float:
+    """Check h [s]: h^2 and 1 / h^2 times masses must be finite in that precision, too."""
+    number = check_positive_number("time_step", time_step, "s")
+    longest = _LONGEST_STEP[torch.float64 if dtype == torch.float64 else torch.float32]
+    if not 1.0 / longest <= number <= longest:
+        raise ValueError(
+            f"time_step must lie within {1.0 / longest:g} and {longest:g} [s] in {dtype}, got {time_step!r}"
+        )
+    return number
+
+
+def check_tolerance(tolerance: float) -> float:
+    """Check a tolerance of any numeric type, and return a float."""
+    number = _number_or_nan(tolerance)
+    if not 0.0 <= number < 1.0:
+        raise ValueError(f"Simulator: tolerance must lie in [0, 1), got {tolerance!r}")
+    return number
+
+
+def _number_or_nan(value: Any) -> float:
+    try:
+        no_number = isinstance(value, (str, bool, np.bool_)) or getattr(value, "dtype", None) == torch.bool
+        return math.nan if no_number else float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def check_state(rest: Tensor, state: State, *, forces: Tensor | None, fix: str) -> Tensor | None:
+    """Implementation of `Model.check_state`, by the rest positions [V, 3] of a simulator."""
+    if not _is_pair(state):
+        raise TypeError(
+            f"state must be a State, positions and velocities [B, {len(rest)}, 3], got "
+            f"{_kind_of(state)}; rest_state() makes one"
+        )
+    _check_kind(rest, "state", state[0])
+    if state[0].dim() == 0:  # the batch is read before an op checks the shape
+        raise ValueError(f"positions must be [B, {len(rest)}, 3], got []")
+    check_like("velocities", state[1], state[0], "m/s")
+    if forces is None:
+        return None
+    forces = expand_shared(to_full_precision(forces, state[0]), state[0].shape)
+    check_like("forces", forces, state[0], "N", fix=fix)
+    return forces
+
+
+def positions_of(rest: Tensor, state: State | Tensor, name: str) -> Tensor:
+    """Implementation of `Model.positions_of`, by the rest positions [V, 3] of a simulator."""
+    alone = isinstance(state, Tensor)
+    if not (alone or _is_pair(state)):
+        raise TypeError(
+            f"{name} must be a State, positions and velocities [B, {len(rest)}, 3], or positions alone, got "
+            f"{_kind_of(state)}"
+        )
+    positions = state if isinstance(state, Tensor) else state[0]
+    _check_kind(rest, name, positions)
+    if positions.dim() != 3 or positions.shape[1:] != rest.shape:
+        raise ValueError(f"{name} must be [B, {len(rest)}, 3], got {list(positions.shape)}")
+    if not alone:
+        check_like("velocities", state[1], positions, "m/s")
+    return positions
+
+
+def _check_kind(own: Tensor, name: str, positions: Tensor) -> None:
+    if positions.dtype != own.dtype or positions.device != own.device:
+        raise TypeError(
+            f"{name} must be {own.dtype} on {own.device} like the simulator, got {positions.dtype} on "
+            f"{positions.device}; sim.to(...) changes the simulator"
+        )
+
+
+def _is_pair(state: Any) -> bool:
+    pair = isinstance(state, (tuple, list)) and len(state) == 2
+    return pair and isinstance(state[0], Tensor) and isinstance(state[1], Tensor)
+
+
+def _kind_of(value: object) -> str:
+    """Name of a type; for a tuple also the types of its parts."""
+    name = type(value).__name__
+    return f"{name} of {' and '.join(type(part).__name__ for part in value)}" if isinstance(value, tuple) else name

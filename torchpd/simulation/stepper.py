@@ -1,0 +1,298 @@
+"""Steps of a compiled scene: an `nn.Module` that advances states."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from ..common.checks import check_like, check_whole
+from ..common.synonyms import check_arguments
+from ..ops.adjoint import step_gradient
+from ..ops.registration import INFO_WIDTH, refuse_tangents
+from ..plan.material import MATERIAL_ROWS, environments_of_material, named_arrays
+from ..scene.targets import Targets
+from .readable import Readable
+from .rollout import PerStep, Rollout, run_rollout
+from .state import Info, State, StepCall, Track
+
+__all__ = ["Stepper"]
+
+_ops = torch.ops.torchpd
+
+
+class Stepper(Readable):
+    """Steps, rollouts, energies and gradients of a `Simulator`."""
+
+    __call__: StepCall
+
+    # ---- states
+
+    @check_arguments("Simulator.rest_state")
+    def rest_state(self, batch: int | None = None) -> State:
+        """The rest positions with zero velocities [batch, V, 3].
+
+        Args:
+            batch: environments; by default one for each environment of the material.
+        """
+        count = (
+            environments_of_material(named_arrays(self)) if batch is None else check_whole("batch", batch, minimum=0)
+        )
+        shape = (count, -1, -1)
+        positions = self.rest_positions.expand(shape).clone()
+        return State(positions, torch.zeros_like(positions))
+
+    def forward(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        return_info: bool = False,
+    ) -> State | tuple[State, Info]:
+        """Advance a state by one time step.
+
+        `torch.autocast` changes no result; within it, forces may have half precision.
+
+        Gradients come from the implicit adjoint at the end of the step, with friction, and hold for all arguments but
+        `start`. Their error follows that of the step: docs/limits.md#friction-and-gradients. Forward mode and
+        `torch.func.grad` are not provided.
+
+        Args:
+            state: positions and velocities [B, V, 3] [m, m/s].
+            forces: on the vertices [B, V, 3] [N], or [V, 3] or [1, V, 3] for all environments; constant in the step.
+            targets: of pins and spheres at the end of the step [m], by part; or one tensor [P, 3] or [B, P, 3] for all
+                pins. A sphere takes its centre [3] or [B, 3], or with its velocity [6] or [B, 6], which friction needs.
+            start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
+                The first two are moved out of contacts by rigid motions where that lowers the energy.
+            return_info: also return a report of the solve; costs about ten iterations, no synchronisation.
+
+        Returns:
+            The next state, or (state, info).
+        """
+        forces = self.check_state(state, forces=forces)
+        material = self.material_at(targets, state[0].shape[0])
+        given, inertial = _first_iterate(start, state[0])
+        refuse_tangents(*state, forces, *material)
+        self._notices.before(self, state, material, self.time_step, report=return_info)
+        positions, velocities, rows = _ops.step(
+            state[0],
+            state[1],
+            forces,
+            given,
+            material,
+            list(self.plan.arrays),
+            **self.step_settings(inertial=inertial, report=return_info),
+        )
+        after = State(positions, velocities)
+        if not return_info:
+            return after
+        self._notices.after(self, positions, rows)
+        return after, Info.from_rows(rows)
+
+    @torch.no_grad()
+    def step_(
+        self,
+        state: State,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
+        start: str | Tensor = "velocity",
+        *,
+        info: Tensor | None = None,
+    ) -> None:
+        """Advance a state in place by one time step, without gradients. Arguments as in `forward`.
+
+        If an exception such as Ctrl-C ends it, each environment is either at the start or at the end of the step.
+
+        Args:
+            info: rows [B, 7] float64 to fill in, see `Info.from_rows`; None leaves out residual, energy and inverted.
+        """
+        forces = self.check_state(state, forces=forces)
+        if state[0].requires_grad or state[1].requires_grad:
+            raise ValueError(
+                "step_ overwrites the state, so it must not require gradients; detach it or call the simulator"
+            )
+        if not (info is None or isinstance(info, Tensor)):
+            raise TypeError(
+                f"step_: info must be None or a float64 tensor {[len(state[0]), INFO_WIDTH]} to fill in, got "
+                f"{type(info).__name__}"
+            )
+        given, inertial = _first_iterate(start, state[0])
+        material = self.material_at(targets, state[0].shape[0])
+        self._notices.before(self, state, material, self.time_step, report=info is not None)
+        rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
+        _ops.step_(
+            state[0],
+            state[1],
+            rows,
+            forces,
+            given,
+            material,
+            list(self.plan.arrays),
+            **self.step_settings(inertial=inertial, report=info is not None),
+        )
+        if info is not None:
+            self._notices.after(self, state[0], info)
+
+    @check_arguments("Simulator.rollout")
+    def rollout(
+        self,
+        state: State,
+        steps: int,
+        every: int = 1,
+        *,
+        forces: Tensor | PerStep | None = None,
+        targets: Targets | PerStep | None = None,
+        first: int = 0,
+        start: str = "velocity",
+        return_info: bool = False,
+        progress: bool = False,
+    ) -> Track:
+        """Advance a state by many time steps and record some of them.
+
+        Ctrl-C ends it within a second on a CPU, and on a GPU with `progress`.
+
+        Args:
+            state: the start, which is not recorded.
+            steps: number of steps.
+            every: steps between records; the track has steps // every records.
+            forces: as in `forward`, constant, or a function of the step number.
+            targets: as in `forward`, constant, or a function of the step number. A constant sphere with a velocity
+                moves on. If a function gives centres only, velocities are their differences between steps; before step
+                0 the scene counts.
+            first: number of the first step when this rollout continues another: `rollout(state, 9)` equals
+                `rollout(rollout(state, 5).state(), 4, first=5)`. A function of targets is then also called for step
+                first - 1.
+            start: first iterate of every step, "velocity" or "inertial".
+            return_info: fill in residual, energy and inverted of the recorded steps, see `Info`.
+            progress: show a bar; a GPU then synchronises every 0.1 s or so.
+
+        Returns:
+            Track of the recorded states.
+        """
+        steps, every = check_whole("steps", steps, minimum=0), check_whole("every", every, minimum=1)
+        first = check_whole("first", first, minimum=0)
+        if not _is_start(start):
+            raise ValueError(f'rollout: start must be "velocity" or "inertial", got {_in_short(start)}')
+        call = Rollout(state, steps, every, forces, targets, start == "inertial", return_info, first)
+        return run_rollout(self, call, progress=progress)
+
+    def advance(
+        self,
+        state: State,
+        forces: Tensor | None,
+        material: list[Tensor],
+        *,
+        steps: int,
+        every: int,
+        inertial: bool,
+        report: bool,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Take steps from a checked state and forces in one call of the op; spheres start where `material` has them.
+
+        Returns:
+            Positions and velocities [steps // every, B, V, 3], and rows for `Info.from_rows`.
+        """
+        refuse_tangents(*state, forces, *material)
+        self._notices.before(self, state, material, self.time_step, report=report)
+        # the adjoint needs every state, so the op has a derivative only with every=1
+        thinned = every > 1 and torch.is_grad_enabled() and _requires_grad(*state, forces, *material)
+        found = _ops.rollout(
+            state[0],
+            state[1],
+            forces,
+            material,
+            list(self.plan.arrays),
+            steps=steps // every * every if thinned else steps,
+            every=1 if thinned else every,
+            **self.step_settings(inertial=inertial, report=report),
+        )
+        if thinned:
+            # copies: a view would keep all states alive, and the adjoint's states must not change with these
+            found = [out[every - 1 :: every].clone(memory_format=torch.contiguous_format) for out in found]
+        positions, velocities, rows = found
+        if report and not torch.compiler.is_compiling():
+            for reached, row in zip(positions, rows, strict=True):
+                self._notices.after(self, reached, row)
+        return positions, velocities, rows
+
+    # ---- energies
+
+    def energy(self, state: State | Tensor, targets: Targets | None = None) -> Tensor:
+        """Mechanical energy of each environment [B] [J], differentiable twice.
+
+        Elastic energy, springs of soft pins, weight (zero at the origin) and, for a `State`, kinetic energy.
+
+        Args:
+            state: a `State`, or positions [B, V, 3] alone.
+            targets: of pins, as in `forward`.
+        """
+        positions = self.positions_of(state)
+        refuse_tangents(positions)
+        arrays = self.material_at(targets, positions.shape[0])
+        material = dict(zip(MATERIAL_ROWS, arrays, strict=True))
+        energy = cast(Tensor, _ops.element_energy(positions, arrays, list(self.plan.arrays))).sum(-1)
+        weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
+        energy = energy - (material["masses"] * weight).sum(-1)
+        if len(self.plan.pin_vertex):
+            energy = energy + self._spring_energy(positions, material["pin_stiffness"], material["pin_targets"])
+        if not isinstance(state, Tensor):
+            energy = energy + 0.5 * (material["masses"] * state[1].square().sum(-1)).sum(-1)
+        return energy
+
+    def _spring_energy(self, positions: Tensor, stiffness: Tensor, targets: Tensor) -> Tensor:
+        vertices = self.plan.vertex_order[self.plan.pin_vertex.long()].long()
+        soft = torch.where(torch.isinf(stiffness), torch.zeros_like(stiffness), stiffness)
+        return 0.5 * (soft * (positions[:, vertices] - targets).square().sum(-1)).sum(-1)
+
+    def gradient(self, positions: State | Tensor) -> Tensor:
+        """Gradient of the elastic energy [B, V, 3] [N], the negative of the elastic forces.
+
+        Args:
+            positions: [B, V, 3], or a `State`.
+        """
+        positions = self.positions_of(positions, "positions")
+        result: Tensor = _ops.gradient(positions, self.material(), list(self.plan.arrays))
+        return result
+
+    def step_gradient(
+        self, state: State, after: State | Tensor, forces: Tensor | None = None, targets: Targets | None = None
+    ) -> Tensor:
+        """Gradient [B, V, 3] [N] of a step's objective at given positions; a solve drives it to zero.
+
+        Contacts are not part of the objective: their forces remain in the gradient, see `contact_forces`. It is zero at
+        hard pins.
+
+        Args:
+            state: start of the step.
+            after: positions [B, V, 3] at which to evaluate it, or a `State`, for example the next one.
+            forces: as in `forward`.
+            targets: as in `forward`.
+        """
+        return step_gradient(self.checked_call(state, after, forces, targets))
+
+
+def _first_iterate(start: str | Tensor, positions: Tensor) -> tuple[Tensor | None, bool]:
+    if isinstance(start, Tensor):
+        check_like("start", start, positions, "first iterate, m")
+        if start.requires_grad and torch.is_grad_enabled():
+            raise ValueError(
+                "start, the first iterate, requires a gradient, but a solved step does not depend on it: detach() it"
+            )
+        return start, False
+    if not _is_start(start):
+        raise ValueError(f'start must be "velocity", "inertial" or positions [B, V, 3], got {_in_short(start)}')
+    return None, start == "inertial"
+
+
+def _is_start(start: object) -> bool:
+    return isinstance(start, str) and start in ("velocity", "inertial")
+
+
+def _in_short(value: object) -> str:
+    return repr(value) if isinstance(value, str) else type(value).__name__
+
+
+def _requires_grad(*tensors: Tensor | None) -> bool:
+    return any(tensor is not None and tensor.requires_grad for tensor in tensors)

@@ -1,0 +1,116 @@
+"""Stress and strain of every tetrahedron.
+
+The energy of a tetrahedron is w V / 2 |F - R|^2. w is Young's modulus, F the deformation gradient and R the nearest
+rotation (see `Solid`). So the first Piola-Kirchhoff stress is P = dE/dF / V = w (F - R), and Cauchy's is
+
+    sigma = P F^T / det F = w (F F^T - R F^T) / det F.
+
+Both are constant in a tetrahedron. The material has Poisson ratio 0. In a partly full tetrahedron (`mesh.fill`) the
+stress is that of its average material.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..common.reprs import by_sizes
+from ..common.small_matrices import dot, product, root
+from ..ops.registration import nearest_rotation
+from ..scene.scene import Scene
+
+__all__ = ["Stress", "stress", "vertex_average"]
+
+
+class Stress(NamedTuple):
+    """Stress and strain of every tetrahedron, see `Simulator.stress`. Stresses are NaN where `inverted`."""
+
+    cauchy: Tensor  # [B, E, 3, 3] Pa, symmetric
+    von_mises: Tensor  # [B, E] Pa, sqrt(3 / 2 s : s), s the deviator of `cauchy`
+    strain: Tensor  # [B, E, 3, 3], Green's, (F^T F - 1) / 2
+    inverted: Tensor  # [B, E] bool, true unless det F > 0
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.cauchy, "batch", "tets", trailing=2)
+
+
+class _Rest(NamedTuple):
+    """Arrays of the rest shape for read-outs."""
+
+    tets: Tensor  # [E, 4]
+    inverse_edges: Tensor  # [E, 3, 3] 1/m
+    order: Tensor  # [4 E] tetrahedra of each vertex, vertex after vertex
+    counts: Tensor  # [V] number of them
+    shares: Tensor  # [4 E] share of each in the volume around its vertex
+
+
+# kept, because scenes do not change and a copy to a GPU would wait for it
+_REST: WeakKeyDictionary[Scene, dict[tuple[torch.device, torch.dtype], _Rest]] = WeakKeyDictionary()
+
+
+def _rest(scene: Scene, device: torch.device, dtype: torch.dtype) -> _Rest:
+    kept = _REST.setdefault(scene, {})
+    if (device, dtype) not in kept:
+        starts = [scene.vertex_range(solid).start for solid in scene.solids]
+        tets = np.concatenate([s.mesh.tets + start for s, start in zip(scene.solids, starts, strict=True)])
+        positions = np.concatenate([solid.mesh.vertices for solid in scene.solids])
+        corners = positions[tets]
+        edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+        order = np.argsort(tets.reshape(-1), kind="stable")
+        vertex, tet = tets.reshape(-1)[order], order // 4
+        volumes = np.linalg.det(edges)[tet]
+        shares = volumes / np.bincount(vertex, weights=volumes, minlength=len(positions))[vertex]
+        counts = np.bincount(vertex, minlength=len(positions))
+        whole = (torch.from_numpy(array).to(device) for array in (tets, tet, counts))
+        real = (torch.from_numpy(array).to(device, dtype) for array in (np.linalg.inv(edges), shares))
+        (corner, tet_of, count), (inverse_edges, share) = whole, real
+        kept[device, dtype] = _Rest(corner, inverse_edges, tet_of, count, share)
+    return kept[device, dtype]
+
+
+def stress(scene: Scene, positions: Tensor, stiffness: Tensor) -> Stress:
+    """Implementation of `Simulator.stress` for checked positions [B, V, 3] and stiffness [E] or [B, E]."""
+    rest = _rest(scene, positions.device, positions.dtype)
+    corners = positions[:, rest.tets]
+    F = product((corners[:, :, 1:] - corners[:, :, :1]).mT, rest.inverse_edges)
+    identity = torch.eye(3, dtype=F.dtype, device=F.device)
+    strain = 0.5 * (product(F.mT, F) - identity)
+    a, b, c = F.unbind(-1)
+    determinant = dot(a, torch.linalg.cross(b, c))
+    inverted = ~(determinant.detach() > 0.0)
+    # so that no NaN reaches the derivatives of the others
+    lost = inverted[..., None, None]
+    F = torch.where(lost, identity, F)
+    scale = stiffness / torch.where(inverted, 1.0, determinant)
+    cauchy = scale[..., None, None] * product(F - nearest_rotation(F), F.mT)
+    cauchy = 0.5 * (cauchy + cauchy.mT)  # symmetric except for rounding
+    xx, yy, zz = cauchy.diagonal(dim1=-2, dim2=-1).unbind(-1)
+    shear = torch.stack((cauchy[..., 0, 1], cauchy[..., 1, 2], cauchy[..., 2, 0]), dim=-1)
+    squared = 0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3.0 * dot(shear, shear)
+    return Stress(
+        torch.where(lost, torch.nan, cauchy), torch.where(inverted, torch.nan, root(squared)), strain, inverted
+    )
+
+
+def vertex_average(scene: Scene, values: Tensor, like: Tensor) -> Tensor:
+    """Implementation of `Simulator.vertex_average`, in the precision and on the device of `like`."""
+    if not isinstance(values, Tensor):
+        raise TypeError(f"vertex_average: values must be a tensor [B, E, ...], got {type(values).__name__}")
+    if values.dtype != like.dtype or values.device != like.device:
+        raise TypeError(
+            f"vertex_average: values must be {like.dtype} on {like.device} like the simulator, got {values.dtype} on "
+            f"{values.device}"
+        )
+    rest = _rest(scene, like.device, like.dtype)
+    if values.dim() < 2 or values.shape[1] != len(rest.tets):
+        raise ValueError(f"vertex_average: values must be [B, {len(rest.tets)}, ...], got {list(values.shape)}")
+    rows = values.flatten(2) if values.dim() > 2 else values.unsqueeze(-1)
+    # a segment is summed in order, so bits do not depend on the batch
+    terms = (rows[:, rest.order] * rest.shares[:, None]).movedim(0, 1)
+    total = torch.segment_reduce(terms.flatten(1), "sum", lengths=rest.counts, axis=0, unsafe=True)
+    means: Tensor = total.unflatten(1, terms.shape[1:]).movedim(0, 1)
+    return means.reshape(len(values), len(rest.counts), *values.shape[2:])

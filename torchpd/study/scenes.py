@@ -1,0 +1,178 @@
+"""What a study looks at: a scene at any stiffness and resolution, a motion of it, and points to follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..api.simulator import Simulator
+from ..formats.bodies import holds_body
+from ..geometry import shapes
+from ..geometry.tet_mesh import TetMesh
+from ..geometry.tetrahedralize import tetrahedralize
+from ..geometry.tri_mesh import TriMesh
+from ..scene.effects import Gravity, Ground, Pin, Solid
+from ..scene.scene import Scene
+from ..simulation.state import State
+
+__all__ = ["SCENES", "SUBJECTS", "Subject", "subject_of"]
+
+Array = NDArray[np.float64]
+
+DENSITY = 1000.0  # kg/m^3
+_GAP = 0.002  # m between the ground and a body that is about to land
+_LANDING = (0.3, -2.0, 0.0)  # m/s
+_HELD = 0.1  # of the height of a body
+_SWING = 2.0  # m/s at its top
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A family of scenes: the same body at other stiffnesses and resolutions.
+
+    `start(sim)` is the beginning of the motion; a single step is studied after `steps_before` steps of it.
+    `probes(scene, x)` [n, 3] m are the same material points at every resolution, from positions [V, 3].
+    """
+
+    name: str
+    mesh: Callable[[int], TetMesh]
+    scene: Callable[[TetMesh, float], Scene]  # of a Young's modulus [Pa]
+    start: Callable[[Simulator], State]
+    probes: Callable[[TetMesh, Array], Array]
+    resolution: int
+    resolutions: tuple[int, ...]  # of the study of the mesh, the finest is its reference; one: nothing to compare
+    youngs: float  # Pa
+    time_step: float  # s
+    steps_before: int = 0
+
+
+# ---- a beam: held at x = 0 and thrown downwards, as in the tests
+
+
+def _beam_mesh(resolution: int) -> TetMesh:
+    return shapes.box((1.0, 0.2, 0.2), (5 * resolution, resolution, resolution))
+
+
+def _beam_scene(mesh: TetMesh, youngs: float) -> Scene:
+    body = Solid(mesh, youngs=youngs, density=DENSITY)
+    return Scene(body, Pin(body, mesh.vertices[:, 0] == 0.0), Gravity((0.0, -9.8, 0.0)))
+
+
+def _beam_start(sim: Simulator) -> State:
+    state = sim.rest_state()
+    state.velocities[..., 1] = -10.0 * state.positions[..., 0] ** 2
+    return state
+
+
+def _beam_probes(mesh: TetMesh, positions: Array) -> Array:
+    """The four edges at x = 0.2, 0.4, ... 1 m, which are vertices at every resolution."""
+    rest = mesh.vertices
+    fifths, edges = 5.0 * rest[:, 0], 5.0 * rest[:, 1:]
+    chosen = (np.abs(fifths - fifths.round()) < 1e-9) & (fifths > 0.5) & (np.abs(edges - edges.round()) < 1e-9).all(1)
+    found = np.flatnonzero(chosen)
+    order = np.lexsort(rest[found].T.round(9))
+    return positions[found[order]]
+
+
+# ---- a body that lands, or is held
+
+
+def _landing_scene(mesh: TetMesh, youngs: float) -> Scene:
+    return Scene(Solid(mesh, youngs=youngs, density=DENSITY), Gravity((0.0, -9.8, 0.0)), Ground())
+
+
+def _landing_start(sim: Simulator) -> State:
+    state = sim.rest_state()
+    state.velocities[:] = torch.tensor(_LANDING, dtype=sim.dtype, device=sim.device)
+    return state
+
+
+def _held_scene(mesh: TetMesh, youngs: float) -> Scene:
+    body = Solid(mesh, youngs=youngs, density=DENSITY)
+    return Scene(body, Pin(body, _above_held(mesh.vertices[:, 1]) <= 0.0), Gravity((0.0, -9.8, 0.0)))
+
+
+def _held_start(sim: Simulator) -> State:
+    state = sim.rest_state()
+    state.velocities[..., 0] = _SWING * _above_held(state.positions[..., 1]).clip(0.0) ** 2
+    return state
+
+
+def _above_held(heights: Any) -> Any:
+    """0 where the part that is held ends, 1 at the top, of an array or a tensor."""
+    low = heights.min()
+    return ((heights - low) / (heights.max() - low) - _HELD) / (1.0 - _HELD)
+
+
+# how a body moves; stiff enough to stand where it is held
+SCENES: dict[str, dict[str, Any]] = {
+    "lands": {"scene": _landing_scene, "start": _landing_start, "youngs": 3e4, "steps_before": 4},
+    "held": {"scene": _held_scene, "start": _held_start, "youngs": 1e6},
+}
+
+
+def _above_ground(mesh: TetMesh) -> TetMesh:
+    low, high = mesh.bounds
+    return mesh.translated((0.0, _GAP - float(low[1]), 0.0)) if high[1] > low[1] else mesh
+
+
+def _surface_points(mesh: TetMesh, positions: Array) -> Array:
+    return positions if mesh.embedding is None else mesh.embedding.apply(positions)
+
+
+def _body(name: str, shape: TetMesh | TriMesh, scene: str | None) -> Subject:
+    """A metre long, just above the ground."""
+    if scene not in (None, *SCENES):
+        raise ValueError(f"study: no scene {scene!r}; there are {', '.join(SCENES)}")
+    low, high = shape.bounds
+    placed = shape.translated(-(low + high) / 2.0).scaled(1.0 / float((high - low).max()))
+    lattice = isinstance(placed, TriMesh)
+
+    def mesh(resolution: int) -> TetMesh:
+        if isinstance(placed, TetMesh):
+            return _above_ground(placed)
+        return _above_ground(tetrahedralize(placed, cells=resolution, progress=False))
+
+    return Subject(
+        name, mesh, probes=_surface_points, resolution=14, resolutions=(8, 11, 16, 22) if lattice else (14,),
+        time_step=1 / 60, **SCENES[scene or "lands"],
+    )  # fmt: skip
+
+
+def _beam(scene: str | None = None) -> Subject:
+    if scene is not None:
+        raise ValueError("study: the scene is for bodies (octopus or a mesh), the beam is always held")
+    return Subject(
+        "beam",
+        _beam_mesh,
+        _beam_scene,
+        _beam_start,
+        _beam_probes,
+        resolution=5,
+        resolutions=(1, 2, 3, 4, 5, 8),
+        youngs=1e6,
+        time_step=1 / 30,
+    )
+
+
+SUBJECTS: dict[str, Callable[..., Subject]] = {  # of a scene
+    "beam": _beam,
+    "octopus": lambda scene=None: _body("octopus", shapes.octopus(), scene),
+}
+
+
+def subject_of(name: str, scene: str | None = None) -> Subject:
+    """A subject by its name, or from the file of a mesh (surface or tetrahedral); bodies move as one of `SCENES`."""
+    if name in SUBJECTS:
+        return SUBJECTS[name](scene)
+    path = Path(name)
+    if not path.is_file():
+        raise FileNotFoundError(f"study: {name} is neither a file of a mesh nor one of {', '.join(SUBJECTS)}")
+    shape = TetMesh.from_file(path) if holds_body("study", path) else TriMesh.from_file(path)
+    return _body(path.name, shape, scene)

@@ -1,0 +1,3 @@
+"""Rendering and films."""
+
+__all__: list[str] = []
