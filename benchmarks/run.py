@@ -29,7 +29,7 @@ Row = dict[str, Any]
 
 
 def workspace_bytes(sim: pd.Simulator, batch: int) -> int:
-    """Memory of one environment while it steps on the CPU, as csrc/cpu/workspace.h lays it out (no forces)."""
+    """Memory of one environment while it steps on the CPU, as csrc/cpu/step/workspace.h lays it out (no forces)."""
     plan = sim.plan
     slots = len(plan.slot_vertex)
     # five vectors and two weights a vertex, two vectors a slot; alone, a vector takes four numbers

@@ -111,7 +111,7 @@ class System:
         return product
 
     def friction_product_at(self, positions: Tensor, sliding: Tensor) -> Map:
-        """What vertices that slide make of H: see csrc/solver/friction_adjoint.h."""
+        """What vertices that slide make of H: see csrc/solver/adjoint/friction.h."""
         along, normal, across, bend, lean = sliding.unbind(-2)
         inertia = self.inertia.unsqueeze(-1)
 

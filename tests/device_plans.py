@@ -150,7 +150,7 @@ class Rest:
 
     @classmethod
     def of(cls, plan: Arrays, lanes: Lanes) -> Rest:
-        """As StoredRest of csrc/cuda/patch.h reads them; or of the positions that ComputedRest has, but for a turn."""
+        """As StoredRest of pairs_per_thread.h reads them; or of the positions that ComputedRest has, but for a turn."""
         if plan.sizes[SIZES.index("kernel")] != STREAM:
             quads = plan.pair_rest.astype(np.float64).reshape(-1, 3, LANES, 4).transpose(0, 2, 1, 3).reshape(-1, 3, 4)
             inverse = np.zeros((len(quads), 2, 3, 3))

@@ -157,7 +157,7 @@ ROUGH_EDGE = (pd.Ground(friction=ROUGH), pd.Ground(0.0, (1.0, 0.0, 0.0)))
     ("walls", "velocity", "names", "error"),
     [
         (STICKY_EDGE, (-0.3, -0.2, 0.03), ("normal to z", "height"), TOLERANCE),
-        # the steps themselves differ from exact contacts where one is rough, see csrc/solver/friction_adjoint.h
+        # the steps themselves differ from exact contacts where one is rough, see csrc/solver/adjoint/friction.h
         (ROUGH_EDGE, (-0.3, -0.2, 0.8), ("normal to z", "height", "friction"), 0.03),
     ],
     ids=["sticks", "slides"],

@@ -110,7 +110,7 @@ def test_glue_is_compiled_as_in_a_build_with_cuda(tool: dict[str, Any]) -> None:
         path for path in csrc.glob("**/*.cpp") if "cuda" in path.parts[-2:-1] or "TORCHPD_CUDA" in path.read_text()
     }
     assert {csrc / name for name in tool["GLUE"]} == wanted
-    command = tool["command_for"]("nvcc", csrc / "cuda" / "ops.cpp", ["-I", "x"], ("80",))
+    command = tool["command_for"]("nvcc", csrc / "binding" / "cuda" / "ops.cpp", ["-I", "x"], ("80",))
     assert {"-DTORCHPD_CUDA", "-std=c++20", "-I", "x"} <= set(command)
     assert "-fsyntax-only" in " ".join(command)
 

@@ -1,4 +1,4 @@
-"""What csrc/cuda/runtime.cu says where a GPU cannot do what is asked: compiled for the host, with a CUDA made here."""
+"""What runtime.cu says where a GPU cannot do what is asked: compiled for the host, with a CUDA made here."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from programs import ROOT
 
 # An A100 without code, whose blocks may have 166912 bytes; it counts how often an error was cleared.
 PROGRAM = """
-#include "cuda/runtime.h"
+#include "cuda/common/runtime.h"
 #include <exception>
 #include <iostream>
 
@@ -62,7 +62,7 @@ def words(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     folder = tmp_path_factory.mktemp("runtime")
     (folder / "main.cpp").write_text(PROGRAM, encoding="utf-8")
     program = folder / "program"
-    sources = [folder / "main.cpp", ROOT / "csrc" / "cuda" / "runtime.cu"]
+    sources = [folder / "main.cpp", ROOT / "csrc" / "cuda" / "common" / "runtime.cu"]
     flags = ["-std=c++20", "-x", "c++", "--cudart", "none", "-I", ROOT / "csrc"]
     subprocess.run([nvcc, *flags, *sources, "-o", program], check=True)
     return subprocess.run([program], capture_output=True, text=True, check=True).stdout.splitlines()

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 import torchpd as pd
 from torchpd.scene import SceneValues
 
-SMALL_PAIRS = 512  # csrc/plan/device_patch.cpp
+SMALL_PAIRS = 512  # csrc/plan/gpu/patch.cpp
 
 
 def test_patches_hold_their_interior_and_then_shared_vertices(lanes: Lanes, plan: Arrays, values: SceneValues) -> None:

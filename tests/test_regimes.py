@@ -174,7 +174,7 @@ def test_patches_of_a_pipeline_are_larger() -> None:
     assert {patches(free, H100), patches(free, small), patches(touching, few)} == {more}
     # as many as there are multiprocessors rather than fewer larger ones
     assert patches(free, few._replace(multiprocessors=more - 1)) == more - 1
-    # their slots are what bringers hold at once (csrc/cuda/pipeline.h), and two fit
+    # their slots are what bringers hold at once (csrc/cuda/stream/pipeline.h), and two fit
     plan = choose_plan(box_values((40, 12, 12)), torch.float32, few, "stream")
     assert plan.size("most_slots") <= 640
     half = 24 * plan.size("most_slots") + 12 * plan.size("most_entries")

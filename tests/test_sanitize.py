@@ -18,9 +18,9 @@ from torchpd.plan import kernel_choice as regimes
 
 TOOLS = ROOT / "tools"
 H100 = Properties(132, 232448, 16)
-FAR_THREADS = {torch.float32: 384, torch.float64: 192}  # global_memory_threads of csrc/cuda/fused_kernels.cuh
-PIPELINE_SLOTS = 1024  # csrc/cuda/pipeline.h
-ROUNDS_WARPS = 4  # csrc/cuda/stream_rigid.h: with more parts a team has several blocks
+FAR_THREADS = {torch.float32: 384, torch.float64: 192}  # global_memory_threads of csrc/cuda/fused/kernels.cuh
+PIPELINE_SLOTS = 1024  # csrc/cuda/stream/pipeline.h
+ROUNDS_WARPS = 4  # csrc/cuda/stream/rigid.h: with more parts a team has several blocks
 
 
 @pytest.fixture(name="tool", scope="module")

@@ -1,4 +1,4 @@
-"""How many environments share a block (csrc/cuda/several_shape.h), compiled for the host."""
+"""How many environments share a block (csrc/cuda/small_batch/block_shape.h), compiled for the host."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from programs import compiled
 
 # In: pairs, slots, batch, multiprocessors, shared memory of one and the most of a block, bytes of an environment.
 PROGRAM = """
-#include "cuda/several_shape.h"
+#include "cuda/small_batch/block_shape.h"
 #include <cstdio>
 
 int main() {

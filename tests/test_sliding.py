@@ -98,7 +98,7 @@ def compare_with_differences(
 
 @pytest.mark.parametrize(("frictions", "error"), [((0.3, 0.0), 1e-3), ((0.0, 0.3), 1e-3), ((0.3, 0.2), 2e-2)])
 def test_along_a_wall(frictions: tuple[float, float], error: float) -> None:
-    """On the ground and against a wall: the corner was up to 21 % off (csrc/solver/friction_adjoint.h)."""
+    """On the ground and against a wall: the corner was up to 21 % off (csrc/solver/adjoint/friction.h)."""
     walls = (pd.Ground(GROUND, friction=frictions[0]), pd.Ground(0.0, (0.0, 0.0, 1.0), friction=frictions[1]))
     sim = simulator(*walls, youngs=2e5)
     sim.set_material(gravity=torch.tensor([0.0, -9.8, -4.0]))

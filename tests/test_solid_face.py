@@ -1,4 +1,4 @@
-"""Tetrahedra on a face (csrc/effects/solid_face.h): energy and forces are the reference's.
+"""Tetrahedra on a face (csrc/elements/solid_pair.h): energy and forces are the reference's.
 
 The headers are compiled for the host, so that what a GPU runs is seen without one.
 """
@@ -26,7 +26,7 @@ COUNT = 400
 # its own once more in the way of the CPU, and those of both where corners are looked at one by one, with an energy and
 # without.
 PROGRAM = """
-#include "effects/solid.h"
+#include "elements/solid.h"
 #include <cmath>
 #include <cstdio>
 #include <initializer_list>

@@ -33,14 +33,14 @@ TARGETS = ("80", "90")
 # to save time only the kernels that most steps run
 NEWER_TARGETS = ("100",)
 NEWER_SOURCES = (
-    "several_float.cu",
+    "small_batch_float.cu",
     "fused_float.cu",
-    "fused_touching_float.cu",
+    "fused_contacts_float.cu",
     "stream_float.cu",
     "multilevel_float.cu",
 )
 # C++ that only a CUDA build of torch compiles, and what has parts for it
-GLUE = ("cuda/ops.cpp", "cuda/freeform_ops.cpp", "module.cpp")
+GLUE = ("binding/cuda/ops.cpp", "freeform/cuda/ops.cpp", "binding/module.cpp")
 # a torch without CUDA lacks the header that says how its CUDA part was built
 GLUE_FLAGS = ("-std=c++20", "-Xcompiler=-fsyntax-only,-Wall,-Wextra,-Wno-psabi", "-DC10_CUDA_NO_CMAKE_CONFIGURE_FILE")
 

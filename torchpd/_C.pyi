@@ -1,4 +1,4 @@
-"""Types of the compiled module; csrc/module.cpp implements it."""
+"""Types of the compiled module; csrc/binding/module.cpp implements it."""
 
 from collections.abc import Callable
 from typing import Any

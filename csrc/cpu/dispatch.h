@@ -1,6 +1,6 @@
 // Which compiled instruction set this machine runs.
 #pragma once
-#include "plan/views.h"
+#include "views/views.h"
 
 #include <string>
 #include <vector>

@@ -1,11 +1,11 @@
 // The compiled physics of one instruction set. Included once by each cpu/isa_*.cpp, after PD_TARGET is set.
 #pragma once
-#include "cpu/adjoint.h"
-#include "cpu/conjugate.h"
-#include "cpu/fields.h"
-#include "cpu/multilevel_stepper.h"
-#include "cpu/report.h"
-#include "cpu/stepper.h"
+#include "cpu/adjoint/conjugate_gradients.h"
+#include "cpu/adjoint/energy_fields.h"
+#include "cpu/adjoint/system.h"
+#include "cpu/multilevel/stepper.h"
+#include "cpu/step/report.h"
+#include "cpu/step/stepper.h"
 
 #include <algorithm>
 #include <atomic>

@@ -17,8 +17,8 @@
 #include <vector>
 
 #include "cpu/dispatch.h"
-#include "cpu/team.h"
-#include "plan/views.h"
+#include "threads/team.h"
+#include "views/views.h"
 #if defined(__x86_64__)
 #include <immintrin.h>
 #endif

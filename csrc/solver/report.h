@@ -12,8 +12,8 @@
 // unsolved; solved steps have been seen to keep up to half of the four.
 #pragma once
 #include "math/vec.h"
-#include "plan/views.h"
 #include "solver/vertex.h"
+#include "views/views.h"
 
 namespace pd::inline PD_TARGET {
 

@@ -10,11 +10,11 @@
 // included. Projection onto one plane keeps this, since D is one number a vertex;
 // several contacts of a vertex are projected on one after another, and a ball acts as a plane within an iteration.
 #pragma once
-#include "math/chebyshev.h"
 #include "math/config.h"
 #include "math/scalar.h"
 #include "math/vec.h"
-#include "plan/views.h"
+#include "solver/chebyshev.h"
+#include "views/views.h"
 
 namespace pd::inline PD_TARGET {
 

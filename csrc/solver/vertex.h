@@ -1,6 +1,6 @@
 // What a step does with one vertex: weigh, predict, hold, project, accelerate, measure.
 #pragma once
-#include "effects/contact.h"
+#include "contact/plane_sphere.h"
 #include "math/vec.h"
 
 #include <limits>
@@ -78,7 +78,7 @@ struct Vertex {
     return select(inverse > Real(T(0)), free, held);
   }
 
-  // `u` out of the contacts; `around`: see effects/contact.h
+  // `u` out of the contacts; `around`: see contact/plane_sphere.h
   template <class Obstacles>
   PD_HD Value project(const Obstacles& contacts, const Value& u, const Value& around) const {
     if constexpr (!Touching) return u;
@@ -132,7 +132,7 @@ struct Vertex {
     return hold(zero, diagonal * (u - project(contacts, subtract_product(u, inverse, free), u)));
   }
 
-  // what contacts leave to the vertex at u: see effects/contact.h
+  // what contacts leave to the vertex at u: see contact/plane_sphere.h
   PD_HD Leeway<Real> leeway(const Contacts<Real>& contacts, const Value& u,
                             const Value& force) const {
     return contacts.leeway(Lanes::vec3(x),
@@ -146,7 +146,7 @@ struct Vertex {
     return hold(Lanes::value({none, none, none}), Lanes::value(diagonal * taken));
   }
 
-  // `next` out of the contacts, from u with dE/du: see effects/contact.h
+  // `next` out of the contacts, from u with dE/du: see contact/plane_sphere.h
   PD_HD Value land(const Contacts<Real>& contacts, const Value& next, const Value& u,
                    const Value& slope) const {
     if constexpr (!Touching) return next;

@@ -22,7 +22,7 @@ __all__ = [
 
 
 class PlanRow(NamedTuple):
-    """One line of csrc/plan/plan.def, of multilevel.def, or of device.def: a constant array."""
+    """One line of csrc/views/cpu_plan.def, of multilevel.def, or of gpu_plan.def: a constant array."""
 
     name: str
     type: str
@@ -32,7 +32,7 @@ class PlanRow(NamedTuple):
 
 
 class MaterialRow(NamedTuple):
-    """One line of csrc/plan/material.def: an array that training may change."""
+    """One line of csrc/views/material.def: an array that training may change."""
 
     name: str
     width: int
@@ -46,7 +46,7 @@ class MaterialRow(NamedTuple):
 
 
 class SettingRow(NamedTuple):
-    """One line of csrc/plan/settings.def: a setting of a step."""
+    """One line of csrc/views/settings.def: a setting of a step."""
 
     name: str
     type: str  # in schemas: "int", "float" or "bool"
@@ -68,5 +68,5 @@ MATERIAL_TABLE = tuple(MaterialRow(*row) for row in _C.material_table())
 SETTINGS_TABLE = tuple(SettingRow(*row) for row in _C.settings_table())
 # where the columns of the material's arrays stand in their rows
 PLANES, SPHERES = (_columns(array) for array in ("planes", "spheres"))
-# numbers of a GPU plan's `sizes`: csrc/plan/device_sizes.def
+# numbers of a GPU plan's `sizes`: csrc/views/gpu_sizes.def
 DEVICE_SIZES = tuple(_C.device_sizes())

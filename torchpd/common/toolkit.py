@@ -28,7 +28,7 @@ CUDA_ARCHITECTURES = "8.0;9.0+PTX"
 NVCC_FLAGS = ("-std=c++20", "-O3", "--expt-relaxed-constexpr", "--fmad=false")
 # Two architectures at a time, and code that is a quarter as large on disk: neither changes what runs.
 NVCC_PACKING = ("--threads=2", "-Xfatbin=-compress-all")
-LEAST_RELEASE = "12.3"  # the first with PTX 8.3, which has the words of 128 bits of csrc/cuda/collect.h
+LEAST_RELEASE = "12.3"  # the first with PTX 8.3, which has the words of 128 bits of csrc/cuda/common/reductions.h
 
 
 class Toolkit(NamedTuple):

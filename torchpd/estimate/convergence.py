@@ -43,7 +43,7 @@ __all__ = [
     "spectrum_of",
 ]
 
-_LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/math/chebyshev.h
+_LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/solver/chebyshev.h
 # iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
 _LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
 # of Multilevel where something lands, in those of Chebyshev for an error of 1e-3, and in their square roots

@@ -27,7 +27,7 @@ __all__ = ["describe", "workspace_bytes"]
 _FOLDED = "folded into the inertia of a vertex: nothing per iteration"
 
 _ANY_BATCH = 2**31 - 1
-_TURNING_MODES = 24  # of the coarse problem of Multilevel("corotated"), see csrc/solver/corotation.h
+_TURNING_MODES = 24  # of the coarse problem of Multilevel("corotated"), see csrc/solver/multilevel/deflation.h
 
 
 def _solver_line(sim: Stepper) -> str:

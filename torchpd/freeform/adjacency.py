@@ -184,7 +184,7 @@ def corner_lists(elements: Index, count: int) -> tuple[Index, Index]:
 
 
 def gather_lists(triangles: Index, vertices: int, pairs: Touching, quadrics: int) -> list[Index]:
-    """The first eight arrays of csrc/patches/lists.def, in its order; the rest belongs to samples."""
+    """The first eight arrays of csrc/freeform/lists.def, in its order; the rest belongs to samples."""
     return [
         triangles,
         _starts(pairs.patch, len(triangles)),

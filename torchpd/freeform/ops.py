@@ -1,6 +1,6 @@
 """Python side of the ops of free-form patches: fake kernels, derivatives, rules for vmap.
 
-The maths is in csrc/patches. Each op has an adjoint that is an op too, `<name>_vjp`, without a derivative of its own.
+The maths is in csrc/freeform. Each op has an adjoint that is an op too, `<name>_vjp`, without a derivative of its own.
 """
 
 from __future__ import annotations

@@ -247,7 +247,7 @@ def _fine_enough(patches: PatchSurface) -> int:
 
 
 def _cells(patches: PatchSurface, level: int) -> tuple[Any, Any, Any]:
-    """Cells [C, 17], weights [12, 3] and places [m^2, 9] as csrc/patches/rays.h has them."""
+    """Cells [C, 17], weights [12, 3] and places [m^2, 9] as csrc/freeform/rays.h has them."""
     elements = patches.triangles.cpu().numpy().astype(np.int64)
     steps, triangles = grid(level)
     fine = _CHECKS * level
@@ -273,8 +273,8 @@ def _cells(patches: PatchSurface, level: int) -> tuple[Any, Any, Any]:
 def _tree_order(middles: Any, per_leaf: int) -> Any:
     """Things in the order of the leaves: halved at the median of their longest extent, again and again.
 
-    The halves are those of the complete tree in csrc/patches/tree.h, leaf l of 2^L from l C / 2^L on, so many or more
-    in each.
+    The halves are those of the complete tree in csrc/freeform/box_tree.h, leaf l of 2^L from l C / 2^L on, so many or
+    more in each.
     """
     count = len(middles)
     order = np.arange(count)

@@ -61,7 +61,7 @@ class PatchSamples:
 
     patch: Tensor  # int32 [S]
     barycentrics: Tensor  # [S, 3]
-    lists: tuple[Tensor, ...]  # the last three arrays of csrc/patches/lists.def
+    lists: tuple[Tensor, ...]  # the last three arrays of csrc/freeform/lists.def
 
     def __len__(self) -> int:
         return len(self.patch)
@@ -85,7 +85,7 @@ class PatchSurface:
     base: BaseKind
     measured_at: MeasuredAt
     thickness: float
-    lists: tuple[Tensor, ...]  # the first eight arrays of csrc/patches/lists.def
+    lists: tuple[Tensor, ...]  # the first eight arrays of csrc/freeform/lists.def
     reach: Tensor  # [P] bound of |h| where it is measured on the surface, else 0 [m]
     steepness: Tensor  # [P] bound of d/dh sum_i R_i(P + h D) there, else 0
 

@@ -88,7 +88,7 @@ class PatchTransport(nn.Module):
 
     @property
     def constraints(self) -> list[Tensor]:
-        """The arrays of csrc/patches/constraints.def, in its order."""
+        """The arrays of csrc/freeform/constraints.def, in its order."""
         return [self.tets, self.tet_start, self.point_tet]
 
     def gradients(self, positions: Tensor, fallback: Tensor | None = None) -> Tensor:

@@ -14,7 +14,7 @@ few, as many as the plan and batch ask for), so a CUDA graph can record it. An e
 
 Contacts: the normal direction of a vertex that a contact holds is taken out of the system; a vertex that friction holds
 moves with its start, on a ball about its centre. Where vertices slide against friction the system is not symmetric:
-csrc/solver/friction_adjoint.h. What contacts themselves get stands in csrc/solver/contact_gradients.h.
+csrc/solver/adjoint/friction.h. What contacts themselves get stands in csrc/solver/adjoint/contact_gradients.h.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .diagonal import named_material, pinned_vertices, step_diagonal
 
 __all__ = ["ADJOINT_TOLERANCE", "AdjointCall", "is_recording", "mend_adjoint", "step_gradient"]
 
-# see csrc/solver/adjoint.h
+# see csrc/solver/adjoint/system.h
 ADJOINT_TOLERANCE = dict(zip((torch.float32, torch.float64), _C.adjoint_tolerance, strict=True))
 # A body stretched this much turns so little that its Hessian is the constant, positive majoriser but for 1e-4.
 _STRETCH = 1e4

@@ -33,7 +33,7 @@ __all__ = [
 _WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
 # by their number in the `sizes` of a GPU's plan
 KERNELS = ("block", "cluster", "grid", "stream")
-_SIZE_GROUPS = 3  # as in csrc/plan/views.h
+_SIZE_GROUPS = 3  # as in csrc/views/views.h
 
 
 def kernel_of(arrays: Sequence[Tensor]) -> str:
@@ -172,7 +172,7 @@ def with_loose_pieces(plan: Plan, values: SceneValues) -> Plan:
 
 
 def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
-    """Counts in the order of PlanSize in csrc/plan/views.h."""
+    """Counts in the order of PlanSize in csrc/views/views.h."""
     slots = np.diff(arrays["patch_slot"])
     counts = (
         len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), len(arrays["group_size"]),

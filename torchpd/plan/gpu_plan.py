@@ -36,7 +36,7 @@ def compile_device_plan(
         progress: show a bar when the mesh is large.
 
     Returns:
-        The arrays of csrc/plan/device.def in its order, on the CPU.
+        The arrays of csrc/views/gpu_plan.def in its order, on the CPU.
     """
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")

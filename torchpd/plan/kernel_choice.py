@@ -49,12 +49,12 @@ _MANY_SHARE = 4
 _LEVEL_TETS, _LEVEL_ALONE, _FEW_ALONE, _MANY_TETS = 384, 1152, 384, 1900
 _LEVELS = ("few", "any", "many")  # how many environments it is for
 # a patch at most, five rounds of its threads where all have partners, and how many patches share a multiprocessor of an
-# H100 (csrc/cuda/stream.h)
+# H100 (csrc/cuda/stream/kernels.h)
 _STREAM_TETS = {torch.float32: 1920, torch.float64: 960}
 _STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
 # so many times as many in a pipeline, of which a multiprocessor works on one at a time and holds two, where there is so
 # much shared memory for them and every multiprocessor has one: their slots are what its threads have in registers at
-# once (csrc/cuda/pipeline.h)
+# once (csrc/cuda/stream/pipeline.h)
 _PIPED_MORE, _PIPED_BYTES = 1.2, 200_000
 _MOST_FIELDS = 2  # of a pass: the products with a second derivative
 

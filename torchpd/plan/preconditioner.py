@@ -79,7 +79,7 @@ def has_strangers(plan: Plan, material: Sequence[Tensor], time_step: float) -> b
     inertias = inertias[inertias.isfinite()]
     if not len(inertias):
         return False
-    # as Misfit in csrc/solver/misfit.h: what has grown as a whole M serves
+    # as Misfit in csrc/solver/multilevel/material_mismatch.h: what has grown as a whole M serves
     trusted = torch.maximum(elements.max(), inertias.min())
     return bool(inertias.max() > _C.known_inertia * trusted)
 
@@ -93,7 +93,7 @@ def precondition_plan(
     most_direct: int | None = None,
     progress: bool = False,
 ) -> Plan:
-    """The plan with a multilevel approximation of A^-1 for a material, see csrc/plan/multilevel_build.h.
+    """The plan with a multilevel approximation of A^-1 for a material, see csrc/plan/multilevel/build.h.
 
     Args:
         plan: of any device.

@@ -25,7 +25,7 @@ LARGEST_COUNT = 1_000_000_000  # of iterations; the ops have the same limit
 Diagonal = Literal["weighted", "plain"]
 # settings of a step that the simulator says, whatever the solver
 _OTHERS = ("iterations", "time_step", "tolerance", "inertial", "report")
-_DEFAULTS: dict[str, Any] = {}  # of the others, as csrc/plan/settings.def declares them
+_DEFAULTS: dict[str, Any] = {}  # of the others, as csrc/views/settings.def declares them
 if load_extension()[0] is not None:  # a solver can be described without it
     from ..common.tables import SETTINGS_TABLE
 

@@ -11,9 +11,10 @@ forces p_k minimise |r - sum_k p_k n_k|. An active contact has p_k > 0 and gap_k
 iteration without its force crosses a wider gap. D is the diagonal of the step. The factor 4 bounds relaxation times
 acceleration, both below 2. Gaps of active contacts are that large only where planes meet at flat angles (see `Ground`).
 
-Several active contacts have p_k = m_k . r, with the m_k dual to their normals, as in csrc/solver/contact_gradients.h.
-The rest t is tangential to all of them. Colliders share it in proportion to mu_k p_k, and together take no more than
-that (Coulomb). So in a corner normal forces come first. The part that contacts do not take is the residual.
+Several active contacts have p_k = m_k . r, with the m_k dual to their normals, as in
+csrc/solver/adjoint/contact_gradients.h. The rest t is tangential to all of them. Colliders share it in proportion to
+mu_k p_k, and together take no more than that (Coulomb). So in a corner normal forces come first. The part that contacts
+do not take is the residual.
 
 Sums over vertices follow a fixed binary tree, so an environment has the same bits in every batch.
 """
@@ -48,7 +49,7 @@ __all__ = [
     "reactions",
 ]
 
-_SPANNED = 1e-6  # Gram determinant from which normals count as independent, as in csrc/effects/contact.h
+_SPANNED = 1e-6  # Gram determinant from which normals count as independent, as in csrc/contact/plane_sphere.h
 _FASTEST = 4.0  # bound of relaxation times acceleration, both below 2
 _PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
 

@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 
 __all__ = ["RigidPieces"]
 
-_NOISE = {torch.float32: 1e-5, torch.float64: 1e-12}  # relative rounding of an energy, as in csrc/solver/outer.h
+_NOISE = {
+    torch.float32: 1e-5,
+    torch.float64: 1e-12,
+}  # relative rounding of an energy, as in csrc/solver/multilevel/line_search.h
 # arrays on which the pieces and their functions depend
 _MADE_OF = ("stiffness", "masses", "damping", "pin_stiffness", "pin_hard")
 

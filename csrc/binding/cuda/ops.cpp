@@ -1,0 +1,103 @@
+// The ops on CUDA. Torch provides memory, stream and device.
+#include "binding/rollout_adjoint.h"
+
+#include "binding/plan_views.h"
+#include "cuda/common/launch.h"
+
+#include <c10/cuda/CUDAGraphsC10Utils.h>
+#include <c10/cuda/CUDAGuard.h>
+#include <c10/cuda/CUDAStream.h>
+
+namespace pd {
+namespace {
+
+struct Cuda {
+  template <class T>
+  using Plan = DevicePlan<T>;
+
+  template <class T>
+  static Plan<T> plan_view(at::TensorList arrays, const Place& place) {
+    return device_plan_view<T>(arrays, place);
+  }
+
+  template <class T>
+  static void step(const DeviceStep<T>& call, const Tensor& like) {
+    const bool stream = call.plan.kernel == int(DeviceKernel::stream);
+    run(like, call, step_bytes<T>, stream ? run_stream<T> : run_fused<T>);
+  }
+
+  template <class T>
+  static void field(const DeviceField<T>& call, const Tensor& like) {
+    run(like, call, field_bytes<T>, run_field<T>);
+  }
+
+  template <class T>
+  static void report(const DeviceReport<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_report(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+  template <class T>
+  static void precondition(const PreconditionCall<T>& call, const Tensor& like) {
+    run(like, call, precondition_bytes<T>, run_precondition<T>);
+  }
+
+  template <class T>
+  static void conjugate(const DeviceConjugate<T>& call, const Tensor& like) {
+    run(like, call, conjugate_bytes<T>, run_conjugate<T>);
+  }
+
+  template <class T>
+  static void adjoint_system(const DeviceAdjointSystem<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_adjoint_system(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+  template <class T>
+  static void contact_gradients(const DeviceContactGradients<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_contact_gradients(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+  template <class T>
+  static void adjoint_result(const AdjointResultCall<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_adjoint_result(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+  template <class T>
+  static void vertex_sum(const VertexSumCall<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_vertex_sum(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+  static bool recording(const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    return c10::cuda::currentStreamCaptureStatusMayInitCtx() != c10::cuda::CaptureStatus::None;
+  }
+
+  template <class T>
+  static void rotation(const RotationCall<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_rotation(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
+ private:
+  // The memory returns to torch's allocator at once, which reuses it only on the same stream.
+  template <class Call>
+  static void run(const Tensor& like, const Call& call, std::int64_t (*bytes)(const Call&),
+                  void (*launch)(const Call&, void*, Stream)) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    const Tensor memory = at::empty({bytes(call)}, like.options().dtype(at::kByte));
+    launch(call, memory.mutable_data_ptr(), c10::cuda::getCurrentCUDAStream().stream());
+  }
+};
+
+}  // namespace
+
+TORCH_LIBRARY_IMPL(torchpd, CUDA, m) {
+  register_ops<Cuda>(m);
+  register_adjoint_ops<Cuda>(m);
+}
+
+}  // namespace pd

@@ -1,0 +1,207 @@
+// Gradients of a step for the arrays of its material, once its adjoint is solved.
+#pragma once
+#include "binding/find_op.h"
+#include "binding/step_taken.h"
+#include "solver/adjoint/contact_gradients.h"
+#include "views/vertex_sum.h"
+
+#include <cstddef>
+#include <cstdint>
+#include <functional>
+#include <optional>
+#include <string_view>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+namespace pd {
+
+// K l, by the dispatcher, whose profiler then sees it.
+inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier) {
+  static const auto op =
+      find_op<Tensor(const Tensor&, const Tensor&, at::TensorList, at::TensorList)>(
+          "torchpd::hessian_product");
+  return op.call(t.after, multiplier, t.material, t.plan);
+}
+
+// Environments of whose ends the loss knows anything. One of no number that it leaves out must not spoil what it shares.
+class Asked {
+ public:
+  Asked(const Tensor& grad_positions, const Tensor& grad_velocities) {
+    // what is alone shares nothing
+    if (grad_positions.size(0) < 2 || grad_positions[0].numel() == 0) return;
+    const auto some = [](const Tensor& gradient) { return gradient.ne(0.0).flatten(1).any(1); };
+    is_ = some(grad_positions).logical_or_(some(grad_velocities));
+  }
+
+  // [batch, ...], 0 for others
+  Tensor only(const Tensor& each) const {
+    if (!is_.defined()) return each;
+    std::vector<std::int64_t> shape(each.dim(), 1);
+    shape[0] = -1;
+    return at::where(is_.view(shape), each, 0.0);
+  }
+
+ private:
+  Tensor is_;
+};
+
+// [batch, vertices, ...] to [batch, ...]. Those of torch add up in an order that follows from the batch.
+template <class Backend, class T>
+Tensor sum_vertices_typed(const Tensor& values) {
+  const Tensor from = values.contiguous();
+  std::vector<std::int64_t> shape = from.sizes().vec();
+  shape.erase(shape.begin() + 1);
+  const Tensor out = at::empty(shape, from.options());
+  if (out.numel() == 0) return out;
+  Backend::vertex_sum(VertexSumCall<T>{from.size(0), from.size(1), out.numel() / from.size(0),
+                                       from.const_data_ptr<T>(), out.mutable_data_ptr<T>()},
+                      out);
+  return out;
+}
+
+template <class Backend>
+Tensor sum_vertices(const Tensor& values) {
+  return values.scalar_type() == at::kFloat ? sum_vertices_typed<Backend, float>(values)
+                                            : sum_vertices_typed<Backend, double>(values);
+}
+
+// Whose gradients are wanted, of all contacts.
+struct WantedContacts {
+  bool planes = true, spheres = true;
+};
+
+// Gradients for planes [batch, planes, 5] and spheres [batch, spheres, 8], of none where nobody wants them; `elastic`: K l.
+template <class Backend, class T>
+std::tuple<Tensor, Tensor> gradients_for_contacts_typed(const AdjointTensors& t,
+                                                        const Tensor& multiplier,
+                                                        const Tensor& elastic, double time_step,
+                                                        WantedContacts wanted) {
+  StepTaken<Backend, T> step(t, time_step);
+  ContactGradientsCall<T, typename Backend::template Plan<T>> call{step.call};
+  call.multiplier = step.keep(multiplier);
+  call.elastic = step.keep(elastic);
+  const Material<T>& m = step.call.material;
+  const auto of_vertices = [&](std::int64_t count, std::int64_t numbers) {
+    return at::empty({step.call.batch, step.call.plan.vertices, count, numbers}, t.after.options());
+  };
+  const Tensor planes = of_vertices(wanted.planes ? m.planes_count : 0, planes_numbers);
+  const Tensor spheres = of_vertices(wanted.spheres ? m.spheres_count : 0, spheres_numbers);
+  if (planes.numel() > 0) call.planes = planes.mutable_data_ptr<T>();
+  if (spheres.numel() > 0) call.spheres = spheres.mutable_data_ptr<T>();
+  if (call.planes || call.spheres) Backend::contact_gradients(call, multiplier);
+  return {sum_vertices_typed<Backend, T>(planes), sum_vertices_typed<Backend, T>(spheres)};
+}
+
+template <class Backend>
+std::tuple<Tensor, Tensor> gradients_for_contacts(const AdjointTensors& t, const Tensor& multiplier,
+                                                  const Tensor& elastic, double time_step,
+                                                  WantedContacts wanted = {}) {
+  return multiplier.scalar_type() == at::kFloat ? gradients_for_contacts_typed<Backend, float>(
+                                                      t, multiplier, elastic, time_step, wanted)
+                                                : gradients_for_contacts_typed<Backend, double>(
+                                                      t, multiplier, elastic, time_step, wanted);
+}
+
+// -l . dr/dp of every environment, for an array p of the material, from its formulas for all of them.
+class MaterialGradients {
+ public:
+  // `elastic`: K l, undefined where nobody has worked it out; `contacts`: gradients_for_contacts by K l; `sum`: sum_vertices
+  using Contacts = std::function<std::tuple<Tensor, Tensor>(const Tensor& elastic)>;
+  using Sum = Tensor (*)(const Tensor& values);
+  MaterialGradients(const AdjointTensors& t, const Tensor& multiplier, const Tensor& elastic,
+                    Contacts contacts, Sum sum, const Asked& asked, double time_step)
+      : t_(t),
+        multiplier_(multiplier),
+        elastic_(elastic),
+        contacts_(std::move(contacts)),
+        sum_(sum),
+        asked_(asked),
+        h_(time_step) {}
+
+  // of the array in a place; what environments share has the sum over them
+  Tensor of(std::size_t place) const {
+    const Tensor& array = t_.material[place];
+#define X(name, width, rows, meaning)    \
+  if (place == place_in_material(#name)) \
+    return reduce(name(), array, (width > 1 ? 1 : 0) + (std::string_view(#rows) != "one"));
+#include "views/material.def"
+#undef X
+    TORCH_INTERNAL_ASSERT(false);
+  }
+
+ private:
+  Tensor reduce(const Tensor& every, const Tensor& like, std::int64_t own) const {
+    const Tensor each = asked_.only(every);
+    return like.dim() == own ? each.sum(0) : each.sum_to_size(like.sizes());
+  }
+
+  const Tensor& material(const char* name) const { return t_.material[place_in_material(name)]; }
+  Tensor mass() const { return material("masses").unsqueeze(-1); }
+  Tensor rate() const { return (t_.after - t_.positions) / h_; }
+  Tensor hard() const { return material("pin_stiffness").isinf(); }
+
+  // user's numbers of the pinned vertices
+  Tensor pins() const {
+    constexpr int vertex_order = 1, pin_vertex = 2;  // of every plan
+    return t_.plan[vertex_order].index_select(0, t_.plan[pin_vertex]).to(at::kLong);
+  }
+  Tensor pinned(const Tensor& field) const { return field.index_select(1, pins()); }
+
+  // K l; what was worked out before does not know yet that an environment is lost
+  Tensor product() const {
+    return elastic_.defined() ? elastic_ + 0.0 * multiplier_ : elastic_product(t_, multiplier_);
+  }
+
+  // what vertices that are held pass on
+  Tensor passed_on() const { return t_.grad_positions + t_.grad_velocities / h_ - product(); }
+
+  Tensor stiffness() const {
+    static const auto op =
+        find_op<Tensor(const Tensor&, const Tensor&, at::TensorList, at::TensorList)>(
+            "torchpd::element_energy_product");
+    std::vector<Tensor> unit(t_.material.begin(), t_.material.end());
+    unit[place_in_material("stiffness")] = at::ones_like(material("stiffness"));
+    return -op.call(t_.after, multiplier_, unit, t_.plan);
+  }
+
+  Tensor masses() const {
+    const Tensor lag = 1 + material("damping").unsqueeze(-1).unsqueeze(-1) * h_;
+    const Tensor pull = (lag * rate() - t_.velocities) / h_ - material("gravity").unsqueeze(-2);
+    return -(multiplier_ * pull).sum(-1);
+  }
+
+  Tensor gravity() const { return sum_(mass() * multiplier_); }
+
+  Tensor damping() const { return -sum_((mass() * multiplier_ * rate()).flatten(1)); }
+
+  Tensor pin_stiffness() const {
+    const Tensor stretch = pinned(t_.after) - material("pin_targets");
+    return at::where(hard(), 0.0, -(pinned(multiplier_) * stretch).sum(-1));
+  }
+
+  // hard ones take on what their vertices pass on
+  Tensor pin_targets() const {
+    const Tensor held = hard().unsqueeze(-1);
+    const Tensor springs = at::where(held, 0.0, material("pin_stiffness").unsqueeze(-1));
+    return at::where(held, pinned(passed_on()), springs * pinned(multiplier_));
+  }
+
+  Tensor planes() const { return std::get<0>(of_contacts()); }
+  Tensor spheres() const { return std::get<1>(of_contacts()); }
+  const std::tuple<Tensor, Tensor>& of_contacts() const {
+    if (!of_contacts_) of_contacts_ = contacts_(product());
+    return *of_contacts_;
+  }
+
+  const AdjointTensors& t_;
+  const Tensor& multiplier_;
+  const Tensor& elastic_;
+  Contacts contacts_;
+  Sum sum_;
+  const Asked& asked_;
+  double h_;
+  mutable std::optional<std::tuple<Tensor, Tensor>> of_contacts_;
+};
+
+}  // namespace pd

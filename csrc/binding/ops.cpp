@@ -1,0 +1,179 @@
+// The ops: schemas, and the CPU behind them.
+#include "binding/rollout_adjoint.h"
+
+#include "binding/plan_views.h"
+#include "cpu/dispatch.h"
+
+#include <ATen/Parallel.h>
+
+#include <algorithm>
+#include <string>
+#include <vector>
+
+namespace pd {
+namespace {
+
+struct Cpu {
+  template <class T>
+  using Plan = pd::Plan<T>;
+
+  template <class T>
+  static Plan<T> plan_view(at::TensorList arrays, const Place& place) {
+    return pd::plan_view<T>(arrays, place);
+  }
+
+  static void step(const StepCall<float>& call, const Tensor&) {
+    kernels().step32(call, threads());
+  }
+  static void step(const StepCall<double>& call, const Tensor&) {
+    kernels().step64(call, threads());
+  }
+  static void field(const FieldCall<float>& call, const Tensor&) {
+    kernels().field32(call, threads());
+  }
+  static void field(const FieldCall<double>& call, const Tensor&) {
+    kernels().field64(call, threads());
+  }
+  static void report(const ReportCall<float>& call, const Tensor&) {
+    kernels().report32(call, threads());
+  }
+  static void report(const ReportCall<double>& call, const Tensor&) {
+    kernels().report64(call, threads());
+  }
+  static void precondition(const PreconditionCall<float>& call, const Tensor&) {
+    kernels().precondition32(call, threads());
+  }
+  static void precondition(const PreconditionCall<double>& call, const Tensor&) {
+    kernels().precondition64(call, threads());
+  }
+  static void conjugate(const ConjugateCall<float>& call, const Tensor&) {
+    kernels().conjugate32(call, threads());
+  }
+  static void conjugate(const ConjugateCall<double>& call, const Tensor&) {
+    kernels().conjugate64(call, threads());
+  }
+  static void adjoint_system(const AdjointSystemCall<float>& call, const Tensor&) {
+    kernels().adjoint_system32(call, threads());
+  }
+  static void adjoint_system(const AdjointSystemCall<double>& call, const Tensor&) {
+    kernels().adjoint_system64(call, threads());
+  }
+  static void contact_gradients(const ContactGradientsCall<float>& call, const Tensor&) {
+    kernels().contact_gradients32(call, threads());
+  }
+  static void contact_gradients(const ContactGradientsCall<double>& call, const Tensor&) {
+    kernels().contact_gradients64(call, threads());
+  }
+  static void adjoint_result(const AdjointResultCall<float>& call, const Tensor&) {
+    kernels().adjoint_result32(call, threads());
+  }
+  static void adjoint_result(const AdjointResultCall<double>& call, const Tensor&) {
+    kernels().adjoint_result64(call, threads());
+  }
+  template <class T>
+  static void vertex_sum(const VertexSumCall<T>& call, const Tensor&) {
+    // as many environments for each thread as make waking it worth while
+    const std::int64_t grain =
+        at::internal::GRAIN_SIZE / std::max<std::int64_t>(1, call.vertices * call.numbers) + 1;
+    at::parallel_for(0, call.batch, grain, [&](std::int64_t begin, std::int64_t end) {
+      for (std::int64_t e = begin; e < end; ++e) {
+        for (std::int64_t n = 0; n < call.numbers; ++n) {
+          const T* from = call.values + e * call.vertices * call.numbers + n;
+          double sum = 0;
+          for (std::int64_t i = 0; i < call.vertices; ++i) sum += double(from[i * call.numbers]);
+          call.out[e * call.numbers + n] = T(sum);
+        }
+      }
+    });
+  }
+  static void rotation(const RotationCall<float>& call, const Tensor&) {
+    kernels().rotation32(call, threads());
+  }
+  static void rotation(const RotationCall<double>& call, const Tensor&) {
+    kernels().rotation64(call, threads());
+  }
+
+  static bool recording(const Tensor&) { return false; }
+
+  static int threads() { return at::get_num_threads(); }
+};
+
+}  // namespace
+
+TORCH_LIBRARY(torchpd, m) {
+  // A CUDA graph of torch.compile returns what it was given and others want, backward above all,
+  // and can return nothing on the CPU, where every plan has its counts: no op that takes one may be
+  // in such a graph. Ours (capture.py) can hold them.
+  const std::vector<at::Tag> between_graphs{at::Tag::cudagraph_unsafe};
+  const auto with_plan = [&](const std::string& schema) { m.def(schema.c_str(), between_graphs); };
+  with_plan(
+      "step(Tensor positions, Tensor velocities, Tensor? forces, Tensor? start, Tensor[] material, "
+      "Tensor[] plan, *, " +
+      settings_schema() + ") -> (Tensor, Tensor, Tensor)");
+  with_plan(
+      "step_(Tensor(a!) positions, Tensor(b!) velocities, Tensor(c!) info, Tensor? forces, Tensor? "
+      "start, Tensor[] material, Tensor[] plan, *, " +
+      settings_schema() + ") -> ()");
+  with_plan(
+      "rollout(Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, Tensor[] "
+      "plan, *, SymInt steps, SymInt every, " +
+      settings_schema() + ") -> (Tensor, Tensor, Tensor)");
+  with_plan("gradient(Tensor positions, Tensor[] material, Tensor[] plan) -> Tensor");
+  with_plan(
+      "hessian_product(Tensor positions, Tensor direction, Tensor[] material, Tensor[] plan) -> "
+      "Tensor");
+  with_plan("element_energy(Tensor positions, Tensor[] material, Tensor[] plan) -> Tensor");
+  with_plan(
+      "element_energy_product(Tensor positions, Tensor direction, Tensor[] material, Tensor[] "
+      "plan) "
+      "-> Tensor");
+  with_plan("elastic_diagonal(Tensor[] material, Tensor[] plan, *, bool weighted) -> Tensor");
+  with_plan("precondition(Tensor field, Tensor[] plan) -> Tensor");
+  with_plan(
+      "step_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor positions, "
+      "Tensor "
+      "velocities, Tensor? forces, Tensor[] material, Tensor[] plan, *, float time_step, bool[]? "
+      "wanted=None) -> Tensor[]");
+  with_plan(
+      "rollout_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
+      "after_velocities, Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, "
+      "Tensor[] plan, *, float time_step, bool[]? wanted=None) -> Tensor[]");
+  // its kernel, for every device, comes from Python
+  with_plan(
+      "mend_adjoint(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor right, "
+      "Tensor inverse, "
+      "Tensor? projector, Tensor[] material, Tensor[] plan, *, float time_step) -> Tensor");
+  with_plan(
+      "adjoint_system(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
+      "positions, Tensor "
+      "velocities, Tensor? forces, Tensor[] material, Tensor[] plan, *, float time_step) -> "
+      "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+  with_plan(
+      "contact_gradients(Tensor multiplier, Tensor elastic, Tensor grad_positions, Tensor "
+      "grad_velocities, Tensor after, Tensor positions, Tensor velocities, Tensor? forces, "
+      "Tensor[] "
+      "material, Tensor[] plan, *, float time_step) -> (Tensor, Tensor)");
+  m.def(
+      "adjoint_result(Tensor multiplier, Tensor error, Tensor grad_velocities, Tensor[] "
+      "material, Tensor? grad_positions=None, Tensor? elastic=None, Tensor? projector=None, "
+      "Tensor? "
+      "stuck=None, Tensor? sliding=None, *, float time_step) -> (Tensor, Tensor, Tensor)");
+  with_plan(
+      "conjugate_gradients(Tensor positions, Tensor right, Tensor inertia, Tensor inverse, Tensor? "
+      "projector, Tensor[] material, Tensor[] plan, Tensor? sliding=None, *, float tolerance) -> "
+      "(Tensor, Tensor)");
+  with_plan(
+      "conjugate_gradients_(Tensor(a!) solution, Tensor(b!) residual, Tensor(c!) direction, "
+      "Tensor(d!) "
+      "progress, Tensor positions, Tensor inertia, Tensor inverse, Tensor? projector, Tensor[] "
+      "material, Tensor[] plan, *, float tolerance, int iterations) -> ()");
+  m.def("nearest_rotation(Tensor matrices) -> Tensor");
+  m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
+}
+
+TORCH_LIBRARY_IMPL(torchpd, CPU, m) {
+  register_ops<Cpu>(m);
+  register_adjoint_ops<Cpu>(m);
+}
+
+}  // namespace pd

@@ -1,0 +1,340 @@
+// Tensors to views: the arrays of a plan and of a material, and how long they have to be.
+#pragma once
+#include "binding/checks.h"
+#include "views/shared_memory.h"
+#include "views/views.h"
+
+#include <ATen/ATen.h>
+#include <c10/util/Exception.h>
+
+#include <cstddef>
+#include <cstdint>
+#include <string>
+#include <string_view>
+#include <vector>
+
+namespace pd {
+
+template <class T>
+constexpr at::ScalarType scalar_type = sizeof(T) == 4 ? at::kFloat : at::kDouble;
+template <>
+constexpr at::ScalarType scalar_type<int32> = at::kInt;
+template <>
+constexpr at::ScalarType scalar_type<int16> = at::kShort;
+
+#define X(name, type, width, rows, meaning) +1
+constexpr int plan_arrays = 0
+#include "views/cpu_plan.def"
+    ;
+#undef X
+
+// The counts of a plan. They stay on the CPU, so that no op waits for another device.
+inline const int32* sizes_view(const Tensor& t, std::int64_t count) {
+  check_array(t, at::kInt, count, 1, {at::kCPU, "every plan's sizes"}, "plan.sizes", "counts");
+  return t.const_data_ptr<int32>();
+}
+
+// Lengths of the arrays, by the names in cpu_plan.def.
+struct PlanRows {
+  std::int64_t size, vertex, group, pin, block, patch_end, slot, shared_end, shared_slot;
+};
+
+#define X(name, type, width, rows, meaning) +1
+constexpr int level_arrays = 0
+#include "views/multilevel.def"
+    ;
+#undef X
+
+// Lengths of the arrays, by the names in multilevel.def.
+struct LevelRows {
+  std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_lift, host_fine_lift,
+      device_fine_lift, fine_node_end, middle_end, middle_entry, middle, middle_lift,
+      host_middle_lift, device_middle_lift, middle_node_end, coarse_entry, device_coarse_entry;
+};
+
+// The preconditioner's arrays, which begin at `first`.
+template <class T>
+Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
+                      const Place& place) {
+  check_array(arrays[first], at::kInt, level_size_count, 1, {at::kCPU, "every plan's sizes"},
+              "plan.level_sizes", "counts");
+  const int32* size = arrays[first].const_data_ptr<int32>();
+  Levels<T> levels = count_levels<T>(size, vertices);
+  const bool middle = levels.has_middle();
+  const std::int64_t coarse = levels.coarse_unknowns();
+  LevelRows count{};
+  count.level_size = level_size_count;
+  count.tet = tets;
+  count.vertex = vertices;
+  count.fine_end = vertices + 1;
+  count.fine_entry = size[level_fine_entries];
+  count.fine_lift = size[level_fine_lifts];
+  count.fine_node_end = levels.fine_nodes + 1;
+  count.middle_end = middle ? levels.fine_nodes + 1 : 0;
+  count.middle_entry = size[level_middle_entries];
+  count.middle = middle ? levels.fine_nodes : 0;
+  count.middle_lift = size[level_middle_lifts];
+  count.middle_node_end = middle ? levels.middle_nodes + 1 : 0;
+  count.coarse_entry = coarse * (coarse + 1) / 2;
+  const bool on_device = place.device.is_cuda();
+  (on_device ? count.device_fine_lift : count.host_fine_lift) = count.fine_lift;
+  (on_device ? count.device_middle_lift : count.host_middle_lift) = count.middle_lift;
+  count.device_coarse_entry = on_device ? count.coarse_entry : 0;
+  const Place on_cpu{at::kCPU, "every plan's sizes"};
+  int at = first;
+  using real = T;
+#define X(name, type, width, rows, meaning)                                                   \
+  check_array(arrays[at], scalar_type<type>, count.rows, width, at == first ? on_cpu : place, \
+              "plan." #name, meaning);                                                        \
+  levels.name = arrays[at++].const_data_ptr<type>();
+#include "views/multilevel.def"
+#undef X
+  return levels;
+}
+
+// What the arrays hold is trusted; how long they are is not.
+template <class T>
+Plan<T> plan_view(at::TensorList arrays, const Place& place) {
+  constexpr int with_levels = plan_arrays + level_arrays;
+  TORCH_CHECK_VALUE(arrays.size() == plan_arrays || arrays.size() == with_levels,
+                    "plan must be the ", plan_arrays, " arrays of Plan.arrays, or ", with_levels,
+                    " with those of a multilevel preconditioner, got ", arrays.size());
+  const int32* size = sizes_view(arrays[0], plan_size_count);
+  Plan<T> plan;
+  plan.vertices = size[plan_vertices];
+  plan.tets = size[plan_tets];
+  plan.pins = size[plan_pins];
+  plan.groups = size[plan_groups];
+  plan.blocks = size[plan_blocks];
+  plan.patches = size[plan_patches];
+  plan.slots = size[plan_slots];
+  plan.shared = size[plan_shared];
+  plan.most_slots = size[plan_most_slots];
+  TORCH_CHECK_VALUE(plan.patches >= 1 && plan.most_slots >= 1 && plan.most_slots <= plan.slots,
+                    "plan.sizes must count at least one patch, and no more slots in one than in "
+                    "all, got ",
+                    plan.patches, " patches with up to ", plan.most_slots, " of ", plan.slots,
+                    " slots; compile the scene again");
+  PlanRows count{};
+  count.size = plan_size_count;
+  count.vertex = plan.vertices;
+  count.group = plan.groups;
+  count.pin = plan.pins;
+  count.block = plan.blocks;
+  count.patch_end = plan.patches + 1;
+  count.slot = plan.slots;
+  count.shared_end = plan.shared + 1;
+  // every slot that does not hold an interior vertex of its patch holds a shared one
+  count.shared_slot = plan.slots - (plan.vertices - plan.shared);
+  int at = 0;
+  using real = T;
+#define X(name, type, width, rows, meaning)                                                     \
+  check_array(arrays[at], scalar_type<type>, count.rows, width, place, "plan." #name, meaning); \
+  plan.name = arrays[at++].const_data_ptr<type>();
+#include "views/cpu_plan.def"
+#undef X
+  if (arrays.size() == with_levels)
+    plan.levels = levels_view<T>(arrays, plan_arrays, plan.vertices, plan.tets, place);
+  return plan;
+}
+
+// A multilevel schedule needs the arrays of its preconditioner.
+template <class P>
+void check_levels(const P& plan, bool wanted) {
+  TORCH_CHECK_VALUE(!wanted || plan.levels.there(),
+                    "plan has no multilevel preconditioner; a Simulator with solver=Multilevel() "
+                    "makes one");
+}
+
+#define X(name, type, width, rows, meaning) +1
+constexpr int device_plan_arrays = 0
+#include "views/gpu_plan.def"
+    ;
+#undef X
+
+// Where part_slot stands in the table: how many vertices can move freely is not among the counts.
+#define X(name, type, width, rows, meaning) name,
+enum class DevicePlanArray : int {
+#include "views/gpu_plan.def"
+};
+#undef X
+constexpr int part_slot_array = int(DevicePlanArray::part_slot);
+
+// Lengths of the arrays, by the names in gpu_plan.def.
+struct DevicePlanRows {
+  std::int64_t size, vertex, pin, pinned_vertex, block, patch_end, patch, slot, shared_end,
+      shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, piece_end, part,
+      stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex;
+};
+
+template <class T>
+DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
+  constexpr int with_levels = device_plan_arrays + level_arrays;
+  TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays || arrays.size() == with_levels,
+                    "plan must be the ", device_plan_arrays, " arrays of a plan for ",
+                    place.device.str(), ", or ", with_levels,
+                    " with those of a multilevel preconditioner, got ", arrays.size(),
+                    "; sim.to(...) compiles the plan of a device");
+  const int32* size = sizes_view(arrays[0], size_count);
+  DevicePlan<T> plan = count_device_plan<T>(size);
+  TORCH_CHECK_VALUE(plan.kernel >= 0 && plan.kernel <= 3 && plan.patches >= 1 &&
+                        (plan.kernel != 0 || plan.patches == 1) && plan.most_slots >= 1 &&
+                        plan.most_slots <= plan.slots && plan.most_entries >= 0,
+                    "plan.sizes must name a kernel, 0 to 3, and at least one patch, one alone for "
+                    "kernel 0, got kernel ",
+                    plan.kernel, " and ", plan.patches, " patches; compile the scene again");
+  constexpr int stream = 3;  // of DeviceKernel, which this file does not see
+  TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays || plan.kernel == stream,
+                    "plan must be one for kernel 3 (stream) where it has a multilevel "
+                    "preconditioner, which no other knows, got kernel ",
+                    plan.kernel);
+  TORCH_CHECK_VALUE(plan.environments >= 0 && plan.environments <= most_environments,
+                    "plan.sizes must have a multiprocessor work on 0 to ", most_environments,
+                    " environments, got ", plan.environments, "; compile the scene again");
+  TORCH_CHECK_VALUE(plan.blocks <= most_blocks, "plan.sizes must count up to ", most_blocks,
+                    " blocks of 32 pairs of tetrahedra, whose corners 32 bits count, got ",
+                    plan.blocks, "; compile the scene again, with fewer patches");
+  // every slot that does not hold an interior vertex of its patch holds a shared one, but of a cluster, where all are inside
+  // one patch; pieces and pins may be absent
+  const bool pieces = plan.pieces > 0, cluster = plan.kernel == 1;
+  DevicePlanRows count{};
+  count.size = size_count;
+  count.vertex = plan.vertices;
+  count.pin = plan.pins;
+  count.pinned_vertex = plan.pins ? plan.vertices : 0;
+  count.block = plan.blocks;
+  count.patch = plan.patches;
+  count.patch_end = plan.patches + 1;
+  count.slot = plan.slots;
+  count.shared_end = plan.shared + 1;
+  count.shared_slot = cluster ? 0 : plan.slots - (plan.vertices - plan.shared);
+  count.stream_slot = plan.kernel == stream ? count.shared_slot : 0;
+  count.copied_vertex = cluster ? plan.vertices : 0;
+  count.piece_slot = pieces ? plan.slots : 0;
+  count.part_patch_end = pieces ? plan.patches + 1 : 0;
+  count.part_end = pieces ? plan.parts + 1 : 0;
+  count.part_slot = pieces ? arrays[part_slot_array].size(0) : 0;
+  count.piece_end = pieces ? plan.pieces + 1 : 0;
+  count.part = plan.parts;
+  const bool computed = plan.kernel == stream, fixed = computed && sizeof(T) == 4;
+  count.stored_block = computed ? 0 : plan.blocks;
+  count.rest_slot = computed && !fixed ? plan.slots : 0;
+  count.fixed_slot = fixed ? plan.slots : 0;
+  count.computed_block = computed ? plan.blocks : 0;
+  count.computed_patch = computed ? plan.patches : 0;
+  count.sender = plan.senders;
+  TORCH_CHECK_VALUE(plan.kernel != 2 || plan.senders >= count.shared_slot,
+                    "plan.sizes must count a row of senders for each of the ", count.shared_slot,
+                    " shared slots of kernel 2, got ", plan.senders, "; compile the scene again");
+  const Place on_cpu{at::kCPU, "every plan's sizes"};
+  int at = 0;
+  using real = T;
+#define X(name, type, width, rows, meaning)                                               \
+  check_array(arrays[at], scalar_type<type>, count.rows, width, at == 0 ? on_cpu : place, \
+              "plan." #name, meaning);                                                    \
+  plan.name = arrays[at++].const_data_ptr<type>();
+#include "views/gpu_plan.def"
+#undef X
+  if (arrays.size() == with_levels)
+    plan.levels = levels_view<T>(arrays, device_plan_arrays, plan.vertices, plan.tets, place);
+  return plan;
+}
+
+template <class T>
+Values<T> values_view(const Tensor& t, std::int64_t rows, std::int64_t width, bool single,
+                      std::int64_t batch, const Place& place, const char* name,
+                      const char* meaning) {
+  check_storage(t, scalar_type<T>, place, std::string("material.") + name, meaning);
+  std::vector<std::int64_t> shape;
+  if (!single) shape.push_back(rows);
+  if (width > 1) shape.push_back(width);
+  const at::IntArrayRef sizes = t.sizes();
+  const bool own = sizes.size() == shape.size() + 1 && (sizes[0] == batch || sizes[0] == 1);
+  TORCH_CHECK_VALUE((own ? sizes.slice(1) : sizes) == at::IntArrayRef(shape), "material.", name,
+                    " must be ", at::IntArrayRef(shape), " or the same after a batch of ", batch,
+                    ", as many environments as the positions have (", meaning, "), got ",
+                    describe(t));
+  return {t.const_data_ptr<T>(), own && sizes[0] == batch ? rows * width : 0};
+}
+
+struct Rows {
+  std::int64_t tet, vertex, pin, plane, sphere, one = 1;
+};
+
+#define X(name, width, rows, meaning) +1
+constexpr int material_arrays = 0
+#include "views/material.def"
+    ;
+#undef X
+
+// Where an array stands in a material.
+constexpr std::size_t place_in_material(std::string_view name) {
+  constexpr std::string_view names[] = {
+#define X(name, width, rows, meaning) #name,
+#include "views/material.def"
+#undef X
+  };
+  std::size_t place = 0;
+  while (names[place] != name) ++place;
+  return place;
+}
+
+// The array of a name.
+inline const Tensor& array_of(at::TensorList material, std::string_view name) {
+  TORCH_CHECK_VALUE(material.size() == material_arrays, "material must be ", material_arrays,
+                    " arrays, got ", material.size());
+  return material[place_in_material(name)];
+}
+
+// Young's moduli, one for each tetrahedron of a plan.
+inline Tensor stiffness_of(at::TensorList material, std::int64_t tets) {
+  const Tensor& stiffness = array_of(material, "stiffness");
+  check_tets(stiffness, tets);
+  return stiffness.contiguous();
+}
+
+// Columns, where an array has any, are all of its numbers.
+constexpr int columns_of(std::string_view name) {
+  int numbers = 0;
+#define X(name, width, rows, meaning)
+#define COLUMN(array, column, width, meaning) numbers += name == #array ? width : 0;
+#include "views/material.def"
+#undef X
+  return numbers;
+}
+#define X(name, width, rows, meaning) \
+  static_assert(columns_of(#name) == 0 || columns_of(#name) == width);
+#include "views/material.def"
+#undef X
+
+inline std::int64_t rows_of(const Tensor& t, int width, const char* name) {
+  const int own = width > 1 ? 2 : 1;
+  TORCH_CHECK_VALUE(t.dim() == own || t.dim() == own + 1, "material.", name, " must have ", own,
+                    " dimensions, or ", own + 1, " with a batch, got ", describe(t));
+  return t.size(width > 1 ? -2 : -1);
+}
+
+template <class T>
+Material<T> material_view(at::TensorList arrays, std::int64_t vertices, std::int64_t pins,
+                          std::int64_t batch, const Place& place) {
+  TORCH_CHECK_VALUE(arrays.size() == material_arrays, "material must be ", material_arrays,
+                    " arrays, got ", arrays.size());
+  Material<T> material;
+  Rows count{};
+  count.vertex = vertices;
+  count.pin = pins;
+  int at = 0;
+#define X(name, width, rows, meaning)                                                          \
+  if (std::string(#rows) == "tet") count.tet = rows_of(arrays[at], width, #name);              \
+  if (std::string(#rows) == "plane") count.plane = rows_of(arrays[at], width, #name);          \
+  if (std::string(#rows) == "sphere") count.sphere = rows_of(arrays[at], width, #name);        \
+  material.name = values_view<T>(arrays[at++], count.rows, width, std::string(#rows) == "one", \
+                                 batch, place, #name, meaning);
+#include "views/material.def"
+#undef X
+  material.planes_count = int(count.plane);
+  material.spheres_count = int(count.sphere);
+  return material;
+}
+
+}  // namespace pd

@@ -1,0 +1,58 @@
+// A step that was taken, as the ops of its adjoint are given it.
+#pragma once
+#include "binding/ops.h"
+#include "binding/plan_views.h"
+#include "solver/adjoint/system.h"
+
+#include <vector>
+
+namespace pd {
+
+// A step that was taken, and what a loss wants of its outcome.
+struct AdjointTensors {
+  Tensor grad_positions, grad_velocities, after, positions, velocities;
+  OptionalTensor forces;
+  at::TensorList material, plan;
+};
+
+// What a call asks of a step that was taken, and the tensors that it points into.
+template <class Backend, class T>
+class StepTaken {
+ public:
+  AdjointSystemCall<T, typename Backend::template Plan<T>> call;
+  bool touching;
+
+  StepTaken(const AdjointTensors& t, double time_step) {
+    const Place place{t.after.device()};
+    call.plan = Backend::template plan_view<T>(t.plan, place);
+    call.batch = t.after.size(0);
+    check_vertices(t.after, call.plan.vertices);
+    call.material =
+        material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch, place);
+    const Material<T>& m = call.material;
+    call.elastic = {keep(diagonal_typed<Backend, T>(t.material, t.plan, true)),
+                    m.stiffness.stride ? call.plan.vertices : 0};
+    touching = m.planes_count + m.spheres_count > 0;
+    call.time_step = time_step;
+    call.grad_positions = keep(t.grad_positions);
+    call.grad_velocities = keep(t.grad_velocities);
+    if (!touching) return;
+    call.after = keep(t.after);
+    call.positions = keep(t.positions);
+    call.velocities = keep(t.velocities);
+    if (t.forces) call.forces = keep(*t.forces);
+    call.elastic_gradient =
+        keep(run_field<Backend>(Field::gradient, t.after.contiguous(), {}, t.material, t.plan));
+  }
+  StepTaken(const StepTaken&) = delete;
+
+  const T* keep(const Tensor& tensor) {
+    kept_.push_back(tensor.contiguous());
+    return kept_.back().template const_data_ptr<T>();
+  }
+
+ private:
+  std::vector<Tensor> kept_;
+};
+
+}  // namespace pd

@@ -1,0 +1,399 @@
+// Runner of solver/adjoint/conjugate_gradients.h: one environment at a time, by one thread or by a team.
+#pragma once
+#include "cpu/multilevel/v_cycle.h"
+#include "cpu/step/sweep.h"
+#include "solver/adjoint/friction.h"
+
+#include <algorithm>
+#include <cmath>
+#include <memory>
+
+namespace pd::inline PD_TARGET {
+
+// What the elements of a plan keep of a place: nine numbers of a rotation, nine of its answer, blocks of lanes side by side.
+template <class T>
+class Turnings {
+  static constexpr int W = native_width<T>, numbers = 18;
+
+ public:
+  explicit Turnings(const Plan<T>& plan)
+      : storage_(allocate_zeroed(std::int64_t(plan.blocks) * block_lanes * numbers * sizeof(T))),
+        data_(reinterpret_cast<T*>(storage_.get())) {}
+
+  void set(const BlockPart<T>& part, const Turning<Pack<T, W>>& turning) {
+    each(part, turning, [](auto& number, T* at) { number.store(at); });
+  }
+  Turning<Pack<T, W>> get(const BlockPart<T>& part) const {
+    Turning<Pack<T, W>> turning;
+    each(part, turning, [](auto& number, T* at) { number = Pack<T, W>::load(at); });
+    return turning;
+  }
+
+ private:
+  template <class Any, class Visit>
+  void each(const BlockPart<T>& part, Any& turning, const Visit& visit) const {
+    T* at = data_ + std::int64_t(part.block) * block_lanes * numbers + part.first_lane;
+    for (auto* matrix : {&turning.rotation, &turning.answer}) {
+      for (auto& row : matrix->row) {
+        for (auto* number : {&row.x, &row.y, &row.z}) {
+          visit(*number, at);
+          at += block_lanes;
+        }
+      }
+    }
+  }
+
+  Storage storage_;
+  T* data_;
+};
+
+// Vectors of BiCGStab: p, the first residual of a cycle, the correction of y, and the second product of an iteration.
+template <class T>
+struct FrictionVectors {
+  Quad<T>*search, *shadow, *correction, *smoothed;  // [vertices]
+
+  explicit FrictionVectors(std::int64_t vertices)
+      : storage_(allocate_zeroed(4 * vertices * sizeof(Quad<T>))) {
+    search = reinterpret_cast<Quad<T>*>(storage_.get());
+    shadow = search + vertices;
+    correction = shadow + vertices;
+    smoothed = correction + vertices;
+  }
+
+ private:
+  Storage storage_;
+};
+
+// What an environment is solved in, by all of a team.
+template <class T>
+struct ConjugateMemory {
+  Workspace<Single<T>> vectors;
+  Turnings<T> turnings;
+  std::unique_ptr<Cycle<Single<T>>> cycle;  // of a plan with levels
+  FrictionVectors<T> friction;
+
+  explicit ConjugateMemory(const ConjugateCall<T>& call)
+      : vectors(call), turnings(call.plan), friction(call.friction ? call.plan.vertices : 0) {
+    if (call.plan.levels.there()) cycle = std::make_unique<Cycle<Single<T>>>(call.plan.levels);
+  }
+};
+
+template <class T>
+class ConjugatePass {
+  using Lanes = Single<T>;
+  using Sum = Sums<Lanes>;
+
+ public:
+  ConjugatePass(const ConjugateCall<T>& call, ConjugateMemory<T>& work, Scratch<Lanes>& scratch,
+                const Team& team)
+      : call_(call),
+        plan_(call.plan),
+        w_(work.vectors),
+        turnings_(work.turnings),
+        cycle_(work.cycle.get()),
+        f_(work.friction),
+        team_(team),
+        sweep_{plan_, w_, scratch, team} {}
+
+  void run(std::int64_t environment) {
+    Conjugate numbers(call_.progress + environment * progress_count);
+    if (!numbers.active) return;
+    environment_ = environment;
+    find_unit();
+    load(numbers.begins);
+    numbers.scale_by(1 / double(unit_));
+    if (numbers.begins) begin(numbers);
+    int k = 0;
+    for (; k < call_.iterations && numbers.active && !team_.ended(plan_.vertices); ++k)
+      iterate(numbers);
+    store(solve_friction(numbers, k));
+    numbers.scale_by(double(unit_));
+    if (team_.rank == 0) numbers.write(call_.progress + environment * progress_count);
+    team_.barrier();
+  }
+
+ private:
+  std::int64_t row(std::int64_t i) const {
+    return (environment_ * plan_.vertices + plan_.vertex_order[i]) * 3;
+  }
+  Quad<T> read(const T* from, std::int64_t i) const {
+    return to_quad(from[row(i)], from[row(i) + 1], from[row(i) + 2]);
+  }
+
+  // Every thread finds it for itself.
+  void find_unit() {
+    const std::int64_t count = 3 * std::int64_t(plan_.vertices);
+    const T* residual = call_.residual + environment_ * count;
+    T largest = 0;
+    for (std::int64_t i = 0; i < count; ++i) largest = std::max(largest, std::abs(residual[i]));
+    unit_ = unit_near(largest);
+  }
+
+  void load(bool begins) {
+    const T per_unit = T(1) / unit_;
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.x[i] = read(call_.positions, i);
+      solution()[i] = begins ? to_quad<T>(0, 0, 0) : per_unit * read(call_.solution, i);
+      residual()[i] = per_unit * read(call_.residual, i);
+      direction()[i] = per_unit * read(call_.direction, i);
+      w_.inertia[i] = call_.inertia.of(environment_)[plan_.vertex_order[i]];
+      w_.inverse[i] = call_.inverse.of(environment_)[plan_.vertex_order[i]];
+    }
+    const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;
+    for (std::int64_t e = team_.begin(elements); e < team_.end(elements); ++e) {
+      w_.weight[e] = plan_.tet_volume[e] * call_.stiffness.of(environment_)[plan_.tet_order[e]];
+    }
+    team_.barrier();
+    sweep_.set_origins();
+    team_.barrier();
+    const auto turn = one_by_one([&](const auto& elements, int s) {
+      using R = typename std::remove_cvref_t<decltype(elements)>::R;
+      Vec3<R> x[4];
+      elements.corners(s, 0, x);
+      turnings_.set(elements.part(s), Turning<R>(deformation_gradient(x, elements.rest(s))));
+    });
+    sweep_.run(0, turn, [](std::int64_t, const Quad<T>&, Sum&) {});
+  }
+
+  void begin(Conjugate& numbers) {
+    const double weighted = cycle_ ? apply_levels() : 0;
+    each_part([&](std::int64_t i, Sum& sums) {
+      const Quad<T> right = residual()[i];
+      direction()[i] = preconditioned_residual(i);
+      // zero, unless something is infinite or no number
+      const Quad<T> lost = multiply_add(T(0), w_.x[i], T(0) * right);
+      sums.first = multiply_add(right, right, sums.first) + lost;
+      sums.second = multiply_add(right, direction()[i], sums.second);
+    });
+    const auto sum = total(1);
+    numbers.begin(sum.first, cycle_ ? weighted : sum.second);
+    team_.barrier();  // before the next sums stand there
+  }
+
+  // visit(vertex, elastic Hessian times the direction, sums)
+  template <class Visit>
+  void multiply(const Visit& visit) {
+    const auto product = one_by_one([&](const auto& elements, int s) {
+      using R = typename std::remove_cvref_t<decltype(elements)>::R;
+      Vec3<R> dx[4], g[4];
+      elements.corners(s, 1, dx);
+      solid_hessian_product(turnings_.get(elements.part(s)), dx, elements.rest(s),
+                            elements.weight(s), g);
+      elements.add(s, g);
+    });
+    sweep_.template run<2>(0, product, visit);
+  }
+
+  void iterate(Conjugate& numbers) {
+    multiply([&](std::int64_t i, const Quad<T>& force, Sum& sums) {
+      const Quad<T> d = direction()[i];
+      const Vec3<T> moved = conjugate_image(to_vec3(force), to_vec3(d), w_.inertia[i],
+                                            w_.inverse[i] != T(0), projector(i), across(i));
+      image()[i] = Lanes::value(moved);
+      sums.first = multiply_add(d, image()[i], sums.first);
+    });
+    const T step = T(numbers.step(total(0).first));
+    if (!numbers.active) return;
+    each_part([&](std::int64_t i, Sum& sums) {
+      solution()[i] = multiply_add(step, direction()[i], solution()[i]);
+      const Quad<T> rest = subtract_product(residual()[i], step, image()[i]);
+      residual()[i] = rest;
+      sums.first = multiply_add(rest, rest, sums.first);
+      sums.second = multiply_add(rest, w_.inverse[i] * rest, sums.second);
+    });
+    const auto sum = total(1);
+    numbers.judge(sum.first, call_.tolerance);
+    if (!numbers.active) return;
+    const T keep = T(numbers.keep(cycle_ ? apply_levels() : sum.second));
+    // not part by part: others may still read the sums
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      direction()[i] = multiply_add(keep, direction()[i], preconditioned_residual(i));
+    team_.barrier();
+  }
+
+  // Goes on with friction, after so many products; returns whether it has.
+  bool solve_friction(const Conjugate& numbers, int products) {
+    if (!call_.friction || !adds_friction(numbers, call_.tolerance) || !some_slide()) return false;
+    FrictionSolve friction(nullptr, numbers.scale);
+    friction.begin(products, adjoint_iterations);
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      f_.correction[i] = to_quad<T>(0, 0, 0);
+    while (friction.active() && !team_.ended(plan_.vertices)) advance(friction);
+    if (team_.rank == 0) friction.write(call_.friction + environment_ * friction_count);
+    return true;
+  }
+
+  // every thread looks for itself
+  bool some_slide() const {
+    for (std::int64_t i = 0; i < plan_.vertices; ++i) {
+      if (slides(sliding(i))) return true;
+    }
+    return false;
+  }
+
+  void advance(FrictionSolve& friction) {
+    const FrictionStage stage = friction.stage;
+    if (cycle_ && stage != FrictionStage::residual)
+      precondition(stage == FrictionStage::first ? f_.search : residual());
+    const auto z = [&](std::int64_t i) {
+      if (stage == FrictionStage::residual) return solution()[i] + f_.correction[i];
+      if (cycle_) return cycle_->result()[i];
+      return w_.inverse[i] * (stage == FrictionStage::first ? f_.search : residual())[i];
+    };
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      direction()[i] = Lanes::value(press(to_vec3(z(i)), sliding(i)));
+    team_.barrier();
+    multiply([&](std::int64_t i, const Quad<T>& force, Sum& sums) {
+      const Quad<T> product =
+          Lanes::value(friction_image(to_vec3(force), to_vec3(z(i)), w_.inertia[i],
+                                      w_.inverse[i] != T(0), projector(i), sliding(i)));
+      if (stage == FrictionStage::residual) {
+        const Quad<T> rest = (T(1) / unit_) * read(call_.right, i) - product;
+        residual()[i] = rest;
+        sums.first = multiply_add(rest, rest, sums.first);
+      } else if (stage == FrictionStage::first) {
+        image()[i] = product;
+        sums.first = multiply_add(f_.shadow[i], product, sums.first);
+      } else {
+        f_.smoothed[i] = product;
+        sums.first = multiply_add(product, residual()[i], sums.first);
+        sums.second = multiply_add(product, product, sums.second);
+      }
+    });
+    const auto sum = total(0);
+    if (stage == FrictionStage::residual) return correct(friction, sum.first);
+    const bool first = stage == FrictionStage::first;
+    const T step = T(first ? friction.go(sum.first) : friction.smooth(sum.first, sum.second));
+    if (first && friction.stage == FrictionStage::residual) return;
+    const Quad<T>* const product = first ? image() : f_.smoothed;
+    each_part([&](std::int64_t i, Sum& sums) {
+      f_.correction[i] = multiply_add(step, z(i), f_.correction[i]);
+      const Quad<T> rest = subtract_product(residual()[i], step, product[i]);
+      residual()[i] = rest;
+      sums.first = multiply_add(rest, rest, sums.first);
+      sums.second = multiply_add(f_.shadow[i], rest, sums.second);
+    });
+    if (first) return;
+    const auto left = total(1);
+    const T keep = T(friction.judge(left.first, left.second, call_.tolerance));
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      f_.search[i] =
+          multiply_add(keep, subtract_product(f_.search[i], step, image()[i]), residual()[i]);
+    team_.barrier();
+  }
+
+  // With the true residual of y and its correction, by its |r|^2: begins a cycle, or ends.
+  void correct(FrictionSolve& friction, double square) {
+    const bool enters = friction.accept(square, call_.tolerance);
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      if (enters) solution()[i] = solution()[i] + f_.correction[i];
+      f_.correction[i] = to_quad<T>(0, 0, 0);
+      f_.search[i] = f_.shadow[i] = residual()[i];
+    }
+    team_.barrier();
+  }
+
+  // M of a field, for the result of the cycle
+  void precondition(const Quad<T>* field) {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      cycle_->input()[i] = field[i];
+    team_.barrier();
+    cycle_->run(team_);
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      Quad<T>& z = cycle_->result()[i];
+      z = Lanes::value(preconditioned(to_vec3(z), to_vec3(field[i]), w_.inverse[i],
+                                      plan_.levels.reference_inertia[i], projector(i)));
+    }
+    team_.barrier();
+  }
+
+  // M of the residual, for `preconditioned_residual`; returns r . M r
+  double apply_levels() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      cycle_->input()[i] = residual()[i];
+    team_.barrier();
+    cycle_->run(team_);
+    each_part([&](std::int64_t i, Sum& sums) {
+      Quad<T>& z = cycle_->result()[i];
+      z = Lanes::value(preconditioned(to_vec3(z), to_vec3(residual()[i]), w_.inverse[i],
+                                      plan_.levels.reference_inertia[i], projector(i)));
+      sums.second = multiply_add(residual()[i], z, sums.second);
+    });
+    const double sum = total(1).second;
+    team_.barrier();  // before the next sums stand there
+    return sum;
+  }
+  Quad<T> preconditioned_residual(std::int64_t i) const {
+    return cycle_ ? cycle_->result()[i] : w_.inverse[i] * residual()[i];
+  }
+
+  const T* sliding(std::int64_t i) const {
+    return call_.sliding ? call_.sliding + slide_count * row(i) : nullptr;
+  }
+  const T* across(std::int64_t i) const {
+    return call_.sliding ? sliding(i) + 3 * slide_across : nullptr;
+  }
+  // of what contacts let through; null where all is
+  const T* projector(std::int64_t i) const {
+    return call_.projector ? call_.projector + 3 * row(i) : nullptr;
+  }
+
+  // `slides`: the multiplier is G^T of what was solved for
+  void store(bool slides) {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      if (slides) solution()[i] = Lanes::value(press(to_vec3(solution()[i]), sliding(i)));
+      write(call_.solution, i, unit_ * solution()[i]);
+      write(call_.residual, i, unit_ * residual()[i]);
+      write(call_.direction, i, unit_ * direction()[i]);
+    }
+  }
+  void write(T* to, std::int64_t i, const Quad<T>& a) const {
+    for (int c = 0; c < 3; ++c) to[row(i) + c] = a.q.v[c];
+  }
+
+  // The vertices of every part of a sweep, whose sums are left as it leaves them: in one order however many threads there are.
+  template <class Visit>
+  void each_part(const Visit& visit) {
+    for (int part = team_.begin(w_.part_count); part < team_.end(w_.part_count); ++part) {
+      const bool whole = part < plan_.patches;
+      const int first =
+          whole ? plan_.patch_vertex[part]
+                : plan_.patch_vertex[plan_.patches] + (part - plan_.patches) * shared_chunk;
+      const int end =
+          whole ? plan_.patch_vertex[part + 1] : std::min(first + shared_chunk, plan_.vertices);
+      Sum sums = sweep_.no_sums();
+      for (int i = first; i < end; ++i) visit(i, sums);
+      sweep_.record(1, part, sums, 0.0);
+    }
+    team_.barrier();
+  }
+
+  // every thread adds up the same parts in the same order, so all come to the same decisions
+  typename Workspace<Lanes>::Part total(int parity) const {
+    typename Workspace<Lanes>::Part sum = w_.parts[parity][0];
+    for (int part = 1; part < w_.part_count; ++part) {
+      sum.first += w_.parts[parity][part].first;
+      sum.second += w_.parts[parity][part].second;
+    }
+    return sum;
+  }
+
+  // the directions stand where a sweep looks for its second field
+  Quad<T>* direction() const { return w_.before; }
+  Quad<T>* solution() const { return w_.velocity; }
+  Quad<T>* residual() const { return w_.target; }
+  Quad<T>* image() const { return w_.force; }
+
+  const ConjugateCall<T>& call_;
+  const Plan<T>& plan_;
+  Workspace<Lanes>& w_;
+  Turnings<T>& turnings_;
+  const Cycle<Lanes>* cycle_;
+  FrictionVectors<T>& f_;
+  const Team& team_;
+  Sweep<Lanes> sweep_;
+  std::int64_t environment_ = 0;
+  T unit_ = 1;  // unit_near
+};
+
+}  // namespace pd::inline PD_TARGET

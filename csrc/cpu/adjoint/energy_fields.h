@@ -1,0 +1,117 @@
+// Elastic energy and its derivatives at given positions, and their diagonal, environment by environment.
+#pragma once
+#include "cpu/step/sweep.h"
+
+namespace pd::inline PD_TARGET {
+
+template <class T>
+class FieldPass {
+  using Lanes = Single<T>;
+  using Sum = Sums<Lanes>;
+
+ public:
+  FieldPass(const FieldCall<T>& call, Workspace<Lanes>& work, Scratch<Lanes>& scratch,
+            const Team& team)
+      : call_(call),
+        plan_(call.plan),
+        w_(work),
+        scratch_(scratch),
+        team_(team),
+        sweep_{plan_, work, scratch, team} {}
+
+  void run(std::int64_t environment) {
+    load(environment);
+    if (call_.field == Field::gradient) {
+      vertex_field<1, 3>(environment, SolidGradient<false>{});
+    } else if (call_.field == Field::diagonal) {
+      vertex_field<1, 1>(environment, SolidDiagonal{});
+    } else if (call_.field == Field::report) {
+      vertex_field<1, 3>(environment, SolidReport{});
+    } else if (call_.field == Field::hessian_product) {
+      vertex_field<2, 3>(environment, SolidHessian{});
+    } else if (call_.field == Field::element_energy) {
+      element_field<1>(environment, [](const auto& x, const auto& rest, const auto& weight) {
+        using R = std::remove_cvref_t<decltype(weight)>;
+        const auto d = strain(x[0], rest);
+        return R(0.5) * weight * frobenius(d, d);
+      });
+    } else {
+      element_field<2>(environment, [](const auto& x, const auto& rest, const auto& weight) {
+        return element_energy_product(x[0], x[1], rest, weight);
+      });
+    }
+    team_.barrier();
+  }
+
+ private:
+  Quad<T> read(const T* from, std::int64_t environment, std::int64_t i) const {
+    const T* p = from + (environment * plan_.vertices + plan_.vertex_order[i]) * 3;
+    return to_quad(p[0], p[1], p[2]);
+  }
+
+  // Positions relative to each patch's first vertex, and on top of them what they are displaced by, as in a step.
+  void load(std::int64_t environment) {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      if (call_.positions) w_.x[i] = read(call_.positions, environment, i);
+      if (call_.displacement) w_.u[i] = read(call_.displacement, environment, i);
+      if (call_.direction) w_.before[i] = read(call_.direction, environment, i);
+    }
+    const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;
+    for (std::int64_t e = team_.begin(elements); e < team_.end(elements); ++e) {
+      const T volume = plan_.tet_volume[e] * (call_.weighted ? plan_.tet_bound[e] : T(1));
+      w_.weight[e] = volume * call_.stiffness.of(environment)[plan_.tet_order[e]];
+    }
+    team_.barrier();
+    sweep_.set_origins();
+    team_.barrier();
+  }
+
+  template <int Fields, int Components, class Element>
+  void vertex_field(std::int64_t environment, Element element) {
+    sweep_.template run<Fields>(0, element, [&](std::int64_t i, const Quad<T>& force, Sum&) {
+      T* to = call_.out + (environment * plan_.vertices + plan_.vertex_order[i]) * Components;
+      for (int c = 0; c < Components; ++c) to[c] = force.q.v[c];
+    });
+  }
+
+  template <int Fields, class Element>
+  void element_field(std::int64_t environment, Element element) {
+    constexpr int W = native_width<T>;
+    for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
+      sweep_.template gather_slots<Fields>(patch);
+      const Quad<T>* const fields[2] = {scratch_.x, scratch_.direction};
+      for (int block = plan_.patch_block[patch]; block < plan_.patch_block[patch + 1]; ++block) {
+        for (int first = 0; first < block_lanes; first += W) {
+          write_lanes<Fields>(environment, {&plan_, block, first}, fields, element);
+        }
+      }
+    }
+  }
+
+  template <int Fields, class Element>
+  void write_lanes(std::int64_t environment, BlockPart<T> part, const Quad<T>* const (&field)[2],
+                   Element& element) {
+    constexpr int W = native_width<T>;
+    using R = Pack<T, W>;
+    Vec3<R> corner[Fields][4];
+    for (int f = 0; f < Fields; ++f) {
+      for (int c = 0; c < 4; ++c) corner[f][c] = gather_corner<T, W>(field[f], part.corner(c));
+    }
+    const auto rest = read_rest<R>([&](int number) { return R::load(part.rest(number)); });
+    const R value = element(corner, rest, R::load(w_.weight + part.element()));
+    for (int lane = 0; lane < W; ++lane) {
+      // padding repeats an element of the patch with no volume: it must not write
+      if (plan_.tet_volume[part.element() + lane] == T(0)) continue;
+      call_.out[environment * plan_.tets + plan_.tet_order[part.element() + lane]] = value.v[lane];
+    }
+  }
+
+  const FieldCall<T>& call_;
+  const Plan<T>& plan_;
+  Workspace<Lanes>& w_;
+  Scratch<Lanes>& scratch_;
+  const Team& team_;
+  Sweep<Lanes> sweep_;
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,37 @@
+// Runner of measure_misfit (solver/multilevel/material_mismatch.h) on the CPU.
+#pragma once
+#include "solver/multilevel/material_mismatch.h"
+#include "threads/team.h"
+
+namespace pd::inline PD_TARGET {
+
+// `inertia(i)` is a of an internal vertex. The ranges do not depend on how the team shares the work.
+template <class T, class Inertia>
+struct MisfitRunner {
+  const Plan<T>& plan;
+  const Team& team;
+  Range (*ranges)[ranges_count];  // one row a thread
+  Inertia inertia;
+
+  template <class Visit>
+  void each_tet(const Visit& visit) const {
+    for (std::int64_t t = team.begin(plan.tets); t < team.end(plan.tets); ++t) visit(t);
+  }
+
+  template <class Visit>
+  void each_vertex(const Visit& visit) const {
+    for (std::int64_t i = team.begin(plan.vertices); i < team.end(plan.vertices); ++i)
+      visit(i, inertia(i));
+  }
+
+  void meet(Range (&range)[ranges_count]) const {
+    for (int n = 0; n < ranges_count; ++n) ranges[team.rank][n] = range[n];
+    team.barrier();
+    for (int rank = 0; rank < team.size; ++rank) {
+      for (int n = 0; n < ranges_count; ++n) range[n].add(ranges[rank][n]);
+    }
+    team.barrier();
+  }
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,415 @@
+// Runner of solver/multilevel/lbfgs.h on the CPU: what Stepper does of a step, and another way to the next iterate.
+#pragma once
+#include "cpu/multilevel/deflation.h"
+#include "cpu/multilevel/material_mismatch.h"
+#include "cpu/multilevel/workspace.h"
+#include "cpu/step/stepper.h"
+#include "solver/multilevel/trial_vertex.h"
+
+#include <algorithm>
+
+namespace pd::inline PD_TARGET {
+
+// `Touching`: see solver/vertex.h.
+template <class Lanes, bool Touching>
+class MultilevelStepper : public Stepper<Lanes, Touching> {
+  using Base = Stepper<Lanes, Touching>;
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Value = typename Lanes::Value;
+  using Wide = typename Lanes::Wide;
+  using Sum = Sums<Lanes>;
+  using Work = OuterWork<Lanes>;
+  static constexpr int width = Lanes::environments, dots = Work::dots;
+  using Base::call_, Base::contacts_, Base::done_, Base::in_, Base::plan_, Base::schedule_,
+      Base::set_, Base::sweep_, Base::team_, Base::used_, Base::vertex, Base::w_;
+
+ public:
+  MultilevelStepper(const StepCall<T>& call, Workspace<Lanes>& work, Scratch<Lanes>& scratch,
+                    const Team& team, std::int64_t first, Work& outer)
+      : Base(call, work, scratch, team, first),
+        o_(outer),
+        lbfgs_(set_.learns()),
+        corotates_(set_.schedule == ScheduleKind::corotated),
+        corotation_(plan_, team, work, outer.corotation) {}
+
+  // All steps of the call, with a record every `set_.every`.
+  void roll() {
+    this->load();
+    this->weigh();
+    compare_with_reference();
+    for (int t = 0; t < set_.steps; ++t) {
+      multilevel_step(*this);
+      if (this->is_ended()) return;
+      if ((t + 1) % set_.every == 0) this->store((t + 1) / set_.every - 1);
+      this->move_balls();
+    }
+  }
+
+  void start() {
+    Base::start();
+    newest_ = 0;
+    corotated_ = false;
+    const Wide friction = Lanes::widen(contacts_.friction());
+    for (int lane = 0; lane < width; ++lane) {
+      const bool rough = Lanes::lane(friction, lane) > 0;
+      outer_[lane].begin(misfit_[lane], Touching, rough, corotates_, energy_noise<T>(),
+                         this->stop_[lane].fall);
+      pairs_[lane] = {};
+      made_[lane] = doubted_[lane] = 0;
+      has_[lane] = holds_[lane] = false;
+      if (corotates_) corotation_.forget(lane);
+      schedule_[lane].rho = misfit_[lane].spread;
+    }
+  }
+
+  void descend() { multilevel_iterations(*this, set_); }
+
+  // E and what is out of balance at the trial u
+  void evaluate(int k) {
+    sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
+      const auto v = vertex(i);
+      sums.energy = v.add_energy(w_.u[i], sums.energy);
+      o_.fresh[i] = v.unbalanced(contacts_, w_.u[i], force);
+      if constexpr (Touching) {
+        const auto left = v.leeway(contacts_, w_.u[i], force);
+        o_.fresh_free[i] = left.free;
+        o_.fresh_friction[i] = v.friction(left.taken);
+        o_.fresh_gradient[i] = v.gradient(w_.u[i], force);
+        // work against the friction of the base
+        sums.first = multiply_add(o_.friction[i], w_.u[i] - o_.base[i], sums.first);
+      }
+    });
+  }
+
+  // every thread decides from the same sums, so all decide alike
+  void judge(int k) {
+    const auto sum = this->total(k & 1);
+    for (int lane = 0; lane < width; ++lane) {
+      if (done_[lane]) {
+        Lanes::set_lane(accepted_, lane, T(0));
+        // what moves on in its lane has no part in sums either
+        Lanes::set_lane(finite_, lane, T(0));
+        continue;
+      }
+      const double work = outer_[lane].known ? Lanes::lane(sum.first, lane) : 0;
+      const double energy = Lanes::lane(sum.energy, lane) + work;
+      const bool accepted = outer_[lane].accept(energy, work, lbfgs_);
+      Lanes::set_lane(accepted_, lane, T(accepted ? 1 : 0));
+      Lanes::set_lane(finite_, lane, T(energy < HUGE_VAL ? 1 : 0));
+    }
+  }
+
+  // The pair from the base to the trial, kept or not: it holds for the curvature on the way. Then the base moves on.
+  void learn(int k) {
+    newest_ = (newest_ + 1) % history;
+    iteration_ = k;
+    pass([&](std::int64_t i, Value(&sum)[dots]) {
+      if (k == 0) {
+        o_.base[i] = w_.u[i];
+        o_.pull[i] = o_.fresh[i];
+      }
+      const Value change = w_.u[i] - o_.base[i];
+      // directions are those of another step at first
+      const Value s = k == 0 ? none_ : restricted(i, change);
+      const Value y = k == 0 ? none_ : restricted(i, o_.fresh[i] - o_.pull[i]);
+      if constexpr (Touching) {
+        for (int a = 0; corotates_ && a < 3; ++a) {
+          const Value d = Lanes::value(o_.fresh_free[i].row[a]) - Lanes::value(o_.free[i].row[a]);
+          sum[2 * history + 3] = multiply_add(d, d, sum[2 * history + 3]);
+        }
+        keep_directions(i);
+      }
+      // what momentum goes on along
+      w_.before[i] = choose(o_.base[i], w_.before[i]);
+      o_.base[i] = choose(w_.u[i], o_.base[i]);
+      o_.pull[i] = choose(o_.fresh[i], o_.pull[i]);
+      sum[2 * history] = multiply_add(change, change, sum[2 * history]);
+      if (set_.tolerance > 0) {
+        const Value way = w_.u[i] - w_.target[i];
+        sum[2 * history + 1] = multiply_add(way, way, sum[2 * history + 1]);
+      }
+      if (!lbfgs_) return;
+      // what is no number must not poison sums in which it has no part, those of the next environment among them
+      o_.s[newest_][i] = pick(finite_, numbers(s), none_);
+      o_.y[newest_][i] = pick(finite_, numbers(y), none_);
+      const Value g = restricted(i, o_.pull[i]);
+      for (int j = 0; j < history; ++j) {
+        sum[j] = multiply_add(o_.s[j][i], y, sum[j]);
+        sum[history + j] = multiply_add(o_.s[j][i], g, sum[history + j]);
+      }
+      sum[2 * history + 2] = multiply_add(y, y, sum[2 * history + 2]);
+    });
+    double total[dots];
+    for (int lane = 0; lane < width; ++lane) {
+      add_up(lane, total);
+      outer_[lane].walk(total[2 * history]);
+      if (outer_[lane].accepted && !(total[2 * history + 3] == 0)) holds_[lane] = false;
+      stop(lane, k, total[2 * history], total[2 * history + 1]);
+      if (!lbfgs_) continue;
+      Pairs& pairs = pairs_[lane];
+      for (int j = 0; j < history; ++j) {
+        pairs.product[j][newest_] = total[j];
+        pairs.pulled[j] = total[history + j];
+      }
+      const bool teaches = k > 0 && outer_[lane].teaches();
+      pairs.admit(newest_, teaches, total[2 * history], total[2 * history + 2]);
+      if (outer_[lane].forgets()) pairs.clear();
+      pairs.first_loop(newest_);
+    }
+    team_.barrier();
+  }
+
+  // whether no lane asks for M
+  bool goes_by_diagonal() const {
+    const auto without = [&](int lane) { return done_[lane] || outer_[lane].diagonal; };
+    for (int lane = 0; lane < width; ++lane)
+      if (!without(lane)) return false;
+    return lbfgs_;
+  }
+
+  // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
+  void precondition() {
+    if (corotates_) corotate(iteration_);
+    Real alpha[history] = {}, scale;
+    for (int lane = 0; lane < width; ++lane) {
+      for (int j = 0; j < history; ++j) Lanes::set_lane(alpha[j], lane, T(pairs_[lane].alpha[j]));
+      Lanes::set_lane(scale, lane, T(outer_[lane].weight(set_.relaxation, is_held(lane))));
+    }
+    Value* in = o_.cycle.input();
+    each_vertex([&](std::int64_t i) {
+      Value q = restricted(i, o_.pull[i]);
+      if (lbfgs_) {
+        for (int j = 0; j < history; ++j) q = subtract_product(q, alpha[j], o_.y[j][i]);
+        q = restricted(i, q);
+      }
+      in[i] = scale * q;
+    });
+    if (!corotated_) {
+      o_.cycle.run(team_);
+    } else {
+      run_corotated(scale);
+    }
+    if (lbfgs_) return correct();
+    each_vertex([&](std::int64_t i) { o_.direction[i] = o_.cycle.result()[i]; });
+  }
+
+  // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi iteration
+  void advance() {
+    Real beta, length, fallback, diagonal;
+    bool some_fallback = false;
+    for (int lane = 0; lane < width; ++lane) {
+      Outer& outer = outer_[lane];
+      const bool goes = !done_[lane], falls_back = goes && (outer.plain || outer.diagonal);
+      const double b = goes ? outer.send(schedule_[lane].limit, lbfgs_, has_[lane],
+                                         corotates_ && made_[lane] == 0, is_held(lane))
+                            : 0;
+      Lanes::set_lane(beta, lane, T(b));
+      Lanes::set_lane(length, lane, T(goes ? (1 + b) * outer.length() : 0));
+      Lanes::set_lane(fallback, lane, T(falls_back ? 1 : 0));
+      Lanes::set_lane(diagonal, lane, T(outer.accelerates() ? 1 : 0));
+      some_fallback = some_fallback || falls_back;
+      used_[lane] += goes ? 1 : 0;
+    }
+    const Real theta(T(set_.relaxation)), one(T(1));
+    each_vertex([&](std::int64_t i) {
+      const auto v = vertex(i);
+      const auto at = trial_vertex(v, i);
+      const Value before = w_.before[i];
+      const Value& slope = Touching ? o_.gradient[i] : o_.pull[i];
+      Value next = at.step(contacts_, before, slope, o_.direction[i], length, beta);
+      if (some_fallback)
+        next = pick(fallback,
+                    at.jacobi(contacts_, before, slope, diagonal > Real(T(0)), theta, one + beta),
+                    next);
+      w_.u[i] = v.hold(v.target, next);
+    });
+  }
+
+  // the last trial counts only if it is better than the base, and that only if its energy is a number
+  void settle() {
+    Real lost;
+    for (int lane = 0; lane < width; ++lane)
+      Lanes::set_lane(lost, lane, outer_[lane].energy < HUGE_VAL ? T(0) : T(NAN));
+    const Value none = Lanes::value({lost, lost, lost});
+    each_vertex([&](std::int64_t i) { w_.u[i] = choose(w_.u[i], o_.base[i]) + none; });
+    for (int lane = 0; lane < width; ++lane) schedule_[lane].restarts = outer_[lane].restarts;
+  }
+
+ private:
+  // whether contacts are in the small problem
+  bool is_held(int lane) const {
+    if constexpr (!Touching) return false;
+    return made_[lane] > 0 && corotation_.is_held(lane);
+  }
+
+  // The lanes whose small problem is made at iteration k, of where they stand.
+  void corotate(int k) {
+    bool asks[width], some = false;
+    for (int lane = 0; lane < width; ++lane) {
+      Outer& outer = outer_[lane];
+      const TurningPlan plan(k, made_[lane], outer.restarts - doubted_[lane], Touching,
+                             outer.turns());
+      asks[lane] = false;
+      // alone it would not have come here
+      if (outer.diagonal) continue;
+      asks[lane] = !done_[lane] && plan.make;
+      some = some || asks[lane];
+      if (plan.forget) corotation_.forget(lane);
+      has_[lane] = asks[lane] || (has_[lane] && !plan.forget);
+      if (!asks[lane]) continue;
+      ++made_[lane];
+      doubted_[lane] = outer.restarts;
+      outer.strayed = 0;
+      holds_[lane] = false;
+    }
+    double scales[width];
+    for (int lane = 0; lane < width; ++lane) scales[lane] = outer_[lane].scale;
+    if (some) corotation_.make(o_.base, asks, scales);
+    corotated_ = std::any_of(has_, has_ + width, [](bool has) { return has; });
+    if constexpr (Touching) {
+      bool holds[width];
+      for (int lane = 0; lane < width; ++lane) {
+        holds[lane] = has_[lane] && !holds_[lane] && !done_[lane] && !outer_[lane].diagonal;
+        holds_[lane] = holds_[lane] || holds[lane];
+      }
+      if (corotated_) corotation_.hold(o_.free, holds, scales);
+    }
+  }
+
+  // the cycle, and what the small problem gives, around it where something holds vertices that M has free
+  void run_corotated(const Real& scale) {
+    Value *in = o_.cycle.input(), *z = o_.cycle.result();
+    bool around[width], some = false;
+    for (int lane = 0; lane < width; ++lane) {
+      around[lane] = !plan_.levels.direct && (Touching || misfit_[lane].strangers);
+      some = some || around[lane];
+    }
+    corotation_.measure(in, around);
+    if (some) each_vertex([&](std::int64_t i) { in[i] = corotation_.without(i, in[i]); });
+    o_.cycle.run(team_);
+    corotation_.answer(z, around, some, scale);
+    each_vertex([&](std::int64_t i) { z[i] = corotation_.with(i, z[i]); });
+  }
+
+  // where the lane accepted its trial `a`, else `b`
+  Value choose(const Value& a, const Value& b) const { return pick(accepted_, a, b); }
+
+  // 0 for what is infinite or NaN
+  static Value numbers(const Value& a) {
+    const auto number = [](const Real& x) {
+      return select(lesser(x, -x) > Real(T(-HUGE_VAL)), x, Real(T(0)));
+    };
+    const Vec3<Real> v = Lanes::vec3(a);
+    return Lanes::value({number(v.x), number(v.y), number(v.z)});
+  }
+
+  static Value pick(const Real& flag, const Value& a, const Value& b) {
+    return select(flag > Real(T(0)), a, b);
+  }
+
+  template <class Visit>
+  void each_vertex(Visit visit) const {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) visit(i);
+    team_.barrier();
+  }
+
+  // visit(vertex, sums), chunk by chunk: neither threads nor the batch change the order of a sum
+  template <class Visit>
+  void pass(Visit visit) {
+    for (std::int64_t c = team_.begin(o_.chunks); c < team_.end(o_.chunks); ++c) {
+      Value sum[dots];
+      for (Value& s : sum) s = none_;
+      const std::int64_t end = std::min<std::int64_t>(plan_.vertices, (c + 1) * Work::chunk);
+      for (std::int64_t i = c * Work::chunk; i < end; ++i) visit(i, sum);
+      for (int d = 0; d < dots; ++d) o_.sums[c][d] = Sweep<Lanes>::add_components(sum[d]);
+    }
+    team_.barrier();
+  }
+
+  void add_up(int lane, double (&total)[dots]) const {
+    for (int d = 0; d < dots; ++d) {
+      total[d] = 0;
+      for (int c = 0; c < o_.chunks; ++c) total[d] += Lanes::lane(o_.sums[c][d], lane);
+    }
+  }
+
+  // from the base
+  TrialVertex<Lanes, Touching> trial_vertex(const Vertex<Lanes, Touching>& v,
+                                            std::int64_t i) const {
+    return {v, o_.base[i], o_.pull[i], o_.free + i, plan_.levels, i, outliers_};
+  }
+  Value restricted(std::int64_t i, const Value& field) const {
+    return trial_vertex(vertex(i), i).restricted(field);
+  }
+
+  void keep_directions(std::int64_t i) {
+    o_.gradient[i] = choose(o_.fresh_gradient[i], o_.gradient[i]);
+    o_.friction[i] = choose(o_.fresh_friction[i], o_.friction[i]);
+    for (int a = 0; a < 3; ++a) {
+      o_.free[i].row[a] = Lanes::vec3(
+          choose(Lanes::value(o_.fresh_free[i].row[a]), Lanes::value(o_.free[i].row[a])));
+    }
+  }
+
+  // the second loop of L-BFGS, and the slope g.d
+  void correct() {
+    const Value* z = o_.cycle.result();
+    pass([&](std::int64_t i, Value(&sum)[dots]) {
+      for (int j = 0; j < history; ++j) sum[j] = multiply_add(o_.y[j][i], z[i], sum[j]);
+      const Value d = trial_vertex(vertex(i), i).completed(z[i]);
+      sum[history] = multiply_add(o_.pull[i], d, sum[history]);
+    });
+    double total[dots], with[history], c[history];
+    Real factor[history];
+    for (int lane = 0; lane < width; ++lane) {
+      add_up(lane, total);
+      for (int j = 0; j < history; ++j) with[j] = total[j];
+      pairs_[lane].second_loop(newest_, with, c);
+      for (int j = 0; j < history; ++j) Lanes::set_lane(factor[j], lane, T(c[j]));
+      const double slope = pairs_[lane].slope(total[history], c);
+      if (!done_[lane] && !outer_[lane].descends(slope)) pairs_[lane].clear();
+    }
+    each_vertex([&](std::int64_t i) {
+      Value d = z[i];
+      for (int j = 0; j < history; ++j) d = multiply_add(factor[j], o_.s[j][i], d);
+      o_.direction[i] = d;
+    });
+  }
+
+  // The soft stop of an environment, by a trial that it went on from, or went back from: at rest rounding decides which.
+  void stop(int lane, int k, double change, double way) {
+    if (!(set_.tolerance > 0) || k == 0 || done_[lane]) return;
+    done_[lane] = outer_[lane].ends(set_.tolerance, schedule_[lane], change, way);
+  }
+
+  // how far the material is from that of M, per lane
+  void compare_with_reference() {
+    for (int lane = 0; lane < width; ++lane) {
+      const auto inertia = [&](std::int64_t i) {
+        return Lanes::lane(Lanes::widen(w_.inertia[i]), lane);
+      };
+      MisfitRunner<T, decltype(inertia)> run{plan_, team_, o_.ranges, inertia};
+      misfit_[lane] =
+          measure_misfit(run, plan_.levels, call_.material.stiffness.of(in_.environment(lane)));
+      Lanes::set_lane(outliers_.trusted, lane, T(misfit_[lane].trusted));
+      outliers_.some = outliers_.some || misfit_[lane].strangers;
+    }
+  }
+
+  Work& o_;
+  bool lbfgs_, corotates_, corotated_ = false;
+  Outliers<Real> outliers_{false, Real(T(1))};  // in any lane
+  int newest_ = 0, iteration_ = 0;
+  bool has_[width] = {};                        // a small problem
+  bool holds_[width] = {};                      // and in it what contacts hold at the base
+  int made_[width] = {}, doubted_[width] = {};  // times, and failed trials by then
+  Corotation<Lanes> corotation_;
+  Value none_ = Lanes::value({Real(T(0)), Real(T(0)), Real(T(0))});
+  Real accepted_{T(1)}, finite_{T(1)};
+  Misfit misfit_[width];
+  Outer outer_[width];
+  Pairs pairs_[width];
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,68 @@
+// Memory of the multilevel solver's outer iteration.
+#pragma once
+#include "cpu/multilevel/deflation_workspace.h"
+#include "cpu/multilevel/v_cycle.h"
+#include "math/mat.h"
+
+namespace pd::inline PD_TARGET {
+
+// Vectors of the outer iteration, beside those of a Workspace, in which u is the trial.
+template <class Lanes>
+struct OuterWork {
+  using Real = typename Lanes::Real;
+  using Value = typename Lanes::Value;
+  using Wide = typename Lanes::Wide;
+
+  static constexpr int dots = 2 * history + 4;  // sums that one pass may make
+  static constexpr int chunk = 256;             // vertices that one of them covers
+
+  Cycle<Lanes> cycle;
+  CorotationWork<Lanes> corotation;
+  Value *base, *pull, *fresh,
+      *direction;  // [vertices] iterate to go on from, residuals there and at the trial
+  Value *s[history], *y[history];  // [vertices] L-BFGS pairs
+  Mat3<Real>*free, *fresh_free;  // [vertices] directions that contacts leave; none without contacts
+  // [vertices] dE/du with what contacts balance, and their friction; none without contacts
+  Value *gradient, *fresh_gradient, *friction, *fresh_friction;
+  Wide (*sums)[dots];             // [chunks]
+  Range (*ranges)[ranges_count];  // [threads] of the material to that of M
+  int chunks;
+
+  OuterWork(const StepCall<typename Lanes::Scalar>& call, bool touching, int threads)
+      : cycle(call.plan.levels),
+        corotation(call.plan, call.settings.schedule == ScheduleKind::corotated, touching, threads),
+        chunks((call.plan.vertices + chunk - 1) / chunk) {
+    const bool pairs = call.settings.learns();
+    const std::int64_t n = call.plan.vertices, held = touching ? n : 0;
+    const std::int64_t vectors = 4 * n + 4 * held + (pairs ? 2 * history * n : 0);
+    storage_ = allocate_zeroed(vectors * sizeof(Value) + 2 * held * sizeof(Mat3<Real>) +
+                               chunks * sizeof(*sums) + threads * sizeof(*ranges) + 4 * alignment);
+    std::byte* at = storage_.get();
+    for (Value** field : {&base, &pull, &fresh, &direction}) *field = place<Value>(at, n);
+    for (int i = 0; i < history; ++i) {
+      s[i] = place<Value>(at, pairs ? n : 0);
+      y[i] = place<Value>(at, pairs ? n : 0);
+    }
+    for (Value** field : {&gradient, &fresh_gradient, &friction, &fresh_friction})
+      *field = place<Value>(at, held);
+    for (Mat3<Real>** field : {&free, &fresh_free}) *field = place<Mat3<Real>>(at, held);
+    sums = place<Wide[dots]>(at, chunks);
+    ranges = place<Range[ranges_count]>(at, threads);
+  }
+
+ private:
+  static constexpr std::size_t alignment = 64;
+
+  template <class Item>
+  static Item* place(std::byte*& at, std::int64_t count) {
+    const auto address = reinterpret_cast<std::uintptr_t>(at);
+    Item* items =
+        reinterpret_cast<Item*>((address + alignof(Item) - 1) / alignof(Item) * alignof(Item));
+    at = reinterpret_cast<std::byte*>(items + count);
+    return items;
+  }
+
+  Storage storage_;
+};
+
+}  // namespace pd::inline PD_TARGET

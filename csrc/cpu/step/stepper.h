@@ -1,0 +1,338 @@
+// Runner of solver/step.h on the CPU: one environment by a team of threads, or W environments by one thread.
+#pragma once
+#include "cpu/step/inputs.h"
+#include "cpu/step/rigid.h"
+#include "cpu/step/sweep.h"
+#include "solver/chebyshev.h"
+#include "solver/step.h"
+#include "solver/vertex.h"
+
+namespace pd::inline PD_TARGET {
+
+// `Touching`: see solver/vertex.h.
+template <class Lanes, bool Touching>
+class Stepper {
+ protected:
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Value = typename Lanes::Value;
+  using Wide = typename Lanes::Wide;
+  using Sum = Sums<Lanes>;
+  static constexpr int width = Lanes::environments;
+
+ public:
+  // `first` is the first environment; lanes past the batch repeat its last one and are not written back.
+  Stepper(const StepCall<T>& call, Workspace<Lanes>& work, Scratch<Lanes>& scratch,
+          const Team& team, std::int64_t first)
+      : call_(call),
+        plan_(call.plan),
+        set_(call.settings),
+        w_(work),
+        team_(team),
+        sweep_{plan_, work, scratch, team},
+        in_{call, first},
+        h_(T(set_.time_step)),
+        theta_(T(set_.relaxation)) {}
+
+  // All steps of the call, with a record every `set_.every`.
+  void roll() {
+    load();
+    weigh();
+    for (int t = 0; t < set_.steps; ++t) {
+      step(*this, set_);
+      if (is_ended()) return;
+      if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
+      move_balls();
+    }
+  }
+
+  void predict() {
+    const Real none(T(0));
+    const Value origin = Lanes::value({none, none, none});
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.target[i] = target(i, none, origin);
+    }
+    team_.barrier();
+    if (team_.rank == 0)
+      in_.each_pin([&](std::int64_t i, Real spring, Value pin) {
+        const Value offset = pin - w_.x[i];
+        const Real soft = select(spring < Real(T(HUGE_VAL)), spring, none);
+        w_.target[i] = vertex(i).hold(offset, target(i, soft, offset));
+      });
+    sweep_.set_origins();
+    team_.barrier();
+  }
+
+  void start() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.u[i] = w_.before[i] = vertex(i).first(contacts_, guess(i));
+    }
+    const Wide friction = Lanes::widen(contacts_.friction());
+    for (int lane = 0; lane < width; ++lane) {
+      schedule_[lane] = Schedule(set_, least_[lane], Lanes::lane(friction, lane) > 0);
+      coming_[lane] = schedule_[lane].next(0);
+      used_[lane] = 0;
+      done_[lane] = false;
+    }
+    started_ = false;
+    team_.barrier();
+  }
+
+  // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
+  void align() {
+    const bool first = !started_;
+    started_ = true;
+    if (plan_.groups == 0 || (first && set_.start() == StartKind::given)) return;
+    if constexpr (Touching) {
+      if (first && team_.rank == 0)
+        begin_still(
+            plan_, w_, contacts_, [&](int i) { return vertex(i); },
+            [&](int i) { return guess(i); });
+    }
+    bool goes_on = true;
+    for (int leg = 0; goes_on; ++leg) {
+      if (team_.rank == 0) w_.some_go_on = find_motions<Touching>(plan_, w_, contacts_, first, leg);
+      team_.barrier();
+      goes_on = w_.some_go_on;
+      for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+        if (plan_.vertex_group[i] < 0) continue;
+        const Vec3<Real> y = Lanes::vec3(w_.x[i] + w_.u[i]);
+        const Vec3<Real> way = w_.motion[plan_.vertex_group[i]].of(y);
+        w_.u[i] = vertex(i).moved(w_.u[i], way);
+        if (first) w_.before[i] = w_.u[i];
+      }
+      team_.barrier();
+    }
+  }
+
+  // What the first iterate is made of.
+  Value guess(std::int64_t i) const {
+    if (set_.start() == StartKind::given) return in_.at_vertex(call_.start, i) - w_.x[i];
+    return set_.start() == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
+  }
+
+  void iterate(int k) {
+    for (int lane = 0; lane < width; ++lane) {
+      Lanes::set_lane(omega_, lane, T(coming_[lane]));
+      Lanes::set_lane(active_, lane, T(done_[lane] ? 0 : 1));
+    }
+    const bool guard = schedule_[0].wants_energy(k);
+    if (guard) {
+      sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
+        sums.energy = vertex(i).add_energy(w_.u[i], sums.energy);
+        update(i, force, sums);
+      });
+    } else {
+      sweep_.run(k & 1, SolidGradient<false>{},
+                 [&](std::int64_t i, const Value& force, Sum& sums) { update(i, force, sums); });
+    }
+    conclude(k, guard);
+  }
+
+  bool finished() const {
+    if (is_ended()) return true;
+    for (bool done : done_) {
+      if (!done) return false;
+    }
+    return true;
+  }
+
+  // Whether the call is to end now; then nothing of this step counts.
+  bool is_ended() const { return team_.ended(std::int64_t(plan_.vertices) * width); }
+
+  void finish() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.x[i] = w_.x[i] + w_.u[i];
+      w_.velocity[i] = Real(T(1) / h_) * w_.u[i];
+    }
+    team_.barrier();
+  }
+
+ protected:
+  Value target(std::int64_t i, const Real& spring, const Value& pin) const {
+    const Real h(h_), mass = in_.number(call_.material.masses, plan_.vertex_order[i]);
+    const Real weight = inertia_weight(mass, damping_, spring, h);
+    const Real none(T(0));
+    const Value force = call_.forces ? w_.force[i] : Lanes::value({none, none, none});
+    return inertia_target(weight, mass, w_.velocity[i], gravity_, force, spring, pin, h);
+  }
+
+  PD_HD Vertex<Lanes, Touching> vertex(std::int64_t i) const {
+    return {w_.x[i], w_.target[i], w_.inertia[i], w_.inverse[i]};
+  }
+
+  void load() {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.x[i] = in_.at_vertex(call_.positions, i);
+      w_.velocity[i] = in_.at_vertex(call_.velocities, i);
+      if (call_.forces) w_.force[i] = in_.at_vertex(call_.forces, i);
+    }
+    gravity_ = in_.vector(call_.material.gravity, 0);
+    for (int lane = 0; lane < width; ++lane) {
+      stop_[lane] = {
+          square_of_fall(plan_.vertices, set_.time_step, Lanes::get_lane(gravity_, lane))};
+    }
+    damping_ = in_.number(call_.material.damping, 0);
+    const Material<T>& material = call_.material;
+    contacts_ = {w_.planes, w_.balls, material.planes_count, material.spheres_count};
+    if (team_.rank == 0) {
+      for (int c = 0; c < material.planes_count; ++c) {
+        w_.planes[c] = {Lanes::vec3(in_.vector(material.planes, planes_numbers * c)),
+                        in_.number(material.planes, planes_numbers * c + planes_height),
+                        in_.number(material.planes, planes_numbers * c + planes_friction)};
+      }
+      for (int c = 0; c < material.spheres_count; ++c) {
+        w_.balls[c] = {
+            Lanes::vec3(in_.vector(material.spheres, spheres_numbers * c)),
+            Lanes::vec3(in_.vector(material.spheres, spheres_numbers * c + spheres_motion)),
+            in_.number(material.spheres, spheres_numbers * c + spheres_radius),
+            in_.number(material.spheres, spheres_numbers * c + spheres_friction)};
+      }
+    }
+    team_.barrier();
+  }
+
+  void move_balls() {
+    if (team_.rank == 0) {
+      for (int c = 0; c < contacts_.ball_count; ++c)
+        w_.balls[c].center = w_.balls[c].center + w_.balls[c].motion;
+    }
+    if (contacts_.ball_count) team_.barrier();
+  }
+
+  // a and 1 / D of every vertex, w V of every element, and the smallest a / D
+  void weigh() {
+    const Real none(T(0));
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      w_.inertia[i] = inertia_weight(in_.number(call_.material.masses, plan_.vertex_order[i]),
+                                     damping_, none, Real(h_));
+    }
+    team_.barrier();
+    if (team_.rank == 0)
+      in_.each_pin([&](std::int64_t i, Real spring, Value) {
+        w_.inertia[i] = held_inertia(w_.inertia[i] + spring, spring);
+      });
+    set_weights(set_.weighted);
+    team_.barrier();
+    sweep_.run(0, SolidDiagonal{}, [&](std::int64_t i, const Value& force, Sum& sums) {
+      const Real a = w_.inertia[i];
+      const Real elastic = Lanes::vec3(force).x;
+      w_.inverse[i] = inverse_diagonal(a, elastic);
+      sums.least = lesser(sums.least, share_of_inertia(a, elastic, w_.inverse[i]));
+    });
+    Real least = Real(T(HUGE_VAL));
+    for (int part = 0; part < w_.part_count; ++part) least = lesser(least, w_.parts[0][part].least);
+    for (int lane = 0; lane < width; ++lane) least_[lane] = Lanes::lane(Lanes::widen(least), lane);
+    team_.barrier();
+    set_weights(false);
+    team_.barrier();
+  }
+
+  // w V, times l_e when `bounded`
+  void set_weights(bool bounded) {
+    const int lanes = w_.shared_weight ? 1 : width;
+    const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;
+    for (std::int64_t e = team_.begin(elements); e < team_.end(elements); ++e) {
+      const T volume = plan_.tet_volume[e] * (bounded ? plan_.tet_bound[e] : T(1));
+      for (int lane = 0; lane < lanes; ++lane) {
+        w_.weight[e * lanes + lane] =
+            volume * call_.material.stiffness.of(in_.environment(lane))[plan_.tet_order[e]];
+      }
+    }
+  }
+
+  void update(std::int64_t i, const Value& force, Sum& sums) {
+    const Value u = w_.u[i], before = w_.before[i];
+    Value next = vertex(i).next(contacts_, u, before, force, Real(theta_), omega_);
+    if (set_.tolerance > 0) {
+      // environments that are done keep their iterate
+      next = select(active_ > Real(T(0)), next, u);
+      // nothing of both where a pin holds the vertex on its target
+      const Value change = next - u, way = u - w_.target[i];
+      sums.first = multiply_add(change, change, sums.first);
+      sums.second = multiply_add(way, way, sums.second);
+    }
+    w_.before[i] = u;
+    w_.u[i] = next;
+  }
+
+  typename Workspace<Lanes>::Part total(int parity) const {
+    typename Workspace<Lanes>::Part sum = w_.parts[parity][0];
+    for (int part = 1; part < w_.part_count; ++part) {
+      sum.energy = sum.energy + w_.parts[parity][part].energy;
+      sum.first = sum.first + w_.parts[parity][part].first;
+      sum.second = sum.second + w_.parts[parity][part].second;
+    }
+    return sum;
+  }
+
+  // every thread adds up the same parts in the same order, so all come to the same decisions
+  void conclude(int k, bool guard) {
+    const bool soft = set_.tolerance > 0;
+    double omega[width];  // of this iteration
+    for (int lane = 0; lane < width; ++lane) {
+      used_[lane] += done_[lane] ? 0 : 1;
+      omega[lane] = coming_[lane];
+      coming_[lane] = schedule_[lane].next(k + 1);
+    }
+    if (!guard && !soft) return;
+    const auto sum = total(k & 1);
+    for (int lane = 0; lane < width; ++lane) {
+      if (done_[lane]) continue;
+      if (guard) schedule_[lane].check(Lanes::lane(sum.energy, lane));
+      if (!soft) continue;
+      const double change = Lanes::lane(sum.first, lane), way = Lanes::lane(sum.second, lane);
+      const Share share = schedule_[lane].share_of(omega[lane]);
+      done_[lane] = stop_[lane].ends(set_.tolerance, share, change, way);
+    }
+  }
+
+  void store(int record) {
+    const std::int64_t first_row = record * call_.batch;
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      for (int lane = 0; lane < width && in_.first + lane < call_.batch; ++lane) {
+        const std::int64_t at =
+            ((first_row + in_.first + lane) * plan_.vertices + plan_.vertex_order[i]) * 3;
+        write(call_.out_positions + at, Lanes::get_lane(w_.x[i], lane));
+        write(call_.out_velocities + at, Lanes::get_lane(w_.velocity[i], lane));
+      }
+    }
+    if (!call_.info || team_.rank != 0) return;
+    for (int lane = 0; lane < width && in_.first + lane < call_.batch; ++lane) {
+      double* row = call_.info + (first_row + in_.first + lane) * info_count;
+      row[info_residual] = row[info_energy] = NAN;
+      row[info_iterations] = used_[lane];
+      row[info_restarts] = schedule_[lane].restarts;
+      row[info_converged] = done_[lane] && least_[lane] >= 0;
+      row[info_rho] = schedule_[lane].rho;
+      row[info_inverted] = -1;
+    }
+  }
+
+  static void write(T* to, const Vec3<T>& v) {
+    to[0] = v.x;
+    to[1] = v.y;
+    to[2] = v.z;
+  }
+
+  const StepCall<T>& call_;
+  const Plan<T>& plan_;
+  const Settings& set_;
+  Workspace<Lanes>& w_;
+  const Team& team_;
+  Sweep<Lanes> sweep_;
+  Inputs<Lanes> in_;
+  T h_, theta_;
+  Contacts<Real> contacts_;
+  Value gravity_ = {};
+  Real damping_{T(0)}, omega_{T(1)}, active_{T(1)};
+  double least_[width] = {};
+  Schedule schedule_[width];
+  double coming_[width] = {};  // the next omega
+  SoftStop stop_[width];
+  int used_[width] = {};
+  bool done_[width] = {};
+  bool started_ = false;  // has a first iterate
+};
+
+}  // namespace pd::inline PD_TARGET

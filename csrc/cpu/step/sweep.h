@@ -1,0 +1,151 @@
+// One pass over the mesh: element forces patch by patch, then every vertex once with the force on it.
+//
+// Interior vertices are visited as soon as their patch is done, while it is in the cache; shared ones in a second pass that
+// adds what the patches left, in patch order. The partition is fixed by the plan, so the bits do not depend on threads.
+#pragma once
+#include "cpu/step/element_blocks.h"
+#include "cpu/step/workspace.h"
+#include "elements/solid.h"
+#include "threads/team.h"
+
+namespace pd::inline PD_TARGET {
+
+// Positions, directions and forces of the slots of one patch, one per thread.
+template <class Lanes>
+struct Scratch {
+  using Value = typename Lanes::Value;
+  Value *x, *direction, *force;
+
+  explicit Scratch(int slots) : storage_(allocate_zeroed(3 * sizeof(Value) * (slots + 1))) {
+    x = reinterpret_cast<Value*>(storage_.get());
+    direction = x + slots;
+    force = direction + slots;
+  }
+
+ private:
+  Storage storage_;
+};
+
+// Sums that the visits of one part make; components are added up at its end.
+template <class Lanes>
+struct Sums {
+  typename Lanes::Value energy, first, second;
+  typename Lanes::Real least;
+};
+
+template <class Lanes>
+struct Sweep {
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Value = typename Lanes::Value;
+  using Wide = typename Lanes::Wide;
+  using Work = Workspace<Lanes>;
+
+  const Plan<T>& plan;
+  Work& work;
+  Scratch<Lanes>& scratch;
+  const Team& team;
+
+  static Wide add_components(const Value& a) {
+    const Vec3<Real> v = Lanes::vec3(a);
+    return (Lanes::widen(v.x) + Lanes::widen(v.y)) + Lanes::widen(v.z);
+  }
+
+  static Sums<Lanes> no_sums() {
+    const Real zero(T(0));
+    const Value none = Lanes::value({zero, zero, zero});
+    return {none, none, none, Real(T(HUGE_VAL))};
+  }
+
+  void record(int parity, int part, const Sums<Lanes>& sums, Wide elements) {
+    work.parts[parity][part] = {Wide(0.5) * add_components(sums.energy) + elements,
+                                add_components(sums.first), add_components(sums.second),
+                                sums.least};
+  }
+
+  // element: see each_element; the second field is the direction. visit(vertex, force, sums)
+  template <int Fields = 1, class Element, class Visit>
+  void run(int parity, Element element, Visit visit) {
+    for (int patch = team.begin(plan.patches); patch < team.end(plan.patches); ++patch) {
+      LaneSums<Lanes> lanes;
+      lanes.clear();
+      elements_of<Fields>(patch, lanes, element);
+      Sums<Lanes> sums = no_sums();
+      visit_interior(patch, visit, sums);
+      record(parity, patch, sums, lanes.total());
+    }
+    team.barrier();
+    const int chunks = work.part_count - plan.patches;
+    for (int chunk = team.begin(chunks); chunk < team.end(chunks); ++chunk) {
+      Sums<Lanes> sums = no_sums();
+      visit_shared(chunk, visit, sums);
+      record(parity, plan.patches + chunk, sums, Wide(0.0));
+    }
+    team.barrier();
+  }
+
+  // Positions relative to the first vertex of each patch, which keep their last bits however far from the origin.
+  void set_origins() {
+    for (int patch = team.begin(plan.patches); patch < team.end(plan.patches); ++patch) {
+      const int first = plan.patch_slot[patch], end = plan.patch_slot[patch + 1];
+      const Value anchor = work.x[plan.slot_vertex[first]];
+      for (int slot = first; slot < end; ++slot) {
+        work.origin[slot] = work.x[plan.slot_vertex[slot]] - anchor;
+      }
+    }
+  }
+
+  // Copies what the slots of a patch refer to, for elements to read.
+  template <int Fields>
+  void gather_slots(int patch) {
+    const int first = plan.patch_slot[patch], count = plan.patch_slot[patch + 1] - first;
+    for (int slot = 0; slot < count; ++slot) {
+      scratch.x[slot] = work.origin[first + slot] + work.u[plan.slot_vertex[first + slot]];
+      if constexpr (Fields == 2)
+        scratch.direction[slot] = work.before[plan.slot_vertex[first + slot]];
+    }
+  }
+
+ private:
+  template <int Fields, class Element>
+  void elements_of(int patch, LaneSums<Lanes>& lanes, const Element& element) {
+    gather_slots<Fields>(patch);
+    const int count = plan.patch_slot[patch + 1] - plan.patch_slot[patch];
+    const Real zero(T(0));
+    const Value none = Lanes::value({zero, zero, zero});
+    for (int slot = 0; slot < count; ++slot) scratch.force[slot] = none;
+    const Value* fields[Fields];
+    fields[0] = scratch.x;
+    if constexpr (Fields == 2) fields[1] = scratch.direction;
+    const auto& corners = const_cast<const Value* const(&)[Fields]>(fields);
+    using Elements = typename ElementsOf<Fields, Lanes>::type;
+    each_element(plan, patch,
+                 Elements(plan, corners, work.weight, work.shared_weight, scratch.force, lanes),
+                 element);
+  }
+
+  template <class Visit>
+  void visit_interior(int patch, Visit& visit, Sums<Lanes>& sums) {
+    const int begin = plan.patch_vertex[patch], interior = plan.patch_vertex[patch + 1] - begin;
+    const int first = plan.patch_slot[patch], count = plan.patch_slot[patch + 1] - first;
+    for (int slot = 0; slot < interior; ++slot) visit(begin + slot, scratch.force[slot], sums);
+    for (int slot = interior; slot < count; ++slot)
+      work.shared_force[first + slot] = scratch.force[slot];
+  }
+
+  template <class Visit>
+  void visit_shared(int chunk, Visit& visit, Sums<Lanes>& sums) {
+    const int begin = chunk * shared_chunk;
+    const int end = begin + shared_chunk < plan.shared ? begin + shared_chunk : plan.shared;
+    const int first_vertex = plan.patch_vertex[plan.patches];
+    for (int i = begin; i < end; ++i) {
+      Value force = work.shared_force[plan.shared_slot[plan.shared_start[i]]];
+      for (int s = plan.shared_start[i] + 1; s < plan.shared_start[i + 1]; ++s) {
+        force = force + work.shared_force[plan.shared_slot[s]];
+      }
+      visit(first_vertex + i, force, sums);
+    }
+  }
+};
+
+}  // namespace pd::inline PD_TARGET

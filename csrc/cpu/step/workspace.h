@@ -1,0 +1,119 @@
+// Memory of one running step: the state of one environment, or of W side by side.
+#pragma once
+#include "contact/plane_sphere.h"
+#include "cpu/step/lanes.h"
+#include "solver/rigid/rolling_contact.h"
+
+#include <cstdint>
+#include <memory>
+#include <new>
+
+namespace pd::inline PD_TARGET {
+
+struct FreeAligned {
+  void operator()(std::byte* p) const { ::operator delete[](p, std::align_val_t{64}); }
+};
+using Storage = std::unique_ptr<std::byte[], FreeAligned>;
+
+// Zeroed, because the unused fourth component of a quad is read along.
+inline Storage allocate_zeroed(std::size_t bytes) {
+  return Storage(new (std::align_val_t{64}) std::byte[bytes]());
+}
+
+// of a loose piece, see solver/rigid/free_motion.h
+template <class Wide>
+struct GroupSums {
+  Wide start[StartSums::count];
+  Wide rigid[RigidSums::count];
+  Vec3<Wide> center;
+  Wide gaps[Touch::planes + 1], touch[Touch::sums], bounds[Touch::bounds];
+  Wide found[Found::count];
+  bool tips, still;  // in some environment
+};
+
+constexpr int shared_chunk = 256;  // shared vertices that one sum covers
+
+template <class Lanes>
+struct Workspace {
+  using T = typename Lanes::Scalar;
+  using Real = typename Lanes::Real;
+  using Value = typename Lanes::Value;
+  using Wide = typename Lanes::Wide;
+
+  // sums of one part (a patch, or a chunk of shared vertices) over an iteration
+  struct Part {
+    Wide energy, first, second;
+    Real least;
+  };
+
+  Value *x, *velocity, *force, *target, *u, *before;  // [vertices]
+  Real *inertia, *inverse;                            // [vertices] a, 1 / D (0: does not move)
+  Value *origin, *shared_force;                       // [slots]
+  Part* parts[2];               // iterations alternate, so that nobody overwrites what others read
+  GroupSums<Wide>* group_sums;  // [groups]
+  RigidMotion<Real>* motion;    // [groups]
+  Real (*touched)[Touch::planes];  // [groups] 1 for each of the first planes that it touches
+  Real* still;                     // [groups] 1 if it starts from where it is
+  Tipping* tipping;                // [groups, environments]
+  bool* goes_on;                   // [groups, environments] moves in this leg, then: in the next
+  TippingSearch<Real>* search;     // [groups]
+  Plane<Real>* planes;
+  Ball<Real>* balls;
+  T* weight;  // [elements], or [elements, W] when stiffness differs between environments
+  int part_count;
+  bool shared_weight;
+  bool some_go_on = false;  // in the next leg, of any environment
+
+  explicit Workspace(const StepCall<T>& call)
+      : Workspace(call.plan, call.material, call.material.stiffness.stride == 0,
+                  call.forces != nullptr) {}
+
+  explicit Workspace(const FieldCall<T>& call) : Workspace(call.plan, {}, true, false) {}
+
+  explicit Workspace(const ConjugateCall<T>& call) : Workspace(call.plan, {}, true, true) {}
+
+ private:
+  static constexpr std::size_t alignment = 64;
+
+  Workspace(const Plan<T>& plan, const Material<T>& material, bool same_stiffness, bool forces) {
+    shared_weight = Lanes::environments == 1 || same_stiffness;
+    part_count = plan.patches + (plan.shared + shared_chunk - 1) / shared_chunk;
+    arrange(plan, material, forces, nullptr);
+    storage_ = allocate_zeroed(size_);
+    arrange(plan, material, forces, storage_.get());
+  }
+
+  template <class Item>
+  void place(Item*& array, std::int64_t count, std::byte* base) {
+    array = reinterpret_cast<Item*>(base + size_);
+    size_ += (count * sizeof(Item) + alignment - 1) / alignment * alignment;
+  }
+
+  void arrange(const Plan<T>& plan, const Material<T>& material, bool forces, std::byte* base) {
+    size_ = 0;
+    for (Value** array : {&x, &velocity, &target, &u, &before}) place(*array, plan.vertices, base);
+    place(force, forces ? plan.vertices : 0, base);
+    for (Real** array : {&inertia, &inverse}) place(*array, plan.vertices, base);
+    place(origin, plan.slots, base);
+    place(shared_force, plan.shared ? plan.slots : 0, base);
+    for (Part*& array : parts) place(array, part_count, base);
+    place(group_sums, plan.groups, base);
+    place(motion, plan.groups, base);
+    place(touched, plan.groups, base);
+    place(still, plan.groups, base);
+    const int tipping_groups = material.planes_count > 0 ? plan.groups : 0;
+    place(tipping, tipping_groups * Lanes::environments, base);
+    place(search, tipping_groups, base);
+    place(goes_on, plan.groups * Lanes::environments, base);
+    place(planes, material.planes_count, base);
+    place(balls, material.spheres_count, base);
+    place(weight,
+          std::int64_t(plan.blocks) * block_lanes * (shared_weight ? 1 : Lanes::environments),
+          base);
+  }
+
+  std::size_t size_ = 0;
+  Storage storage_;
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,8 +1,0 @@
-#include "cuda/fused.cuh"
-
-namespace pd {
-template std::int64_t fused_bytes(const DeviceStep<float>&);
-template void run_fused(const DeviceStep<float>&, void*, Stream);
-
-int largest_cluster() { return largest_cluster_with<float>(); }
-}  // namespace pd

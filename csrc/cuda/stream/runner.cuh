@@ -1,0 +1,295 @@
+// Runs solver/step.h on the host: every part of a step is a launch. It supports every mesh, effect
+// and batch.
+#pragma once
+#include "cuda/common/arena.h"
+#include "cuda/common/launch.h"
+#include "cuda/common/runtime.h"
+#include "cuda/common/teams.cuh"
+#include "cuda/stream/multilevel_interface.h"
+#include "cuda/stream/pipeline.h"
+#include "cuda/stream/pipeline_elements.h"
+#include "cuda/stream/pipeline_load.h"
+#include "cuda/stream/pipeline_schedule.h"
+#include "cuda/stream/pipeline_update.h"
+#include "cuda/stream/rigid.h"
+#include "cuda/stream/shared_vertices.h"
+#include "solver/multilevel/lbfgs.h"
+#include "solver/step.h"
+#include "views/shared_memory.h"
+
+#include <algorithm>
+#include <cstdint>
+#include <limits>
+#include <utility>
+
+namespace pd {
+
+template <class T>
+StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
+  const DeviceStep<T>& step = call.step;
+  const DevicePlan<T>& plan = step.plan;
+  const Material<T>& material = step.material;
+  StreamMemory<T> m;
+  for (Quad<T>** array : {&m.x, &m.velocity, &m.target, &m.u, &m.before})
+    arena.place(*array, step.batch * plan.vertices);
+  arena.place(m.origin, step.batch * plan.slots);
+  arena.place(m.shared_force, step.batch * call.places());
+  arena.place(m.weights,
+              (material.stiffness.stride ? step.batch : 1) * plan.blocks * 2 * pair_lanes);
+  arena.place(m.patch_weight, (material.stiffness.stride ? step.batch : 1) * plan.patches);
+  arena.place(m.sums, step.batch * call.sum_rows() * sums_count);
+  arena.place(m.progress, step.batch);
+  arena.place(m.omega, step.batch * guard_period);
+  arena.place(m.pieces, step.batch * plan.pieces);
+  arena.place(m.part_sum, step.batch * plan.parts * PartSums::count);
+  arena.place(m.counter, plan.pieces > 0 ? step.batch : 0);
+  arena.place(m.planes, step.batch * material.planes_count);
+  arena.place(m.spheres, step.batch * material.spheres_count);
+  return m;
+}
+
+// Launches on one stream, in order.
+class Launcher {
+ public:
+  explicit Launcher(cudaStream_t stream) : stream_(stream) {}
+
+  // one block of `threads` threads per task, `count` tasks
+  template <class Call, class... Arguments>
+  void run(void (*kernel)(Call, Arguments...), std::int64_t count, int threads, std::size_t shared,
+           const Call& call, Arguments... arguments) const {
+    if (count == 0) return;
+    kernel<<<blocks_of(count), threads, shared, stream_>>>(call, arguments...);
+    check(cudaGetLastError());
+  }
+
+  // The same for a kernel that waits itself (cuda/stream/kernel_overlap.h), so that it may start before the
+  // previous kernel has ended.
+  template <class Call, class... Arguments>
+  void run_overlapped(void (*kernel)(Call, Arguments...), std::int64_t count, int threads,
+                      std::size_t shared, const Call& call, Arguments... arguments) const {
+    if (count == 0) return;
+    cudaLaunchAttribute attribute = {};
+    attribute.id = cudaLaunchAttributeProgrammaticStreamSerialization;
+    attribute.val.programmaticStreamSerializationAllowed = 1;
+    cudaLaunchConfig_t config = {};
+    config.gridDim = dim3(blocks_of(count));
+    config.blockDim = dim3(unsigned(threads));
+    config.dynamicSmemBytes = shared;
+    config.stream = stream_;
+    config.attrs = &attribute;
+    config.numAttrs = runs_code_for_90(reinterpret_cast<const void*>(kernel)) ? 1 : 0;
+    check(cudaLaunchKernelEx(&config, kernel, call, arguments...));
+  }
+
+ private:
+  cudaStream_t stream_;
+};
+
+template <class T, bool HasContacts>
+class StreamRunner {
+ public:
+  // `outer`: memory of outer_bytes, for the multilevel solver only
+  StreamRunner(const StreamCall<T>& call, void* multilevel_memory, cudaStream_t stream)
+      : call_(call),
+        set_(call_.step.settings),
+        plan_(call_.step.plan),
+        multilevel_(multilevel_memory),
+        stream_(stream),
+        launcher_(stream),
+        teams_(call.step.batch, resident_blocks(rounds_kernel(), rounds_threads, 0),
+               std::max(1, (plan_.parts * warp_size + rounds_threads - 1) / rounds_threads)) {
+    patches_ = call.step.batch * plan_.patches;
+    pass_shared_ = pass_shared_bytes(sizeof(T), plan_.most_slots, plan_.most_entries, 2);
+  }
+
+  StreamRunner(const StreamRunner&) = delete;
+
+  void rollout() {
+    vertices<VertexTask::load>(0);
+    assemble_diagonal();
+    if (set_.multilevel()) run_material_comparison(call_, multilevel_, stream_);
+    for (int t = 0; t < set_.steps; ++t) {
+      if (set_.multilevel()) {
+        multilevel_step(*this);
+      } else {
+        step(*this, set_);
+      }
+      if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
+      if (HasContacts && t + 1 < set_.steps) environments<EnvironmentTask::move_spheres>(0);
+    }
+  }
+
+  void predict() {
+    vertices<VertexTask::predict>(0);
+    launcher_.run(stream_origins<T>, patches_, vertex_threads, 0, call_);
+  }
+
+  void start() {
+    vertices<VertexTask::start>(0);
+    decide<Decision::start>(0);
+    started_ = false;
+  }
+
+  void align() {
+    const bool first = !started_;
+    started_ = true;
+    if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
+    RoundsCall<T> call = {call_, Aligning(plan_, HasContacts, first), teams_.count, teams_.blocks,
+                          call_.memory.counter};
+    launch_teams(rounds_kernel(), call, call.counter, rounds_threads, 0, stream_);
+  }
+
+  void iterate(int k) {
+    const bool checks = k % guard_period == 0;
+    if (checks && set_.schedule == ScheduleKind::guarded) {
+      pass<Visit::update_guarded>(k);
+    } else {
+      pass<Visit::update>(k);
+    }
+    if (alternates(set_)) std::swap(call_.memory.u, call_.memory.before);
+    if (checks || set_.tolerance > 0) decide<Decision::iterate>(k);
+  }
+
+  void descend() { run_multilevel(call_, multilevel_, stream_); }
+
+  // always false, since a query would synchronise; converged environments skip the kernels instead
+  bool finished() const { return false; }
+
+  void finish() { vertices<VertexTask::finish>(0); }
+
+ private:
+  void assemble_diagonal() {
+    const bool own = call_.step.material.stiffness.stride != 0;
+    const std::int64_t sets = own ? patches_ : plan_.patches;
+    launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, set_.weighted);
+    // the pass starts from u = 0 at the current positions
+    launcher_.run(stream_origins<T>, patches_, vertex_threads, 0, call_);
+    pass<Visit::diagonal>(0);
+    decide<Decision::diagonal>(0);
+    if (set_.weighted) launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, false);
+  }
+
+  void store(int record) {
+    vertices<VertexTask::store>(record);
+    if (call_.step.info) environments<EnvironmentTask::store>(record);
+  }
+
+  template <Visit What>
+  void pass(int k) {
+    // Messages of each pipeline pass carry a new number. The first pass of a call writes 0 to every
+    // place, so no old message matches. With a tolerance the number is 0 too, and stream_shared
+    // waits for the whole pass, since converged environments send nothing.
+    const unsigned round = set_.tolerance > 0 ? 0 : ++round_;
+    const bool piped = pipe<What>(k, round);
+    if (!piped)
+      launcher_.run(stream_patches<What, T, HasContacts>, patches_, pass_threads, pass_shared_,
+                    call_, k);
+    launcher_.run_overlapped(stream_shared<What, T, HasContacts>,
+                             call_.step.batch * call_.shared_blocks(), shared_threads, 0, call_, k,
+                             piped ? round : 0u);
+  }
+
+  // Runs an iteration's patches as a pipeline if shared memory holds two of them. The number of
+  // patches has no influence: the pipeline sums in another order, and an environment must have the
+  // same bits in any batch.
+  template <Visit What>
+  bool pipe(int k, unsigned round) {
+    constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
+    if constexpr (updates && !HasContacts && sizeof(T) == 4) {
+      const auto kernel = stream_pipeline<What, T>;
+      // the pipeline uses 32-bit indices; slots are the largest array of an environment
+      constexpr std::int64_t most = std::numeric_limits<std::uint32_t>::max();
+      if (plan_.most_slots > pipeline_slots || call_.step.batch * plan_.slots > most) return false;
+      const std::size_t shared =
+          2 * pipeline_half_bytes(sizeof(T), plan_.most_slots, plan_.most_entries);
+      const std::int64_t blocks =
+          resident_blocks(reinterpret_cast<const void*>(kernel), pipeline_threads, shared);
+      launcher_.run_overlapped(kernel, std::min(blocks, patches_), pipeline_threads, shared, call_,
+                               k, round);
+      return blocks > 0;
+    }
+    return false;
+  }
+
+  template <Decision What>
+  void decide(int k) {
+    // one thread per row of sums
+    const int rows = What == Decision::start ? 1 : std::min(call_.sum_rows(), decide_threads);
+    const int threads = (rows + warp_size - 1) / warp_size * warp_size;
+    launcher_.run_overlapped(stream_decide<What, T>, call_.step.batch, threads, 0, call_, k);
+  }
+
+  template <VertexTask What>
+  void vertices(int record) {
+    const std::int64_t blocks = (plan_.vertices + vertex_threads - 1) / vertex_threads;
+    launcher_.run(stream_vertices<What, T, HasContacts>, call_.step.batch * blocks, vertex_threads,
+                  0, call_, record);
+  }
+
+  template <EnvironmentTask What>
+  void environments(int record) {
+    launcher_.run(stream_environments<What, T>, blocks_for(call_.step.batch), vertex_threads, 0,
+                  call_, record);
+  }
+
+  static const void* rounds_kernel() {
+    return reinterpret_cast<const void*>(stream_rounds<T, HasContacts>);
+  }
+
+  static std::int64_t blocks_for(std::int64_t threads) {
+    return (threads + vertex_threads - 1) / vertex_threads;
+  }
+
+  StreamCall<T> call_;
+  const Settings& set_;
+  const DevicePlan<T>& plan_;
+  void* multilevel_;
+  cudaStream_t stream_;
+  Launcher launcher_;
+  Teams teams_;           // for rigid motions
+  std::int64_t patches_;  // of all environments
+  std::size_t pass_shared_;
+  bool started_ = false;
+  unsigned round_ = 0;
+};
+
+template <class T>
+std::int64_t stream_bytes(const DeviceStep<T>& step) {
+  Arena arena(nullptr);
+  arrange(arena, StreamCall<T>{step, {}});
+  return arena.size() + (step.settings.multilevel() ? multilevel_bytes(step) : 0);
+}
+
+// Raises the shared memory limit of the pass kernels above the default of 48 KB.
+template <class T, bool HasContacts>
+void allow_shared_memory(std::size_t bytes) {
+  for (const auto kernel : {stream_patches<Visit::diagonal, T, HasContacts>,
+                            stream_patches<Visit::update, T, HasContacts>,
+                            stream_patches<Visit::update_guarded, T, HasContacts>}) {
+    if (resident_blocks(reinterpret_cast<const void*>(kernel), pass_threads, bytes) == 0)
+      refuse_shared_memory(bytes);
+  }
+}
+
+template <class T, bool HasContacts>
+void run_stream_with(const StreamCall<T>& call, void* multilevel_memory, cudaStream_t stream) {
+  allow_shared_memory<T, HasContacts>(
+      pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 2));
+  StreamRunner<T, HasContacts>(call, multilevel_memory, stream).rollout();
+}
+
+template <class T>
+void run_stream(const DeviceStep<T>& step, void* memory, Stream to) {
+  const auto stream = static_cast<cudaStream_t>(to);
+  StreamCall<T> call{step, {}};
+  Arena arena(memory);
+  call.memory = arrange(arena, call);
+  void* multilevel_memory = static_cast<std::byte*>(memory) + arena.size();
+  if (has_contacts(step)) {
+    run_stream_with<T, true>(call, multilevel_memory, stream);
+  } else {
+    run_stream_with<T, false>(call, multilevel_memory, stream);
+  }
+}
+
+}  // namespace pd

@@ -1,0 +1,6 @@
+#include "cuda/stream/runner.cuh"
+
+namespace pd {
+template std::int64_t stream_bytes(const DeviceStep<float>&);
+template void run_stream(const DeviceStep<float>&, void*, Stream);
+}  // namespace pd

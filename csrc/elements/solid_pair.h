@@ -1,0 +1,242 @@
+// Elastic solids by faces: one tetrahedron, or two that share a face, of corners 0, 1 and 2, with their apexes behind them.
+//
+// Their rest shapes stand in a frame of the face, the first axis along the edge from corner 0 to corner 1, the third normal to
+// the face. There Dm^-1 is upper triangular, and all but its last column is the same for both:
+//
+//   F = Ds Dm^-1 = [p e_1,  q e_1 + r e_2,  s e_1 + t e_2 + h e_3],   e_c = x_c - x_0,
+//
+// p, q, r of the face, s, t, h of a tetrahedron. With Q the turn into the frame, F Q^T stands here in place of the F of
+// elements/solid.h and R Q^T in place of its R, so energies and forces are the same. What two tetrahedra share is worked out once:
+// that saves a GPU a sixth of the instructions (tools/instructions.py), and a tetrahedron alone a thirtieth.
+#pragma once
+#include "math/rotation.h"
+
+namespace pd::inline PD_TARGET {
+
+// An effect that has a run_face, for one tetrahedron or two.
+template <class Effect>
+concept OnFaces = requires { requires Effect::on_faces; };
+
+template <class R, int Count>
+struct FaceRest {
+  R p, q, r;            // [1/m]
+  Vec3<R> apex[Count];  // s, t, h of each tetrahedron [1/m]
+
+  // Dm^-1 of one of them
+  PD_HD Mat3<R> inverse(int which) const {
+    const R none(scalar_of<R>(0));
+    const Vec3<R>& a = apex[which];
+    return {{{p, q, a.x}, {none, r, a.y}, {none, none, a.z}}};
+  }
+};
+
+// That of edges from corner 0 in any unit, `per_unit` of which make a metre, and of unit^2 / det Dm of each tetrahedron. In
+// float32 edges are whole numbers up to 2^31: all squares and their inverses fit, and of a face that collapses in these
+// units everything stays finite.
+//
+// s and t are -h times where the apex stands above the face, in the coordinates of its corners. They are as far off as if the
+// apex were by roundings of itself times |e_1||e_2| / |e_1 x e_2|; h has all its bits, however flat the tetrahedron.
+template <class R, int Count>
+PD_HD FaceRest<R, Count> face_rest(const Vec3<R> (&edge)[2 + Count], const R& per_unit,
+                                   const R (&per_determinant)[Count]) {
+  using T = scalar_of<R>;
+  const R least(sizeof(T) == 4 ? T(1) : smallest<T>());
+  const auto no_less = [&](const R& a) { return select(a < least, least, a); };
+  const Vec3<R>&first = edge[0], &second = edge[1];
+  const Vec3<R> normal = exact_cross(first, second), ahead = cross(normal, first);
+  const R length2 = no_less(dot(first, first)), normal2 = no_less(dot(normal, normal));
+  const R per_length2 = reciprocal(length2), per_normal2 = reciprocal(normal2);
+  const R height = rough_square_root(normal2), along = dot(first, second);
+  FaceRest<R, Count> rest;
+  rest.p = per_unit * rough_square_root(per_length2);
+  rest.r = per_unit * rough_square_root(length2 * per_normal2);
+  rest.q = -(along * per_length2) * rest.r;
+  for (int e = 0; e < Count; ++e) {
+    const Vec3<R>& apex = edge[2 + e];
+    const R h = height * per_determinant[e];
+    const R other = per_normal2 * dot(ahead, apex);
+    const R one = per_length2 * subtract_product(dot(first, apex), other, along);
+    rest.apex[e] = {-(h * one), -(h * other), h};
+  }
+  return rest;
+}
+
+// A face at rest of which the tetrahedra are not known yet: the first two axes of its frame, by which an apex has its place there,
+// a_1, a_2 and 1 / h. Then
+//
+//   f_3 = h ((x_3 - x_0) - a_1 f_1 - a_2 f_2)
+//
+// wants no edges any more but what f_1 and f_2 have of them, which keeps registers free.
+template <class R>
+struct FaceFrame {
+  R p, q, r;         // [1/m], see above
+  Vec3<R> one, two;  // axes, times the metres of a unit of edges
+  R height;          // h is that times unit^2 / det Dm
+
+  // see face_rest
+  PD_HD FaceFrame(const Vec3<R> (&edge)[2], const R& unit) {
+    using T = scalar_of<R>;
+    const R least(sizeof(T) == 4 ? T(1) : smallest<T>());
+    const auto no_less = [&](const R& a) { return select(a < least, least, a); };
+    const Vec3<R> normal = exact_cross(edge[0], edge[1]);
+    const R length2 = no_less(dot(edge[0], edge[0])), normal2 = no_less(dot(normal, normal));
+    const R per_unit = reciprocal(unit), per_length2 = reciprocal(length2);
+    const R per_length = rough_square_root(per_length2), share = unit * per_length;
+    height = rough_square_root(normal2);
+    const R per_height = reciprocal(height);
+    p = per_unit * per_length;
+    r = per_unit * (length2 * per_length) * per_height;
+    q = -(dot(edge[0], edge[1]) * per_length2) * r;
+    one = share * edge[0];
+    two = (share * per_height) * cross(normal, edge[0]);
+  }
+};
+
+// The columns that all deformation gradients of a face have, f_1 and f_2, and the third of all their cofactors.
+template <class R>
+struct FaceColumns {
+  Vec3<R> first, second, normal;        // normal = f_1 x f_2
+  R first2, second2, between, normal2;  // |f_1|^2, |f_2|^2, f_1.f_2, |normal|^2
+
+  PD_HD FaceColumns(const Vec3<R>& first, const Vec3<R>& second)
+      : first(first),
+        second(second),
+        normal(cross(first, second)),
+        first2(dot(first, first)),
+        second2(dot(second, second)),
+        between(dot(first, second)),
+        normal2(dot(normal, normal)) {}
+
+  // `Rest`: FaceRest or FaceFrame
+  template <class Rest>
+  PD_HD FaceColumns(const Vec3<R> (&edge)[2], const Rest& rest)
+      : FaceColumns(rest.p * edge[0], multiply_add(rest.r, edge[1], rest.q * edge[0])) {}
+
+  PD_HD Mat3<R> with(const Vec3<R>& third) const { return from_columns(first, second, third); }
+
+  PD_HD Invariants<R> invariants(const Vec3<R>& third) const {
+    const Vec3<R> a = cross(second, third), b = cross(third, first);
+    return {(first2 + second2) + dot(third, third), (dot(a, a) + dot(b, b)) + normal2,
+            dot(third, normal)};
+  }
+
+  // a F + b F F^T F + c cof F, column by column: F F^T F = F (F^T F)
+  PD_HD void combine(const Vec3<R>& third, const R& a, const R& b, const R& c,
+                     Vec3<R> (&column)[3]) const {
+    const R one_three = b * dot(first, third), two_three = b * dot(second, third);
+    const R one_two = b * between, three_three = multiply_add(b, dot(third, third), a);
+    const auto sum = [&](const R& one, const R& two, const R& three, const Vec3<R>& cofactor) {
+      return multiply_add(c, cofactor,
+                          multiply_add(three, third, multiply_add(two, second, one * first)));
+    };
+    column[0] = sum(multiply_add(b, first2, a), one_two, one_three, cross(second, third));
+    column[1] = sum(one_two, multiply_add(b, second2, a), two_three, cross(third, first));
+    column[2] = sum(one_three, two_three, three_three, normal);
+  }
+};
+
+// weight (F - R), column by column; compare finish_strain.
+template <class R>
+PD_HD void finish_columns(const FaceColumns<R>& face, const Vec3<R>& third, const Invariants<R>& i,
+                          const Root<R>& root, const R& weight, Vec3<R> (&column)[3]) {
+  const ClosedForm<R> form(i, root.value);
+  face.combine(third, weight * (R(scalar_of<R>(1)) - form.diagonal), weight * form.scale,
+               -weight * form.twist, column);
+  const auto good = trusted(i, root);
+  if (any(!good)) [[unlikely]] {
+    const Mat3<R> f = face.with(third);
+    Mat3<R> r = f;
+    repair_rotation(f, good, r);
+    const Mat3<R> other = transpose(weight * (f - r)), same = {{column[0], column[1], column[2]}};
+    const Mat3<R> chosen = select(good, same, other);
+    for (int c = 0; c < 3; ++c) column[c] = chosen.row[c];
+  }
+}
+
+// Gradient on all corners; with `Energy`, where it is `wanted`, strains of weight one, whose halved squares times the weights are
+// added to `energy`. One tetrahedron after the other, which takes the fewest registers.
+template <bool Energy, class R, int Count>
+PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, Count>& rest,
+                               const R (&weight)[Count], bool wanted, Vec3<R> (&g)[3 + Count],
+                               R& energy) {
+  const Vec3<R> edge[2] = {x[1] - x[0], x[2] - x[0]};
+  const FaceColumns<R> face(edge, rest);
+  Vec3<R> third[Count];
+  for (int e = 0; e < Count; ++e) {
+    const Vec3<R>& apex = rest.apex[e];
+    third[e] =
+        multiply_add(apex.z, x[3 + e] - x[0], multiply_add(apex.y, edge[1], apex.x * edge[0]));
+  }
+  Vec3<R> first, second;  // columns of stress of all tetrahedra
+  for (int e = 0; e < Count; ++e) {
+    const Vec3<R>& apex = rest.apex[e];
+    const Invariants<R> i = face.invariants(third[e]);
+    Vec3<R> stress[3];
+    const bool strains = Energy && wanted;
+    finish_columns(face, third[e], i, largest_root(i), strains ? R(scalar_of<R>(1)) : weight[e],
+                   stress);
+    if (strains) {
+      const R square =
+          (dot(stress[0], stress[0]) + dot(stress[1], stress[1])) + dot(stress[2], stress[2]);
+      energy = multiply_add(R(scalar_of<R>(0.5)) * weight[e], square, energy);
+      for (Vec3<R>& column : stress) column = weight[e] * column;
+    }
+    g[3 + e] = apex.z * stress[2];
+    first = e == 0 ? stress[0] : first + stress[0];
+    second = e == 0 ? stress[1] : second + stress[1];
+    g[1] = e == 0 ? apex.x * stress[2] : multiply_add(apex.x, stress[2], g[1]);
+    g[2] = e == 0 ? apex.y * stress[2] : multiply_add(apex.y, stress[2], g[2]);
+    g[0] = e == 0 ? g[3] : g[0] + g[3 + e];
+  }
+  g[1] = multiply_add(rest.q, second, multiply_add(rest.p, first, g[1]));
+  g[2] = multiply_add(rest.r, second, g[2]);
+  g[0] = -((g[1] + g[2]) + g[0]);
+}
+
+// The same of two tetrahedra, whose corners are looked at where they are wanted, and forces left where they are known: look(corner,
+// position, rest) with rest positions in any unit, of so many metres; leave(corner, force). `factor`: unit^2 / det Dm of each.
+// between() comes after the first, where the fewest registers are in use.
+template <bool Energy, class Rest, class R, class Look, class Leave, class Between>
+PD_HD void solid_pair_gradient(const R (&factor)[2], const R (&weight)[2], const R& unit, R& energy,
+                               const Look& look, const Leave& leave, const Between& between) {
+  Vec3<R> x[3];
+  Rest rest[3];
+  for (int c = 0; c < 3; ++c) look(c, x[c], rest[c]);
+  const FaceFrame<R> frame({rest[1] - rest[0], rest[2] - rest[0]}, unit);
+  const FaceColumns<R> face({x[1] - x[0], x[2] - x[0]}, frame);
+  Vec3<R> first, second, apexes;  // what they leave to the corners of the face
+  for (int e = 0; e < 2; ++e) {
+    Vec3<R> apex;
+    Rest apex_rest;
+    look(3 + e, apex, apex_rest);
+    const Vec3<R> place = apex_rest - rest[0];
+    const R h = frame.height * factor[e];
+    const R one = dot(frame.one, place), two = dot(frame.two, place);
+    const Vec3<R> third =
+        h * subtract_product(subtract_product(apex - x[0], one, face.first), two, face.second);
+    const Invariants<R> i = face.invariants(third);
+    Vec3<R> stress[3];
+    finish_columns(face, third, i, largest_root(i), Energy ? R(scalar_of<R>(1)) : weight[e],
+                   stress);
+    if (Energy) {
+      const R square =
+          (dot(stress[0], stress[0]) + dot(stress[1], stress[1])) + dot(stress[2], stress[2]);
+      energy = multiply_add(R(scalar_of<R>(0.5)) * weight[e], square, energy);
+      for (Vec3<R>& column : stress) column = weight[e] * column;
+    }
+    const Vec3<R> force = h * stress[2];
+    leave(3 + e, force);
+    const Vec3<R> along = subtract_product(stress[0], one, force);
+    const Vec3<R> across = subtract_product(stress[1], two, force);
+    first = e == 0 ? along : first + along;
+    second = e == 0 ? across : second + across;
+    apexes = e == 0 ? force : apexes + force;
+    if (e == 0) between();
+  }
+  const Vec3<R> g1 = multiply_add(frame.q, second, frame.p * first), g2 = frame.r * second;
+  leave(0, -((g1 + g2) + apexes));
+  leave(1, g1);
+  leave(2, g2);
+}
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,25 @@
+// Cuts a mesh into patches that have no vertex in common: the first half of the plan of a cluster.
+#pragma once
+
+#include "plan/mesh/partition.h"
+
+#include <cstdint>
+#include <vector>
+
+namespace pd {
+
+// Each patch has every tetrahedron that touches one of its own vertices, so that some are in several.
+struct Ownership {
+  Partition mesh;
+  std::vector<std::int32_t> owner;  // patch of each vertex
+};
+
+// Recursive bisection of vertices across the axis that leaves the busiest side the fewest tetrahedra, which takes time like
+// patches times tetrahedra. Up to `vertices` patches.
+Ownership own_vertices(const double* positions, std::int64_t vertices, const std::int64_t* tets,
+                       std::int64_t count, std::int64_t patches);
+
+// All vertices lie inside the patch that owns them.
+Numbering number_owned(const std::vector<std::int32_t>& owner, int patches);
+
+}  // namespace pd

@@ -1,0 +1,51 @@
+// Builds the patches of a GPU plan in local numbers: slots, pairs and entries.
+#pragma once
+
+#include "plan/gpu/pairing.h"
+#include "plan/mesh/partition.h"
+
+#include <algorithm>
+#include <cstdint>
+#include <iterator>
+#include <vector>
+
+namespace pd {
+
+constexpr int lanes = 32;
+constexpr std::int64_t none = 65535;  // marks a missing entry; a patch has fewer entries
+constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
+// numbers of kernels, as in DeviceKernel
+constexpr int block_kernel = 0, cluster_kernel = 1, grid_kernel = 2, stream_kernel = 3;
+
+struct Mesh {
+  const double* positions;
+  const std::int64_t* tets;
+  Partition partition;
+  Numbering numbering;
+  std::vector<std::int32_t> owner;  // cluster: the patch that owns each vertex
+  int kernel;
+
+  // The patch that counts the energy of a tetrahedron, if several compute it.
+  std::int32_t counted_by(std::int32_t tet) const {
+    const std::int64_t* v = tets + 4 * std::int64_t(tet);
+    return std::min({owner[v[0]], owner[v[1]], owner[v[2]], owner[v[3]]});
+  }
+};
+
+// A patch in local numbers.
+struct MeshPatch {
+  std::vector<std::int32_t> vertex;  // user's vertex of each slot
+  std::vector<std::int32_t> first;   // first entry of each slot
+  std::vector<std::int32_t> forces;  // entries that each slot sums
+  std::vector<Pair> pairs;           // user's tetrahedra; corners are slots
+  std::int64_t outer = 0;            // number of leading pairs that may touch shared vertices
+  std::int64_t entries = 0;
+  bool piped = false;  // whether cuda/stream/pipeline.h reads and writes the entries
+
+  std::int64_t blocks() const { return (std::ssize(pairs) + lanes - 1) / lanes; }
+};
+
+// Throws std::invalid_argument when a patch exceeds a 16-bit count.
+std::vector<MeshPatch> make_patches(const Mesh& mesh, std::int64_t vertices);
+
+}  // namespace pd

@@ -1,0 +1,137 @@
+#include "plan/mesh/partition.h"
+
+#include "plan/mesh/bisect.h"
+
+#include <algorithm>
+#include <numeric>
+
+namespace pd {
+
+namespace {
+
+// The least coordinates of every tetrahedron's corners. Ordered by them, a cut shares the vertices on one side of it alone;
+// ordered by centres it shares some on either side.
+std::vector<Point> low_corners(const double* x, const std::int64_t* tets, std::int64_t count) {
+  std::vector<Point> low(count);
+  for (std::int64_t t = 0; t < count; ++t) {
+    for (int c = 0; c < 3; ++c) {
+      low[t][c] = x[3 * tets[4 * t] + c];
+      for (int k = 1; k < 4; ++k) low[t][c] = std::min(low[t][c], x[3 * tets[4 * t + k] + c]);
+    }
+  }
+  return low;
+}
+
+// Splits [begin, end) of `items` at `middle` across the longest side of the box of their low corners.
+void bisect(std::vector<std::int32_t>& items, const std::vector<Point>& corners, std::int64_t begin,
+            std::int64_t middle, std::int64_t end) {
+  const auto axis = axes_by_length(std::span(items).subspan(begin, end - begin), corners);
+  std::nth_element(items.begin() + begin, items.begin() + middle, items.begin() + end,
+                   along(axis, corners));
+}
+
+void divide(Partition& mesh, const std::vector<Point>& corners, std::int64_t begin,
+            std::int64_t end, std::int64_t patches, std::int64_t grain) {
+  if (patches <= 1) {
+    std::sort(mesh.tets.begin() + begin, mesh.tets.begin() + end);
+    mesh.start.push_back(end);
+    return;
+  }
+  const std::int64_t grains = (end - begin + grain - 1) / grain, left = patches / 2;
+  const std::int64_t middle = std::min(end, begin + grains * left / patches * grain);
+  if (middle > begin && middle < end) bisect(mesh.tets, corners, begin, middle, end);
+  divide(mesh, corners, begin, middle, left, grain);
+  divide(mesh, corners, middle, end, patches - left, grain);
+}
+
+// Shared vertices in an order that puts those of the same patches side by side: what one patch reads of another lies together
+// then. They follow the last patch of each, by which all forces on them are there. `shared` keeps its order otherwise.
+void gather_by_patches(const Partition& mesh, const std::int64_t* tets,
+                       const std::vector<std::uint8_t>& is_shared,
+                       std::vector<std::int64_t>& shared) {
+  std::vector<std::int32_t> number(is_shared.size(), -1);
+  for (std::size_t i = 0; i < shared.size(); ++i) number[shared[i]] = std::int32_t(i);
+  std::vector<std::vector<std::int32_t>> patches(shared.size());
+  for (int p = 0; p < mesh.patches(); ++p) {
+    for (const std::int32_t t : mesh.patch(p)) {
+      for (int k = 0; k < 4; ++k) {
+        const std::int32_t i = number[tets[4 * std::int64_t(t) + k]];
+        if (i >= 0 && (patches[i].empty() || patches[i].back() != p)) patches[i].push_back(p);
+      }
+    }
+  }
+  std::stable_sort(shared.begin(), shared.end(), [&](std::int64_t a, std::int64_t b) {
+    const auto &one = patches[number[a]], &two = patches[number[b]];
+    return std::lexicographical_compare(one.rbegin(), one.rend(), two.rbegin(), two.rend());
+  });
+}
+
+}  // namespace
+
+Partition partition_mesh(const double* positions, const std::int64_t* tets, std::int64_t count,
+                         std::int64_t patches, std::int64_t grain) {
+  Partition mesh{std::vector<std::int32_t>(count), {0}};
+  std::iota(mesh.tets.begin(), mesh.tets.end(), 0);
+  divide(mesh, low_corners(positions, tets, count), 0, count, patches, grain);
+  return mesh;
+}
+
+Numbering number_vertices(const Partition& mesh, const std::int64_t* tets, std::int64_t vertices) {
+  Numbering n;
+  n.is_shared.assign(vertices, 0);
+  n.internal.assign(vertices, -1);
+  std::vector<std::int32_t> owner(vertices, -1);  // first patch of each vertex
+  std::vector<std::int64_t> by_owner;             // in order of first appearance
+  by_owner.reserve(vertices);
+  for (int p = 0; p < mesh.patches(); ++p) {
+    for (const std::int32_t t : mesh.patch(p)) {
+      for (int k = 0; k < 4; ++k) {
+        const std::int64_t v = tets[4 * std::int64_t(t) + k];
+        if (owner[v] < 0) {
+          owner[v] = p;
+          by_owner.push_back(v);
+        } else if (owner[v] != p) {
+          n.is_shared[v] = 1;
+        }
+      }
+    }
+  }
+  n.patch_vertex.assign(mesh.patches() + 1, 0);
+  n.vertex_order.reserve(by_owner.size());
+  const auto append = [&](std::int64_t v) {
+    n.internal[v] = std::int32_t(n.vertex_order.size());
+    n.vertex_order.push_back(std::int32_t(v));
+  };
+  std::vector<std::int64_t> shared;
+  for (const std::int64_t v : by_owner) {
+    if (n.is_shared[v]) {
+      shared.push_back(v);
+    } else {
+      append(v);
+      ++n.patch_vertex[owner[v] + 1];
+    }
+  }
+  gather_by_patches(mesh, tets, n.is_shared, shared);
+  for (const std::int64_t v : shared) append(v);
+  std::partial_sum(n.patch_vertex.begin(), n.patch_vertex.end(), n.patch_vertex.begin());
+  return n;
+}
+
+SharedSlots link_shared(const std::vector<std::int32_t>& slot_vertex, std::int32_t first_shared,
+                        std::int64_t vertices) {
+  SharedSlots shared;
+  shared.start.assign(vertices - first_shared + 1, 0);
+  for (const std::int32_t v : slot_vertex) {
+    if (v >= first_shared) ++shared.start[v - first_shared + 1];
+  }
+  std::partial_sum(shared.start.begin(), shared.start.end(), shared.start.begin());
+  shared.slot.resize(shared.start.back());
+  std::vector<std::int32_t> next(shared.start.begin(), shared.start.end() - 1);
+  for (std::size_t slot = 0; slot < slot_vertex.size(); ++slot) {
+    const std::int32_t v = slot_vertex[slot];
+    if (v >= first_shared) shared.slot[next[v - first_shared]++] = std::int32_t(slot);
+  }
+  return shared;
+}
+
+}  // namespace pd

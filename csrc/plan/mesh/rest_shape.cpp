@@ -1,0 +1,92 @@
+#include "plan/mesh/rest_shape.h"
+
+#define PD_NO_FMA
+#include "math/svd.h"
+
+#include <cmath>
+
+namespace pd {
+
+namespace {
+
+Vec3<double> row_of(const double* positions, std::int64_t vertex) {
+  const double* x = positions + 3 * vertex;
+  return {x[0], x[1], x[2]};
+}
+
+// Largest eigenvalue of a symmetric 3x3 matrix that is positive semidefinite, by Newton's method on its characteristic
+// polynomial, from above (its trace). Next to a multiple root that loses up to two thirds of the digits: singular values then.
+double largest_eigenvalue(const Mat3<double>& a) {
+  const Mat3<double> c = cofactor(a);
+  const double trace = a.row[0].x + a.row[1].y + a.row[2].z;
+  const double minors = c.row[0].x + c.row[1].y + c.row[2].z;
+  const double det = dot(a.row[0], c.row[0]);
+  double l = trace;
+  for (int step = 0; step < 100; ++step) {
+    const double p = ((l - trace) * l + minors) * l - det;
+    const double slope = (3 * l - 2 * trace) * l + minors;
+    const double change = slope > 0 ? p / slope : 0;
+    l -= change;
+    if (!(change > 1e-15 * trace)) break;
+  }
+  const bool simple = (3 * l - 2 * trace) * l + minors > 0.01 * trace * trace;
+  return simple ? l : signed_svd(a).s[0];
+}
+
+}  // namespace
+
+Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet) {
+  const auto at = [&](int k) { return row_of(positions, tet[k]); };
+  const Mat3<double> dm = from_columns(at(1) - at(0), at(2) - at(0), at(3) - at(0));
+  const Mat3<double> adjoint = transpose(cofactor(dm));
+  const double det = dot(dm.row[0], cofactor(dm).row[0]);
+  const Mat3<double> inverse = (1 / det) * adjoint;
+  const Vec3<double>(&n)[3] = inverse.row;
+  const Vec3<double> n0 = -((n[0] + n[1]) + n[2]);
+  return {{n[0].x, n[0].y, n[0].z, n[1].x, n[1].y, n[1].z, n[2].x, n[2].y, n[2].z},
+          det / 6,
+          element_bound({{{n0.x, n0.y, n0.z},
+                          {n[0].x, n[0].y, n[0].z},
+                          {n[1].x, n[1].y, n[1].z},
+                          {n[2].x, n[2].y, n[2].z}}})};
+}
+
+template <std::size_t Corners>
+std::array<double, 3 * (Corners - 2)> face_rest(const double* positions,
+                                                const std::array<std::int64_t, Corners>& vertex) {
+  const auto edge = [&](int c) {
+    return row_of(positions, vertex[c]) - row_of(positions, vertex[0]);
+  };
+  const Vec3<double> first = edge(1), second = edge(2), normal = cross(first, second);
+  const double length = std::sqrt(dot(first, first)), area = std::sqrt(dot(normal, normal));
+  const double p = 1 / length, q = -dot(first, second) / (length * area), r = length / area;
+  std::array<double, 3 * (Corners - 2)> rest = {p, q, r};
+  for (int c = 3; c < int(Corners); ++c) {
+    // where the apex stands along the axes of the face
+    const Vec3<double> apex = edge(c);
+    const double along = dot(first, apex) / length;
+    const double across = dot(cross(normal, first), apex) / (area * length);
+    const double h = area / dot(normal, apex);
+    double* column = &rest[3 * (c - 2)];
+    column[0] = -h * (p * along + q * across);
+    column[1] = -h * r * across;
+    column[2] = h;
+  }
+  return rest;
+}
+
+template std::array<double, 6> face_rest(const double*, const std::array<std::int64_t, 4>&);
+template std::array<double, 9> face_rest(const double*, const std::array<std::int64_t, 5>&);
+
+double element_bound(const std::array<std::array<double, 3>, 4>& gradients) {
+  // the nonzero eigenvalues of S S^T, S the normalised gradients, are those of the 3x3 matrix S^T S
+  Mat3<double> sum = {};
+  for (const auto& g : gradients) {
+    const Vec3<double> n = {g[0], g[1], g[2]};
+    const Vec3<double> unit = (1 / std::sqrt(dot(n, n))) * n;
+    sum = {{sum.row[0] + unit.x * unit, sum.row[1] + unit.y * unit, sum.row[2] + unit.z * unit}};
+  }
+  return largest_eigenvalue(sum);
+}
+
+}  // namespace pd

@@ -1,0 +1,447 @@
+#include "plan/multilevel/build.h"
+
+#include "plan/multilevel/aggregate.h"
+#include "plan/multilevel/block_matrix.h"
+#include "plan/multilevel/fine_matrix.h"
+#include "solver/multilevel/lbfgs.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <stdexcept>
+#include <utility>
+
+namespace pd {
+
+namespace {
+
+constexpr int functions = 4;                        // 1, x, y, z
+constexpr int most_coarse_nodes = 256;              // 1024 unknowns of the dense level
+constexpr std::int32_t most_of_two_levels = 12000;  // free vertices that two levels serve
+constexpr double fine_smoothing = 1.14, middle_smoothing = 1.333;  // omega of I - omega D^-1 A
+constexpr double weakest_coupling = 0.02;  // of middle nodes, of their scaled blocks
+constexpr int turning_groups = 4;          // as many as solver/multilevel/deflation.h has
+constexpr double turning_reach = 2;     // how far groups overlap, in mean depths of their vertices
+constexpr double coarse_shift = 1e-12;  // of the diagonal: above what rounding takes from a pivot
+constexpr double dependent = 1e-8;  // what orthogonalisation leaves of a column that adds nothing
+
+// Diagonal of a matrix of square blocks.
+std::vector<double> diagonal(const BlockMatrix& a) {
+  std::vector<double> d(std::size_t(a.rows) * a.height, 0.0);
+  for (std::int32_t row = 0; row < a.rows; ++row) {
+    for (std::int32_t p = a.start[row]; p < a.start[row + 1]; ++p) {
+      if (a.column[p] != row) continue;
+      for (int i = 0; i < a.height; ++i)
+        d[std::size_t(row) * a.height + i] = a.value[p * a.block() + i * a.width + i];
+    }
+  }
+  return d;
+}
+
+// Edges of a matrix: how large its blocks are beside the diagonal (Frobenius), where more than `least`.
+std::vector<Coupling> couplings(const BlockMatrix& a, const std::vector<double>& d,
+                                const std::vector<std::array<double, 3>>& centre, double least) {
+  std::vector<Coupling> found;
+  for (std::int32_t row = 0; row < a.rows; ++row) {
+    for (std::int32_t p = a.start[row]; p < a.start[row + 1]; ++p) {
+      const std::int32_t column = a.column[p];
+      if (column <= row) continue;
+      double sum = 0, square = 0;
+      for (int i = 0; i < a.height; ++i) {
+        for (int j = 0; j < a.width; ++j) {
+          const double v = a.value[p * a.block() + i * a.width + j];
+          const double scale =
+              d[std::size_t(row) * a.height + i] * d[std::size_t(column) * a.width + j];
+          if (scale > 0) sum += v * v / scale;
+        }
+      }
+      for (int c = 0; c < 3; ++c) {
+        const double side = centre[row][c] - centre[column][c];
+        square += side * side;
+      }
+      if (sum > least * least) found.push_back({row, column, std::sqrt(sum), std::sqrt(square)});
+    }
+  }
+  return found;
+}
+
+// Makes the four columns of q [rows, 4] orthonormal, or zero where they depend on those before; q R is what they were.
+std::array<double, 16> orthonormalise(std::vector<double>& q) {
+  std::array<double, 16> r{};
+  const std::size_t rows = q.size() / functions;
+  const auto dot = [&](int a, int b) {
+    double sum = 0;
+    for (std::size_t i = 0; i < rows; ++i) sum += q[i * functions + a] * q[i * functions + b];
+    return sum;
+  };
+  for (int c = 0; c < functions; ++c) {
+    const double before = std::sqrt(dot(c, c));
+    // twice is enough (Kahan and Parlett)
+    for (int pass = 0; pass < 2; ++pass) {
+      for (int k = 0; k < c; ++k) {
+        const double part = dot(k, c);
+        r[k * functions + c] += part;
+        for (std::size_t i = 0; i < rows; ++i) q[i * functions + c] -= part * q[i * functions + k];
+      }
+    }
+    const double left = std::sqrt(dot(c, c)), scale = left > dependent * before ? 1 / left : 0;
+    r[c * functions + c] = scale > 0 ? left : 0;
+    for (std::size_t i = 0; i < rows; ++i) q[i * functions + c] *= scale;
+  }
+  return r;
+}
+
+// Functions that every aggregate can represent: [rows, height, 4] in, orthonormal for each aggregate out.
+struct Tentative {
+  BlockMatrix lift;             // one block a row
+  std::vector<double> reduced;  // R [aggregates, 4, 4]: the functions of the next level
+};
+
+Tentative tentative(const std::vector<double>& candidates, int height, const Aggregates& groups) {
+  const std::int32_t rows = std::int32_t(groups.of.size());
+  const int block = height * functions;
+  Tentative t{{height, functions, rows, groups.count, {0}, {}, {}}, {}};
+  std::vector<std::vector<std::int32_t>> members(groups.count);
+  for (std::int32_t i = 0; i < rows; ++i) {
+    if (groups.of[i] >= 0) {
+      members[groups.of[i]].push_back(i);
+      t.lift.column.push_back(groups.of[i]);
+    }
+    t.lift.start.push_back(std::int32_t(t.lift.column.size()));
+  }
+  t.lift.value.resize(t.lift.column.size() * block);
+  std::vector<double> q;
+  for (const auto& member : members) {
+    q.clear();
+    for (const std::int32_t i : member)
+      q.insert(q.end(), candidates.begin() + std::int64_t(i) * block,
+               candidates.begin() + (std::int64_t(i) + 1) * block);
+    const auto r = orthonormalise(q);
+    t.reduced.insert(t.reduced.end(), r.begin(), r.end());
+    for (std::size_t k = 0; k < member.size(); ++k)
+      std::copy_n(q.begin() + k * block, block,
+                  t.lift.value.begin() + std::int64_t(t.lift.start[member[k]]) * block);
+  }
+  return t;
+}
+
+// (I - omega D^-1 A) P
+BlockMatrix smoothed(const BlockMatrix& a, const std::vector<double>& inverse, double omega,
+                     const BlockMatrix& p, int threads) {
+  BlockMatrix lift = multiply(a, p, threads);
+  const std::int64_t block = lift.block();
+  for (std::int32_t row = 0; row < lift.rows; ++row) {
+    for (std::int32_t e = lift.start[row]; e < lift.start[row + 1]; ++e) {
+      const bool own = p.start[row] < p.start[row + 1] && p.column[p.start[row]] == lift.column[e];
+      for (std::int64_t k = 0; k < block; ++k) {
+        const double scale = omega * inverse[std::size_t(row) * lift.height + k / functions];
+        const double kept = own ? p.value[p.start[row] * block + k] : 0;
+        lift.value[e * block + k] = kept - scale * lift.value[e * block + k];
+      }
+    }
+  }
+  return lift;
+}
+
+// 1 / (lambda_max diag A), lambda_max of diag(A)^-1 A by power iteration and 5 % more; 0 where there is no function.
+std::vector<double> scaled_inverse(const BlockMatrix& a, int threads) {
+  const std::vector<double> d = diagonal(a);
+  std::vector<double> x(d.size()), y;
+  std::uint32_t state = 1;
+  for (std::size_t i = 0; i < x.size(); ++i) {
+    state = state * 1664525u + 1013904223u;  // any start that is no eigenvector will do
+    x[i] = d[i] > 0 ? double(state) / 4294967296.0 - 0.5 : 0;
+  }
+  double largest = 1;
+  for (int step = 0; step < 30; ++step) {
+    // lambda = |D^-1 A x| / |x| in the metric of D
+    double before = 0, after = 0;
+    apply(a, x, y, threads);
+    for (std::size_t i = 0; i < x.size(); ++i) {
+      const double next = d[i] > 0 ? y[i] / d[i] : 0;
+      before += d[i] * x[i] * x[i];
+      after += d[i] * next * next;
+      x[i] = next;
+    }
+    if (!(before > 0) || !(after > 0)) break;
+    largest = std::sqrt(after / before);
+    for (double& v : x) v /= std::sqrt(after);
+  }
+  std::vector<double> inverse(d.size());
+  for (std::size_t i = 0; i < d.size(); ++i)
+    inverse[i] = d[i] > 0 ? 1 / (1.05 * largest * d[i]) : 0;
+  return inverse;
+}
+
+// Neighbouring numbers put together, where the graph falls into more pieces than the dense level can hold.
+Aggregates limited(Aggregates groups, std::int32_t most) {
+  if (groups.count <= most) return groups;
+  for (std::int32_t& g : groups.of)
+    g = g < 0 ? g : std::int32_t(std::int64_t(g) * most / groups.count);
+  groups.count = most;
+  return groups;
+}
+
+// L^-1 of a matrix L L^T, row by row up to the diagonal; nothing in the rows of what is held.
+std::vector<double> coarse_factor(const BlockMatrix& a, const Mask& held, int threads) {
+  const int n = a.rows * a.height;
+  std::vector<double> dense(std::size_t(n) * n, 0.0);
+  for (std::int32_t row = 0; row < a.rows; ++row) {
+    for (std::int32_t p = a.start[row]; p < a.start[row + 1]; ++p) {
+      for (int i = 0; i < a.height; ++i) {
+        for (int j = 0; j < a.width; ++j)
+          dense[(std::size_t(row) * a.height + i) * n + std::size_t(a.column[p]) * a.width + j] =
+              a.value[p * a.block() + i * a.width + j];
+      }
+    }
+  }
+  for (int i = 0; i < n; ++i) {
+    double& d = dense[std::size_t(i) * n + i];
+    d = d > 0 ? d * (1 + coarse_shift) : 1;
+  }
+  std::vector<double> factor = inverse_cholesky_factor(std::move(dense), n, threads);
+  for (std::int64_t i = 0; i < std::ssize(held); ++i) {
+    if (held[i]) std::fill_n(factor.begin() + i * (i + 1) / 2, i + 1, 0.0);
+  }
+  return factor;
+}
+
+BlockMatrix galerkin(const BlockMatrix& a, const BlockMatrix& lift, const Transposed& transposed,
+                     int threads) {
+  return multiply(transposed.matrix, multiply(a, lift, threads), threads);
+}
+
+// Rest positions in internal order, and the affine functions on them, of the size of one.
+struct Affine {
+  std::vector<std::array<double, 3>> position;
+  std::vector<double> candidates;  // [vertices, 4]
+};
+
+Affine affine(const MultilevelScene& s) {
+  Affine result;
+  std::array<double, 3> low{}, high{};
+  for (std::int64_t i = 0; i < s.vertices; ++i) {
+    const double* x = s.positions + 3 * std::int64_t(s.vertex_order[i]);
+    result.position.push_back({x[0], x[1], x[2]});
+    for (int c = 0; c < 3; ++c) {
+      low[c] = i ? std::min(low[c], x[c]) : x[c];
+      high[c] = i ? std::max(high[c], x[c]) : x[c];
+    }
+  }
+  const double size = std::max({high[0] - low[0], high[1] - low[1], high[2] - low[2]});
+  for (const auto& x : result.position) {
+    result.candidates.push_back(1);
+    for (int c = 0; c < 3; ++c)
+      result.candidates.push_back((x[c] - 0.5 * (low[c] + high[c])) / size);
+  }
+  return result;
+}
+
+std::vector<std::array<double, 3>> mean_positions(
+    const std::vector<std::array<double, 3>>& position, const Aggregates& groups) {
+  std::vector<std::array<double, 3>> mean(groups.count, {0, 0, 0});
+  std::vector<int> count(groups.count, 0);
+  for (std::size_t i = 0; i < position.size(); ++i) {
+    if (groups.of[i] < 0) continue;
+    ++count[groups.of[i]];
+    for (int c = 0; c < 3; ++c) mean[groups.of[i]][c] += position[i][c];
+  }
+  for (std::size_t g = 0; g < mean.size(); ++g) {
+    for (double& x : mean[g]) x /= count[g];
+  }
+  return mean;
+}
+
+// How a level is lifted from the one below, and the matrix of the one below.
+struct Step {
+  BlockMatrix lift;
+  Transposed restriction;
+  BlockMatrix coarse;
+};
+
+Step coarsen(const BlockMatrix& matrix, const std::vector<double>& inverse, double omega,
+             const BlockMatrix& tentative_lift, int threads) {
+  Step step;
+  step.lift = smoothed(matrix, inverse, omega, tentative_lift, threads);
+  step.restriction = transpose(step.lift);
+  step.coarse = galerkin(matrix, step.lift, step.restriction, threads);
+  return step;
+}
+
+// diag(factor scale) m
+BlockMatrix scaled(BlockMatrix m, double factor, const std::vector<double>& scale) {
+  for (std::int32_t row = 0; row < m.rows; ++row) {
+    for (std::int32_t e = m.start[row]; e < m.start[row + 1]; ++e) {
+      for (std::int64_t k = 0; k < m.block(); ++k)
+        m.value[e * m.block() + k] *= factor * scale[std::size_t(row) * m.height + k / m.width];
+    }
+  }
+  return m;
+}
+
+// sum += m, of which `sum` has all blocks
+void add_to(BlockMatrix& sum, const BlockMatrix& m) {
+  for (std::int32_t row = 0; row < m.rows; ++row) {
+    std::int32_t to = sum.start[row];
+    for (std::int32_t e = m.start[row]; e < m.start[row + 1]; ++e) {
+      while (to < sum.start[row + 1] && sum.column[to] != m.column[e]) ++to;
+      if (to == sum.start[row + 1]) throw std::logic_error("a matrix level lacks its diagonal");
+      for (std::int64_t k = 0; k < m.block(); ++k)
+        sum.value[to * m.block() + k] += m.value[e * m.block() + k];
+    }
+  }
+}
+
+// (I - S A) P, S = (keep first + second) D^-1 - second first D^-1 A D^-1 being what a level smooths by.
+BlockMatrix folded(const BlockMatrix& a, const std::vector<double>& inverse, const BlockMatrix& p,
+                   int threads) {
+  constexpr double once = Smoother::keep * Smoother::first + Smoother::second;
+  constexpr double twice = Smoother::second * Smoother::first;
+  const BlockMatrix image = multiply(a, p, threads);
+  BlockMatrix lift = scaled(multiply(a, scaled(image, twice, inverse), threads), 1, inverse);
+  add_to(lift, scaled(image, -once, inverse));
+  add_to(lift, p);
+  return lift;
+}
+
+// Lifts as a GPU has them, and their transposes.
+void fold(Step& step, const BlockMatrix& a, const std::vector<double>& inverse, int threads) {
+  step.lift = folded(a, inverse, step.lift, threads);
+  step.restriction = transpose(step.lift);
+}
+
+// The nodes below the middle level.
+Aggregates group_nodes(const BlockMatrix& matrix,
+                       const std::vector<std::array<double, 3>>& position) {
+  const Graph graph =
+      coupling_graph(matrix.rows, couplings(matrix, diagonal(matrix), position, weakest_coupling));
+  const int wanted = std::clamp(matrix.rows / 8, 1, most_coarse_nodes);
+  return limited(aggregate(graph, Mask(matrix.rows, 0), wanted), most_coarse_nodes);
+}
+
+// Four groups of vertices that overlap: 1 inside, falling to nothing a way off, over the sum of all. [vertices, 4]
+std::vector<double> turning_weights(const Graph& graph, const Mask& held,
+                                    const Positions& position) {
+  const std::int32_t vertices = graph.vertices();
+  const Aggregates groups =
+      limited(aggregate_far_apart(graph, held, position, turning_groups), turning_groups);
+  std::array<std::vector<double>, turning_groups> distance;
+  for (int g = 0; g < turning_groups; ++g) distance[g] = distances_to(graph, groups, g);
+  // how deep vertices lie in their group, in the mean
+  double depth = 0, count = 0;
+  for (std::int32_t v = 0; v < vertices; ++v) {
+    double least = HUGE_VAL;
+    for (int g = 0; g < turning_groups; ++g) {
+      if (g != groups.of[v]) least = std::min(least, distance[g][v]);
+    }
+    if (held[v] || !(least < HUGE_VAL)) continue;
+    depth += least;
+    ++count;
+  }
+  const double way = depth > 0 ? turning_reach * depth / count : 1;
+  std::vector<double> weights(std::size_t(vertices) * turning_groups, 0.0);
+  for (std::int32_t v = 0; v < vertices; ++v) {
+    if (held[v]) continue;
+    double* of = &weights[std::size_t(v) * turning_groups];
+    double sum = 0;
+    for (int g = 0; g < turning_groups; ++g) {
+      of[g] = std::max(0.0, 1 - distance[g][v] / way);
+      sum += of[g];
+    }
+    for (int g = 0; g < turning_groups; ++g) of[g] /= sum;
+  }
+  return weights;
+}
+
+using Numbers = std::vector<std::int32_t>;
+
+void store(BlockMatrix& matrix, Numbers& start, Numbers& column, std::vector<double>& value) {
+  start = std::move(matrix.start);
+  column = std::move(matrix.column);
+  value = std::move(matrix.value);
+}
+
+// Of the transposed matrix: where its values stand in the other, or these values, too.
+void store_nodes(Step& step, bool values, Numbers& start, Numbers& row, Numbers& from,
+                 std::vector<double>& value) {
+  start = std::move(step.restriction.matrix.start);
+  row = std::move(step.restriction.matrix.column);
+  if (!values) {
+    from = std::move(step.restriction.from);
+    return;
+  }
+  const std::int64_t block = step.lift.block();
+  for (const std::int32_t e : step.restriction.from) {
+    const auto first = step.lift.value.begin() + e * block;
+    value.insert(value.end(), first, first + block);
+  }
+}
+
+}  // namespace
+
+MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
+                                  const std::function<void(double)>& progress) {
+  MultilevelTables t;
+  FineMatrix fine = assemble(scene, threads);
+  progress(0.2);
+  for (const double bound : fine.bound) t.fine_inverse.push_back(bound > 0 ? 1 / bound : 0);
+  t.reference_stiffness.assign(scene.stiffness, scene.stiffness + scene.count);
+  for (std::int64_t i = 0; i < scene.vertices; ++i)
+    t.reference_inertia.push_back(scene.inertia[scene.vertex_order[i]]);
+  t.level_sizes.assign(level_size_count, 0);
+  t.level_sizes[level_fine_entries] = fine.matrix.start.back();
+  const Affine rest = affine(scene);
+  const Graph graph = coupling_graph(
+      fine.matrix.rows, couplings(fine.matrix, diagonal(fine.matrix), rest.position, 0));
+  t.turning_weight = turning_weights(graph, fine.held, rest.position);
+  if (scene.vertices <= scene.most_direct) {
+    t.level_sizes[level_direct] = 1;
+    t.coarse_factor = coarse_factor(fine.matrix, fine.held, threads);
+    t.fine_lift_start.assign(std::size_t(scene.vertices) + 1, 0);
+    t.fine_node_start = {0};
+    store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
+    progress(1.0);
+    return t;
+  }
+  const auto free = std::int32_t(std::count(fine.held.begin(), fine.held.end(), 0));
+  const bool middle =
+      free > most_of_two_levels || connected_pieces(graph, fine.held) > most_coarse_nodes;
+  const std::int32_t nodes = std::max(1, free / (free < 1000 ? 15 : 30));
+  const Aggregates groups =
+      aggregate(graph, fine.held, middle ? nodes : std::min(nodes, most_coarse_nodes));
+  progress(0.5);
+
+  const Tentative first = tentative(rest.candidates, 1, groups);
+  Step step = coarsen(fine.matrix, t.fine_inverse, fine_smoothing, first.lift, threads);
+  if (scene.folded) fold(step, fine.matrix, t.fine_inverse, threads);
+  t.level_sizes[level_fine_lifts] = step.lift.start.back();
+  t.level_sizes[level_fine_nodes] = groups.count;
+  store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
+  store_nodes(step, scene.folded, t.fine_node_start, t.fine_node_row, t.fine_node_lift,
+              t.fine_node_weight);
+  store(step.lift, t.fine_lift_start, t.fine_lift_node, t.fine_lift_weight);
+  progress(0.7);
+
+  BlockMatrix coarse = std::move(step.coarse);
+  if (middle) {
+    t.middle_inverse = scaled_inverse(coarse, threads);
+    const Aggregates last = group_nodes(coarse, mean_positions(rest.position, groups));
+    const Tentative second = tentative(first.reduced, functions, last);
+    step = coarsen(coarse, t.middle_inverse, middle_smoothing, second.lift, threads);
+    if (scene.folded) fold(step, coarse, t.middle_inverse, threads);
+    t.level_sizes[level_middle_entries] = coarse.start.back();
+    t.level_sizes[level_middle_lifts] = step.lift.start.back();
+    t.level_sizes[level_middle_nodes] = last.count;
+    store(coarse, t.middle_start, t.middle_column, t.middle_value);
+    store_nodes(step, scene.folded, t.middle_node_start, t.middle_node_row, t.middle_node_lift,
+                t.middle_node_weight);
+    store(step.lift, t.middle_lift_start, t.middle_lift_node, t.middle_lift_weight);
+    coarse = std::move(step.coarse);
+  }
+  progress(0.8);
+  t.coarse_factor = coarse_factor(coarse, {}, threads);
+  progress(1.0);
+  return t;
+}
+
+}  // namespace pd

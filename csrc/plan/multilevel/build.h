@@ -1,0 +1,40 @@
+// Prepares the multilevel approximation of A^-1 for a scene: the arrays of views/multilevel.def.
+//
+// A = diag(a) + sum_e w_e V_e grad N grad N^T is constant, so all of this happens once. Smoothed aggregation (Vanek, Mandel
+// and Brezina 1996) with the affine functions as near-nullspace: pieces that move rigidly, or strain evenly, cost nothing.
+#pragma once
+
+#include "views/views.h"
+
+#include <cstdint>
+#include <functional>
+#include <vector>
+
+namespace pd {
+
+// The scene, checked by the caller, in the user's numbers but for `vertex_order` (internal number -> user's number).
+struct MultilevelScene {
+  const double* positions;  // [vertices, 3] at rest
+  std::int64_t vertices;
+  const std::int64_t* tets;  // [count, 4] of positive volume
+  std::int64_t count;
+  const std::int32_t* vertex_order;  // [vertices]
+  const double* stiffness;           // [count] Pa
+  const double* inertia;             // [vertices] a, inf where a pin holds the vertex exactly [N/m]
+  std::int64_t most_direct;          // vertices of a mesh that needs no levels: M is A^-1 itself
+  bool folded;                       // lifts as a GPU has them
+};
+
+// The table as vectors.
+struct MultilevelTables {
+  using real = double;
+#define X(name, type, width, rows, meaning) std::vector<type> name;
+#include "views/multilevel.def"
+#undef X
+};
+
+// `progress` hears the fraction done now and then. The same bits for any number of threads.
+MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
+                                  const std::function<void(double)>& progress);
+
+}  // namespace pd

@@ -1,0 +1,108 @@
+// Conjugate gradients (Hestenes and Stiefel 1952) on H l = b, H = P (a + K) P with the elastic Hessian K, preconditioned by
+// 1 / D, or by P M P where the plan has levels, with 1 / D on vertices of which M knows nothing. Where vertices slide against
+// friction H has what turns their slip besides (slide_across).
+//
+// P leaves out vertices that do not move, and of others what contacts do not let through. D is one number a vertex, so P and
+// 1 / D commute, and all vectors stay where P leaves them.
+#pragma once
+#include "math/mat.h"
+#include "views/views.h"
+
+#include <limits>
+
+namespace pd::inline PD_TARGET {
+
+// One environment's numbers between iterations, as in ConjugateProgress.
+struct Conjugate {
+  double product, scale, error;
+  bool active, begins;
+
+  PD_HD explicit Conjugate(const double* from)
+      : product(from[progress_product]),
+        scale(from[progress_scale]),
+        error(from[progress_error]),
+        active(from[progress_active] != 0),
+        begins(from[progress_active] < 0) {}
+
+  PD_HD void write(double* to) const {
+    to[progress_product] = product;
+    to[progress_scale] = scale;
+    to[progress_active] = active ? 1 : 0;
+    to[progress_error] = error;
+  }
+
+  // what they are of a right side so many times as large
+  PD_HD void scale_by(double factor) {
+    product *= factor * factor;
+    scale *= factor;
+  }
+
+  // by |b|^2, plus zero times every position, and b . z, z = b / D or M b
+  PD_HD void begin(double square, double weighted) {
+    scale = sqrt(square);
+    product = weighted;
+    active = scale > 0;
+    error = active ? 1 : scale;
+  }
+
+  // how far to go along the direction; along one without positive curvature H is not positive, and what there is stays
+  PD_HD double step(double curvature) {
+    active = curvature > 0;
+    return active ? product / curvature : 0;
+  }
+
+  // whether the residual r is not the end yet, by |r|^2
+  PD_HD void judge(double square, double tolerance) {
+    const double residual = sqrt(square);
+    active = residual > tolerance * scale;
+    // what got lost on the way is an error, however large
+    error = residual < HUGE_VAL ? residual / scale : HUGE_VAL;
+  }
+
+  // what of the last direction the next one keeps, by r . z
+  PD_HD double keep(double next) {
+    const double ratio = next / product;
+    product = next;
+    return ratio;
+  }
+};
+
+// What vectors are solved for in: a power of two near the largest number of the residual, so that squares of theirs have room.
+// Neither it nor one over it is infinite or no normal number.
+template <class T>
+PD_HD T unit_near(T largest) {
+  if (!(largest > T(0) && largest < T(HUGE_VAL))) return T(1);
+  constexpr int most = std::numeric_limits<T>::max_exponent - 3;
+  const int exponent = ilogb(double(largest));
+  return T(ldexp(1.0, exponent > most ? most : exponent < -most ? -most : exponent));
+}
+
+// The part of a field that contacts let through. `projector`: nine numbers, or null.
+template <class T>
+PD_HD Vec3<T> project(const Vec3<T>& field, const T* p) {
+  if (!p) return field;
+  return Mat3<T>{{{p[0], p[1], p[2]}, {p[3], p[4], p[5]}, {p[6], p[7], p[8]}}} * field;
+}
+
+// P (a d + K d) of a vertex; `moves`: it has any part in P. `across`: slide_across, by which H has its square more; or null.
+template <class T>
+PD_HD Vec3<T> conjugate_image(const Vec3<T>& elastic, const Vec3<T>& direction, T inertia,
+                              bool moves, const T* projector, const T* across) {
+  if (!moves) return {T(0), T(0), T(0)};
+  Vec3<T> image = multiply_add(inertia, direction, elastic);
+  if (across) {
+    const Vec3<T> turning = {across[0], across[1], across[2]};
+    image = multiply_add(dot(turning, direction), turning, image);
+  }
+  return project(image, projector);
+}
+
+// z of a vertex with residual r: P M r, but r / D where it was held when M was made. `of_levels`: (M r) there.
+template <class T>
+PD_HD Vec3<T> preconditioned(const Vec3<T>& of_levels, const Vec3<T>& residual, T inverse,
+                             T reference_inertia, const T* projector) {
+  const bool known = inverse != T(0) && reference_inertia < T(HUGE_VAL);
+  return known ? project(of_levels, projector) : inverse * residual;
+}
+
+}  // namespace pd::inline PD_TARGET

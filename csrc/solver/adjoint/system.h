@@ -1,0 +1,306 @@
+// The system of a step's adjoint, H l = dL/dx' + dL/dv' / h on what moves, and what its solution says of the state before; see
+// torchpd/ops/adjoint.py. A vertex at a time, no neighbours.
+#pragma once
+#include "contact/plane_sphere.h"
+#include "math/mat.h"
+#include "solver/vertex.h"
+#include "views/views.h"
+
+namespace pd::inline PD_TARGET {
+
+// Relative residual at which a solve stops: near the rounding floor of each precision.
+template <class T>
+constexpr double adjoint_tolerance = sizeof(T) == 4 ? 1e-5 : 1e-10;
+// times that, a solve has failed
+constexpr double adjoint_failed = 1e3;
+constexpr int adjoint_iterations = 2000;  // at most
+
+// of what friction could take back: slip below it counts as none
+constexpr double sticking = 1e-3;
+
+// A contact as a vertex meets it.
+template <class T>
+struct ContactAt {
+  int number;  // planes, then balls
+  Vec3<T> normal;
+  T gap, friction;
+  Vec3<T> motion;
+  T curved;  // 1 / its distance from the middle of a ball
+};
+
+// What contacts do to a vertex of a solved step. One holds it when an unaccelerated iteration, x' - r / D, would end inside.
+template <class T>
+struct HeldVertex {
+  Vec3<T> position;  // x'
+  Vec3<T> moved;     // x' - x
+  Vec3<T> residual;  // r, the gradient of the step's objective
+  T diagonal;
+
+  // off the normals that hold it
+  Mat3<T> projector = {{{T(1), T(0), T(0)}, {T(0), T(1), T(0)}, {T(0), T(0), T(1)}}};
+  bool stuck = false;  // friction holds it
+  int sticks_to = -1;  // that of this contact, the last if there are several
+  T carried = T(1);    // and it goes so far as its start does, along the surface
+  T curvature = T(0);  // of the surface that it slides on, times the push
+  int contacts = 0;    // that hold it
+  Vec3<T> first_normal = {};
+  T first_friction = T(0);
+  Vec3<T> slides[slide_count] = {};
+
+  // Returns whether it is held along a normal that earlier contacts do not span; where they have put it out of one that they span,
+  // that does nothing any more.
+  PD_HD bool touch(const ContactAt<T>& contact) {
+    const Vec3<T>&normal = contact.normal, &motion = contact.motion;
+    const T friction = contact.friction, curved = contact.curved;
+    const T push = dot(residual, normal);
+    if (!(push > T(0) && contact.gap < push / diagonal)) return false;
+    // so that all together are a projector
+    const Vec3<T> left = projector * normal;
+    const T size = dot(left, left);
+    if (!(size > T(spanned))) return false;
+    projector = take_off(projector, left, T(1) / size);
+    const Vec3<T> slip = tangential(moved - motion, normal);
+    const T slipped = square_root(dot(slip, slip));
+    const bool sticks = friction > T(0) && holds(slipped, friction * push);
+    stuck = stuck || sticks;
+    if (sticks) sticks_to = contact.number;
+    curvature = multiply_add(push, curved, curvature);
+    for (Vec3<T>& of : slides) of = {T(0), T(0), T(0)};
+    ++contacts;
+    carried = T(1);
+    if (contacts == 1) {
+      first_normal = normal;
+      first_friction = friction;
+      // it ends where the line from the centre to its start, moved along, meets the ball
+      const T begins = T(1) - curved * dot(moved - motion, normal);
+      if (sticks && begins > T(0)) carried = T(1) / begins;
+      if (friction > T(0) && !sticks)
+        slide_on(normal, push, friction, motion, curved, slip, slipped);
+    } else if (contacts == 2 && curvature == T(0)) {
+      slide_along_edge(normal, friction);
+    }
+    return true;
+  }
+
+  // what friction can take back in one iteration is more than what has slipped
+  PD_HD bool holds(T slipped, T most) const { return slipped * diagonal <= T(sticking) * most; }
+
+  PD_HD void slide_on(const Vec3<T>& normal, T push, T friction, const Vec3<T>& motion, T curved,
+                      const Vec3<T>& slip, T slipped) {
+    const T rate = T(1) / slipped, along = friction * rate;
+    slides[slide_along] = along * slip;
+    slides[slide_normal] = normal;
+    slides[slide_across] = (square_root(along * push) * rate) * cross(normal, slip);
+    slides[slide_bend] = (along * square_root(push * curved)) * slip;
+    slides[slide_lean] = (curved * dot(moved - motion, normal)) * slides[slide_across];
+  }
+
+  // Between two planes, whose edge leaves a slip no other direction: the friction of both, of whose pushes r is made.
+  PD_HD void slide_along_edge(const Vec3<T>& normal, T friction) {
+    const T both = dot(first_normal, normal), share = T(1) / (T(1) - both * both);
+    const Vec3<T> first = share * subtract_product(first_normal, both, normal);
+    const Vec3<T> second = share * subtract_product(normal, both, first_normal);
+    const Vec3<T> rub = multiply_add(friction, second, first_friction * first);
+    const Vec3<T> slip = projector * moved;
+    const T slipped = square_root(dot(slip, slip)), force = dot(rub, residual);
+    if (!(force > T(0))) return;  // smooth ones
+    stuck = stuck || holds(slipped, force);
+    if (stuck) return;
+    slides[slide_along] = (T(1) / slipped) * slip;
+    slides[slide_normal] = rub;
+  }
+};
+
+// adds(contact): of those by which `vertex` is held along one more normal.
+template <class T, class Adds>
+PD_HD void touch_all(HeldVertex<T>& vertex, const Material<T>& material, std::int64_t environment,
+                     const Adds& adds) {
+  const Vec3<T>& x = vertex.position;
+  const auto touch = [&](const ContactAt<T>& contact) {
+    if (vertex.touch(contact)) adds(contact);
+  };
+  for (int c = 0; c < material.planes_count; ++c) {
+    const T* p = material.planes.of(environment) + planes_numbers * c;
+    const Vec3<T> normal = {p[0], p[1], p[2]};
+    touch({c,
+           normal,
+           dot(normal, x) - p[planes_height],
+           p[planes_friction],
+           {T(0), T(0), T(0)},
+           T(0)});
+  }
+  for (int c = 0; c < material.spheres_count; ++c) {
+    const T* p = material.spheres.of(environment) + spheres_numbers * c;
+    const Vec3<T> offset = x - Vec3<T>{p[0], p[1], p[2]};
+    const T length = square_root(dot(offset, offset));
+    if (!(length > T(0))) continue;
+    touch({material.planes_count + c,
+           (T(1) / length) * offset,
+           length - p[spheres_radius],
+           p[spheres_friction],
+           {p[spheres_motion], p[spheres_motion + 1], p[spheres_motion + 2]},
+           T(1) / length});
+  }
+}
+
+// One vertex of one environment, by the user's number; `pin` holds it, or -1.
+template <class T, class P>
+struct AdjointVertex {
+  const AdjointSystemCall<T, P>& call;
+  std::int64_t environment;
+  int vertex, pin;
+
+  PD_HD Vec3<T> read(const T* from) const {
+    const T* p = from + 3 * (environment * call.plan.vertices + vertex);
+    return {p[0], p[1], p[2]};
+  }
+
+  PD_HD void write(T* to, const Vec3<T>& a) const {
+    T* p = to + 3 * (environment * call.plan.vertices + vertex);
+    p[0] = a.x;
+    p[1] = a.y;
+    p[2] = a.z;
+  }
+
+  PD_HD T mass() const { return call.material.masses.of(environment)[vertex]; }
+
+  PD_HD T spring() const {
+    return pin < 0 ? T(0) : call.material.pin_stiffness.of(environment)[pin];
+  }
+
+  PD_HD T inertia(T spring) const {
+    return inertia_weight(mass(), *call.material.damping.of(environment), spring,
+                          T(call.time_step));
+  }
+
+  // r = m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - force + k (x' - pin) + elasticity; contacts do not enter
+  PD_HD Vec3<T> residual(const Vec3<T>& after, const Vec3<T>& moved) const {
+    const T h = T(call.time_step);
+    const T* g = call.material.gravity.of(environment);
+    Vec3<T> pull =
+        mass() * multiply_add(T(1) / h, read(call.velocities), Vec3<T>{g[0], g[1], g[2]});
+    if (call.forces) pull = pull + read(call.forces);
+    Vec3<T> sum = multiply_add(inertia(T(0)), moved, read(call.elastic_gradient)) - pull;
+    if (pin >= 0) {
+      const T* p = call.material.pin_targets.of(environment) + 3 * std::int64_t(pin);
+      sum = multiply_add(spring(), after - Vec3<T>{p[0], p[1], p[2]}, sum);
+    }
+    return sum;
+  }
+
+  // Whether no pin holds it exactly; `weight`: its inertia with its spring.
+  PD_HD static bool moves(T weight) { return weight < T(HUGE_VAL) && weight > -T(HUGE_VAL); }
+
+  PD_HD T diagonal(T weight) const {
+    return moves(weight) ? weight + call.elastic.of(environment)[vertex] : T(1);
+  }
+
+  // dL/dx' + dL/dv' / h
+  PD_HD Vec3<T> asked() const {
+    return multiply_add(T(1) / T(call.time_step), read(call.grad_velocities),
+                        read(call.grad_positions));
+  }
+
+  // What contacts do to it; see touch_all.
+  template <class Adds>
+  PD_HD HeldVertex<T> hold(T weight, const Adds& adds) const {
+    const Vec3<T> after = read(call.after);
+    HeldVertex<T> held{after, after - read(call.positions), {T(0), T(0), T(0)}, diagonal(weight)};
+    if (moves(weight)) {
+      held.residual = residual(after, held.moved);
+      touch_all(held, call.material, environment, adds);
+    }
+    return held;
+  }
+
+  // A vertex that a pin holds exactly, or friction, has no part in H: right side and 1 / D are zero.
+  PD_HD void solve_for() const {
+    const T weight = inertia(spring()), all = diagonal(weight);
+    const bool free = moves(weight);
+    Vec3<T> right = free ? asked() : Vec3<T>{T(0), T(0), T(0)};
+    T kept = free ? weight : T(0), inverse = free ? T(1) / all : T(0);
+    if (call.projector) {
+      const HeldVertex<T> held = hold(weight, [](const ContactAt<T>&) {});
+      const std::int64_t at = environment * call.plan.vertices + vertex;
+      for (int row = 0; row < 3; ++row) {
+        T* to = call.projector + 9 * at + 3 * row;
+        const Vec3<T> left = (held.stuck ? held.carried : T(1)) * held.projector.row[row];
+        to[0] = left.x;
+        to[1] = left.y;
+        to[2] = left.z;
+      }
+      call.stuck[at] = held.stuck;
+      for (int n = 0; n < slide_count; ++n) {
+        T* to = call.sliding + 3 * (slide_count * at + n);
+        const Vec3<T> slides = held.stuck ? Vec3<T>{T(0), T(0), T(0)} : held.slides[n];
+        to[0] = slides.x;
+        to[1] = slides.y;
+        to[2] = slides.z;
+      }
+      kept = kept - held.curvature;
+      // with the turning of the slip, which H has
+      const Vec3<T>& across = held.slides[slide_across];
+      if (free) inverse = T(1) / (all + dot(across, across));
+      if (held.stuck) inverse = T(0);
+      right = held.projector * right;
+    }
+    // also where elasticity without bounds leaves no 1 / D
+    if (!(inverse != T(0))) right = {T(0), T(0), T(0)};
+    write(call.right, right);
+    // what environments share is written once
+    if (environment == 0 || call.rows > 1) {
+      const std::int64_t at = environment * call.plan.vertices + vertex;
+      call.inertia[at] = kept;
+      call.inverse[at] = inverse;
+    }
+  }
+};
+
+// -l . dr / d(x, v) of a vertex: dL/dx = m / h^2 (1 + damping h) l - dL/dv' / h, dL/dv = m / h l; one that friction holds moves
+// with its start, and l of one that slides has what its friction adds (solver/adjoint/friction.h), but where the solve has failed,
+// which leaves friction out. An environment whose solve could not begin has no number for an answer.
+template <class T>
+struct AdjointAnswer {
+  const AdjointResultCall<T>& call;
+  std::int64_t environment, vertex;
+
+  PD_HD std::int64_t at() const { return environment * call.vertices + vertex; }
+
+  PD_HD Vec3<T> read(const T* from) const {
+    const T* p = from + 3 * at();
+    return {p[0], p[1], p[2]};
+  }
+
+  PD_HD void write(T* to, const Vec3<T>& a) const {
+    T* p = to + 3 * at();
+    p[0] = a.x;
+    p[1] = a.y;
+    p[2] = a.z;
+  }
+
+  PD_HD void give() const {
+    const T h = T(call.time_step), mass = call.masses.of(environment)[vertex];
+    const double error = call.error[environment * call.error_stride];
+    Vec3<T> multiplier = read(call.multiplier);
+    if (!(error == error)) multiplier = {T(NAN), T(NAN), T(NAN)};
+    const T inertia = inertia_weight(mass, *call.damping.of(environment), T(0), h);
+    const Vec3<T> before = (T(1) / h) * read(call.grad_velocities);
+    Vec3<T> sum = inertia * multiplier - before;
+    if (call.stuck && call.stuck[at()]) {
+      const T* p = call.projector + 9 * at();
+      const Mat3<T> free = {{{p[0], p[1], p[2]}, {p[3], p[4], p[5]}, {p[6], p[7], p[8]}}};
+      sum = sum + free * (read(call.grad_positions) + before - read(call.elastic));
+    }
+    if (call.sliding && error <= adjoint_failed * adjoint_tolerance<T>) {
+      // the direction of slip turns with its start
+      const T* p = call.sliding + 3 * (slide_count * at() + slide_across);
+      const Vec3<T> across = {p[0], p[1], p[2]};
+      sum = multiply_add(dot(across, multiplier), across, sum);
+    }
+    write(call.out_positions, sum);
+    write(call.out_velocities, (mass / h) * multiplier);
+    write(call.out_multiplier, multiplier);
+  }
+};
+
+}  // namespace pd::inline PD_TARGET

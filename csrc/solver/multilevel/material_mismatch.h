@@ -1,0 +1,84 @@
+// How far the material of a step is from that which M of solver/multilevel/lbfgs.h was made of.
+#pragma once
+#include "math/config.h"
+#include "views/views.h"
+
+#include <cmath>
+
+namespace pd::inline PD_TARGET {
+
+// Ratios of one to the other.
+struct Range {
+  double least = HUGE_VAL, largest = 0;
+
+  PD_HD void count(double ratio) { add({ratio, ratio}); }
+
+  PD_HD void add(const Range& other) {
+    least = other.least < least ? other.least : least;
+    largest = other.largest > largest ? other.largest : largest;
+  }
+};
+
+constexpr double known_inertia =
+    4;  // times what M was made of and the elements have become: more is left to the diagonal
+
+struct Misfit {
+  double scale = 1;        // s of A <= s A_0, strangers aside
+  double spread = 0;       // 1 - q / s, q A_0 <= A <= s A_0 with them
+  double trusted = 1;      // ratio of inertias up to known_inertia times which M is believed
+  bool strangers = false;  // whether there are vertices beyond, or that M alone holds
+
+  Misfit() = default;
+
+  PD_HD Misfit(const Range& elements, const Range& inertias)
+      : trusted(larger(elements.largest, smaller(inertias.least, inertias.largest))),
+        strangers(inertias.largest > known_inertia * trusted) {}
+
+  // `common`: the inertias that are no strangers'; `other_pins`: the step holds other vertices than M does
+  PD_HD void conclude(const Range& elements, const Range& inertias, const Range& common,
+                      bool other_pins) {
+    scale = larger(elements.largest, common.largest);
+    const double least = smaller(elements.least, common.least);
+    spread = other_pins ? 1 : 1 - least / larger(elements.largest, inertias.largest);
+    strangers = strangers || other_pins;
+  }
+
+  PD_HD static double larger(double a, double b) { return a < b ? b : a; }
+  PD_HD static double smaller(double a, double b) { return b < a ? b : a; }
+};
+
+constexpr int ranges_count = 2;  // that threads compare at a time
+
+// Measures together with all threads of a team. The runner supplies each_tet(visit(t)) and each_vertex(visit(i, a)) over the
+// thread's share, a being 0 where the step holds the vertex, and meet(ranges), which makes them those of all threads.
+#if defined(__CUDACC__)
+#pragma nv_exec_check_disable
+#endif
+template <class Runner, class T>
+PD_HD Misfit measure_misfit(Runner& run, const Levels<T>& levels, const T* stiffness) {
+  Range first[ranges_count], second[ranges_count];
+  Range &elements = first[0], &inertias = first[1], &common = second[0], &differ = second[1];
+  run.each_tet([&](std::int64_t t) {
+    elements.count(double(stiffness[t]) / double(levels.reference_stiffness[t]));
+  });
+  // visit(a / a_0) of the vertices that neither the step nor M holds; counts those that one of them alone holds
+  const auto each_inertia = [&](const auto& visit) {
+    run.each_vertex([&](std::int64_t i, double a) {
+      const bool free = levels.fine_inverse[i] > T(0);
+      if (a > 0 && free) visit(a / double(levels.reference_inertia[i]));
+      if ((a > 0) != free) differ.count(1);
+    });
+  };
+  each_inertia([&](double ratio) { inertias.count(ratio); });
+  run.meet(first);
+  Misfit misfit(elements, inertias);
+  const double most = known_inertia * misfit.trusted;
+  each_inertia([&](double ratio) {
+    if (!(ratio > most)) common.count(ratio);
+  });
+  run.meet(second);
+  misfit.conclude(elements, inertias, common, differ.largest > 0);
+  return misfit;
+}
+
+}  // namespace pd::inline PD_TARGET
