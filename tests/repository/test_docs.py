@@ -13,7 +13,7 @@ import pytest
 import torch
 from devices import missing_gpu
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FILES = [
     "README.md",
     "benchmarks/README.md",

@@ -14,7 +14,7 @@ import torch
 
 import torchpd as pd
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SCENE = pd.Scene(pd.Solid(pd.shapes.box((1.0, 0.2, 0.2), (5, 1, 1)), youngs=1e5), pd.Gravity())
 SCRIPT = """\
 import torchpd as tpd

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 HELPERS = Path(__file__).resolve().parent
-ROOT = HELPERS.parent
+ROOT = HELPERS.parent.parent
 CSRC = ROOT / "csrc"
 
 

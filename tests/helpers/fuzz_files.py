@@ -1,7 +1,7 @@
 """Damaged mesh files: each is read or refused by name, in time, in silence and within a bound of memory.
 
-`python tests/fuzz_files.py 5000` damages so many files, made from small sound ones of every format, and reports; a
-second number is that of the first file, for others than the last time.
+`python tests/helpers/fuzz_files.py 5000` damages so many files, made from small sound ones of every format, and
+reports; a second number is that of the first file, for others than the last time.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("poisoned")
 
 MESH = pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2))
 SMOOTH, ROUGH, STICKY = 0.0, 0.3, 3.0
-TOLERANCE = 1e-6  # see tests/test_adjoint.py
+TOLERANCE = 1e-6  # see tests/ops/test_adjoint.py
 
 
 def noise(shape: torch.Size, seed: int) -> Tensor:
