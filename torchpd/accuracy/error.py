@@ -212,9 +212,9 @@ def exact_steps(
     `Multilevel` runs in float64 on the CPU until the residual stops falling. Newton's method follows if the result is
     uncertain, with contacts or without. Other solvers then continue from the best result so far.
 
-    `ExactStep.uncertainty` bounds the remaining error: |grad E| / min m/h^2 >= |u - u*| where the elements are stable,
-    or twice the next step of Newton's method, which is far shorter for stiff bodies. If it is large, there is no
-    converged step to compare with.
+    `ExactStep.uncertainty` bounds the remaining error. Where the elements are stable, |grad E| / min m/h^2 >= |u - u*|.
+    Another bound is twice the next step of Newton's method, which is far shorter for stiff bodies. If the uncertainty
+    is large, there is no converged step to compare with.
 
     Args:
         sim: scene, time step and material; its solver and device do not matter. float32 needs less certainty.

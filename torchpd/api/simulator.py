@@ -60,8 +60,8 @@ class Simulator(Stepper):
         tolerance: an environment stops iterating when its estimated relative displacement error falls below this; 0:
             never. Relative to the displacement that elasticity and contacts (or gravity, if more) cause:
             docs/limits.md.
-        kernel: of a GPU: "block", "cluster", "grid" or "stream"; "auto" takes the first that fits or, with `batch`, the
-            one expected to be fastest; "benchmark" times each that fits. See docs/gpu.md. May be set later.
+        kernel: of a GPU: "block", "cluster", "grid" or "stream". "auto" takes the first that fits or, with `batch`, the
+            one expected to be fastest. "benchmark" times each that fits. See docs/gpu.md. May be set later.
         batch: expected environments of a step, for which a GPU's plan, `Multilevel` and "auto" are chosen. Other
             batches run with the same bits, possibly slower. None: unknown. May be set later. No effect on the CPU.
         adjoint: preconditioner of gradients: "solver" has that of the solver, "multilevel" the matrix of `Multilevel`
@@ -149,7 +149,7 @@ class Simulator(Stepper):
             ValueError: non-finite states, forces or material; a singular system; a scene without motion.
             RuntimeError: no converged step to compare with; solver and iterations stay.
         """
-        from ..accuracy.tuning import tune  # its methods of comparison take a tenth of a second to import
+        from ..accuracy.tuning import tune  # imported here, because its baselines take 0.1 s to import
 
         return tune(
             self,

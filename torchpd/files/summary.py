@@ -164,15 +164,15 @@ def _kernel_lines(sim: Stepper) -> list[str]:
 
 def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     """Memory of a CPU step for one environment [B], besides plan, material and states; `real` bytes a number."""
-    # five vectors of four numbers, two weights, and the slots of the patches
+    # five vectors of four numbers, two weights, and the slots of patches
     numbers = 22 * plan.vertices + 8 * len(plan.slot_vertex)
     if not isinstance(solver, Multilevel):
         return real * numbers
-    # four vectors of the outer iteration, four of a cycle, and eight pairs
+    # four vectors of an iteration, four of a V-cycle, and eight L-BFGS pairs
     numbers += 4 * plan.vertices * (8 + (16 if solver.outer != "momentum" else 0))
     if solver.outer != "corotated":
         return real * numbers
-    # of each vertex sixteen numbers, and A times them; sums of every 256 vertices and of every patch; and two inverses
+    # the coarse problem: 16 numbers per vertex, A times these, sums per 256 vertices and per patch, and two inverses
     products, pairs = 2 * 16 * 16, _TURNING_MODES * (_TURNING_MODES + 1) // 2
     sums = products * -(-plan.vertices // 256) + pairs * plan.patches
     return real * (numbers + 32 * plan.vertices) + 8 * (sums + 2 * _TURNING_MODES**2)

@@ -80,8 +80,7 @@ def _near(lows: Array, highs: Array) -> Iterator[tuple[int, int]]:
 def _points(mesh: TetMesh, place: Array, low: Array, high: Array) -> Array:
     """Points behind the surface of a body in a box: centroids of tets, and corners pulled slightly towards a centroid.
 
-    So bodies that share a face do not overlap, and no corner lies on a face of the other body if both have the same
-    grid.
+    So bodies that share a face do not overlap. If both have the same grid, no corner lies on a face of the other.
     """
     outer = np.zeros(len(place), dtype=np.bool_)
     outer[mesh.boundary()] = True

@@ -24,9 +24,8 @@ class MutationGuard:
 
     def __init__(self, tensor: Tensor | None = None, found: Any = None) -> None:
         self.found = found
-        self._tensor = (
-            None if tensor is None or tensor.is_inference() else tensor
-        )  # inference tensors count no versions
+        # inference tensors count no versions
+        self._tensor = None if tensor is None or tensor.is_inference() else tensor
         self._version = -1 if self._tensor is None else self._tensor._version
 
     def __deepcopy__(self, memo: dict[int, Any]) -> MutationGuard:

@@ -58,7 +58,7 @@ class PinnedPieces:
         """Whether each component can move rigidly in any environment [components]; `hard` is [P] or [B, P].
 
         Soft pins leave a component all rigid motions. Hard ones leave it rotations if they lie at a point or along a
-        line: then at most one eigenvalue of their covariance is significant against the size of the component.
+        line. Then at most one eigenvalue of their covariance is significant against the size of the component.
         """
         loose = np.ones(len(self.squares), dtype=np.bool_)
         if not len(self.points):

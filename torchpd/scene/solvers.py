@@ -23,7 +23,7 @@ __all__ = [
 
 LARGEST_COUNT = 1_000_000_000  # of iterations; the ops have the same limit
 Diagonal = Literal["weighted", "plain"]
-# settings of a step that the simulator says, whatever the solver
+# settings of a step that do not depend on the solver
 _OTHERS = ("iterations", "time_step", "tolerance", "inertial", "report")
 _DEFAULTS: dict[str, Any] = {}  # of the others, as csrc/views/settings.def declares them
 if load_extension()[0] is not None:  # a solver can be described without it

@@ -342,8 +342,8 @@ class Model(nn.Module):
             arrays: by name, see `Simulator`. One number is for all elements, vertices or pins of `stiffness`, `masses`
                 or `pin_stiffness`; [B, 1] is one number for each environment, also of `damping`. The last dimension
                 never counts environments.
-            friction, height, radius: columns of `planes` and `spheres` by name, in place of these: `friction` [C + S]
-                of grounds, then spheres, `height` [C] and `radius` [S] in m. Each may be one number, or [B, 1].
+            friction, height, radius: columns of `planes` and `spheres`, in place of these. `friction` is [C + S] with
+                grounds first, `height` [C] m, `radius` [S] m. Each may be one number, or [B, 1].
 
         Raises:
             ValueError, TypeError: shapes, values, or batches that disagree with each other or with arrays that stay.

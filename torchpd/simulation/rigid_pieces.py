@@ -229,7 +229,7 @@ class RigidPieces:
 def _look(sim: Stepper) -> list[tuple[Any, ...]]:
     """Evidence of writes that needs no values: the objects, their versions and addresses."""
     arrays = [getattr(sim, name) for name in _MADE_OF]
-    # tensors of inference mode count no versions
+    # inference tensors count no versions
     versions = [0 if array.is_inference() else array._version for array in arrays]
     seen = [(array, version, array.data_ptr()) for array, version in zip(arrays, versions, strict=True)]
     return [(None, sim.time_step), *seen]

@@ -90,8 +90,8 @@ class Info(NamedTuple):
         restarts: of the acceleration, because the energy rose. For `Multilevel`: rejected trials.
         converged: whether the estimated error was within `Simulator.tolerance` before the iterations ran out; False
             without a tolerance. It is an error of positions, so it may hold while the residual is large.
-        rho: spectral radius used by the schedule. For `Multilevel` the material mismatch 1 - q / s, where q A_0 <= A <=
-            s A_0 and A_0 is the matrix it was prepared for: 0 if it fits, near 1 if not (`prepare_solver`).
+        rho: spectral radius used by the schedule. For `Multilevel` the material mismatch 1 - q / s in [0, 1), where
+            q A_0 <= A <= s A_0. A_0 is the matrix of `Simulator.prepare_solver`.
         inverted: tetrahedra with det F <= 0 at the end of the step. A body may rest with some, converged, in a folded
             minimum of its energy. -1 unless requested.
 
