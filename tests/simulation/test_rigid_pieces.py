@@ -362,5 +362,5 @@ def test_scenes_without_pieces_are_refused_with_the_numbers() -> None:
         with pytest.raises(ValueError, match=f"10000 to 500000 Pa, and .*{counted}.*; choose another stiffer_than"):
             pd.RigidPieces(sim, stiffer_than=threshold)
     solid = pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2)), 1e5)
-    with pytest.raises(ValueError, match="the scene has contacts"):
+    with pytest.raises(ValueError, match="RigidPieces: the scene must have no contacts"):
         pd.RigidPieces(pd.Simulator(pd.Scene(solid, pd.Ground()), iterations=8), stiffer_than=0.0)
