@@ -105,7 +105,7 @@ def test_rounding_is_told_apart_from_error(error: float) -> None:
     share = 10.0 * 2.0**-23 * float(state.positions.norm()) / exact.scale
     assert share > 10.0 * error
     assert result.rounding >= 0.999 * share
-    assert str(result).startswith(f"error {error:.1e} and up to {result.rounding:.1e} of rounding, ")
+    assert str(result).startswith(f"error {error:.1e} plus rounding of up to {result.rounding:.1e}, ")
     assert result.verify(sim, state, sim(state)).tolist() == [0.0]
     sim.iterations //= 4
     found = float(result.verify(sim, state, sim(state)))

@@ -96,7 +96,7 @@ def test_a_step_of_the_multilevel_solver_takes_what_it_is_said_to(
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_print_says_how_much(kernel: str) -> None:
     sim = on_gpu(body(contacts=False), torch.float32, kernel)
-    said = re.search(r"([\d,]+) B an environment during a step(, at most ([\d,]+) B in all)?$", str(sim), re.MULTILINE)
+    said = re.search(r"([\d,]+) B per environment during a step(, at most ([\d,]+) B in all)?$", str(sim), re.MULTILINE)
     assert said
     one, _, most = said.groups()
     assert int(one.replace(",", "")) == bytes_taken(sim, 1)

@@ -93,7 +93,7 @@ def test_absent_effects_change_no_bits(dtype: torch.dtype, device: torch.device)
             "block",
             (
                 "1 patch,",
-                "one thread block an environment",
+                "one thread block per environment",
                 '"cluster", faster for a few environments (batch=1), "grid" or "stream"',
             ),
         ),
@@ -147,8 +147,8 @@ def test_print_says_what_a_step_takes_on_a_gpu(kernel: str, monkeypatch: pytest.
     monkeypatch.setattr(summary, "step_bytes", taken)
     most = ", at most 9,001 B in all" if kernel == "block" else ""
     for batch, words in (
-        (None, "1,001 B an environment during a step"),
-        (12, "751 B an environment during a step of 12"),
+        (None, "1,001 B per environment during a step"),
+        (12, "751 B per environment during a step of 12"),
     ):
         sim = simulator(bare(), torch.float32, batch=batch)
         sim.plan = choose_plan(sim.scene.values(), torch.float32, Properties(132, 232_448), kernel)

@@ -176,7 +176,9 @@ def test_forces_of_every_step_are_a_function(forces: Any, sim: pd.Simulator) -> 
 
 def test_targets_of_every_step_are_a_function(sim: pd.Simulator) -> None:
     state, targets = sim.rest_state(2), torch.zeros(4, 2, 3, 3)
-    with pytest.raises(ValueError, match=r"targets must be .*, got \[4, 2, 3, 3\]; .* pass a function of the step number"):
+    with pytest.raises(
+        ValueError, match=r"targets must be .*, got \[4, 2, 3, 3\]; .* pass a function of the step number"
+    ):
         sim.rollout(state, 4, targets=targets)
     with pytest.raises(ValueError, match=r"targets must be .*, got \[4, 2, 3, 3\]$"):
         sim(state, targets=targets)

@@ -190,9 +190,9 @@ class TuningResult:
         wanted = f"{self.requested_milliseconds:g} ms" if error is None else f"error {error:g}"
         why = f"{wanted} not reached; {self.left_out}" if self.left_out else f"{wanted} cannot be reached"
         verdict = "" if self.attained else f" ({why})"
-        rounding = f" and up to {self.rounding:.1e} of rounding" if self.rounding > 0.1 * self.error else ""
+        rounding = f" plus rounding of up to {self.rounding:.1e}" if self.rounding > 0.1 * self.error else ""
         other = ", for another material than the present one" if self.other_material else ""
-        return f"error {self.error:.1e}{rounding}, {self.milliseconds:.2g} ms a step of {self.batch}{verdict}{other}"
+        return f"error {self.error:.1e}{rounding}, {self.milliseconds:.2g} ms per step of {self.batch}{verdict}{other}"
 
 
 def _info(info: object, name: str) -> Info:

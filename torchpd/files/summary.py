@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["describe", "workspace_bytes"]
 
 # cost of an effect that only changes the weights and targets, which every vertex has anyway
-_FOLDED = "folded into the inertia of a vertex: nothing per iteration"
+_FOLDED = "part of the vertex weights: no cost per iteration"
 
 _ANY_BATCH = 2**31 - 1
 _TURNING_MODES = 24  # of the coarse problem of Multilevel("corotated"), see csrc/solver/multilevel/deflation.h
@@ -88,7 +88,7 @@ def _preconditioner_lines(sim: Stepper) -> list[str]:
 def _effect_lines(sim: Stepper) -> list[str]:
     scene = sim.scene
     tets = sum(len(solid.mesh.tets) for solid in scene.solids)
-    lines = [f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step an iteration"]
+    lines = [f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step per iteration"]
     if any(solid.mesh.fill is not None for solid in scene.solids):
         lines.append(
             "fill: stiffness and masses are multiplied by the fill of each tetrahedron (mesh.fill), unless set"
@@ -99,9 +99,9 @@ def _effect_lines(sim: Stepper) -> list[str]:
     if bool((sim.damping != 0).any()):
         lines.append(f"damping: {_FOLDED}")
     if scene.grounds:
-        lines.append(f"grounds: {len(scene.grounds)}, one projection a vertex and iteration each")
+        lines.append(f"grounds: {len(scene.grounds)}, one projection per vertex and iteration each")
     if scene.spheres:
-        lines.append(f"spheres: {len(scene.spheres)}, one projection a vertex and iteration each")
+        lines.append(f"spheres: {len(scene.spheres)}, one projection per vertex and iteration each")
     return lines
 
 
@@ -111,7 +111,7 @@ def _pin_lines(sim: Stepper) -> list[str]:
     always, ever = int(rows.all(0).sum()), int(rows.any(0).sum())
     lines = []
     if always:
-        lines.append(f"hard pins: {always} fixed vertices: nothing per iteration")
+        lines.append(f"hard pins: {always} fixed vertices: no cost per iteration")
     if ever > always:
         lines.append(f"pins that are hard in some environments only: {ever - always}, springs in the others")
     if soft := rows.shape[1] - ever:
@@ -122,20 +122,21 @@ def _pin_lines(sim: Stepper) -> list[str]:
 def _pass_line(sim: Stepper) -> str:
     plan = sim.plan
     shared = len(plan.shared_start) - 1
+    patches = f"{plan.patches} patch{'es' * (plan.patches > 1)}"
     second = f" and one over {shared} vertices that patches share" if shared else ""
     return (
-        f"an iteration is one pass over {plan.patches} patches{second}; "
+        f"an iteration is one pass over {patches}{second}; "
         "with 8 or more environments, SIMD lanes run over environments"
     )
 
 
 _LAUNCHES = {
-    "block": "one thread block an environment, or several small ones, all iterations in one launch",
+    "block": "one thread block per environment, or several small ones, all iterations in one launch",
     "cluster": "a cluster of thread blocks, one for each patch, all iterations in one launch",
     "grid": "a thread block for each patch, all iterations in one launch",
     "stream": "a thread block for each patch, launches for every iteration",
 }
-_LEVEL_LAUNCHES = "some thread blocks an environment, all iterations in one launch"
+_LEVEL_LAUNCHES = "some thread blocks per environment, all iterations in one launch"
 
 
 def _kernel_lines(sim: Stepper) -> list[str]:
@@ -157,7 +158,7 @@ def _kernel_lines(sim: Stepper) -> list[str]:
     asked = "" if has_levels(plan.arrays) else f"; Simulator(..., kernel=...) can select {others}"
     return [
         f"kernel {kernel}: {launches}",
-        f"mesh: {patches}, {shared}, {block:,} B of shared memory a thread block",
+        f"mesh: {patches}, {shared}, {block:,} B of shared memory per thread block",
         f"why {kernel}: {plan.why}{batch}{asked}",
     ]
 
@@ -182,11 +183,11 @@ def _step_bytes(sim: Stepper, real: int) -> str:
     """Text about the memory of a step, besides plan, material and states."""
     plan = sim.plan
     if plan.kernel is None:
-        return f"{workspace_bytes(plan, real, sim.solver):,} B an environment during a step"
+        return f"{workspace_bytes(plan, real, sim.solver):,} B per environment during a step"
     scene = sim.compiled
     batch = scene.environments
     each = -(-step_bytes(scene, plan, batch, sim.device) // batch)
-    taken = f"{each:,} B an environment during a step{f' of {batch:,}' if batch > 1 else ''}"
+    taken = f"{each:,} B per environment during a step{f' of {batch:,}' if batch > 1 else ''}"
     if plan.kernel == "stream":
         return taken
     # only environments that run at the same time take memory
