@@ -354,7 +354,7 @@ def test_what_it_was_made_of_goes_along() -> None:
 
 def test_meta_is_refused() -> None:
     there = simulate(torch.float32).to("meta")
-    with pytest.raises(RuntimeError, match="Multilevel is prepared on the CPU or on a GPU, not on meta"):
+    with pytest.raises(RuntimeError, match="device must be the CPU or a GPU for Multilevel, got meta"):
         there.solver = pd.Multilevel()
     assert there.solver == pd.Chebyshev()
 

@@ -270,7 +270,7 @@ def test_solvers_are_checked() -> None:
         (lambda: pd.Chebyshev("classic", rho=0.9, delay=1.5), r"Chebyshev\.delay must be a whole number"),
         (lambda: pd.Chebyshev(rho=math.nan), r"Chebyshev\.rho must be finite"),
         (lambda: pd.Chebyshev(relaxation=3.0), r"Chebyshev\.relaxation must lie in \(0, 2\)"),
-        (lambda: pd.Chebyshev(delay=5), r'Chebyshev\.delay belongs to schedule="classic"'),
+        (lambda: pd.Chebyshev(delay=5), r'Chebyshev\.delay must be None unless schedule="classic", got 5'),
         (lambda: pd.Chebyshev(diagonal="plain"), r'Chebyshev\.diagonal must be "weighted" when guarded'),
     ):
         with pytest.raises(ValueError, match=message):

@@ -168,7 +168,7 @@ def test_a_first_iterate_that_asks_for_a_gradient_is_refused() -> None:
     sim = simulator()
     state = sim.rest_state()
     start = state.positions.clone().requires_grad_()
-    with pytest.raises(ValueError, match=r"start, the first iterate, requires a gradient, .* detach\(\)"):
+    with pytest.raises(ValueError, match=r"start must not require a gradient, .* detach\(\)"):
         sim(state, start=start)
     with torch.no_grad():
         sim(state, start=start)

@@ -174,7 +174,8 @@ class Pin(_Key):
             bad = int(chosen[(chosen < 0) | (chosen >= count)][0])
             raise IndexError(f"Pin.vertices must lie in 0..{count - 1} (vertices of the body), got {bad}")
         if len(np.unique(chosen)) != len(chosen):
-            raise ValueError("Pin.vertices must not name a vertex twice")
+            numbers, counts = np.unique(chosen, return_counts=True)
+            raise ValueError(f"Pin.vertices must name each vertex once, got {int(numbers[counts.argmax()])} twice")
         springs = None
         if stiffness is not None:
             springs = as_array("Pin.stiffness", stiffness, np.float64)
@@ -223,7 +224,7 @@ class Ground(_Key):
         direction = check_vector("Ground.normal", normal)
         largest = float(np.abs(direction).max())
         if largest == 0.0:
-            raise ValueError("Ground.normal must not be the zero vector")
+            raise ValueError("Ground.normal must not be zero, got [0, 0, 0]")
         direction = direction / largest  # so that no length overflows
         direction = direction / np.linalg.norm(direction)
         direction.setflags(write=False)

@@ -82,19 +82,20 @@ class Scene:
                 raise _no_part(part)
         self.parts: tuple[Part, ...] = parts
         if not self.solids:
-            raise ValueError("Scene needs at least one body, for example Solid(mesh, youngs=1e5, density=1000.0)")
+            raise ValueError("Scene needs at least one body, got none; add Solid(mesh, youngs=1e5, density=1000.0)")
         if len({id(part) for part in parts}) != len(parts):
-            raise ValueError("Scene: the same part is given twice")
+            twice = next(part for number, part in enumerate(parts) if any(part is one for one in parts[:number]))
+            raise ValueError(f"Scene: each part must be given once, got the same {type(twice).__name__} twice")
         for kind in (Gravity, Damping):
             if len(self._all(kind)) > 1:
                 raise ValueError(f"Scene takes at most one {kind.__name__}, got {len(self._all(kind))}")
         solids = {id(solid) for solid in self.solids}
         for pin in self.pins:
             if id(pin.solid) not in solids:
-                raise ValueError("Scene: a Pin holds a Solid that is not a part of this scene; pass both")
-        pinned = self._pinned()
-        if len(np.unique(pinned)) != len(pinned):
-            raise ValueError("Scene: two pins hold the same vertex")
+                raise ValueError("Scene: the solid of a Pin must be a part of this scene, got another one; pass both")
+        numbers, counts = np.unique(self._pinned(), return_counts=True)
+        if (counts > 1).any():
+            raise ValueError(f"Scene: pins must hold different vertices, got two at {int(numbers[counts.argmax()])}")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
         """The scene itself, so that a copied simulator knows the same parts."""
@@ -131,7 +132,7 @@ class Scene:
             if other is solid:
                 return slice(start, start + len(other.mesh.vertices))
             start += len(other.mesh.vertices)
-        raise ValueError("Scene.vertex_range: this Solid is not a part of the scene")
+        raise ValueError("Scene.vertex_range: solid must be a part of the scene, got another one")
 
     def pin_range(self, pin: Pin) -> slice:
         """Slice of a pin's targets in pin_targets [P, 3]."""
@@ -140,7 +141,7 @@ class Scene:
             if other is pin:
                 return slice(start, start + len(other.vertices))
             start += len(other.vertices)
-        raise ValueError("Scene.pin_range: this Pin is not a part of the scene")
+        raise ValueError("Scene.pin_range: pin must be a part of the scene, got another one")
 
     def values(self) -> SceneValues:
         """The flat arrays of the scene, in the user's order."""

@@ -119,10 +119,10 @@ class Chebyshev:
                 _keep(self, "delay", check_whole("Chebyshev.delay", self.delay, minimum=0, maximum=LARGEST_COUNT))
         else:
             if self.delay is not None:
-                raise ValueError(f'Chebyshev.delay belongs to schedule="classic"; guarded has none, got {self.delay}')
+                raise ValueError(f'Chebyshev.delay must be None unless schedule="classic", got {self.delay}')
             if self.diagonal == "plain":
                 raise ValueError(
-                    'Chebyshev.diagonal must be "weighted" when guarded: its descent rests on that diagonal'
+                    'Chebyshev.diagonal must be "weighted" when guarded, since descent needs it, got "plain"'
                 )
 
     def settings(self) -> dict[str, Any]:
@@ -202,5 +202,5 @@ def check_solver(solver: object, device: torch.device) -> Solver:
             f"Simulator: solver must be Jacobi, Chebyshev, Multilevel or one of {get_args(SolverName)}, got {given}"
         )
     if isinstance(solver, Multilevel) and device.type not in ("cpu", "cuda"):
-        raise RuntimeError(f"Simulator: Multilevel is prepared on the CPU or on a GPU, not on {device}")
+        raise RuntimeError(f"Simulator: device must be the CPU or a GPU for Multilevel, got {device}")
     return solver

@@ -428,7 +428,7 @@ class Model(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
         if wanted.dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"Simulator runs in torch.float32 or torch.float64, not in {wanted.dtype}")
+            raise TypeError(f"Simulator: dtype must be torch.float32 or torch.float64, got {wanted.dtype}")
         check_time_step(self.time_step, wanted.dtype)
         choice, ends = self.choice, {self.device.type, wanted.device.type}
         # widening does not restore the digits that float32 lost, and "meta" has none

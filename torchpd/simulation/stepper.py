@@ -111,7 +111,7 @@ class Stepper(Readable):
         forces = self.check_state(state, forces=forces)
         if state[0].requires_grad or state[1].requires_grad:
             raise ValueError(
-                "step_ overwrites the state, so it must not require gradients; detach it or call the simulator"
+                "step_: state must not require gradients, because it is overwritten; detach it or call the simulator"
             )
         if not (info is None or isinstance(info, Tensor)):
             raise TypeError(
@@ -278,7 +278,7 @@ def _first_iterate(start: str | Tensor, positions: Tensor) -> tuple[Tensor | Non
         check_like("start", start, positions, "first iterate, m")
         if start.requires_grad and torch.is_grad_enabled():
             raise ValueError(
-                "start, the first iterate, requires a gradient, but a solved step does not depend on it: detach() it"
+                "start must not require a gradient, because a solved step does not depend on it: detach() it"
             )
         return start, False
     if not _is_start(start):

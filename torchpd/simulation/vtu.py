@@ -102,7 +102,7 @@ def _records(compiled: CompiledScene, check: Callable[[State], object], states: 
 
 def _chosen(environment: int | None, batch: int) -> int:
     if environment is None and batch != 1:
-        raise ValueError(f"write_vtu writes one environment, got states of {batch}; choose one: environment=0")
+        raise ValueError(f"write_vtu: environment must be given for states of {batch}, for example environment=0")
     number = check_whole("write_vtu: environment", environment or 0, minimum=0)
     if number >= batch:
         raise IndexError(f"write_vtu: environment must lie in 0..{batch - 1}, got {number}")
