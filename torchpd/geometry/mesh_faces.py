@@ -19,8 +19,8 @@ __all__ = [
     "count_pieces",
     "match_faces",
     "merge_near",
+    "mesh_components",
     "numbered",
-    "pieces_of",
     "report_faces",
 ]
 
@@ -227,7 +227,7 @@ def _enclosed(points: Array, tets: Index) -> float | None:
     return float(np.abs(np.bincount(np.minimum(here, mirrored), weights=signed)).sum())
 
 
-def pieces_of(tets: Index) -> Index:
+def mesh_components(tets: Index) -> Index:
     """A number for each vertex [V]: equal where vertices hang together by tets."""
     count = int(tets.max()) + 1
     rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].reshape(-1)
@@ -237,7 +237,7 @@ def pieces_of(tets: Index) -> Index:
 
 def count_pieces(tets: Index) -> int:
     """How many pieces hang together by vertices."""
-    return len(np.unique(pieces_of(tets)[tets[:, 0]]))
+    return len(np.unique(mesh_components(tets)[tets[:, 0]]))
 
 
 def _report_unmerged(count: str, tets: Index, first: Index, tolerance: float) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..ops.diagonal import named_material
-from ..scene.pins import PinnedPieces
+from ..scene.pins import PinnedComponents
 from ..scene.scene import Scene
 from ..scene.solvers import Solver
 from .cpu_plan import Plan
@@ -38,7 +38,7 @@ class CompiledScene:
     """
 
     scene: Scene
-    pinned: PinnedPieces  # pinned points of the scene's components
+    pinned: PinnedComponents  # pinned points of the scene's components
     plan: Plan
     material: list[Tensor]  # in the order of the ops, with inf for springs of hard pins
     time_step: float  # h [s]

@@ -27,7 +27,7 @@ __all__ = [
     "internal_numbers",
     "kernel_of",
     "loose_pieces",
-    "with_loose_pieces",
+    "with_loose_components",
 ]
 
 _WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
@@ -97,7 +97,7 @@ class Plan:
 
     @property
     def patches(self) -> int:
-        """Pieces of the mesh: the CPU works on one at a time, a GPU has a thread block for each."""
+        """Patches of the mesh: the CPU works on one at a time, a GPU has a thread block for each."""
         return len(self.patch_block) - 1
 
     @property
@@ -159,10 +159,10 @@ def loose_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int
     return group, np.bincount(group[group >= 0], minlength=int(values.loose.sum())).astype(np.int32)
 
 
-def with_loose_pieces(plan: Plan, values: SceneValues) -> Plan:
+def with_loose_components(plan: Plan, values: SceneValues) -> Plan:
     """The plan of a CPU where other pieces of the scene can move rigidly."""
     if plan.kernel is not None:
-        raise ValueError("with_loose_pieces: a GPU's plan has its pieces in other arrays; compile it anew")
+        raise ValueError("with_loose_components: a GPU's plan has its pieces in other arrays; compile it anew")
     group, group_size = (tensor_of(array) for array in loose_pieces(values))
     sizes = plan.sizes.clone()
     sizes[_SIZE_GROUPS] = len(group_size)

@@ -17,7 +17,7 @@ from ..common.gpu import free_memory, properties_of, refuse_full_memory, seen_de
 from ..ops.diagonal import pinned_vertices
 from ..scene.solvers import Multilevel
 from .compiled import CompiledScene
-from .cpu_plan import Plan, compile_plan, with_loose_pieces
+from .cpu_plan import Plan, compile_plan, with_loose_components
 from .kernel_benchmark import quickest_plan, steps_of
 from .kernel_choice import choose_plan
 from .material import in_order, material_of
@@ -146,7 +146,7 @@ def loosened_plan(compiled: CompiledScene, hard: Tensor) -> Plan:
     if bool((loose == before).all()):
         return compiled.plan
     if compiled.plan.kernel is None:
-        return with_loose_pieces(compiled.plan, replace(compiled.scene.values(), loose=loose))
+        return with_loose_components(compiled.plan, replace(compiled.scene.values(), loose=loose))
     return move_plan(compiled, plan_anew(compiled, compiled.dtype, compiled.device, loose), compiled.device)
 
 

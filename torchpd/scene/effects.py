@@ -17,7 +17,7 @@ from ..common.checks import as_array, check_finite, check_positive, check_scalar
 from ..common.reprs import by_fields
 from ..common.synonyms import check_arguments
 from ..geometry.mesh_checks import warn
-from ..geometry.mesh_faces import pieces_of
+from ..geometry.mesh_faces import mesh_components
 from ..geometry.tet_mesh import TetMesh
 
 if TYPE_CHECKING:
@@ -78,9 +78,9 @@ def _longest_side(mesh: TetMesh) -> float:
     length = float(np.ptp(points, axis=0).max())
     if length <= _LONGEST:
         return length
-    piece = pieces_of(mesh.tets)
-    order = np.argsort(piece, kind="stable")
-    starts = np.flatnonzero(np.diff(piece[order], prepend=-1))
+    component = mesh_components(mesh.tets)
+    order = np.argsort(component, kind="stable")
+    starts = np.flatnonzero(np.diff(component[order], prepend=-1))
     sides = np.maximum.reduceat(points[order], starts) - np.minimum.reduceat(points[order], starts)
     return float(sides.max())
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
 
-__all__ = ["PIN_HARD", "PinnedPieces", "hold_exactly", "split_springs"]
+__all__ = ["PIN_HARD", "PinnedComponents", "hold_exactly", "split_springs"]
 
 PIN_HARD = "pin_hard"  # name of the buffer of a simulator
 
@@ -34,15 +34,15 @@ def hold_exactly(springs: Tensor, hard: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class PinnedPieces:
+class PinnedComponents:
     """Pinned points of the connected components of a scene, at rest."""
 
     points: Array  # [P, 3] m
-    piece: Index  # [P] number of the component that each holds
+    component: Index  # [P] number of the component that each holds
     squares: Array  # [components] m^2, second moment by mass: mean square distance of vertices from their mean
 
     @staticmethod
-    def of(positions: Array, masses: Array, component: Index, pin_vertices: Index) -> PinnedPieces:
+    def of(positions: Array, masses: Array, component: Index, pin_vertices: Index) -> PinnedComponents:
         """Build it from arrays of `SceneValues`."""
 
         def means(values: Array) -> Array:
@@ -52,7 +52,7 @@ class PinnedPieces:
 
         arms = positions - means(positions)[component]
         squares = means((arms**2).sum(axis=1, keepdims=True))[:, 0]
-        return PinnedPieces(positions[pin_vertices], component[pin_vertices], squares)
+        return PinnedComponents(positions[pin_vertices], component[pin_vertices], squares)
 
     def loose(self, hard: Mask) -> Mask:
         """Whether each component can move rigidly in any environment [components]; `hard` is [P] or [B, P].
@@ -63,7 +63,7 @@ class PinnedPieces:
         loose = np.ones(len(self.squares), dtype=np.bool_)
         if not len(self.points):
             return loose
-        held, of = np.unique(self.piece, return_inverse=True)
+        held, of = np.unique(self.component, return_inverse=True)
         rows = hard.reshape(-1, len(self.points))
         # distinct masks; np.unique would compare pin by pin
         distinct = {row.tobytes(): number for number, row in enumerate(np.packbits(rows, axis=1))}

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.synonyms import check_arguments
-from ..geometry.mesh_faces import pieces_of
+from ..geometry.mesh_faces import mesh_components
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
-from .pins import PinnedPieces
+from .pins import PinnedComponents
 
 __all__ = ["Part", "Scene", "SceneValues"]
 
@@ -37,7 +37,7 @@ class SceneValues:
     spheres: Array  # [S, 5] center, radius, friction
     damping: float  # 1/s
     component: Index  # [V] number of the connected component of each vertex
-    pinned: PinnedPieces  # pinned points of the components
+    pinned: PinnedComponents  # pinned points of the components
     loose: NDArray[np.bool_]  # [components] whether hard pins leave a component rigid motions
 
 
@@ -152,8 +152,8 @@ class Scene:
         pin_vertices = self._pinned()
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         stiffness = np.concatenate([np.zeros(0), *springs])
-        masses, component = _lumped_masses(positions, tets, density), pieces_of(tets)
-        pinned = PinnedPieces.of(positions, masses, component, pin_vertices)
+        masses, component = _lumped_masses(positions, tets, density), mesh_components(tets)
+        pinned = PinnedComponents.of(positions, masses, component, pin_vertices)
         gravity, damping = self._all(Gravity), self._all(Damping)
         return SceneValues(
             rest_positions=positions,
