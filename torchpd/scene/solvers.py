@@ -150,9 +150,9 @@ class Multilevel:
     on a CPU, and 11 to 29 times on a GPU. The scene takes longer to compile.
 
     A line search checks the energy of each iterate. After four rejected trials in a row, two accelerated Jacobi
-    iterations follow, then four, eight and so on. With contacts, "corotated" shortens rejected trials instead, and
-    takes Jacobi iterations after twelve rejections; with friction also at the start. "lbfgs" and "momentum" do not
-    model contacts; with friction, "lbfgs" takes Jacobi iterations at once.
+    iterations follow, then four, eight and so on. With contacts, "corotated" shortens rejected trials instead. It takes
+    Jacobi iterations after twelve rejections, or with friction after the first two. "lbfgs" and "momentum" do not model
+    contacts; with friction, "lbfgs" takes Jacobi iterations at once.
 
     M is prepared once, for the material of that time (`Simulator.prepare_solver`). An environment with another material
     gets M / s, where s is its largest ratio of inertia or stiffness to that material; `Info.rho` reports the mismatch.

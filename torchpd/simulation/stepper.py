@@ -65,7 +65,8 @@ class Stepper(Readable):
             targets: of pins and spheres at the end of the step [m], by part; or one tensor [P, 3] or [B, P, 3] for all
                 pins. A sphere takes its centre [3] or [B, 3], or with its velocity [6] or [B, 6], which friction needs.
             start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
-                The first two are moved out of contacts by rigid motions where that lowers the energy.
+                The first two are moved along rigid motions and out of contacts. A body that planes would squeeze there
+                starts from x.
             return_info: also return a report of the solve; costs about ten iterations, no synchronisation.
 
         Returns:
@@ -151,16 +152,18 @@ class Stepper(Readable):
     ) -> Track:
         """Advance a state by many time steps and record some of them.
 
-        Ctrl-C ends it within a second on a CPU, and on a GPU with `progress`.
+        A constant target of a sphere with a velocity moves on with it. If a function gives centres without velocities,
+        these are the displacements since the step before. The sphere then starts from its place in the scene, at step 0
+        and after steps whose targets leave it out.
+
+        Ctrl-C ends a rollout within a second on a CPU, and on a GPU with `progress`.
 
         Args:
             state: the start, which is not recorded.
             steps: number of steps.
             every: steps between records; the track has steps // every records.
             forces: as in `forward`, constant, or a function of the step number.
-            targets: as in `forward`, constant, or a function of the step number. A constant sphere with a velocity
-                moves on. If a function gives centres only, velocities are their differences between steps; before step
-                0 the scene counts.
+            targets: as in `forward`, constant, or a function of the step number.
             first: number of the first step when this rollout continues another: `rollout(state, 9)` equals
                 `rollout(rollout(state, 5).state(), 4, first=5)`. A function of targets is then also called for step
                 first - 1.
