@@ -115,8 +115,8 @@ def test_stiff_beams_are_tuned() -> None:
 
 def test_a_kernel_without_multilevel_is_tuned_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A GPU's "block", for one: the study moves by Chebyshev then."""
-    for module in ("contenders", "tuning"):
-        monkeypatch.setattr(f"torchpd.{module}.runs", lambda solver, _: not isinstance(solver, pd.Multilevel))
+    for module in ("candidates", "tuning"):
+        monkeypatch.setattr(f"torchpd.accuracy.{module}.runs", lambda solver, _: not isinstance(solver, pd.Multilevel))
     sim = bar()
     result = sim.tune(swinging(sim), error=1e-2)
     assert result.attained
