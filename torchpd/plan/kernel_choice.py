@@ -1,21 +1,23 @@
-"""Which kernel of a GPU steps a scene, and the plan for it.
+"""Choice of the GPU kernel of a scene, and the plan for it.
 
-    block    one thread block an environment, or several small ones, all iterations in one launch: the mesh fits a
-             block's shared memory
-    cluster  up to 16 blocks that reach each other's shared memory (compute capability 9.0), a patch each, all
-             iterations in one launch: a small mesh
-    grid     a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
-    stream   launches for every iteration: any mesh
+    block    one thread block per environment, or several small environments per block. All iterations run in one
+             launch; the mesh fits the shared memory of a block.
+    cluster  up to 16 blocks that access each other's shared memory (compute capability 9.0), one patch each. All
+             iterations run in one launch; for small meshes.
+    grid     one block per patch. All iterations run in one launch; the patches fit the multiprocessors.
+    stream   launches for every iteration; for any mesh.
 
-Where the number of environments is known (`Simulator(batch=...)`), the kernel that fits and should take least is taken,
-by `kernel_costs`: a cluster for a few environments of a small mesh, launches for many of a large one, and between them
-a grid, of fewer and larger patches the more environments are to run at a time. "benchmark" times each that fits.
-Every vertex belongs to one patch of a cluster, and a patch has every tetrahedron that touches one of its own vertices:
-those at the borders are worked out by several. So no forces are exchanged, and once an iteration the new position of a
-vertex is sent into the shared memory of the patches that have a copy of it. Patches of the others share no tetrahedra,
-and exchange the forces on vertices that they share.
+With a known number of environments (`Simulator(batch=...)`), `kernel_costs` chooses among the kernels that fit. The
+estimate favours a cluster for few environments of a small mesh and "stream" for many of a large one. Between them it
+favours a grid, with fewer and larger patches the more environments run at a time. "benchmark" times every kernel that
+fits.
 
-The batch of a state does not enter: an environment gives the same bits alone and in any batch.
+A cluster assigns every vertex to one patch. A patch holds every tetrahedron that touches one of its own vertices, so
+tetrahedra at patch borders are computed more than once. Patches exchange no forces: once an iteration the new position
+of a vertex is written to the shared memory of the patches that hold a copy. The patches of the other kernels share no
+tetrahedra and exchange the forces on shared vertices.
+
+The batch of a state has no influence: an environment gives the same bits alone and in any batch.
 """
 
 from __future__ import annotations
@@ -38,29 +40,29 @@ from .kernel_costs import iteration_microseconds, kernel_microseconds
 
 __all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
-_GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
-# "auto" looks at clusters for meshes of so many at most; where there are blocks, a patch of one for every so many
+_GRID_TETS = 150  # least per patch: smaller patches cost more in exchange than they save
+# "auto" tries clusters for meshes of up to 8000 tetrahedra, with one patch per 75 while there are blocks
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
-_CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
-# with a multilevel solver environments are many where they have no more multiprocessors than so many each
+# largest share of the vertices that a block of a cluster has threads for, while there are more blocks
+_CLUSTER_OWN = 0.7
+# multilevel solver: environments are many if each has at most this number of multiprocessors
 _MANY_SHARE = 4
-# with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block, of a mesh of so many at
-# most, fewer for few environments; many take less with fewer patches
+# multilevel solver: least tetrahedra per patch; largest mesh in one block, in general and for few environments;
+# tetrahedra per patch for many environments, which run faster with fewer patches
 _LEVEL_TETS, _LEVEL_ALONE, _FEW_ALONE, _MANY_TETS = 384, 1152, 384, 1900
-_LEVELS = ("few", "any", "many")  # how many environments it is for
-# a patch at most, five rounds of its threads where all have partners, and how many patches share a multiprocessor of an
-# H100 (csrc/cuda/stream/kernels.h)
+_LEVELS = ("few", "any", "many")  # by the number of environments
+# Most tetrahedra per patch, five rounds of its threads when all are paired; and patches per multiprocessor of an H100
+# (csrc/cuda/stream/kernels.h).
 _STREAM_TETS = {torch.float32: 1920, torch.float64: 960}
 _STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
-# so many times as many in a pipeline, of which a multiprocessor works on one at a time and holds two, where there is so
-# much shared memory for them and every multiprocessor has one: their slots are what its threads have in registers at
-# once (csrc/cuda/stream/pipeline.h)
+# A pipeline takes patches larger by this factor: a multiprocessor computes one and holds two, if its shared memory
+# suffices and each has a patch. Its threads keep the slots in registers (csrc/cuda/stream/pipeline.h).
 _PIPED_MORE, _PIPED_BYTES = 1.2, 200_000
-_MOST_FIELDS = 2  # of a pass: the products with a second derivative
+_MOST_FIELDS = 2  # most fields of one pass: the products with a second derivative
 
 
 def check_kernel(kernel: str) -> str:
-    """The name of a kernel, "auto" or "benchmark"."""
+    """Return a kernel name after checking it: "auto", "benchmark" or one of KERNELS."""
     names = ("auto", "benchmark", *KERNELS)
     if kernel not in names:
         raise ValueError(f"Simulator: kernel must be {any_of(names)}, got {kernel!r}")
@@ -68,7 +70,7 @@ def check_kernel(kernel: str) -> str:
 
 
 def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
-    """Shared memory of a block of the kernel that a plan is for."""
+    """Shared memory [bytes] per block of the kernel that a plan is for."""
     real = torch.finfo(plan.dtype).bits // 8
     slots, entries = plan.size("most_slots"), plan.size("most_entries")
     if plan.for_levels:
@@ -81,7 +83,7 @@ def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
 
 
 def most_shared_bytes(plan: Plan, planes: int, balls: int) -> int:
-    """The same of whatever runs with a plan: a step, and the way back through it, which passes over all patches."""
+    """Most shared memory [bytes] of a step and of its backward pass, which visits all patches."""
     return max(shared_bytes(plan, planes, balls), _pass_bytes(plan))
 
 
@@ -106,7 +108,7 @@ class _Scene(NamedTuple):
 
     @property
     def real(self) -> int:
-        """Bytes of a number."""
+        """Bytes of a real number."""
         return torch.finfo(self.dtype).bits // 8
 
     def plan(self, kernel: str, patches: int) -> Plan:
@@ -118,7 +120,7 @@ class _Scene(NamedTuple):
         return most_shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
 
     def patches(self, kernel: str, gpu: Properties) -> int:
-        """By the name of a kernel, or for a multilevel solver "few", "many" or any other number of environments."""
+        """Number of patches for a kernel, or for a multilevel solver with "few", "many" or "any" environments."""
         if kernel == "block":
             return 1
         if kernel == "cluster":
@@ -129,7 +131,7 @@ class _Scene(NamedTuple):
         if kernel in _LEVELS:
             if self.tets <= (_FEW_ALONE if kernel == "few" else _LEVEL_ALONE):
                 return 1
-            # 2.5 entries and at least a third of a slot a tetrahedron, see pass_shared_bytes
+            # estimate: 2.5 entries and a third of a slot per tetrahedron, see pass_shared_bytes
             each = (4 * 2.5 + 6 / 3) * self.real
             least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes - _C.corotation_bytes))
             if kernel == "many":
@@ -137,7 +139,7 @@ class _Scene(NamedTuple):
             rounds = -(-int(least) // gpu.multiprocessors)
             return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
         patches = -(-self.tets // _STREAM_TETS[self.dtype])
-        # what does not run at once runs in whole waves, of which the last is full too
+        # patches that do not run at once run in whole waves, of which the last is full too
         wave = _STREAM_TOGETHER[self.dtype] * gpu.multiprocessors
         if self.has_large_halves(gpu) and patches > gpu.multiprocessors:
             wave = gpu.multiprocessors
@@ -145,18 +147,18 @@ class _Scene(NamedTuple):
         return patches if patches <= wave else -(-patches // wave) * wave
 
     def has_large_halves(self, gpu: Properties) -> bool:
-        """Whether iterations of kernel "stream" are a pipeline, in float32 and without contacts, with room for more."""
+        """Whether "stream" runs as a pipeline with larger patches: float32, no contacts, enough shared memory."""
         touching = len(self.values.planes) + len(self.values.spheres) > 0
         return self.dtype == torch.float32 and not touching and gpu.shared >= _PIPED_BYTES
 
     def most_grid_patches(self, gpu: Properties) -> int:
-        """Of a grid: as many as leave each its least number of tetrahedra."""
+        """Most patches of a grid that leave each one its least number of tetrahedra."""
         return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
 
     def grids(self, batch: int, gpu: Properties) -> list[tuple[float, int]]:
-        """Times that an iteration of so many environments should take with numbers of patches, and these; best first.
+        """Estimated microseconds per iteration for each useful number of patches, in ascending order of time.
 
-        Of the numbers with which one environment, two, three... run at a time the largest.
+        For one, two, three... environments at a time, the largest number of patches is listed.
         """
         most = self.most_grid_patches(gpu)
         counts = {min(most, gpu.multiprocessors // together) for together in range(1, gpu.multiprocessors // 2 + 1)}
@@ -167,16 +169,16 @@ class _Scene(NamedTuple):
         return kernel_microseconds(kernel, patches, self.tets, batch, self.dtype, gpu)
 
     def most_own(self) -> int:
-        """Vertices that a block of a cluster has threads for."""
+        """Most vertices that a block of a cluster has threads for."""
         return next(count - 1 for count in itertools.count(1) if not _C.fits_cluster(self.real, 1, count))
 
     def considers(self, kernel: str, gpu: Properties) -> bool:
-        """Whether "auto" looks at a kernel."""
+        """Whether "auto" considers a kernel."""
         return kernel != "cluster" or (gpu.cluster > 1 and self.tets <= _CLUSTER_TETS)
 
     def refuse_unbuilt(self, kernel: str, patches: int, gpu: Properties) -> str:
-        """What is too much of a kernel whatever the plan, which need not be built then; empty where nothing is."""
-        tets = -(-self.tets // patches)  # one patch has so many, and in a cluster copies of others
+        """Reason why a kernel cannot fit, found before the plan is built; empty if it may fit."""
+        tets = -(-self.tets // patches)  # least tetrahedra of the largest patch; a cluster adds copies
         if kernel == "cluster":
             return self.refuse_patch(-(-tets // 2), -(-self.vertices // patches))
         slots = self.vertices if patches == 1 else 4
@@ -186,7 +188,7 @@ class _Scene(NamedTuple):
         return f"at least {least:,} B" if least > gpu.shared else ""
 
     def refuse_patch(self, pairs: int, interior: int) -> str:
-        """Why a patch of a cluster is too large for the threads of a block; empty where it is not."""
+        """Reason why a patch of a cluster exceeds the threads of a block; empty if it fits."""
         if _C.fits_cluster(self.real, pairs, interior):
             return ""
         return f"patches smaller than {pairs} pairs of tetrahedra and {interior} vertices"
@@ -195,7 +197,7 @@ class _Scene(NamedTuple):
 def _fused_plan(
     scene: _Scene, kernel: str, gpu: Properties, batch: int | None = None, patches: int | None = None
 ) -> tuple[Plan | None, str]:
-    """The plan, of so many patches if they are given, and what it needs; None where there is not as much."""
+    """The plan, None if it does not fit, and the shared memory that it needs, in words."""
     patches = scene.patches(kernel, gpu) if patches is None else patches
     refusal = scene.refuse_unbuilt(kernel, patches, gpu)
     if refusal:
@@ -216,7 +218,7 @@ def _fused_plan(
 
 
 def _grid_plan(scene: _Scene, gpu: Properties, batch: int | None) -> tuple[Plan | None, str]:
-    """As `_fused_plan`, of as many patches as are best for so many environments, and fit."""
+    """As `_fused_plan` for a grid, with the fastest number of patches that fits."""
     if batch is None:
         return _fused_plan(scene, "grid", gpu)
     plan, needed, too_few = None, "", 0
@@ -231,7 +233,7 @@ def _grid_plan(scene: _Scene, gpu: Properties, batch: int | None) -> tuple[Plan 
 
 
 def _plans_that_fit(scene: _Scene, gpu: Properties, batch: int) -> Iterator[Plan]:
-    """A plan for every kernel that fits, first the one that should take least for so many environments."""
+    """Plans of the kernels that fit, in ascending order of their estimated time."""
     cluster = _fused_plan(scene, "cluster", gpu)[0] if scene.considers("cluster", gpu) else None
     offers = [
         (scene.microseconds("block", 1, batch, gpu), "block", 1),
@@ -257,12 +259,12 @@ def _plans_that_fit(scene: _Scene, gpu: Properties, batch: int) -> Iterator[Plan
 
 
 def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
-    """More patches where many tetrahedra share a vertex, whose forces one patch sums."""
+    """Plan for "stream"; the number of patches doubles until the slots of each fit."""
     return _plan_that_fits(scene, gpu, "stream", lambda patches: 2 * patches)
 
 
 def _level_plan(scene: _Scene, gpu: Properties, name: str) -> Plan:
-    """For a multilevel solver: as many patches for every multiprocessor, where one each is not enough."""
+    """Plan for a multilevel solver; the number of patches stays a multiple of the multiprocessors."""
 
     def more(patches: int) -> int:
         if name == "many":
@@ -275,12 +277,12 @@ def _level_plan(scene: _Scene, gpu: Properties, name: str) -> Plan:
 
 
 def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
-    """For "stream" or a multilevel solver; `more`: the patches to try after so many with too many slots or forces."""
+    """Plan for "stream" or a multilevel solver; `more` gives the next number of patches to try."""
     patches = min(scene.patches(name, gpu), scene.tets)
     while True:
         try:
             plan = replace(scene.plan("stream", patches), for_levels=name != "stream")
-        except ValueError:  # more in a patch than can be counted
+        except ValueError:  # more entries in a patch than 16 bits count
             if patches == scene.tets:
                 raise
         else:
@@ -300,19 +302,19 @@ def choose_plan(
     progress: bool = True,
     quickest: Callable[[Iterator[Plan]], Plan] = next,
 ) -> Plan:
-    """The plan of a scene for a GPU, on the CPU; move it with `Plan.to`.
+    """Compile the plan of a scene for a GPU. The result is on the CPU; `Plan.to` moves it.
 
     Args:
         values: the flat arrays of `Scene.values`.
         dtype: torch.float32 or torch.float64.
-        gpu: what the device has.
-        kernel: "auto" takes the first of "block", "cluster", "grid" and "stream" that fits, and where the batch is
-            known the one that `kernel_costs` expects to be the quickest; a "cluster" where the GPU has them, and for
-            a small mesh alone. "benchmark" takes the one that `quickest` returns.
-        levels: for a multilevel solver, which runs as "stream" does but for its iterations.
-        batch: environments that a step will have; None: not known, which is between few and many.
+        gpu: properties of the device.
+        kernel: a name, "benchmark" (`quickest` chooses), or "auto": the fastest by `kernel_costs` if the batch is
+            known, else the first of "block", "cluster", "grid", "stream" that fits. "auto" uses a cluster only for a
+            small mesh.
+        levels: for a multilevel solver, which runs as "stream" except for its iterations.
+        batch: number of environments of a step; None: unknown, treated as between few and many.
         progress: show a bar when the mesh is large.
-        quickest: for "benchmark": takes a plan for every kernel that fits, see `kernel_benchmark`.
+        quickest: for "benchmark": chooses among a plan for every kernel that fits, see `kernel_benchmark`.
     """
     check_kernel(kernel)
     scene = _Scene(values, dtype, progress)
@@ -342,7 +344,7 @@ def choose_plan(
         if plan is not None:
             return replace(plan, why=_reason(kernel, needs, gpu))
         if kernel == name:
-            # those that come later need less
+            # later kernels need less
             others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.considers(other, gpu)]
             raise ValueError(
                 f"Simulator: kernel={kernel!r} does not fit this GPU: {_facts(needs, gpu)}; take {any_of(others)}, or "

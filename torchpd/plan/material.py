@@ -1,4 +1,4 @@
-"""The arrays that training may change: how they start, and what they must be."""
+"""The material arrays of a simulator: initial values, shapes and checks."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ __all__ = [
 ]
 
 MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
-ARRAYS = (*MATERIAL_ROWS, PIN_HARD)  # what `set_material` replaces
-# What users look for by the names of scenes.
+ARRAYS = (*MATERIAL_ROWS, PIN_HARD)  # arrays that `set_material` replaces
+# hints for names of scene arguments given to `set_material`
 PARTS_OF_ROWS = {
     "density": "masses are of vertices [kg], a density times their share of volume",
     "youngs": "stiffness is Young's modulus of each tetrahedron [Pa]",
 }
 
-_UNIT_SLACK = 1e-4  # of the length of a plane's normal: float32 rounding and a training step's
+_UNIT_SLACK = 1e-4  # tolerance on the length of a plane normal: float32 rounding, and that of a training step
 
 
 def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
-    """What `named_arrays` gives, of a scene, in the precision of the simulation, checked after rounding to it."""
+    """Material arrays of a scene by name, as `named_arrays`, in the simulation precision; checked after rounding."""
     at_rest = MATERIAL_ROWS["spheres"].width - values.spheres.shape[1]
     spheres = np.pad(values.spheres, ((0, 0), (0, at_rest)))
     material = {
@@ -63,17 +63,17 @@ def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
 
 
 def dims_of(name: str) -> int:
-    """Dimensions of an array that all environments share."""
+    """Number of dimensions of an array without a batch."""
     return 1 if name == PIN_HARD else MATERIAL_ROWS[name].dims
 
 
 def named_arrays(sim: nn.Module) -> dict[str, Tensor]:
-    """The arrays as a simulator keeps them: those that training may change, and which pins are hard."""
+    """Material arrays of a simulator by name: the trainable ones and the mask of hard pins."""
     return {name: getattr(sim, name) for name in ARRAYS}
 
 
 def in_order(arrays: Mapping[str, Tensor]) -> list[Tensor]:
-    """The rows of the material as the ops take them, of what `named_arrays` gives."""
+    """Rows of the material in the order of the ops, from the arrays by name."""
     held = {"pin_stiffness": hold_exactly(arrays["pin_stiffness"], arrays[PIN_HARD])}
     return [held.get(name, arrays[name]) for name in MATERIAL_ROWS]
 
@@ -88,7 +88,7 @@ def _require(good: Tensor, name: str, contract: str, tensor: Tensor) -> None:
 
 
 def check_material(owner: str, name: str, tensor: Tensor) -> None:
-    """Refuse values that no step can work with; shapes are the caller's to check."""
+    """Refuse values that a step cannot use; the caller checks shapes."""
     full = f"{owner}: {name}"
     if name == "pin_stiffness":
         _require(tensor >= 0, full, ">= 0, inf for pins that hold exactly,", tensor)
@@ -110,7 +110,7 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
 
 
 def real_tensor(owner: str, name: str, value: Tensor | float) -> Tensor:
-    """A tensor of real numbers that are there; on the CPU what is none yet."""
+    """Convert to a dense tensor of real numbers, on the CPU if it is not a tensor yet."""
     try:
         tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")
     except (TypeError, ValueError, RuntimeError):
@@ -123,10 +123,10 @@ def real_tensor(owner: str, name: str, value: Tensor | float) -> Tensor:
 
 
 def one_for_all_rows(name: str, tensor: Tensor, rows: int) -> Tensor:
-    """Expand one number for all rows, [] or [1], to [rows], and one for each environment, [B, 1], to [B, rows].
+    """Expand one number, [] or [1], to [rows], and one per environment, [B, 1], to [B, rows].
 
-    The last dimension always counts rows: [n] is one number for each of n rows, never for each of n environments.
-    Only an array without rows, `damping`, has one number for each environment: [B], or [B, 1].
+    The last dimension always counts rows: [n] is one number for each of n rows, never for each of n environments. Only
+    an array without rows, `damping`, has one number for each environment: [B], or [B, 1].
     """
     if tensor.dim() > 2 or (name in MATERIAL_ROWS and MATERIAL_ROWS[name].width > 1):
         return tensor
@@ -137,7 +137,7 @@ def one_for_all_rows(name: str, tensor: Tensor, rows: int) -> Tensor:
 
 
 def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Tensor:
-    """What is to replace the array `own` of a simulator, in its precision and on its device."""
+    """Check a value for the material array `own`; returns it in the precision and on the device of `own`."""
     row, tensor = MATERIAL_ROWS[name], real_tensor(owner, name, value).detach()
     tensor = tensor.to(dtype=own.dtype, device=own.device)
     shape = tuple(own.shape[own.dim() - row.dims :])
@@ -153,7 +153,7 @@ def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Te
 
 
 def check_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
-    """What is to replace the mask of hard pins `own` of a simulator, on its device."""
+    """Check a value for the mask of hard pins `own`; returns it on the device of `own`."""
     try:
         tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")
     except (TypeError, ValueError, RuntimeError):
@@ -172,7 +172,7 @@ def check_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
 
 
 def fingerprint(arrays: Iterable[Tensor]) -> str:
-    """Of shapes and bits: another one where any number differs. Brings the arrays to the CPU."""
+    """Hash of the shapes and bits of arrays. Copies them to the CPU."""
     found = hashlib.blake2b(digest_size=16)
     for array in arrays:
         found.update(repr(tuple(array.shape)).encode())
@@ -181,7 +181,7 @@ def fingerprint(arrays: Iterable[Tensor]) -> str:
 
 
 def check_batches(owner: str, new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None:
-    """Refuse arrays of different numbers of environments; those without a batch, or with one of 1, serve any number."""
+    """Refuse arrays with different numbers of environments; an array without a batch, or with 1, suits any number."""
     first: tuple[int, str] | None = None
     for name in ARRAYS:
         array, stays = new.get(name, kept[name]), "" if name in new else " (kept)"
@@ -198,7 +198,7 @@ def check_batches(owner: str, new: Mapping[str, Tensor], kept: Mapping[str, Tens
 
 
 def check_environments(name: str, batch: int, arrays: Mapping[str, Tensor]) -> None:
-    """Refuse material of other environments than those of a state, which `name` calls."""
+    """Refuse a state whose batch differs from that of the material; `name` names the state in the error."""
     for row, array in arrays.items():
         if array.dim() > dims_of(row) and len(array) not in (1, batch):
             raise ValueError(
@@ -208,5 +208,5 @@ def check_environments(name: str, batch: int, arrays: Mapping[str, Tensor]) -> N
 
 
 def environments_of_material(arrays: Mapping[str, Tensor]) -> int:
-    """How many environments arrays of the material, by name, have numbers for; 1 where all share them."""
+    """Number of environments of the material arrays by name; 1 where all share them."""
     return max(len(array) if array.dim() > dims_of(name) else 1 for name, array in arrays.items())

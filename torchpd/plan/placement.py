@@ -1,4 +1,4 @@
-"""Moving a simulator: every device needs a plan of its own."""
+"""Plan placement: compile, move and rebuild the plan when device, precision, solver or pins change."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _reason(device: torch.device | None = None) -> str:
 
 
 def find_device(name: str) -> torch.device:
-    """What --device names, if it is there."""
+    """Parse and check the `--device` argument."""
     kind = name.split(":")[0]
     if kind not in ("cpu", "cuda"):
         raise ValueError(f"--device must be cpu or cuda, got {name}")
@@ -59,7 +59,7 @@ def find_device(name: str) -> torch.device:
 
 
 def check_wanted_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor:
-    """What `fn`, which moves or converts, makes of an empty tensor; explains why a GPU cannot be had."""
+    """Apply `fn`, which moves or converts, to an empty tensor; explains why a GPU is not available."""
     try:
         wanted = fn(probe)
     except (AssertionError, RuntimeError) as error:
@@ -79,16 +79,16 @@ def check_wanted_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor
 
 
 def _same_plan(source: torch.device, target: torch.device) -> bool:
-    """Whether the plan of one device serves the other: nothing runs on "meta"."""
+    """Whether the plan of one device is valid on the other; nothing runs on "meta"."""
     if source.type != "cuda" or target.type != "cuda":
         return target.type in ("meta", source.type)
     return source == target or properties_of(source) == properties_of(target)
 
 
 def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
-    """The scene's plan for a device and the solver, on the CPU, without what the solver prepares."""
+    """Compile the plan of a scene for a device, on the CPU, without the preconditioner."""
     values = compiled.scene.values()
-    # "meta" does not know which pins are hard
+    # on "meta" the hard pins are unknown
     if loose is None and compiled.device.type != "meta":
         loose = values.pinned.loose(compiled.named["pin_stiffness"].isinf().cpu().numpy())
     values = values if loose is None else replace(values, loose=loose)
@@ -103,22 +103,22 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
 
 
 def _wants_levels(compiled: CompiledScene) -> bool:
-    """Whether steps or gradients use a multilevel preconditioner."""
+    """Whether the steps or the adjoint use a multilevel preconditioner."""
     return isinstance(compiled.solver, Multilevel) or compiled.adjoint == "multilevel"
 
 
 def _has_patches_for(compiled: CompiledScene, plan: Plan) -> bool:
-    """Whether the patches serve the solver: a GPU wants others for a multilevel solver, whatever gradients use."""
+    """Whether the patches suit the solver: on a GPU a multilevel solver needs its own, the adjoint does not."""
     return plan.kernel is None or plan.for_levels == isinstance(compiled.solver, Multilevel)
 
 
 def serves(compiled: CompiledScene) -> bool:
-    """Whether the plan has what solver and gradients use."""
+    """Whether the plan suits the solver and the adjoint."""
     return _has_patches_for(compiled, compiled.plan) and has_levels(compiled.plan.arrays) == _wants_levels(compiled)
 
 
 def _with_levels(compiled: CompiledScene, plan: Plan, reference: Reference) -> Plan:
-    """The plan with a multilevel preconditioner; of a GPU's kernels only one reads it."""
+    """Add a multilevel preconditioner to a plan. On a GPU only the stream kernel reads it."""
     if plan.kernel not in (None, "stream"):
         raise ValueError(
             f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={compiled.kernel!r}, which is '
@@ -128,7 +128,7 @@ def _with_levels(compiled: CompiledScene, plan: Plan, reference: Reference) -> P
 
 
 def plan_for_solver(compiled: CompiledScene) -> Plan:
-    """The plan with what solver and gradients use, made of the material."""
+    """The plan for the current solver and adjoint; a preconditioner is built from the current material."""
     plan = without_levels(compiled.plan)
     if not _has_patches_for(compiled, plan):
         plan = _compile(compiled, compiled.dtype, compiled.device)
@@ -138,7 +138,10 @@ def plan_for_solver(compiled: CompiledScene) -> Plan:
 
 
 def loosened_plan(compiled: CompiledScene, hard: Tensor) -> Plan:
-    """The plan where pieces that a mask [P] or [B, P] lets go move rigidly too; the one that is there if they do."""
+    """The plan after pins are released by a mask [P] or [B, P]: their components may move rigidly too.
+
+    Returns the present plan if no component changes.
+    """
     before = compiled.plan.loose
     if before is None or bool(before.all()):
         return compiled.plan
@@ -151,9 +154,9 @@ def loosened_plan(compiled: CompiledScene, hard: Tensor) -> Plan:
 
 
 def plan_that_holds(compiled: CompiledScene, plan: Plan, hard: Tensor) -> Plan:
-    """The plan whose preconditioner, if it has one, holds no pin but those that are hard in every environment [P].
+    """The plan with a preconditioner that holds only the pins that are hard in every environment [P].
 
-    It is made of what the one before was made of, but for the pins that are let go: held by it they would not move.
+    Its reference material stays, except at the released pins: held by the preconditioner, they would not move.
     """
     if not has_levels(plan.arrays):
         return plan
@@ -170,7 +173,7 @@ def plan_that_holds(compiled: CompiledScene, plan: Plan, hard: Tensor) -> Plan:
 
 
 def move_plan(compiled: CompiledScene, plan: Plan, device: torch.device, material: int = 0) -> Plan:
-    """A plan on its device, where a GPU has room for it, for `material` bytes beside it and for a step."""
+    """Move a plan to a device. A GPU must have memory for it, `material` further bytes, and a step."""
     if plan.device == device:
         return plan
     if device.type == "cuda":
@@ -180,12 +183,12 @@ def move_plan(compiled: CompiledScene, plan: Plan, device: torch.device, materia
 
 
 def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.device) -> int:
-    """Memory of a step beside plan, material and states, as the op takes it.
+    """Memory of a step in bytes, beside plan, material and states, as the op allocates it.
 
     Args:
-        compiled: whose solver and material the step has.
-        plan: of a GPU, with what the solver prepares; it may still be on the CPU.
-        batch: environments.
+        compiled: the scene; its solver and material are used.
+        plan: of a GPU, with its preconditioner if any; it may still be on the CPU.
+        batch: number of environments.
         device: the GPU.
     """
     real = torch.finfo(plan.dtype).bits // 8
@@ -200,16 +203,16 @@ def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.de
 
 
 def is_recording(device: torch.device) -> bool:
-    """Whether torch.compile or a CUDA graph is looking on, which can wait for no value."""
+    """Whether torch.compile or a CUDA graph is recording, so that no value may be read."""
     return torch.compiler.is_compiling() or (device.type == "cuda" and torch.cuda.is_current_stream_capturing())
 
 
 def plan_anew(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
-    """The plan for a precision and a device, on the CPU; `loose`: pieces that can move rigidly."""
+    """Compile the plan for a precision and a device, on the CPU; `loose`: components that may move rigidly."""
     plan = _compile(compiled, dtype, device, loose)
     if not _wants_levels(compiled):
         return plan
-    # what M was made of goes along, as into a file; coming from "meta" the values are lost
+    # The reference material stays, as in a saved file. On "meta" its values are lost.
     if compiled.device.type == "meta":
         arrays = in_order(material_of(compiled.scene.values(), compiled.dtype))
         source = compile_plan(compiled.scene.values(), dtype=compiled.dtype, progress=False)
@@ -220,7 +223,7 @@ def plan_anew(compiled: CompiledScene, dtype: torch.dtype, device: torch.device,
 
 
 def plan_on(compiled: CompiledScene, dtype: torch.dtype, device: torch.device) -> Plan:
-    """The plan for a precision and a device: the one that is there, moved, where that will do."""
+    """The plan for a precision and a device: the present one, moved, if it is valid there."""
     same = dtype == compiled.dtype and _same_plan(compiled.device, device)
     plan = compiled.plan if same else plan_anew(compiled, dtype, device)
     numbers = sum(array.numel() for array in compiled.material) + 3 * compiled.vertices

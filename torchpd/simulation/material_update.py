@@ -1,4 +1,4 @@
-"""How the material of a simulator is replaced: checked first, then all arrays or none."""
+"""Replacement of the material of a simulator: all arrays are checked first, then all or none are written."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ __all__ = [
     "write_change",
 ]
 
-# what decides how many iterations a step takes
+# arrays that the convergence rate of a step depends on
 _OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)
-# of each name the arrays that have it, and where
+# columns by name: the arrays that have one, and its place there
 COLUMNS = {
     "friction": {"planes": PLANES["friction"], "spheres": SPHERES["friction"]},
     "height": {"planes": PLANES["height"]},
@@ -56,29 +56,29 @@ _THINGS = {"planes": "grounds", "spheres": "spheres"}
 
 
 class Change(NamedTuple):
-    """Arrays that are to be replaced, checked, and the plan that serves them."""
+    """A checked change of the material, and the plan that suits it."""
 
-    arrays: dict[str, Tensor]  # by name, as they will be
-    originals: dict[str, Tensor]  # of those that a parametrization makes
-    replaced: dict[str, Tensor]  # new parameters, and a new buffer, where nothing can be written over
+    arrays: dict[str, Tensor]  # new values by name
+    originals: dict[str, Tensor]  # originals of parametrized arrays
+    replaced: dict[str, Tensor]  # new parameters, or a new buffer, where the present ones cannot be written in place
     plan: Plan
-    learned: list[str]  # those of another batch whose former parameter was learned
+    learned: list[str]  # trainable parameters that are new because the batch changed
 
     @property
     def alters_pins(self) -> bool:
-        """Whether pins are held otherwise."""
+        """Whether the change touches the pins."""
         return "pin_stiffness" in self.arrays or PIN_HARD in self.arrays
 
     @property
     def alters_rate(self) -> bool:
-        """Whether a step may take another number of iterations."""
+        """Whether the change may alter the convergence rate of a step."""
         return any(name in self.arrays for name in _OF_THE_RATE)
 
 
 def check_change(
     sim: nn.Module, compiled: CompiledScene, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False
 ) -> Change:
-    """What `set_material` and loading are to write, for whom errors name; `anew`: nothing is written over."""
+    """Check the arrays of `set_material` or of a state_dict; `anew`: make new parameters, write none in place."""
     check_has_values(owner, compiled.device)
     for name in arrays:
         if name not in ARRAYS and name not in COLUMNS:
@@ -118,7 +118,7 @@ def check_change(
 
 
 def write_change(sim: nn.Module, change: Change) -> None:
-    """Replace the arrays of a simulator; its plan is the caller's to replace."""
+    """Write the arrays of a change; the caller replaces the plan."""
     with persistent_tensors():
         for name, tensor in change.arrays.items():
             if name in change.originals:
@@ -130,7 +130,7 @@ def write_change(sim: nn.Module, change: Change) -> None:
 
 
 def warn_of_new_parameters(change: Change) -> None:
-    """Say which parameters an optimiser does not know."""
+    """Warn of new parameters that an existing optimiser does not hold."""
     if change.learned:
         warn_user(
             f"the simulator has a new parameter for {' and '.join(change.learned)}, of another batch, which an "
@@ -139,14 +139,17 @@ def warn_of_new_parameters(change: Change) -> None:
 
 
 def _pins_apart(was: Tensor, owner: str, springs: Tensor, hard: Tensor | None) -> dict[str, Tensor]:
-    """Springs as they are stored, and which pins are hard: given as inf, or those that `hard` says; `was`: now."""
+    """Split springs into stored values and the mask of hard pins; `was` is the present mask.
+
+    A pin is hard where its spring is inf, or where `hard` says so.
+    """
     stored, infinite = split_springs(springs)
     if hard is not None:
         _refuse_pins(f"{owner}: pin_stiffness is inf, which holds exactly, where {PIN_HARD} is False", infinite & ~hard)
         return {"pin_stiffness": stored, PIN_HARD: hard}
     if was.dim() == 2 and was.shape != springs.shape:
         was = was.any(0)
-    # what sim.pin_stiffness has there: who scales that must not let go unawares
+    # sim.pin_stiffness holds 0 at hard pins: scaling it must not release them silently
     _refuse_pins(
         f"{owner}: pin_stiffness is 0 for pins that are hard, and does not say whether these are let go: give inf to "
         f"hold on, {PIN_HARD}=False to let go, or {PIN_HARD} of every pin",
@@ -162,14 +165,14 @@ def _refuse_pins(fault: str, bad: Tensor) -> None:
 
 
 def _plan_with(compiled: CompiledScene, own: dict[str, Tensor], arrays: dict[str, Tensor]) -> Plan:
-    """The plan that serves the material with some arrays replaced."""
+    """The plan that suits the material after some arrays are replaced."""
     if "pin_stiffness" not in arrays and PIN_HARD not in arrays:
         return compiled.plan
     now = in_order(own | arrays)
     plan = loosened_plan(compiled, arrays.get(PIN_HARD, own[PIN_HARD]))
     if not has_levels(plan.arrays):
         return plan
-    # what is held belongs to the structure of a preconditioner
+    # pinned vertices are part of the structure of a preconditioner
     held = _held_everywhere(compiled.material), _held_everywhere(now)
     if torch.equal(*held) and not has_strangers(plan, now, compiled.time_step):
         return plan
@@ -177,18 +180,18 @@ def _plan_with(compiled: CompiledScene, own: dict[str, Tensor], arrays: dict[str
 
 
 def _held_everywhere(material: list[Tensor]) -> Tensor:
-    """Whether each pin holds exactly in all environments [P]."""
+    """Whether each pin is hard in all environments [P]."""
     hard = named_material(material)["pin_stiffness"].isinf()
     return hard.all(0) if hard.dim() == 2 else hard
 
 
-# ---- columns that have names in scenes: friction, height of grounds, radius of spheres
+# ---- columns by name: friction, height of grounds, radius of spheres
 
 
 def _whole_arrays(
     own: Mapping[str, Tensor], owner: str, arrays: Mapping[str, Tensor | float]
 ) -> dict[str, Tensor | float]:
-    """The arrays with the named columns written into those of the simulator; values are the caller's to check."""
+    """Write named columns into whole arrays; the caller checks values."""
     whole = {name: value for name, value in arrays.items() if name not in COLUMNS}
     for name in [name for name in arrays if name in COLUMNS]:
         if given := [array for array in COLUMNS[name] if array in arrays]:
@@ -205,7 +208,7 @@ def _whole_arrays(
 
 
 def _column(like: Tensor, owner: str, name: str, value: Tensor | float, rows: Mapping[str, int]) -> Tensor:
-    """[rows] or [B, rows], in the precision and on the device of `like`."""
+    """Expand a column value to [rows] or [B, rows], in the precision and on the device of `like`."""
     things, count = " and ".join(_THINGS[array] for array in rows), sum(rows.values())
     if count == 0:
         raise ValueError(f"{owner}: {name} is of {things}, and the scene has none")
@@ -219,7 +222,7 @@ def _column(like: Tensor, owner: str, name: str, value: Tensor | float, rows: Ma
 
 
 def _with_column(owner: str, name: str, array: str, own: Tensor, value: Tensor) -> Tensor:
-    """The array [rows, width], or with a batch, with other numbers in one column."""
+    """Copy of an array [rows, width], or with a batch, with one column replaced."""
     batches = [len(t) for t, dims in ((own, MATERIAL_ROWS[array].dims), (value, 1)) if t.dim() > dims]
     if len(batches) == 2 and batches[0] != batches[1] and 1 not in batches:
         raise ValueError(
@@ -235,7 +238,7 @@ def _with_column(owner: str, name: str, array: str, own: Tensor, value: Tensor) 
 
 
 def check_kinds(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
-    """Refuse what a simulator cannot keep as it is: tensors of another precision or device."""
+    """Refuse tensors of another precision or device, which a simulator cannot adopt without a conversion."""
     for name, array in arrays.items():
         own = getattr(sim, name)
         if isinstance(array, Tensor) and (array.dtype, array.device) != (own.dtype, own.device):
@@ -253,15 +256,15 @@ def load_material(
     replace_material: Callable[..., None],
     load: Callable[..., None],
 ) -> None:
-    """Check values, and replace by arrays of every environment where they were shared; then `load` as torch does.
+    """Check the material in a state_dict, write it, then call `load`, torch's own loader.
 
-    Takes the arguments of `Module._load_from_state_dict`.
+    Takes the arguments of `Module._load_from_state_dict`. Arrays that environments shared may get a batch.
     """
     local_metadata, *_, errors = rest
     assign = bool(local_metadata.get("assign_to_params_buffers", False))
     owner = f"{type(sim).__name__}.load_state_dict"
     arrays = {n: state_dict[prefix + n] for n in ARRAYS if prefix + n in state_dict}
-    # older ones say by inf which pins are hard
+    # former files mark hard pins by inf in pin_stiffness
     older, original = PIN_HARD not in arrays, f"{prefix}parametrizations.pin_stiffness.original"
     try:
         with torch.no_grad():
@@ -270,12 +273,12 @@ def load_material(
                 arrays |= {"pin_stiffness": made} if bool(made.isinf().any()) else {PIN_HARD: made.isinf()}
             check_saved(sim, owner, arrays)
             if older and PIN_HARD not in arrays and bool(arrays.get("pin_stiffness", torch.zeros(())).isinf().any()):
-                # none of the present version has inf, so 0 there is a pin that was let go
+                # present files hold no inf: 0 there is a pin that was released
                 arrays[PIN_HARD] = arrays["pin_stiffness"].isinf()
             if assign:
                 check_kinds(sim, owner, arrays)
             elif PIN_HARD in arrays:
-                arrays[PIN_HARD] = arrays[PIN_HARD].bool()  # as torch converts the others
+                arrays[PIN_HARD] = arrays[PIN_HARD].bool()  # torch converts the other arrays likewise
             replace_material(owner, arrays, anew=assign)
     except (TypeError, ValueError) as error:
         if not prefix:
@@ -292,7 +295,7 @@ def load_material(
 
 
 def check_saved(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
-    """Refuse what `set_material` would stretch, and torch refuses after arrays before it are written."""
+    """Refuse shapes that `set_material` would expand: torch would refuse them after writing other arrays."""
     for name, array in arrays.items():
         if not isinstance(array, Tensor):
             raise TypeError(f"{owner}: {name} must be a tensor, got {type(array).__name__}")
@@ -309,7 +312,7 @@ def check_saved(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
 
 
 def check_originals(sim: nn.Module, state_dict: Mapping[str, Any]) -> None:
-    """Refuse what does not fit a parametrization, which torch finds out after arrays before it are written."""
+    """Refuse originals of a wrong shape: torch would find them after writing other arrays."""
     own = sim.state_dict()
     for name, array in state_dict.items():
         if not name.startswith("parametrizations.") or name not in own:
@@ -323,19 +326,19 @@ def check_originals(sim: nn.Module, state_dict: Mapping[str, Any]) -> None:
 
 
 def check_keys(sim: nn.Module, state_dict: Mapping[str, Any], *, strict: bool) -> None:
-    """Refuse what is no state_dict and, where `strict`, one with other names, before anything is loaded."""
+    """Refuse an object that is no state_dict or, if `strict`, one with other keys, before anything is loaded."""
     if not isinstance(state_dict, Mapping):
         raise TypeError(
             f"{type(sim).__name__}.load_state_dict: state_dict must be what state_dict() gave, got "
             f"{type(state_dict).__name__}"
         )
-    # a hook may give keys other names
+    # a hook may rename keys
     if strict and not sim._load_state_dict_pre_hooks:
         wanted = sim.state_dict()
         faults = [
             f"{fault} key(s) in state_dict: {', '.join(map(repr, keys))}"
             for fault, keys in (
-                # which pins are hard older ones say by inf
+                # former files have no mask of hard pins
                 ("Missing", [key for key in wanted if key not in (*state_dict, PIN_HARD)]),
                 ("Unexpected", [key for key in state_dict if key not in wanted]),
             )

@@ -1,4 +1,4 @@
-"""Material that `torch.nn.utils.parametrize` makes of something else, for one of its logarithm."""
+"""Material arrays under `torch.nn.utils.parametrize`, such as one stored as its logarithm."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _Module = TypeVar("_Module", bound=nn.Module)
 
 
 def parametrization(module: nn.Module, name: str) -> ParametrizationList:
-    """What makes a parametrized array."""
+    """The parametrization of an array."""
     found: ParametrizationList = module.parametrizations[name]  # type: ignore[index, assignment]
     return found
 
 
 def make(module: nn.Module, name: str, original: Tensor) -> Tensor:
-    """What a parametrization makes of another original than its own."""
+    """Apply the parametrization of an array to another original."""
     steps: list[Any] = list(parametrization(module, name))
     for one in steps:
         original = one(original)
@@ -29,10 +29,11 @@ def make(module: nn.Module, name: str, original: Tensor) -> Tensor:
 
 
 def invert(owner: str, module: nn.Module, name: str, wanted: Tensor) -> tuple[Tensor, Tensor]:
-    """What to make an array of, and what that makes: `wanted`, up to rounding. Nothing is changed.
+    """Original whose parametrization gives `wanted` up to rounding, and the array that it gives. Changes nothing.
 
     Raises:
-        ValueError: another shape, no right_inverse, one that gives several tensors, or one that does not give it back.
+        ValueError: another shape; no right_inverse, or one that returns several tensors; or the result differs from
+            `wanted`.
     """
     makes, shape = parametrization(module, name), getattr(module, name).shape
     steps: list[Any] = list(makes)
@@ -61,16 +62,16 @@ def invert(owner: str, module: nn.Module, name: str, wanted: Tensor) -> tuple[Te
 
 
 def plain_copy(module: _Module) -> _Module:
-    """A deep copy whose arrays are numbers, which nothing makes and nobody learns: any others may replace them."""
+    """Deep copy with plain arrays, without parametrizations or gradients, so that any value may replace them."""
     with torch.inference_mode(False), torch.no_grad():
         copied = copy.deepcopy(module)
-        # what a copy compiles is nobody's to wait for
+        # a copy compiles without a progress bar
         if "progress" in vars(copied):
             vars(copied)["progress"] = False
         if is_parametrized(copied):
             made: Any = copied.parametrizations
             arrays = {name: getattr(copied, name).detach().clone() for name in made}
-            # remove_parametrizations would take the properties from the class, which the copy shares with the module
+            # remove_parametrizations would delete the properties from the class, which the copy shares
             copied.__class__ = type_before_parametrizations(copied)
             del copied.parametrizations
             for name, array in arrays.items():
