@@ -1,4 +1,4 @@
-"""The one place where a mesh file is opened: whatever its reader runs into becomes an error in words."""
+"""The one place that opens mesh files: every failure of a reader becomes an error that explains it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ENDINGS = "the file's name must end in .mesh, .msh, .vtk or .vtu, or as another
 
 
 def existing(path: PathLike) -> Path:
-    """The path of a file that is there; otherwise a `FileNotFoundError`."""
+    """Path of an existing file; raises `FileNotFoundError` otherwise."""
     file = Path(path)
     if not file.is_file():
         raise FileNotFoundError(f"no such mesh file: {file}")
@@ -36,14 +36,14 @@ def read(owner: str, path: PathLike, unit: Unit | None = None) -> MeshContent:
     """Read points and cells of a mesh file.
 
     Args:
-        owner: who asks, with which the errors begin.
-        path: the file; the suffix of its name says in which format it is.
-        unit: of its numbers, see `torchpd.common.units`.
+        owner: name of the caller, with which errors begin.
+        path: the file; its suffix selects the format.
+        unit: of its numbers, see `torchpd.units`.
 
     Raises:
-        FileNotFoundError: there is no such file, or one that belongs to it is missing.
+        FileNotFoundError: the file, or one that belongs to it, is missing.
         ModuleNotFoundError: the format needs a package that is not installed.
-        ValueError: anything else, with the name of the file, its format and what was met.
+        ValueError: any other failure; the error gives the name of the file, its format and the cause.
     """
     factor = metres(owner, unit)
     file = existing(path)
@@ -57,7 +57,7 @@ def read(owner: str, path: PathLike, unit: Unit | None = None) -> MeshContent:
         raise ValueError(f"{failure}: the file is empty; write it again")
     said = io.StringIO()
     try:
-        # Libraries print what is wrong with a file, and some exit the process.
+        # libraries print faults of a file, and some exit the process
         with redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             content = kind.read(file)
@@ -83,7 +83,7 @@ def read(owner: str, path: PathLike, unit: Unit | None = None) -> MeshContent:
 
 @contextmanager
 def naming(owner: str, path: PathLike) -> Iterator[None]:
-    """Errors of a mesh that is made of a file name the file."""
+    """Prefix errors of a mesh made from a file with the name of the file."""
     try:
         yield
     except (ValueError, IndexError, TypeError) as error:
@@ -93,7 +93,7 @@ def naming(owner: str, path: PathLike) -> Iterator[None]:
 
 
 def _check(content: MeshContent) -> None:
-    """Every cell must have its corners, which are points of the file, and these be finite."""
+    """Check that cells have all corners, that these are points of the file, and that these points are finite."""
     for block in content.cells:
         corners = CELLS.get(block.kind, (0, 0))[0]
         if corners and block.corners.shape[1:] != (corners,):
@@ -110,8 +110,8 @@ def _check(content: MeshContent) -> None:
 
 
 def _words(error: BaseException, said: str, kind: Format) -> str:
-    """What a reader met, as one line."""
-    # meshio names the file again, by its path, behind what it met
+    """One-line description of a reader's error."""
+    # meshio appends the path of the file to its errors
     told = re.sub(r" ?Error: Couldn't read file .*", "", " ".join(said.split())).removeprefix("Error: ")
     words = " ".join(str(error).split())
     if isinstance(error, ValueError) and words:

@@ -41,7 +41,7 @@ def read(path: Path) -> MeshContent:
 def _table(
     mesh: ElementTree.Element, group: str, tag: str, names: list[str]
 ) -> np.ndarray[tuple[int, int], np.dtype[np.str_]]:
-    """The attributes of all entries of a group, in the order of their indices."""
+    """Attributes of all entries of a group, in the order of their indices."""
     groups = mesh.findall(group)
     entries = [entry for part in groups for entry in part]
     declared = sum(int(part.get("size", "-1")) for part in groups)

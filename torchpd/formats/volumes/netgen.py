@@ -15,7 +15,7 @@ from .gather import blocks_of, in_space
 
 __all__ = ["read"]
 
-# Kind of an element by the count of its nodes, and its corners in the order of VTK.
+# kind of an element by its node count, and its corners in the order of VTK
 _SOLIDS = {
     4: ("tetra", [0, 2, 1, 3]),
     5: ("pyramid", [0, 3, 2, 1, 4]),
@@ -67,7 +67,7 @@ def read(path: Path) -> MeshContent:
 
 
 def _declared(rows: list[str], what: str) -> list[str]:
-    """The rows behind their count."""
+    """Rows after their count."""
     count = int(parse(rows[0].encode() if rows else b"x", np.int64, f"the count of {what}")[0])
     check_rows(rows[1:], count, what)
     return rows[1:]

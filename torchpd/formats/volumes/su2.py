@@ -27,7 +27,7 @@ _KINDS = {
 
 
 def read(path: Path) -> MeshContent:
-    """Read one zone; a file of several is refused."""
+    """Read one zone; a file with several is refused."""
     lines = lines_of(path, "%")
     dimension, points, kinds, nodes = 3, None, list[str](), list[list[int]]()
     at, declared, markers = 0, 0, 0

@@ -28,7 +28,7 @@ NAMES = {
 }
 
 
-# Formats whose blocks of elements are what others call regions.
+# formats whose element blocks are the regions
 _BLOCKS = {".e", ".ex2", ".exo"}
 _TETRA_4 = 10  # CGNS
 
@@ -45,7 +45,7 @@ def read(path: Path) -> MeshContent:
 
 
 def _read_fluent(path: Path) -> MeshContent:
-    """Read a .msh of Fluent's, in which cells must list their corners."""
+    """Read a Fluent .msh, whose cells must list their corners."""
     import meshio
 
     data = path.read_bytes()
@@ -62,7 +62,7 @@ def _read_fluent(path: Path) -> MeshContent:
 
 
 def _check_sections(path: Path) -> None:
-    """Refuse files with more than the one section of cells, of one kind in an .hmf, that meshio reads."""
+    """Refuse files with sections that meshio would not read: it reads one of cells, of one kind in an .hmf."""
     import h5py
 
     found: list[str] = []
@@ -82,7 +82,7 @@ def _check_sections(path: Path) -> None:
 
 
 class _Ending(io.BufferedReader):
-    """A file that says when a reader goes on behind its end, where meshio's wait for a bracket that never comes."""
+    """File that raises at its end, where meshio's readers would wait for a bracket forever."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
@@ -92,7 +92,7 @@ class _Ending(io.BufferedReader):
 
 
 def content_of(mesh: Any, *, by_block: bool = False) -> MeshContent:
-    """Points, cells and regions of a `meshio.Mesh`; blocks of cells are regions where there are no others."""
+    """Points, cells and regions of a `meshio.Mesh`; cell blocks are the regions if there are no others."""
     notes: list[str] = []
     chosen = choose(
         (name for name, parts in mesh.cell_data.items() if all(may_be(name, part) for part in parts)), notes
