@@ -149,7 +149,7 @@ def test_a_gpu_that_is_not_there_is_told_which_are(monkeypatch: pytest.MonkeyPat
         raise RuntimeError("CUDA error: invalid device ordinal\nGPU device may be out of range")
 
     there = r"torch sees cuda:0 \(kind 0\), cuda:1 \(kind 1\); CUDA_VISIBLE_DEVICES says"
-    with pytest.raises(RuntimeError, match=rf"^Simulator: there is no such GPU: {there}"):
+    with pytest.raises(RuntimeError, match=rf"^Simulator: device must be an existing GPU: {there}"):
         placing.check_wanted_device(fail, torch.empty(0))
     with pytest.raises(ValueError, match=rf"^--device cuda:2 is not there: {there}"):
         placing.find_device("cuda:2")

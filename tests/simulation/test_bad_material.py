@@ -49,23 +49,23 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
         (
             {"pin_stiffness": 0.0},
             ValueError,
-            r"pin_stiffness is 0 for pins that are hard, .* pin_hard=False to let go.*; at \[0\] \(2 in all\)",
+            r"pin_stiffness is 0 at hard pins.* pin_hard=False.*; at \[0\] \(2 in all\)",
         ),
         ({"pin_stiffness": -1.0}, ValueError, "pin_stiffness must be >= 0, inf for pins that hold exactly, .*, got -1"),
         ({"pin_stiffness": math.nan}, ValueError, "pin_stiffness must be >= 0, inf for pins that hold .*, got nan"),
         (
             {"pin_stiffness": math.inf, "pin_hard": [True, False, True]},
             ValueError,
-            r"pin_stiffness is inf, which holds exactly, where pin_hard is False; at \[1\] \(1 in all\)",
+            r"pin_stiffness must be finite where pin_hard is False, got inf; at \[1\] \(1 in all\)",
         ),
-        ({"pin_hard": 1.0}, TypeError, r"pin_hard must be bool, whether each pin is hard, got torch\.float32"),
+        ({"pin_hard": 1.0}, TypeError, r"pin_hard must be bool .*, got torch\.float32"),
         ({"pin_hard": "yes"}, TypeError, "pin_hard must be a bool or a bool tensor, got 'yes'"),
         ({"pin_hard": None}, TypeError, "pin_hard must be a bool or a bool tensor, got None"),
         ({"pin_hard": [True, False]}, ValueError, r"pin_hard must be one bool, \[3\], .* got \[2\]; pins of the"),
         (
             {"pin_hard": torch.ones(2, 3) > 0, "masses": torch.ones(3, 27)},
             ValueError,
-            "arrays must be of one number of environments.* of 3 environments in masses, of 2 in pin_hard",
+            "arrays must have one number of environments.*, got 3 environments in masses and 2 in pin_hard",
         ),
         ({"gravity": (0.0, math.nan, 0.0)}, ValueError, "gravity must be finite .*, got nan"),
         ({"damping": -1.0}, ValueError, r"damping must be >= 0 in torch\.float32, got -1\.0$"),
@@ -200,5 +200,5 @@ def test_what_is_no_material_is_refused(sim: pd.Simulator) -> None:
         with pytest.raises(TypeError, match="set_material: stiffness must be a number or a tensor, got"):
             sim.set_material(stiffness=value)  # type: ignore[arg-type]
     for loaded in (None, "file.pt", 3):
-        with pytest.raises(TypeError, match=r"load_state_dict: state_dict must be what state_dict\(\) gave, got"):
+        with pytest.raises(TypeError, match=r"load_state_dict: state_dict must be a mapping .*, got"):
             sim.load_state_dict(loaded)  # type: ignore[arg-type]

@@ -64,7 +64,7 @@ def why_not(built: bool, torch_cuda: str | None, devices: int, capability: tuple
             f"build torchpd again; {DOCTOR}"
         )
     if devices == 0:
-        return f"torch sees no CUDA device: look at the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES; {DOCTOR}"
+        return f"torch sees no CUDA device: check the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES; {DOCTOR}"
     if capability is not None and capability < LEAST_CAPABILITY:
         return (
             f"the GPU has compute capability {_dotted(capability)} and the kernels need {_dotted(LEAST_CAPABILITY)} or "
@@ -80,7 +80,7 @@ def _dotted(capability: tuple[int, int]) -> str:
 def seen_devices() -> str:
     """List the GPUs that torch sees, for an error message."""
     names = [f"cuda:{index} ({torch.cuda.get_device_name(index)})" for index in range(torch.cuda.device_count())]
-    return f"torch sees {', '.join(names) or 'none'}; CUDA_VISIBLE_DEVICES says which ones it may see"
+    return f"torch sees {', '.join(names) or 'none'}; CUDA_VISIBLE_DEVICES limits them"
 
 
 def free_memory(device: torch.device) -> int:
@@ -93,7 +93,7 @@ def refuse_full_memory(needed: int, free: int) -> None:
     """Raise an error before an allocation would fail halfway."""
     if needed > free:
         raise RuntimeError(
-            f"Simulator: plan, material and a step need {needed:,} B of memory on the GPU and {free:,} B are free: "
-            "free some (torch.cuda.empty_cache(), other processes), take a coarser mesh, torch.float32 or a smaller "
-            'batch (kernel="grid" works on fewer environments at a time than "stream"), or stay on the CPU'
+            f"Simulator: plan, material and a step need {needed:,} B of memory on the GPU and {free:,} B are free. "
+            "Free some (torch.cuda.empty_cache(), other processes), or take a coarser mesh, torch.float32, a smaller "
+            'batch or the CPU. kernel="grid" works on fewer environments at a time than "stream".'
         )

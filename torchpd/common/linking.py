@@ -49,8 +49,8 @@ def runtime_fault(libraries: Sequence[str], compiler: str) -> str:
     if any(library.startswith("libstdc++.so") for library in libraries):
         return ""
     return (
-        f"`{compiler}` links libstdc++ statically, as the extension needs {', '.join(libraries) or 'no library'}, and "
-        "with a copy of its own beside torch's every error message would crash; take -static-libstdc++ out of CXX, "
-        "CXXFLAGS and LDFLAGS, or install the compiler's shared libstdc++ (Debian and Ubuntu: `apt install g++`), or "
-        "name another compiler in CXX."
+        f"`{compiler}` must link libstdc++ as a shared library, got {', '.join(libraries) or 'no library'}: with a "
+        "static copy beside that of torch every error message would crash. Remove -static-libstdc++ from CXX, CXXFLAGS "
+        "and LDFLAGS, or install the compiler's shared libstdc++ (Debian and Ubuntu: `apt install g++`), or name "
+        "another compiler in CXX."
     )

@@ -139,10 +139,10 @@ def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solv
     spectrum = spectrum_of(compiled)
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
     if spectrum is None:
-        return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
+        return chebyshev, chosen(DEFAULT_ITERATIONS, "all vertices are pinned, or values are unknown")
     if cause := held_up_by(compiled):
         plain = _known(forecast(compiled, chebyshev, spectrum))
-        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and {cause} may keep Multilevel from working"
+        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and {cause} may stall Multilevel"
         return chebyshev, chosen(_enough(plain), why)
     plain, lasting, short = (_known(forecast(compiled, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
     # the other schedules do not treat contacts
@@ -246,9 +246,9 @@ def warn_of_few_iterations(compiled: CompiledScene, choice: Choice | None, chang
         ways = "Take a shorter time_step, or give iterations=..."
     elif choice is not None:
         what += ' that "auto" chose before'
-        ways = "sim.prepare_solver() chooses anew"
+        ways = "sim.prepare_solver() chooses again"
     warn_user(
-        f"{changed or 'Simulator'}: {what} {verb} an error of about {left:.1g} of a step here (1: nothing solved); "
+        f"{changed or 'Simulator'}: {what} {verb} a relative error of about {left:.1g} per step (1: unsolved); "
         f"{expected.words(1e-2)} reach 1e-2. {ways}",
         UnsolvedWarning,
     )

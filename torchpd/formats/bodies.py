@@ -116,7 +116,7 @@ def _without_tets(owner: str, name: str, content: MeshContent) -> str:
     came = f"a surface ({_kinds(content)})" if flat else _kinds(content)
     fix = "turn a surface into tetrahedra with torchpd.tetrahedralize(path, cells=...)"
     if not flat:
-        fix = "write it with its cells where it was made"
+        fix = "export it with its cells"
     must = "must hold tetrahedra, hexahedra, wedges or pyramids"
     return f"{owner}: {name} {must}, got {came}{_noted(content)}; {fix}"
 

@@ -50,7 +50,7 @@ def read(owner: str, path: PathLike, unit: Unit | None = None) -> MeshContent:
     kind = FORMATS.get(file.suffix.lower())
     if kind is None:
         known = " ".join(sorted(FORMATS))
-        others = "TriMesh.from_trimesh(trimesh.load(path)) takes what else trimesh reads"
+        others = "for other formats of trimesh, TriMesh.from_trimesh(trimesh.load(path))"
         raise ValueError(f"{owner} cannot read {file.name}: {_ENDINGS} ({known}); {others}")
     failure = f"{owner} cannot read {file.name} ({kind.name})"
     if not file.stat().st_size:
@@ -117,7 +117,7 @@ def _words(error: BaseException, said: str, kind: Format) -> str:
     if isinstance(error, ValueError) and words:
         return f"{words} ({told})" if told and told not in words else words
     if isinstance(error, MemoryError):
-        words = f"its reader asks for more memory than there is ({words})" if words else "its reader ran out of memory"
+        words = f"its reader needs more memory than is available ({words})" if words else "its reader ran out of memory"
     elif isinstance(error, RecursionError):
         words = "it is nested too deeply"
     elif not told:

@@ -160,7 +160,7 @@ def simplify(mesh: TriMesh, triangles: int) -> TriMesh:
             left -= surface.contract(u, v, x)
     if left > most:
         raise ValueError(
-            f"simplify: {most} triangles must be enough for the topology and shape of the surface, got stuck at {left} "
+            f"simplify: {most} triangles must be enough for the topology and shape of the surface, reached {left} "
             f"of {len(mesh.triangles)}; ask for more, or make a coarse mesh by other means"
         )
     used, numbers = np.unique(surface.triangles[surface.alive], return_inverse=True)

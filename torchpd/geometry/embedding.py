@@ -182,9 +182,9 @@ def _report_far(corners: Array, distance: Array) -> None:
     if far:
         worst = int(cells.argmax())
         warn(
-            f"embed: {far} of {len(cells)} surface vertices lie farther outside of the mesh than a cell is long, up to "
+            f"embed: {far} of {len(cells)} surface vertices lie more than a cell outside of the mesh, up to "
             f"{cells[worst]:.3g} cells ({distance[worst]:.3g} m): their motion is extrapolated. Move or scale the "
-            "surface onto the mesh, surface.transformed(matrix), or use a mesh that reaches around it"
+            "surface onto the mesh, surface.transformed(matrix), or use a mesh that encloses it"
         )
 
 

@@ -177,7 +177,7 @@ def compact(owner: str, elements: Index, count: int, *, drop: bool) -> tuple[Ind
     if not drop:
         raise ValueError(
             f"{owner}.vertices: every vertex must belong to an element, got {lost} of {count} that do not "
-            f"(the first is {int(np.argmin(used))}); pass drop_unreferenced=True to leave them out and renumber"
+            f"(the first is {int(np.argmin(used))}); pass drop_unreferenced=True to drop and renumber them"
         )
     warn(f"{owner}: {lost} of {count} vertices belong to no element and were left out; the others are renumbered")
     return kept, (np.cumsum(used) - 1)[elements]
@@ -231,9 +231,9 @@ def clean_tets(
         elements, signed, flat, twice = elements[kept], signed[kept], flat[kept], twice[kept]
         if not len(elements):
             raise ValueError("TetMesh.tets: no tet has a volume; are all vertices in one plane?")
-    refuse("TetMesh.tets", flat, elements, "volumes must not vanish (compared with rounding of the vertices)", fix)
+    refuse("TetMesh.tets", flat, elements, "volumes must exceed the rounding of the vertices", fix)
     if twice.any():
-        again = f"every tet must come once (that at {first} comes again, with a volume of its own)"
+        again = f"tets must be distinct (that at {first} comes again, with a volume of its own)"
         refuse("TetMesh.tets", twice, elements, again, fix)
     inverted = signed < 0
     flipped = int(inverted.sum())

@@ -161,8 +161,8 @@ def report_faces(points: Array, tets: Index) -> None:
     faces = sort_faces(tets)
     if faces.crowded:
         warn(
-            f"TetMesh: {faces.crowded} of the faces belong to three tets or more, of which some overlap: leave out the "
-            "tets that are no part of the body"
+            f"TetMesh: {faces.crowded} of the faces belong to three tets or more, and some of these tets overlap; "
+            "remove the tets that are no part of the body"
         )
     if faces.folded:
         _report_folded(points, tets, faces)
@@ -186,9 +186,9 @@ def report_faces(points: Array, tets: Index) -> None:
     unmatched = boundary.count_unmatched() if len(boundary.tets) else 0
     if unmatched:
         warn(
-            f"TetMesh: {unmatched} of {len(faces.lone)} outer faces lie on faces with other corners, and nothing joins "
-            "the tets there. Vertices lie on faces or edges of tets that do not use them, or neighbours split a "
-            "quadrilateral along different diagonals: split the cells so that faces match"
+            f"TetMesh: {unmatched} of {len(faces.lone)} outer faces lie on faces with other corners, so the tets there "
+            "are not connected. Vertices lie on faces or edges of other tets, or neighbours split a quadrilateral "
+            "along different diagonals. Split the cells so that faces match"
         )
 
 
@@ -199,8 +199,8 @@ def _report_folded(points: Array, tets: Index, faces: Faces) -> None:
     fills = "" if hull is None else f", but enclose {hull:.4g} m^3"
     warn(
         f"TetMesh: {faces.folded} of {inner} inner faces have both of their tets on one side: the mesh is folded, and "
-        f"tets overlap. Their volumes add up to {volume:.4g} m^3{fills}. No winding mends that: move the vertices, or "
-        "take the mesh as it was before it was deformed"
+        f"tets overlap. Their volumes add up to {volume:.4g} m^3{fills}. No winding repairs that: move the vertices, "
+        "or take the undeformed mesh"
     )
 
 
@@ -242,9 +242,9 @@ def count_pieces(tets: Index) -> int:
 
 def _report_unmerged(count: str, tets: Index, first: Index, tolerance: float) -> None:
     warn(
-        f"TetMesh: {count} outer faces lie on one another with vertices of their own, so nothing joins the tets "
-        f"there: the mesh is in {count_pieces(tets)} pieces. mesh.merged() makes one of vertices at the same place, "
-        f"within {tolerance:.2g} m, which leaves {count_pieces(first[tets])}"
+        f"TetMesh: {count} outer faces coincide without common vertices, so the tets there are not connected: the mesh "
+        f"is in {count_pieces(tets)} pieces. mesh.merged() merges vertices within {tolerance:.2g} m, which leaves "
+        f"{count_pieces(first[tets])}"
     )
 
 

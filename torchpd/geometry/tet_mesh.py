@@ -132,11 +132,11 @@ class TetMesh:
         lost = [name for name, part in parts.items() if part is not None]
         if lost:
             warn(
-                f"TetMesh.to_file: {file.name} is without {' and '.join(lost)}, for which mesh files have no place; "
+                f"TetMesh.to_file: {file.name} omits {' and '.join(lost)}, which mesh files cannot hold; "
                 "Simulator.save keeps them, and mesh.embedding.surface.to_file(...) writes a surface"
             )
         if self.regions is not None and not with_regions:
-            warn(f"TetMesh.to_file: {file.name} is without the regions; .mesh, .msh, .vtk and .vtu keep them")
+            warn(f"TetMesh.to_file: {file.name} omits the regions; .mesh, .msh, .vtk and .vtu hold them")
 
     @property
     def bounds(self) -> Array:

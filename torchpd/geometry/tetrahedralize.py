@@ -97,7 +97,7 @@ def _as_surface(surface: Any, unit: Unit | None) -> TriMesh:
     if isinstance(surface, (str, os.PathLike)):
         return TriMesh.from_file(Path(surface), unit=unit)
     if isinstance(surface, TetMesh):
-        raise TypeError("tetrahedralize: surface must be a surface, got a TetMesh, which is filled already")
+        raise TypeError("tetrahedralize: surface must be a surface, got a TetMesh, which is already filled")
     import trimesh
 
     if isinstance(surface, (trimesh.Trimesh, trimesh.Scene)):
@@ -154,8 +154,8 @@ def _report_open(parts: Parts, solid: NDArray[np.bool_], tolerance: float) -> No
         warn(
             f"tetrahedralize: {sheets} of {total} triangles are a sheet, open or flat, which encloses nothing; "
             f"{of_edges}. The mesh is full where they pass, about a cell thick, and heavier than a thin sheet. To fill "
-            f"an inside, close the surface: corners less than {tolerance:.3g} m and half an edge apart count as one; "
-            "repair what is farther apart, or use fewer cells"
+            f"an inside, close the surface: corners less than {tolerance:.3g} m and half an edge apart count as one. "
+            "Repair wider gaps, or use fewer cells"
         )
     sides = parts.triangles[:, 1:] - parts.triangles[:, :1]
     area = np.where(solid[parts.part], np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1), 0.0)

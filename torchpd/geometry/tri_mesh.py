@@ -97,7 +97,7 @@ class TriMesh:
                 type(part).__name__ for part in surface.geometry.values() if not isinstance(part, trimesh.Trimesh)
             ]
             if others:
-                warn(f"TriMesh.from_trimesh: left out, for they have no triangles: {', '.join(sorted(others))}")
+                warn(f"TriMesh.from_trimesh: geometry without triangles left out: {', '.join(sorted(others))}")
             surface = surface.to_mesh()
         if not isinstance(surface, trimesh.Trimesh):
             raise TypeError(f"TriMesh.from_trimesh: surface must be a Trimesh or a Scene, got {type(surface).__name__}")

@@ -87,17 +87,17 @@ def step_gradient(call: AdjointCall) -> Tensor:
 def _warn_of(failed: Tensor, error: Tensor) -> None:
     warn_user(
         f"torchpd: the adjoint of a step has no solution in {int(failed.sum())} of {len(failed)} environments "
-        f"(relative residual {float(error[failed].max()):.1e}): their states are far from an equilibrium (more "
+        f"(relative residual {float(error[failed].max()):.1e}). Their states are far from an equilibrium (more "
         "iterations in the step help), at an unstable one, or have negative stiffness or masses. Their gradients "
-        "take the rotations as constant.",
+        "treat the rotations as constant.",
     )
 
 
 def _warn_of_friction(failed: Tensor, error: Tensor) -> None:
     warn_user(
-        f"torchpd: the adjoint of a step in which vertices slide is not solved in {int(failed.sum())} of "
-        f"{len(failed)} environments (relative residual {float(error[failed].max()):.1e}): friction jams there. Their "
-        "gradients are approximate."
+        f"torchpd: the adjoint of a step with sliding friction is not solved in {int(failed.sum())} of {len(failed)} "
+        f"environments (relative residual {float(error[failed].max()):.1e}), where friction jams. Their gradients are "
+        "approximate."
     )
 
 

@@ -121,8 +121,8 @@ class Plan:
         """
         if self.kernel is not None and dtype not in (None, self.dtype):
             raise ValueError(
-                f"Plan.to: the plan of a GPU has other arrays in another precision: compile it for {dtype}, "
-                f"as sim.to({dtype}) does; got a plan in {self.dtype}"
+                f"Plan.to: dtype must be {self.dtype} for a GPU plan, got {dtype}; sim.to({dtype}) compiles the plan "
+                "again"
             )
 
         def moved(row: PlanRow, array: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ def loose_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int
 def with_loose_pieces(plan: Plan, values: SceneValues) -> Plan:
     """Copy of a CPU plan for another set of components that a step may move rigidly."""
     if plan.kernel is not None:
-        raise ValueError("with_loose_pieces: a GPU's plan has its pieces in other arrays; compile it anew")
+        raise ValueError("with_loose_pieces: plan must be a CPU plan, got a GPU plan; compile it again")
     group, group_size = (tensor_of(array) for array in loose_pieces(values))
     sizes = plan.sizes.clone()
     sizes[_SIZE_GROUPS] = len(group_size)

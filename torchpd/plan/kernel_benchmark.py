@@ -64,7 +64,7 @@ def quickest_plan(plans: Iterator[Plan], key: Hashable, step: Callable[[Plan], C
     times = _TIMES[key]
     best = min(offers, key=lambda plan: times[str(plan.kernel)])
     words = ", ".join(f"{kernel} {time:.3g} ms" for kernel, time in sorted(times.items(), key=lambda item: item[1]))
-    return replace(best, why=f"the quickest of those timed, milliseconds of a step: {words}")
+    return replace(best, why=f"the fastest kernel, milliseconds per step: {words}")
 
 
 def _milliseconds(step: Callable[[Plan], Callable[[], object]], plan: Plan) -> float:

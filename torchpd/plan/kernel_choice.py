@@ -253,7 +253,7 @@ def _plans_that_fit(scene: _Scene, gpu: Properties, batch: int) -> Iterator[Plan
         if plan is not None:
             done.add(kernel)
             count = f"{batch} environment" + "s" * (batch != 1)
-            yield replace(plan, why=f"of the kernels that fit, expected to be the quickest for {count}")
+            yield replace(plan, why=f"the fastest kernel by estimate for {count}")
         elif kernel == "grid":
             too_few = patches
 
@@ -273,7 +273,7 @@ def _level_plan(scene: _Scene, gpu: Properties, name: str) -> Plan:
         return (rounds + 1 + rounds // 4) * gpu.multiprocessors
 
     plan = _plan_that_fits(scene, gpu, name, more)
-    return replace(plan, many=name == "many", why="what Multilevel runs with")
+    return replace(plan, many=name == "many", why="the kernel of Multilevel")
 
 
 def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
@@ -322,14 +322,13 @@ def choose_plan(
     if levels:
         if kernel not in ("auto", "benchmark", "stream"):
             raise ValueError(
-                f'Simulator: Multilevel runs with kernel="stream" on a GPU, got kernel={kernel!r}; leave it at "auto"'
+                f'Simulator: kernel must be "stream" for Multilevel on a GPU, got {kernel!r}; leave it at "auto"'
             )
         return _level_plan(scene, gpu, size)
     if kernel == "cluster" and gpu.cluster == 1:
         raise ValueError(
-            'Simulator: kernel="cluster" needs thread blocks that reach each other\'s shared memory (NVIDIA compute '
-            'capability 9.0), and this GPU has none; take "block", "grid" or "stream", or "auto", which takes one '
-            "that fits"
+            'Simulator: kernel="cluster" needs thread block clusters (NVIDIA compute capability 9.0), and this GPU has '
+            'none; take "auto", or "block", "grid" or "stream"'
         )
     if kernel == "benchmark":
         return quickest(_plans_that_fit(scene, gpu, 1 if batch is None else batch))
@@ -347,8 +346,8 @@ def choose_plan(
             # later kernels need less
             others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.considers(other, gpu)]
             raise ValueError(
-                f"Simulator: kernel={kernel!r} does not fit this GPU: {_facts(needs, gpu)}; take {any_of(others)}, or "
-                '"auto", which takes one that fits'
+                f"Simulator: kernel={kernel!r} does not fit this GPU: {_facts(needs, gpu)}; "
+                f'take "auto", or {any_of(others)}'
             )
     return replace(_stream_plan(scene, gpu), why=_reason(kernel, needs, gpu))
 
@@ -358,4 +357,4 @@ def _reason(kernel: str, needs: list[str], gpu: Properties) -> str:
 
 
 def _facts(needs: list[str], gpu: Properties) -> str:
-    return f"shared memory a thread block: {', '.join(needs)}, {gpu.shared:,} B are there"
+    return f"shared memory per thread block: {', '.join(needs)}, {gpu.shared:,} B are available"

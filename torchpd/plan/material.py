@@ -36,8 +36,8 @@ MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
 ARRAYS = (*MATERIAL_ROWS, PIN_HARD)  # arrays that `set_material` replaces
 # hints for names of scene arguments given to `set_material`
 PARTS_OF_ROWS = {
-    "density": "masses are of vertices [kg], a density times their share of volume",
-    "youngs": "stiffness is Young's modulus of each tetrahedron [Pa]",
+    "density": "masses holds the mass of each vertex [kg], density times its share of the volume",
+    "youngs": "stiffness holds Young's modulus of each tetrahedron [Pa]",
 }
 
 _UNIT_SLACK = 1e-4  # tolerance on the length of a plane normal: float32 rounding, and that of a training step
@@ -54,7 +54,7 @@ def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
     soft = torch.isfinite(torch.from_numpy(values.pin_stiffness.copy()))
     if not bool(torch.isfinite(material["pin_stiffness"])[soft].all()):
         raise ValueError(
-            f"Pin.stiffness: a spring is too stiff for {dtype}; leave stiffness out to hold vertices exactly"
+            f"Pin.stiffness must be finite in {dtype}, got inf after rounding; leave stiffness out for hard pins"
         )
     for name, tensor in material.items():
         check_material("Simulator", name, tensor)
@@ -159,7 +159,7 @@ def check_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{owner}: {PIN_HARD} must be a bool or a bool tensor, got {value!r}") from None
     if tensor.dtype != torch.bool:
-        raise TypeError(f"{owner}: {PIN_HARD} must be bool, whether each pin is hard, got {tensor.dtype}")
+        raise TypeError(f"{owner}: {PIN_HARD} must be bool for each pin, got {tensor.dtype}")
     tensor = tensor.to(own.device)
     shape = own.shape[-1:]
     tensor = one_for_all_rows(PIN_HARD, tensor, shape[0])
@@ -187,11 +187,11 @@ def check_batches(owner: str, new: Mapping[str, Tensor], kept: Mapping[str, Tens
         array, stays = new.get(name, kept[name]), "" if name in new else " (kept)"
         count = len(array) if array.dim() > dims_of(name) else 1
         if count == 0:
-            raise ValueError(f"{owner}: {name} must be of at least one environment, got {list(array.shape)}")
+            raise ValueError(f"{owner}: {name} must have at least one environment, got {list(array.shape)}")
         if first is not None and count not in (1, first[0]):
             raise ValueError(
-                f"{owner}: arrays must be of one number of environments, or of all, got those of {first[0]} "
-                f"environments in {first[1]}, of {count} in {name}{stays}; replace them in one call"
+                f"{owner}: arrays must have one number of environments or none, got {first[0]} environments in "
+                f"{first[1]} and {count} in {name}{stays}; replace them in one call"
             )
         if count != 1:
             first = count, name + stays
@@ -202,8 +202,8 @@ def check_environments(name: str, batch: int, arrays: Mapping[str, Tensor]) -> N
     for row, array in arrays.items():
         if array.dim() > dims_of(row) and len(array) not in (1, batch):
             raise ValueError(
-                f"{name} must have as many environments as the simulator's {row}, {len(array)}, got {batch}; "
-                "set_material takes another batch, or an array that all environments share"
+                f"{name} must have as many environments as the simulator's {row}, {len(array)}, got {batch}; replace "
+                f"{row} by set_material, for this batch or shared by all environments"
             )
 
 

@@ -54,7 +54,7 @@ def find_device(name: str) -> torch.device:
         raise ValueError("--device cuda: torch sees no CUDA device here; python -m torchpd doctor says more")
     device = torch.device(name)
     if kind == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise ValueError(f"--device {name} is not there: {seen_devices()}")
+        raise ValueError(f"--device must be an existing GPU, got {name}: {seen_devices()}")
     return device
 
 
@@ -65,7 +65,7 @@ def check_wanted_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor
     except (AssertionError, RuntimeError) as error:
         reason = _reason()
         if not reason and "invalid device ordinal" in str(error):
-            raise RuntimeError(f"Simulator: there is no such GPU: {seen_devices()}") from error
+            raise RuntimeError(f"Simulator: device must be an existing GPU: {seen_devices()}") from error
         if not reason or not any(word in str(error) for word in ("CUDA", "NVIDIA")):
             raise
         raise RuntimeError(f"Simulator: no CUDA here: {reason}") from error
@@ -121,8 +121,8 @@ def _with_levels(compiled: CompiledScene, plan: Plan, reference: Reference) -> P
     """Add a multilevel preconditioner to a plan. On a GPU only the stream kernel reads it."""
     if plan.kernel not in (None, "stream"):
         raise ValueError(
-            f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={compiled.kernel!r}, which is '
-            f'"{plan.kernel}" for this scene; set kernel="stream", or leave adjoint at "solver"'
+            f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={compiled.kernel!r} '
+            f'("{plan.kernel}" for this scene); set kernel="stream", or leave adjoint at "solver"'
         )
     return precondition_plan(plan, compiled.scene.values(), *reference, progress=compiled.progress)
 

@@ -92,8 +92,8 @@ def check_change(
     for name, value in arrays.items():
         if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
             warn_user(
-                f"{owner} copies the numbers of {name}, so no gradient gets to what they were made of: give "
-                f'it to calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it'
+                f"{owner} copies the values of {name}, so gradients do not reach the tensor given. Detach it, or "
+                f'pass it per call: torch.func.functional_call(sim, {{"{name}": ...}}, (state,))'
             )
     if replaces_hard:
         checked[PIN_HARD] = check_hard(owner, hard, own[PIN_HARD])
@@ -133,8 +133,8 @@ def warn_of_new_parameters(change: Change) -> None:
     """Warn of new parameters that an existing optimiser does not hold."""
     if change.learned:
         warn_user(
-            f"the simulator has a new parameter for {' and '.join(change.learned)}, of another batch, which an "
-            "optimiser of the one before does not know: make the optimiser anew, or set the batch first"
+            f"the simulator has a new parameter for {' and '.join(change.learned)}, because the batch changed. An "
+            "existing optimiser still holds the former one: create the optimiser again, or set the batch first"
         )
 
 
@@ -145,14 +145,14 @@ def _pins_apart(was: Tensor, owner: str, springs: Tensor, hard: Tensor | None) -
     """
     stored, infinite = split_springs(springs)
     if hard is not None:
-        _refuse_pins(f"{owner}: pin_stiffness is inf, which holds exactly, where {PIN_HARD} is False", infinite & ~hard)
+        _refuse_pins(f"{owner}: pin_stiffness must be finite where {PIN_HARD} is False, got inf", infinite & ~hard)
         return {"pin_stiffness": stored, PIN_HARD: hard}
     if was.dim() == 2 and was.shape != springs.shape:
         was = was.any(0)
     # sim.pin_stiffness holds 0 at hard pins: scaling it must not release them silently
     _refuse_pins(
-        f"{owner}: pin_stiffness is 0 for pins that are hard, and does not say whether these are let go: give inf to "
-        f"hold on, {PIN_HARD}=False to let go, or {PIN_HARD} of every pin",
+        f"{owner}: pin_stiffness is 0 at hard pins, which may mean to keep or to release them. Give inf to keep them "
+        f"hard, {PIN_HARD}=False to release them, or {PIN_HARD} of every pin",
         was & (springs == 0.0),
     )
     return {"pin_stiffness": stored, PIN_HARD: infinite}
@@ -196,7 +196,7 @@ def _whole_arrays(
     for name in [name for name in arrays if name in COLUMNS]:
         if given := [array for array in COLUMNS[name] if array in arrays]:
             column = COLUMNS[name][given[0]]
-            raise TypeError(f"{owner}: give {name} or {given[0]}, whose column {column} it is, got both")
+            raise TypeError(f"{owner}: give {name} or {given[0]} (it is column {column} there), got both")
         rows = {array: own[array].shape[-2] for array in COLUMNS[name]}
         value = _column(own["planes"], owner, name, arrays[name], rows)
         for array, part in zip(rows, value.split(list(rows.values()), dim=-1), strict=True):
@@ -211,7 +211,7 @@ def _column(like: Tensor, owner: str, name: str, value: Tensor | float, rows: Ma
     """Expand a column value to [rows] or [B, rows], in the precision and on the device of `like`."""
     things, count = " and ".join(_THINGS[array] for array in rows), sum(rows.values())
     if count == 0:
-        raise ValueError(f"{owner}: {name} is of {things}, and the scene has none")
+        raise ValueError(f"{owner}: {name} belongs to {things}, and the scene has none")
     tensor = real_tensor(owner, name, value)
     if tensor.dim() > 2 or tensor.numel() == 0 or (tensor.dim() > 0 and tensor.shape[-1] not in (1, count)):
         raise ValueError(
@@ -226,7 +226,8 @@ def _with_column(owner: str, name: str, array: str, own: Tensor, value: Tensor) 
     batches = [len(t) for t, dims in ((own, MATERIAL_ROWS[array].dims), (value, 1)) if t.dim() > dims]
     if len(batches) == 2 and batches[0] != batches[1] and 1 not in batches:
         raise ValueError(
-            f"{owner}: {name} is of {batches[1]} environments, but {array} are of {batches[0]}; give {array} instead"
+            f"{owner}: {name} must have the {batches[0]} environments of {array}, got {batches[1]}; give {array} "
+            "instead"
         )
     if batches:
         own, value = own.expand(max(batches), *own.shape[-2:]), value.expand(max(batches), value.shape[-1])
@@ -320,8 +321,8 @@ def check_originals(sim: nn.Module, state_dict: Mapping[str, Any]) -> None:
         if not isinstance(array, Tensor) or array.shape != own[name].shape:
             came = list(array.shape) if isinstance(array, Tensor) else type(array).__name__
             raise ValueError(
-                f"{type(sim).__name__}.load_state_dict: {name} must be a tensor {list(own[name].shape)} like that of "
-                f"the simulator, got {came}"
+                f"{type(sim).__name__}.load_state_dict: {name} must be a tensor {list(own[name].shape)}, as in the "
+                f"simulator, got {came}"
             )
 
 
@@ -329,7 +330,7 @@ def check_keys(sim: nn.Module, state_dict: Mapping[str, Any], *, strict: bool) -
     """Refuse an object that is no state_dict or, if `strict`, one with other keys, before anything is loaded."""
     if not isinstance(state_dict, Mapping):
         raise TypeError(
-            f"{type(sim).__name__}.load_state_dict: state_dict must be what state_dict() gave, got "
+            f"{type(sim).__name__}.load_state_dict: state_dict must be a mapping from state_dict(), got "
             f"{type(state_dict).__name__}"
         )
     # a hook may rename keys

@@ -40,13 +40,13 @@ def invert(owner: str, module: nn.Module, name: str, wanted: Tensor) -> tuple[Te
     kind = " and ".join(type(one).__name__ for one in steps)
     if wanted.shape != shape:
         raise ValueError(
-            f"{owner}: {name} is made by the parametrization {kind}, of {list(shape)}, and keeps its shape, got "
-            f"{list(wanted.shape)}: take the parametrization away first, and put it back for the other batch"
+            f"{owner}: {name} must keep the shape {list(shape)} of its parametrization {kind}, got "
+            f"{list(wanted.shape)}; remove the parametrization first, and register it again for the other batch"
         )
     if not makes.is_tensor or not all(hasattr(one, "right_inverse") for one in steps):
         raise ValueError(
-            f"{owner}: {name} is made by the parametrization {kind}, which has no right_inverse to say of what "
-            f"one tensor: set sim.parametrizations.{name} itself, or take the parametrization away"
+            f"{owner}: {name} has the parametrization {kind} without a right_inverse to one tensor; set "
+            f"sim.parametrizations.{name} itself, or remove the parametrization"
         )
     original = wanted.clone()
     for one in reversed(steps):
@@ -55,8 +55,8 @@ def invert(owner: str, module: nn.Module, name: str, wanted: Tensor) -> tuple[Te
     fits = original.shape == makes.original.shape and made.shape == shape
     if not (fits and torch.allclose(made, wanted, rtol=1e-3, atol=0.0, equal_nan=True)):
         raise ValueError(
-            f"{owner}: the parametrization {kind} of {name} makes other numbers of what its right_inverse gives "
-            f"than these: set sim.parametrizations.{name} itself, or give it what it can make"
+            f"{owner}: {name} must be a value of its parametrization {kind}, whose right_inverse does not give it "
+            f"back; set sim.parametrizations.{name} itself, or give another value"
         )
     return original, made
 

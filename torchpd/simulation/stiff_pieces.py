@@ -107,13 +107,13 @@ def _why_not(stiffness: Array, threshold: float, free: int, held: int) -> str:
     span = f"the elements have {stiffness.min():g} to {stiffness.max():g} Pa"
     if np.isinf(threshold):
         return (
-            f"RigidPieces: {span}, and without stiffer_than there are pieces only where that spans a factor of "
-            f"{_CONTRAST:g}; give stiffer_than [Pa], or use the simulator alone"
+            f"RigidPieces: stiffer_than has a default only for a stiffness ratio of {_CONTRAST:g}, and {span}; give "
+            "stiffer_than [Pa], or use the simulator alone"
         )
     return (
-        f"RigidPieces: there must be 1 to {_MOST} connected pieces that no hard pin holds; {span}, and stiffer than "
-        f"{threshold:g} Pa are {free + held} pieces, of which hard pins hold {held}; choose another stiffer_than [Pa], "
-        "or use the simulator alone"
+        f"RigidPieces: there must be 1 to {_MOST} connected pieces without hard pins, got {free + held} stiffer than "
+        f"{threshold:g} Pa, {held} of them with hard pins; {span}. Choose another stiffer_than [Pa], or use the "
+        "simulator alone"
     )
 
 
@@ -124,8 +124,8 @@ def _refuse_full_memory(vertices: int, pieces: int, dtype: torch.dtype, device: 
         there = _memory(place)
         if needed > there:
             raise ValueError(
-                f"RigidPieces: {pieces} pieces among {vertices:,} vertices need {needed:,} B of memory and the "
-                f"{place.type} has {there:,} B; choose stiffer_than [Pa] for fewer pieces, or a coarser mesh"
+                f"RigidPieces: {pieces} pieces of {vertices:,} vertices need {needed:,} B of memory, and {place.type} "
+                f"has {there:,} B; choose stiffer_than [Pa] for fewer pieces, or a coarser mesh"
             )
 
 

@@ -29,7 +29,7 @@ __all__ = [
 def check_instances(count: int) -> None:
     """Refuse scenes with endlessly nested parts: twenty levels of two references each are a million parts."""
     if count > MOST_INSTANCES:
-        raise ValueError(f"it has more than {MOST_INSTANCES:,} instances, some of them of each other's parts")
+        raise ValueError(f"it has more than {MOST_INSTANCES:,} instances, some of them nested")
 
 
 def check_tree(roots: Iterable[Hashable], parts_of: Callable[[Any], Iterable[Hashable]]) -> None:
@@ -41,7 +41,7 @@ def check_tree(roots: Iterable[Hashable], parts_of: Callable[[Any], Iterable[Has
             sizes[part] = 0
             sizes[part] = 1 + sum(size(inner) for inner in parts_of(part))
         elif not sizes[part]:
-            raise ValueError("one of its parts is a part of itself")
+            raise ValueError("one of its parts contains itself")
         return sizes[part]
 
     check_instances(sum(size(root) for root in roots))

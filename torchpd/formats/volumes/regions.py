@@ -36,8 +36,8 @@ def choose(names: Iterable[str], notes: list[str]) -> str | None:
     if known:
         return known[0]
     if len(found) == 1:
-        notes.append(f"regions are the array {found[0]!r}, the only one of the cells that holds integers")
+        notes.append(f"regions are the array {found[0]!r}, the only integer array of the cells")
         return found[0]
     if found:
-        notes.append(f"no regions: several arrays of cells hold integers ({', '.join(found)})")
+        notes.append(f"no regions: several cell arrays hold integers ({', '.join(found)})")
     return None
