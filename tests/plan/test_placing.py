@@ -82,7 +82,7 @@ def test_gradients_by_levels_need_the_kernel_that_reads_them(
     monkeypatch.setattr(placing, "free_memory", lambda _: 10**9)
     monkeypatch.setattr(Plan, "to", lambda self, device: self)
     assert plan.kernel == "block"
-    said = r"""adjoint="multilevel" needs kernel="stream" on a GPU, got kernel='auto', which is "block" for this"""
+    said = r"""adjoint="multilevel" needs kernel="stream" on a GPU, got kernel='auto' .*block"""
     with pytest.raises(ValueError, match=said):
         sim.adjoint = "multilevel"
     assert (sim.adjoint, sim.plan) == ("solver", plan)
@@ -148,9 +148,9 @@ def test_a_gpu_that_is_not_there_is_told_which_are(monkeypatch: pytest.MonkeyPat
     def fail(_: torch.Tensor) -> torch.Tensor:
         raise RuntimeError("CUDA error: invalid device ordinal\nGPU device may be out of range")
 
-    there = r"torch sees cuda:0 \(kind 0\), cuda:1 \(kind 1\); CUDA_VISIBLE_DEVICES says"
+    there = r"torch sees cuda:0 \(kind 0\), cuda:1 \(kind 1\); CUDA_VISIBLE_DEVICES"
     with pytest.raises(RuntimeError, match=rf"^Simulator: device must be an existing GPU: {there}"):
         placing.check_wanted_device(fail, torch.empty(0))
-    with pytest.raises(ValueError, match=rf"^--device cuda:2 is not there: {there}"):
+    with pytest.raises(ValueError, match=rf"^--device must be an existing GPU, got cuda:2: {there}"):
         placing.find_device("cuda:2")
     assert [placing.find_device(name).index for name in ("cuda", "cuda:0", "cuda:1")] == [None, 0, 1]

@@ -23,7 +23,11 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
     masses[4:6] = -0.5
     sparse, unreal = torch.ones(48).to_sparse(), torch.ones(48, device="meta")
     for arrays, kind, message in (
-        ({"youngs": 1e5}, TypeError, r"no array 'youngs'; there are stiffness, masses.*; stiffness is Young's modulus"),
+        (
+            {"youngs": 1e5},
+            TypeError,
+            r"no array 'youngs'; there are stiffness, masses.*; stiffness holds Young's modulus",
+        ),
         (
             {"stiffness": torch.ones(3)},
             ValueError,
@@ -91,7 +95,7 @@ def test_a_state_dict_of_another_scene_is_refused_in_its_own_name() -> None:
         sim.load_state_dict(other.state_dict())
     assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
     two = {**sim.state_dict(), "masses": sim.masses.repeat(2, 1), "gravity": sim.gravity.repeat(3, 1)}
-    with pytest.raises(ValueError, match=r"^Simulator\.load_state_dict: arrays must be of one number of environments"):
+    with pytest.raises(ValueError, match=r"^Simulator\.load_state_dict: arrays must have one number of environments"):
         sim.load_state_dict(two)
 
 
@@ -175,10 +179,10 @@ def test_batches_of_the_material_must_agree() -> None:
         return {name: own.expand(count, *own.shape)}
 
     for arrays, message in (
-        (batch("stiffness", 2) | batch("masses", 3), r"of 2 environments in stiffness, of 3 in masses"),
+        (batch("stiffness", 2) | batch("masses", 3), r"got 2 environments in stiffness and 3 in masses"),
         (
             batch("damping", 1) | batch("gravity", 2) | batch("planes", 3),
-            r"of 2 environments in gravity, of 3 in planes",
+            r"got 2 environments in gravity and 3 in planes",
         ),
     ):
         before = named_arrays(sim)
@@ -186,7 +190,7 @@ def test_batches_of_the_material_must_agree() -> None:
             sim.set_material(**arrays)
         assert all(before[name] is array for name, array in named_arrays(sim).items())
     sim.set_material(**batch("stiffness", 2))
-    with pytest.raises(ValueError, match=r"of 2 environments in stiffness \(kept\), of 3 in masses"):
+    with pytest.raises(ValueError, match=r"got 2 environments in stiffness \(kept\) and 3 in masses"):
         sim.set_material(**batch("masses", 3))
     assert sim.masses.dim() == 1
     # one for all, or all of them anew, will do

@@ -328,7 +328,7 @@ def choose_plan(
     if kernel == "cluster" and gpu.cluster == 1:
         raise ValueError(
             'Simulator: kernel="cluster" needs thread block clusters (NVIDIA compute capability 9.0), and this GPU has '
-            'none; take "auto", or "block", "grid" or "stream"'
+            'none; take "auto", "block", "grid" or "stream"'
         )
     if kernel == "benchmark":
         return quickest(_plans_that_fit(scene, gpu, 1 if batch is None else batch))
@@ -347,7 +347,7 @@ def choose_plan(
             others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.considers(other, gpu)]
             raise ValueError(
                 f"Simulator: kernel={kernel!r} does not fit this GPU: {_facts(needs, gpu)}; "
-                f'take "auto", or {any_of(others)}'
+                f"take {any_of(('auto', *others))}"
             )
     return replace(_stream_plan(scene, gpu), why=_reason(kernel, needs, gpu))
 
