@@ -51,7 +51,7 @@ def holds_body(owner: str, path: PathLike) -> bool:
 
 
 def read_body(owner: str, path: PathLike, unit: Unit | None = None) -> Body:
-    """Read a body of tets; a `ValueError` if the file holds none. `unit`: see `torchpd.units`."""
+    """Read a body of tets; a `ValueError` if the file holds none. `unit`: see `torchpd.common.units`."""
     content = read(owner, path, unit)
     solid = split.tets_of(content)
     name = Path(path).name
@@ -74,7 +74,7 @@ def read_body(owner: str, path: PathLike, unit: Unit | None = None) -> Body:
 
 
 def read_surface(owner: str, path: PathLike, unit: Unit | None = None) -> Surface:
-    """Read a surface; a `ValueError` if the file holds no triangle, quad or polygon. `unit`: see `torchpd.units`."""
+    """Read a surface; a `ValueError` if the file holds no face. `unit`: see `torchpd.common.units`."""
     content = read(owner, path, unit)
     flat = split.triangles_of(content)
     if not len(flat.elements):

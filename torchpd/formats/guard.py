@@ -38,7 +38,7 @@ def read(owner: str, path: PathLike, unit: Unit | None = None) -> MeshContent:
     Args:
         owner: name of the caller, with which errors begin.
         path: the file; its suffix selects the format.
-        unit: of its numbers, see `torchpd.units`.
+        unit: of its numbers, see `torchpd.common.units`.
 
     Raises:
         FileNotFoundError: the file, or one that belongs to it, is missing.
