@@ -291,7 +291,7 @@ def test_the_batch_decides_where_environments_share_a_device(monkeypatch: pytest
 def test_the_kernel_of_chebyshev_is_compared_whatever_ran_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU a simulator with Multilevel has a plan of other patches, whose costs are not Chebyshev's."""
     sim = beam(1e6)
-    sim.plan = dataclasses.replace(sim.plan, for_levels=True)
+    sim.plan = dataclasses.replace(sim.plan, for_multilevel=True)
     solvers = []
 
     def fails(compiled: CompiledScene, *_: object) -> None:
@@ -305,7 +305,7 @@ def test_the_kernel_of_chebyshev_is_compared_whatever_ran_before(monkeypatch: py
         assert isinstance(solvers.pop(), pd.Chebyshev)
         # all or nothing
         assert isinstance(sim.solver, pd.Multilevel)
-        assert sim.plan.for_levels
+        assert sim.plan.for_multilevel
 
 
 @pytest.mark.parametrize("youngs", [1e3, 1e4, 1e5, 1e6])

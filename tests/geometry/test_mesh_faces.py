@@ -20,7 +20,7 @@ import torchpd as pd
 from torchpd import MeshWarning, TetMesh, TriMesh
 from torchpd.geometry import shapes
 from torchpd.geometry.embedding import embed_triangles
-from torchpd.geometry.mesh_faces import TET_FACES, count_pieces, merge_near, sort_faces
+from torchpd.geometry.mesh_faces import TET_FACES, count_components, merge_near, sort_faces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -344,7 +344,7 @@ def test_moving_a_mesh_says_nothing_again() -> None:
 
 
 def test_pieces_hang_together_by_vertices() -> None:
-    assert count_pieces(np.array([[0, 1, 2, 3], [3, 4, 5, 6], [9, 10, 11, 12]])) == 2
+    assert count_components(np.array([[0, 1, 2, 3], [3, 4, 5, 6], [9, 10, 11, 12]])) == 2
 
 
 # Files:

@@ -15,12 +15,12 @@ from programs import ROOT
 
 import torchpd as pd
 from torchpd import _C
-from torchpd.common.gpu import H100, Properties, refuse_full_memory, why_not
+from torchpd.common.gpu import H100, Properties, check_free_memory, unavailable_reason
 from torchpd.common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 from torchpd.plan import KERNELS, Plan, compile_plan, kernel_costs
 from torchpd.plan import kernel_choice as regimes
 from torchpd.plan import placement as placing
-from torchpd.plan.kernel_choice import choose_plan, most_shared_bytes, shared_bytes
+from torchpd.plan.kernel_choice import choose_plan, max_shared_bytes, shared_bytes
 from torchpd.plan.preconditioner import precondition_plan
 from torchpd.scene import SceneValues
 
@@ -33,7 +33,7 @@ def test_auto_takes_the_first_that_fits() -> None:
     """Just enough memory for a kernel chooses it, one byte less the next one."""
     values = box_values((6, 6, 6))
     for dtype in REAL:
-        needs = {name: most_shared_bytes(choose_plan(values, dtype, H100, name), 0, 0) for name in KERNELS[:-1]}
+        needs = {name: max_shared_bytes(choose_plan(values, dtype, H100, name), 0, 0) for name in KERNELS[:-1]}
         assert needs["grid"] < needs["cluster"] < needs["block"]
         for shared, kernel in (
             (needs["block"], "block"),
@@ -74,7 +74,7 @@ def test_patches_too_large_for_a_cluster_go_to_a_grid() -> None:
         ):
             choose_plan(large, dtype, gpu, "cluster")
         plan = choose_plan(large, dtype, gpu)
-        assert (plan.kernel, plan.patches) == ("grid", 4116 // regimes._GRID_TETS)
+        assert (plan.kernel, plan.patches) == ("grid", 4116 // regimes._MIN_GRID_TETS)
         assert re.search(needs, plan.why)
 
 
@@ -132,7 +132,7 @@ def test_number_of_patches() -> None:
         assert choose_plan(small, dtype, H100, "block").patches == 1
         grid, tets = choose_plan(small, dtype, H100, "grid").patches, len(small.tets)
         assert grid > 2
-        assert tets / grid >= regimes._GRID_TETS > tets / (grid + 1)
+        assert tets / grid >= regimes._MIN_GRID_TETS > tets / (grid + 1)
         assert choose_plan(small, dtype, Properties(5, 232_448), "grid").patches == 5
         middle = box_values((9, 3, 3))
         cluster, tets = choose_plan(middle, torch.float32, H100, "cluster").patches, len(middle.tets)
@@ -178,7 +178,7 @@ def test_patches_of_a_pipeline_are_larger() -> None:
     plan = choose_plan(box_values((40, 12, 12)), torch.float32, few, "stream")
     assert plan.size("most_slots") <= 640
     half = 24 * plan.size("most_slots") + 12 * plan.size("most_entries")
-    assert 2 * half <= regimes._PIPED_BYTES
+    assert 2 * half <= regimes._PIPELINE_BYTES
 
 
 def test_a_kernel_that_does_not_fit_is_refused_with_numbers() -> None:
@@ -216,13 +216,13 @@ def test_the_way_back_fits_where_the_step_does(
     """Its passes keep a position and a direction of every slot, beside static memory, where a grid has a position."""
     values, real = box_values(cells), torch.finfo(dtype).bits // 8
     plan = choose_plan(values, dtype, H100, kernel, batch=batch)
-    step, most = shared_bytes(plan, 0, 0), most_shared_bytes(plan, 0, 0)
+    step, most = shared_bytes(plan, 0, 0), max_shared_bytes(plan, 0, 0)
     passes = -(-6 * real * plan.size("most_slots") // 16) * 16 + 4 * real * plan.size("most_entries")
     assert most == max(step, passes + _C.pass_static_bytes)
     assert (most > step) == (kernel == "grid")
     # what has room for the step alone gets another plan
     tight = H100._replace(shared=most - 1)
-    assert most_shared_bytes(choose_plan(values, dtype, tight, batch=batch), 0, 0) <= tight.shared
+    assert max_shared_bytes(choose_plan(values, dtype, tight, batch=batch), 0, 0) <= tight.shared
 
 
 def test_what_is_refused_unbuilt_does_not_fit_when_built() -> None:
@@ -264,7 +264,7 @@ def test_patches_of_a_multilevel_solver_fit(gpu: Properties, dtype: torch.dtype)
     """As many for every multiprocessor as fit, also where 16 bits would not count the entries of fewer."""
     values = box_values((54, 11, 11))  # 39 204 tetrahedra
     plan = choose_plan(values, dtype, gpu, levels=True, progress=False)
-    assert plan.for_levels
+    assert plan.for_multilevel
     assert plan.kernel == "stream"
     assert plan.patches % gpu.multiprocessors == 0
     assert shared_bytes(plan, 0, 0) <= gpu.shared
@@ -281,7 +281,7 @@ def test_many_environments_of_a_multilevel_solver_get_larger_patches(gpu: Proper
     least = -(-gpu.multiprocessors // 4)
     few, many = (choose_plan(values, dtype, gpu, levels=True, batch=batch) for batch in (least - 1, least))
     assert (few.many, many.many) == (False, True)
-    assert many.for_levels
+    assert many.for_multilevel
     assert shared_bytes(many, 0, 0) <= gpu.shared
     if gpu == H100 and dtype == torch.float32:
         assert (few.patches, many.patches) == (12, 3)
@@ -383,17 +383,22 @@ def test_why_a_gpu_cannot_be_used(
     facts: tuple[bool, str | None, int] | tuple[bool, str | None, int, tuple[int, int]], words: tuple[str, ...]
 ) -> None:
     for word in words:
-        assert word in why_not(*facts), word
+        assert word in unavailable_reason(*facts), word
 
 
 def test_a_gpu_that_can_be_used() -> None:
-    assert why_not(True, "13.0", 1) == why_not(True, "13.0", 2, (8, 0)) == why_not(True, "13.0", 1, (12, 0)) == ""
+    assert (
+        unavailable_reason(True, "13.0", 1)
+        == unavailable_reason(True, "13.0", 2, (8, 0))
+        == unavailable_reason(True, "13.0", 1, (12, 0))
+        == ""
+    )
 
 
 def test_too_little_memory_is_a_sentence() -> None:
-    refuse_full_memory(1000, 1000)
+    check_free_memory(1000, 1000)
     with pytest.raises(RuntimeError, match=r"step need 1,001 B of memory on the GPU and 1,000 B are free"):
-        refuse_full_memory(1001, 1000)
+        check_free_memory(1001, 1000)
 
 
 def test_plans_are_moved_between_alike_devices_only(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ import torch
 from runs import same_bits
 
 import torchpd as pd
-from torchpd.plan.preconditioner import reference_of
+from torchpd.plan.preconditioner import reference_material
 from torchpd.reference import step_problem
 from torchpd.reference.solvers import newton, relative_error
 from torchpd.simulation import stiff_pieces
@@ -230,7 +230,7 @@ def test_a_preparation_that_fails_changes_nothing() -> None:
 def test_functions_and_fits_are_those_of_a_dense_solve(monkeypatch: pytest.MonkeyPatch) -> None:
     """A Z = 0 beside the pieces and their pins, fits Z = 1, and Z^T A Z: in float64 to 1e5 roundings."""
     sim, _ = blocks("cubes", cells=8)
-    reference = (array.double().numpy() for array in reference_of(sim.plan, sim.material(), sim.time_step))
+    reference = (array.double().numpy() for array in reference_material(sim.plan, sim.material(), sim.time_step))
     stiffness, inertia = reference
     values = sim.scene.values()
     monkeypatch.setattr(stiff_pieces, "_BLOCK", 24)  # does not divide the columns

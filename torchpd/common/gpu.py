@@ -9,16 +9,16 @@ import torch
 __all__ = [
     "DOCTOR",
     "H100",
-    "LEAST_CAPABILITY",
+    "MIN_CAPABILITY",
     "Properties",
+    "check_free_memory",
     "free_memory",
     "properties_of",
-    "refuse_full_memory",
-    "seen_devices",
-    "why_not",
+    "unavailable_reason",
+    "visible_devices",
 ]
 
-LEAST_CAPABILITY = (8, 0)
+MIN_CAPABILITY = (8, 0)
 DOCTOR = "`python -m torchpd doctor` says more"
 
 
@@ -44,7 +44,9 @@ def properties_of(device: torch.device) -> Properties:
         return Properties(found.multi_processor_count, shared, _C.largest_cluster())
 
 
-def why_not(built: bool, torch_cuda: str | None, devices: int, capability: tuple[int, int] | None = None) -> str:
+def unavailable_reason(
+    built: bool, torch_cuda: str | None, devices: int, capability: tuple[int, int] | None = None
+) -> str:
     """Reason why no simulator can run on a GPU, with the fix; empty if one can.
 
     Args:
@@ -65,9 +67,9 @@ def why_not(built: bool, torch_cuda: str | None, devices: int, capability: tuple
         )
     if devices == 0:
         return f"torch sees no CUDA device: check the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES; {DOCTOR}"
-    if capability is not None and capability < LEAST_CAPABILITY:
+    if capability is not None and capability < MIN_CAPABILITY:
         return (
-            f"the GPU has compute capability {_dotted(capability)} and the kernels need {_dotted(LEAST_CAPABILITY)} or "
+            f"the GPU has compute capability {_dotted(capability)} and the kernels need {_dotted(MIN_CAPABILITY)} or "
             'newer (Ampere): take another device, or stay on the CPU with .to("cpu")'
         )
     return ""
@@ -77,7 +79,7 @@ def _dotted(capability: tuple[int, int]) -> str:
     return ".".join(map(str, capability))
 
 
-def seen_devices() -> str:
+def visible_devices() -> str:
     """List the GPUs that torch sees, for an error message."""
     names = [f"cuda:{index} ({torch.cuda.get_device_name(index)})" for index in range(torch.cuda.device_count())]
     return f"torch sees {', '.join(names) or 'none'}; CUDA_VISIBLE_DEVICES limits them"
@@ -89,7 +91,7 @@ def free_memory(device: torch.device) -> int:
     return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
-def refuse_full_memory(needed: int, free: int) -> None:
+def check_free_memory(needed: int, free: int) -> None:
     """Raise an error before an allocation would fail halfway."""
     if needed > free:
         raise RuntimeError(

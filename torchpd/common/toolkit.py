@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 __all__ = [
     "CUDA_ARCHITECTURES",
-    "LEAST_RELEASE",
+    "MIN_RELEASE",
     "NVCC_FLAGS",
     "NVCC_PACKING",
     "Toolkit",
@@ -28,7 +28,7 @@ CUDA_ARCHITECTURES = "8.0;9.0+PTX"
 NVCC_FLAGS = ("-std=c++20", "-O3", "--expt-relaxed-constexpr", "--fmad=false")
 # Compile two architectures at a time, and compress the code to a quarter; neither changes the result.
 NVCC_PACKING = ("--threads=2", "-Xfatbin=-compress-all")
-LEAST_RELEASE = "12.3"  # first release with PTX 8.3, needed for the 128-bit words of csrc/cuda
+MIN_RELEASE = "12.3"  # first release with PTX 8.3, needed for the 128-bit words of csrc/cuda
 
 
 class Toolkit(NamedTuple):
@@ -70,8 +70,8 @@ def choose_toolkit(home: str | None, release: str, torch_cuda: str | None) -> To
         return Toolkit(None, "", f"no working nvcc in {home}/bin")
     if release.split(".")[0] != torch_cuda.split(".")[0]:
         return Toolkit(None, release, f"nvcc is CUDA {release} but torch is built for CUDA {torch_cuda}")
-    if _numbers(release) < _numbers(LEAST_RELEASE):
-        reason = f"nvcc is CUDA {release} and the kernels need {LEAST_RELEASE} or newer: install a newer toolkit"
+    if _numbers(release) < _numbers(MIN_RELEASE):
+        reason = f"nvcc is CUDA {release} and the kernels need {MIN_RELEASE} or newer: install a newer toolkit"
         return Toolkit(None, release, f"{reason} of the same major version, and set CUDA_HOME to it")
     return Toolkit(home, release, "")
 

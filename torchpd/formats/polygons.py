@@ -8,17 +8,17 @@ import numpy as np
 
 from .content import Array, Index
 
-__all__ = ["Wrong", "triangulate"]
+__all__ = ["FaultyPolygons", "triangulate"]
 
 
-class Wrong(NamedTuple):
+class FaultyPolygons(NamedTuple):
     """Number of polygons with fewer than three corners, and of self-intersecting polygons."""
 
     small: int
     crossed: int
 
 
-def triangulate(points: Array, corners: Index, sizes: Index) -> tuple[Index, Index, Wrong]:
+def triangulate(points: Array, corners: Index, sizes: Index) -> tuple[Index, Index, FaultyPolygons]:
     """Cut polygons into triangles without new vertices.
 
     A polygon is a fan from its vertex of the lowest number, so that neighbours are cut alike. Where the fan of a
@@ -48,7 +48,7 @@ def triangulate(points: Array, corners: Index, sizes: Index) -> tuple[Index, Ind
                 fans[row] = ears
         triangles.append(fans.reshape(-1, 3))
         owners.append(np.repeat(which, size - 2))
-    wrong = Wrong(int((sizes < 3).sum()), crossed)
+    wrong = FaultyPolygons(int((sizes < 3).sum()), crossed)
     if not triangles:
         return np.empty((0, 3), dtype=np.int64), np.empty(0, dtype=np.int64), wrong
     owner = np.concatenate(owners)

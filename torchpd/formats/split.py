@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from .content import CELLS, Array, Cells, Index, MeshContent
-from .polygons import Wrong, triangulate
+from .polygons import FaultyPolygons, triangulate
 
 __all__ = ["Split", "tets_of", "triangles_of"]
 
@@ -69,8 +69,8 @@ def tets_of(content: MeshContent) -> Split:
         elements.append(tets)
         owners.append(cells)
     cells_of = _counts(solid)
-    notes = [*_left_out(content), *_of_higher_order(solid)]
-    notes += [f"{_say(cells_of[kind], kind)} became {count} tets" for kind, count in made.items()]
+    notes = [*_omissions(content), *_of_higher_order(solid)]
+    notes += [f"{_count_words(cells_of[kind], kind)} became {count} tets" for kind, count in made.items()]
     if folded:
         notes.append(f"{folded} of the cells that became tets are folded or flat, and so are some of their tets")
     return Split(points, _joined(elements, 4), _regions(solid, owners), notes)
@@ -79,14 +79,14 @@ def tets_of(content: MeshContent) -> Split:
 def triangles_of(content: MeshContent) -> Split:
     """Split all triangles, quads and polygons into triangles."""
     flat = [block for block in content.cells if block.kind in ("triangle", "quad", "polygon") and len(block)]
-    elements, owners, wrong = [], [], Wrong(0, 0)
+    elements, owners, wrong = [], [], FaultyPolygons(0, 0)
     for block in flat:
         if block.kind == "triangle":
             triangles, cells = block.corners, np.arange(len(block))
         else:
             sizes = np.full(len(block), 4) if block.sizes is None else block.sizes
             triangles, cells, bad = triangulate(content.points, block.corners.reshape(-1), sizes)
-            wrong = Wrong(wrong.small + bad.small, wrong.crossed + bad.crossed)
+            wrong = FaultyPolygons(wrong.small + bad.small, wrong.crossed + bad.crossed)
         elements.append(triangles)
         owners.append(cells)
     notes = _of_higher_order(flat)
@@ -116,7 +116,7 @@ def _counts(blocks: list[Cells]) -> Counter[str]:
     return counts
 
 
-def _say(count: int, kind: str) -> str:
+def _count_words(count: int, kind: str) -> str:
     """Count of cells as words."""
     return f"{count} {kind if count == 1 else _PLURALS.get(kind, f'{kind}s')}"
 
@@ -124,10 +124,10 @@ def _say(count: int, kind: str) -> str:
 def _of_higher_order(blocks: list[Cells]) -> list[str]:
     counts = _counts([block for block in blocks if block.order > 1])
     straight = "of higher order: corners kept, nodes on edges left out, so that edges are straight"
-    return [f"{_say(count, kind)} {straight}" for kind, count in counts.items()]
+    return [f"{_count_words(count, kind)} {straight}" for kind, count in counts.items()]
 
 
-def _left_out(content: MeshContent) -> list[str]:
+def _omissions(content: MeshContent) -> list[str]:
     """Notes on cells of other kinds, and on lines and vertices that lie on no other cell."""
     known = [block for block in content.cells if block.kind == "polygon" or CELLS.get(block.kind, (0, 0))[1] >= 2]
     used = np.zeros(len(content.points), dtype=bool)
@@ -143,12 +143,12 @@ def _left_out(content: MeshContent) -> list[str]:
     ]
     notes = []
     for kind, count in _counts(others).items():
-        volume = sum(_hulls(content.points, block) for block in others if block.kind == kind)
-        notes.append(f"{_say(count, kind)} left out" + (f", {volume:.4g} m^3" if volume else ""))
+        volume = sum(_hull_volume(content.points, block) for block in others if block.kind == kind)
+        notes.append(f"{_count_words(count, kind)} left out" + (f", {volume:.4g} m^3" if volume else ""))
     return notes
 
 
-def _hulls(points: Array, block: Cells) -> float:
+def _hull_volume(points: Array, block: Cells) -> float:
     """Volume of the convex hulls of cells of any shape."""
     if block.sizes is None:
         return 0.0
@@ -177,7 +177,7 @@ def _choose_diagonals(blocks: list[Cells]) -> list[Index]:
     if not len(triangles):
         return chosen
     halves = [corners[:, cut] for cut in ([0, 1, 2], [0, 2, 3], [1, 2, 3], [1, 3, 0])]
-    met = _among(np.concatenate(halves), triangles).reshape(4, -1)
+    met = _rows_in(np.concatenate(halves), triangles).reshape(4, -1)
     first, second = met[0] | met[1], met[2] | met[3]
     start = 0
     for number, quad in enumerate(quads):
@@ -193,7 +193,7 @@ def _faces(block: Cells, corners: list[list[int]], width: int) -> Index:
     return block.corners[:, np.array(corners, dtype=np.int64).reshape(-1, width)]
 
 
-def _among(some: Index, others: Index) -> Mask:
+def _rows_in(some: Index, others: Index) -> Mask:
     """Mask of the rows of `some` that have the vertices of a row of `others`, in any order."""
     rows = np.sort(np.concatenate([some, others]), axis=1)
     number = np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)

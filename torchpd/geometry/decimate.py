@@ -80,9 +80,9 @@ class _Surface:
                 self.around[corner].add(number)
         # no two entries have the same vertices and versions: positions are never compared
         self.heap: list[tuple[float, int, int, int, int, Array]] = []
-        self.offer(np.unique(np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
+        self.push(np.unique(np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
 
-    def offer(self, pairs: Index) -> None:
+    def push(self, pairs: Index) -> None:
         """Push edges [N, 2] with the minimum of the summed quadrics, and its position."""
         forms = self.quadrics[pairs[:, 0]] + self.quadrics[pairs[:, 1]]
         places = np.linalg.solve(forms[:, :3, :3], -forms[:, :3, 3:])[..., 0]
@@ -135,7 +135,7 @@ class _Surface:
         self.quadrics[u] += self.quadrics[v]
         self.version[u] += 1
         self.version[v] += 1
-        self.offer(np.array([(min(u, w), max(u, w)) for w in sorted(self.neighbours(u))]).reshape(-1, 2))
+        self.push(np.array([(min(u, w), max(u, w)) for w in sorted(self.neighbours(u))]).reshape(-1, 2))
         return len(wings)
 
 

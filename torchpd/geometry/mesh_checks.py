@@ -25,12 +25,12 @@ __all__ = [
     "compact",
     "corner_words",
     "determinants",
-    "find_repeated",
+    "find_duplicates",
     "has_repeated_corner",
     "is_flat",
-    "refuse",
+    "raise_for_first",
     "scaling",
-    "store",
+    "set_frozen",
     "translation",
     "warn",
 ]
@@ -50,7 +50,7 @@ def warn(message: str) -> None:
     warn_user(message, MeshWarning)
 
 
-def store(part: object, **values: Any) -> None:
+def set_frozen(part: object, **values: Any) -> None:
     """Set fields of a frozen object; arrays become read-only."""
     for name, value in values.items():
         if isinstance(value, np.ndarray):
@@ -103,7 +103,7 @@ def corner_words(elements: Index) -> NDArray[np.uint64]:
     return np.asarray(words[elements])
 
 
-def find_repeated(tets: Index) -> tuple[NDArray[np.bool_], int]:
+def find_duplicates(tets: Index) -> tuple[NDArray[np.bool_], int]:
     """Mask of tets with the corners of an earlier one, in any order, and the original of the first such tet.
 
     Equal tets have equal sums of random words, one per vertex. Corners are compared only where two sums are equal.
@@ -154,7 +154,7 @@ def is_flat(points: Array, tets: Index, values: Array) -> NDArray[np.bool_]:
     return np.asarray(flat)
 
 
-def refuse(name: str, bad: NDArray[np.bool_], elements: Index, fault: str, fix: str) -> None:
+def raise_for_first(name: str, bad: NDArray[np.bool_], elements: Index, fault: str, fix: str) -> None:
     """Raise an error for the first bad element, if any."""
     rows = np.flatnonzero(bad)
     if rows.size:
@@ -216,11 +216,11 @@ def clean_tets(
     groups = None if regions is None else check_regions(regions, len(elements))
     fix = "pass drop_degenerate=True to leave them out"
     if not drop_degenerate:
-        refuse("TetMesh.tets", has_repeated_corner(elements), elements, "corners must differ", fix)
+        raise_for_first("TetMesh.tets", has_repeated_corner(elements), elements, "corners must differ", fix)
     with np.errstate(over="ignore", invalid="ignore"):
         signed = determinants(points, elements)
         flat = is_flat(points, elements, signed)
-    twice, first = find_repeated(elements)
+    twice, first = find_duplicates(elements)
     if drop_degenerate and (flat.any() or twice.any()):
         for bad, fault in ((flat, "have no volume"), (twice & ~flat, "come twice")):
             if bad.any():
@@ -231,10 +231,10 @@ def clean_tets(
         elements, signed, flat, twice = elements[kept], signed[kept], flat[kept], twice[kept]
         if not len(elements):
             raise ValueError("TetMesh.tets: no tet has a volume; are all vertices in one plane?")
-    refuse("TetMesh.tets", flat, elements, "volumes must exceed the rounding of the vertices", fix)
+    raise_for_first("TetMesh.tets", flat, elements, "volumes must exceed the rounding of the vertices", fix)
     if twice.any():
         again = f"tets must be distinct (that at {first} comes again, with a volume of its own)"
-        refuse("TetMesh.tets", twice, elements, again, fix)
+        raise_for_first("TetMesh.tets", twice, elements, again, fix)
     inverted = signed < 0
     flipped = int(inverted.sum())
     if flipped:

@@ -16,10 +16,10 @@ from .mesh_checks import corner_words, determinants, has_repeated_corner, warn
 __all__ = [
     "ROUNDING",
     "TET_FACES",
-    "count_pieces",
+    "count_components",
     "match_faces",
     "merge_near",
-    "numbered",
+    "number_rows",
     "pieces_of",
     "report_faces",
 ]
@@ -125,7 +125,7 @@ def _corners(tets: Index, faces: Index) -> Index:
     return np.asarray(tets[tet[:, None], TET_FACES[k]])
 
 
-def numbered(rows: Array) -> Index:
+def number_rows(rows: Array) -> Index:
     """Numbers for rows [n, 3]; equal rows have equal numbers."""
     order = np.lexsort(rows.T)
     new = np.append(True, (rows[order[1:]] != rows[order[:-1]]).any(axis=1))[: len(rows)]
@@ -145,7 +145,7 @@ def merge_near(points: Array, tolerance: float) -> Index:
     suspects = order[np.append(close, False) | np.append(False, close)]
     if not len(suspects):
         return first
-    number = numbered(points[suspects])
+    number = number_rows(points[suspects])
     _, one = np.unique(number, return_index=True)
     pairs = cKDTree(points[suspects[one]]).query_pairs(tolerance, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=2 * (len(one),))
@@ -235,7 +235,7 @@ def pieces_of(tets: Index) -> Index:
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
-def count_pieces(tets: Index) -> int:
+def count_components(tets: Index) -> int:
     """Number of components that share no vertices."""
     return len(np.unique(pieces_of(tets)[tets[:, 0]]))
 
@@ -243,8 +243,8 @@ def count_pieces(tets: Index) -> int:
 def _report_unmerged(count: str, tets: Index, first: Index, tolerance: float) -> None:
     warn(
         f"TetMesh: {count} outer faces coincide without common vertices, so the tets there are not connected: the mesh "
-        f"is in {count_pieces(tets)} pieces. mesh.merged() merges vertices within {tolerance:.2g} m, which leaves "
-        f"{count_pieces(first[tets])}"
+        f"is in {count_components(tets)} pieces. mesh.merged() merges vertices within {tolerance:.2g} m, which leaves "
+        f"{count_components(first[tets])}"
     )
 
 

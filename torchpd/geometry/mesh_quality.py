@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .mesh_faces import count_pieces
+from .mesh_faces import count_components
 
 __all__ = ["MeshQuality", "element_bounds", "measure_quality", "shape_gradients", "smallest_dihedral"]
 
@@ -106,5 +106,5 @@ def measure_quality(vertices: Array, tets: Index, fill: Array | None = None) -> 
         max_dihedral=angles.max(axis=1),
         element_bounds=element_bounds(normals),
         fill=fill,
-        pieces=count_pieces(tets),
+        pieces=count_components(tets),
     )

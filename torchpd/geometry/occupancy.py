@@ -17,18 +17,18 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .bcc_lattice import Lattice, candidates, split_long
-from .mesh_checks import find_repeated
-from .mesh_faces import numbered
+from .mesh_checks import find_duplicates
+from .mesh_faces import number_rows
 from .tri_mesh import TriMesh
 
-__all__ = ["LEAST_FILL", "Parts", "inside_share", "parts_of"]
+__all__ = ["MIN_FILL", "Parts", "inside_share", "parts_of"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 # Least fraction of a tet: a much softer neighbour slows every solver, and an empty one is singular.
-LEAST_FILL = 0.05
+MIN_FILL = 0.05
 
 # Samples along the edge of a cube, 18 per tet. Even, so that none lies in a symmetry plane of the cube, and lattice
 # planes have as many on either side.
@@ -71,8 +71,8 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     since files repeat vertices along seams, not always to the bit; strips of triangles close the seams. Pieces with
     mostly open edges after that are sheets. Triangles that come from both sides count once.
     """
-    same = numbered(surface.vertices)
-    triangles = surface.triangles[_single(surface.triangles, same)]
+    same = number_rows(surface.vertices)
+    triangles = surface.triangles[_without_duplicates(surface.triangles, same)]
     part = _connected(triangles, same)
     edges = _edges(triangles, same)
     closed, oriented = (np.ones(int(part.max()) + 1, dtype=bool) for _ in range(2))
@@ -83,8 +83,8 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     none = np.empty((0, 3, 3))
     if not rest.any():
         return Parts(corners, part, oriented, none, none, len(corners), (0, len(edges.open)))
-    places, near = _welded(surface.vertices, same, _edges(triangles[rest], same), tolerance)
-    loose = triangles[rest][_single(triangles[rest], near)]
+    places, near = _merge_open_edges(surface.vertices, same, _edges(triangles[rest], same), tolerance)
+    loose = triangles[rest][_without_duplicates(triangles[rest], near)]
     beside = int(closed[part[edges.triangle]].sum())
     own, edges = _connected(loose, near), _edges(loose, near)
     count = int(own.max()) + 1
@@ -108,12 +108,12 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     )
 
 
-def _single(triangles: Index, same: Index) -> Mask:
+def _without_duplicates(triangles: Index, same: Index) -> Mask:
     """Mask of triangles without duplicates, in parts that this closes or that consist of duplicates.
 
     Many models list every triangle twice, once from either side: by winding or by parity they would enclose nothing.
     """
-    again = find_repeated(same[triangles])[0]
+    again = find_duplicates(same[triangles])[0]
     if again.any():
         part = _connected(triangles, same)
         edges = _edges(triangles[~again], same)
@@ -123,7 +123,7 @@ def _single(triangles: Index, same: Index) -> Mask:
     return ~again
 
 
-def _welded(vertices: Array, same: Index, edges: _Edges, tolerance: float) -> tuple[Array, Index]:
+def _merge_open_edges(vertices: Array, same: Index, edges: _Edges, tolerance: float) -> tuple[Array, Index]:
     """Position and number of every vertex; merged vertices have equal ones.
 
     Ends of open edges are merged if they are closer than `tolerance`, and than half of all edges there: the neighbours

@@ -12,7 +12,7 @@ from ..common.checks import check_scalar
 from ..common.synonyms import check_arguments
 from ..common.units import Unit
 from ..formats.bodies import read_body
-from ..formats.guard import naming
+from ..formats.guard import name_file_in_errors
 from .embedding import Embedding, embed_surface, embed_triangles
 from .mesh_checks import (
     MeshWarning,
@@ -22,7 +22,7 @@ from .mesh_checks import (
     determinants,
     has_repeated_corner,
     scaling,
-    store,
+    set_frozen,
     translation,
     warn,
 )
@@ -31,7 +31,7 @@ from .mesh_files import write_tets
 from .mesh_quality import MeshQuality, measure_quality
 from .tri_mesh import PathLike, TriMesh
 
-__all__ = ["MeshWarning", "TetMesh", "embed", "trusted"]
+__all__ = ["MeshWarning", "TetMesh", "embed", "without_face_checks"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -83,7 +83,7 @@ class TetMesh:
         fields = clean_tets(
             vertices, tets, fill, regions, drop_unreferenced=drop_unreferenced, drop_degenerate=drop_degenerate
         )
-        store(self, **fields, embedding=None)
+        set_frozen(self, **fields, embedding=None)
         report_faces(self.vertices, self.tets)
 
     @classmethod
@@ -108,7 +108,7 @@ class TetMesh:
         body = read_body("TetMesh.from_file", path, unit)
         if body.notes:
             warn(f"TetMesh.from_file: {Path(path).name}: {'; '.join(body.notes)}")
-        with naming("TetMesh.from_file", path):
+        with name_file_in_errors("TetMesh.from_file", path):
             mesh = cls(
                 body.points, body.tets, regions=body.regions, drop_unreferenced=True, drop_degenerate=drop_degenerate
             )
@@ -165,7 +165,7 @@ class TetMesh:
                 "it names); make one with torchpd.embed(surface, mesh)"
             )
         mesh: TetMesh = object.__new__(TetMesh)
-        store(mesh, **(vars(self) | {"embedding": embedding}))
+        set_frozen(mesh, **(vars(self) | {"embedding": embedding}))
         return mesh
 
     def merged(self, tolerance: float | None = None, *, drop_degenerate: bool = False) -> TetMesh:
@@ -204,7 +204,7 @@ class TetMesh:
         linear, offset = affine("TetMesh.transformed: matrix", matrix)
         # A reflection inverts every tet: two corners and their weights change places.
         corners = [0, 1, 3, 2] if np.linalg.det(linear) < 0 else [0, 1, 2, 3]
-        mesh = trusted(self.vertices @ linear.T + offset, self.tets[:, corners], self.fill, self.regions)
+        mesh = without_face_checks(self.vertices @ linear.T + offset, self.tets[:, corners], self.fill, self.regions)
         if self.embedding is None:
             return mesh
         return mesh.with_embedding(self.embedding.transformed(matrix, corners))
@@ -226,10 +226,12 @@ class TetMesh:
         return f"TetMesh({len(self.vertices)} vertices, {len(self.tets)} tets{filled}{carried})"
 
 
-def trusted(vertices: Numbers, tets: Numbers, fill: Numbers | None = None, regions: Numbers | None = None) -> TetMesh:
+def without_face_checks(
+    vertices: Numbers, tets: Numbers, fill: Numbers | None = None, regions: Numbers | None = None
+) -> TetMesh:
     """Mesh without the check of its faces, for tets that were checked before or may overlap."""
     mesh: TetMesh = object.__new__(TetMesh)
-    store(mesh, **clean_tets(vertices, tets, fill, regions), embedding=None)
+    set_frozen(mesh, **clean_tets(vertices, tets, fill, regions), embedding=None)
     return mesh
 
 

@@ -21,7 +21,7 @@ from .bcc_lattice import Lattice
 from .embedding import Embedding
 from .mesh_checks import warn
 from .mesh_faces import TET_FACES, match_faces
-from .occupancy import LEAST_FILL, Parts, inside_share, parts_of
+from .occupancy import MIN_FILL, Parts, inside_share, parts_of
 from .tet_mesh import TetMesh, embed
 from .tri_mesh import TriMesh
 
@@ -133,7 +133,7 @@ def _fill_lattice(surface: TriMesh, lattice: Lattice, *, progress: bool, fill_ho
     chosen = np.flatnonzero(kept)
     vertices, tets = lattice.mesh(chosen)
     source, tets = _split_hinges(tets)
-    mesh = TetMesh(vertices[source], tets, fill=np.clip(share.reshape(-1)[chosen], LEAST_FILL, 1.0))
+    mesh = TetMesh(vertices[source], tets, fill=np.clip(share.reshape(-1)[chosen], MIN_FILL, 1.0))
     carriers = np.searchsorted(chosen, numbers)
     return mesh.with_embedding(Embedding(surface, carriers, weights, mesh.tets[carriers], len(mesh.vertices)))
 

@@ -14,7 +14,7 @@ from ..common.checks import as_array, check_finite, check_shape
 from ..common.synonyms import check_arguments
 from ..common.units import Unit, metres
 from ..formats.bodies import read_surface
-from ..formats.guard import naming
+from ..formats.guard import name_file_in_errors
 from .mesh_checks import (
     Numbers,
     affine,
@@ -22,9 +22,9 @@ from .mesh_checks import (
     check_points,
     compact,
     has_repeated_corner,
-    refuse,
+    raise_for_first,
     scaling,
-    store,
+    set_frozen,
     translation,
     warn,
 )
@@ -70,14 +70,16 @@ class TriMesh:
             elements, bad = elements[~bad], bad[~bad]
             if not len(elements):
                 raise ValueError("TriMesh.triangles: no triangle has three different corners")
-        refuse("TriMesh.triangles", bad, elements, "corners must differ", "pass drop_degenerate=True to leave them out")
+        raise_for_first(
+            "TriMesh.triangles", bad, elements, "corners must differ", "pass drop_degenerate=True to leave them out"
+        )
         coordinates = None
         if uvs is not None:
             coordinates = as_array("TriMesh.uvs", uvs, np.float64)
             check_shape("TriMesh.uvs", coordinates, (len(points), 2), "texture coordinates of every vertex")
             check_finite("TriMesh.uvs", coordinates)
         kept, elements = compact("TriMesh", elements, len(points), drop=drop_unreferenced)
-        store(
+        set_frozen(
             self,
             vertices=points[kept],
             triangles=elements,
@@ -135,7 +137,7 @@ class TriMesh:
         surface = read_surface("TriMesh.from_file", path, unit)
         if surface.notes:
             warn(f"TriMesh.from_file: {Path(path).name}: {'; '.join(surface.notes)}")
-        with naming("TriMesh.from_file", path):
+        with name_file_in_errors("TriMesh.from_file", path):
             return cls(surface.points, surface.triangles, uvs=surface.uvs, drop_unreferenced=True, drop_degenerate=True)
 
     def to_trimesh(self) -> Any:

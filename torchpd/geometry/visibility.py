@@ -22,16 +22,16 @@ def _first_hits(origins: Array, directions: Array, corners: Array, *, least: flo
     first = np.full(len(origins), np.inf)
     shift = corners.mean(axis=(0, 1))  # far from the origin, squares would lose digits
     origins, corners = origins - shift, corners - shift
-    middle = corners.mean(axis=1)
-    radius = 1.001 * np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    centroid = corners.mean(axis=1)
+    radius = 1.001 * np.linalg.norm(corners - centroid[:, None], axis=2).max(axis=1)
     length = np.linalg.norm(directions, axis=1)
     rows = max(1, _AT_ONCE // len(corners))
     for start in range(0, len(origins), rows):
         o, d, size = origins[start : start + rows], directions[start : start + rows], length[start : start + rows]
         unit = d / size[:, None]
-        along = unit @ middle.T - (unit * o).sum(axis=1)[:, None]
+        along = unit @ centroid.T - (unit * o).sum(axis=1)[:, None]
         # squared distance from the ray; rounding below zero is covered by the margin of the radius
-        apart = (o**2).sum(axis=1)[:, None] + (middle**2).sum(axis=1) - 2.0 * (o @ middle.T) - along**2
+        apart = (o**2).sum(axis=1)[:, None] + (centroid**2).sum(axis=1) - 2.0 * (o @ centroid.T) - along**2
         near = (apart <= radius**2) & (along >= -radius) & (along <= most * size[:, None] + radius)
         ray, triangle = np.nonzero(near)
         hits = _hits(o[ray], d[ray], corners[triangle])

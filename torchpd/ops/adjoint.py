@@ -84,7 +84,7 @@ def step_gradient(call: AdjointCall) -> Tensor:
     return torch.where(held > 0, torch.zeros_like(gradient), gradient)
 
 
-def _warn_of(failed: Tensor, error: Tensor) -> None:
+def _warn_of_no_solution(failed: Tensor, error: Tensor) -> None:
     warn_user(
         f"torchpd: the adjoint of a step has no solution in {int(failed.sum())} of {len(failed)} environments "
         f"(relative residual {float(error[failed].max()):.1e}). Their states are far from an equilibrium (more "
@@ -139,7 +139,7 @@ def mend_adjoint(
             _warn_of_friction(friction > limit, friction)
         if not bool(failed.any()):
             return solution.clone()
-        _warn_of(failed, error)
+        _warn_of_no_solution(failed, error)
     # the curvature of contact surfaces is no part of the majoriser
     inertia, _ = step_diagonal(arrays, material, time_step)
     instead, _ = torch.ops.torchpd.conjugate_gradients(

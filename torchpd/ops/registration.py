@@ -17,7 +17,7 @@ from .diagonal import named_material
 from .vmap import register_rule
 from .vmap_step import rollout_vjp_rule, step_vjp_rule
 
-__all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_tangents"]
+__all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_forward_mode"]
 
 INFO_WIDTH = _C.info_numbers
 
@@ -47,12 +47,12 @@ def nearest_rotation(F: Tensor) -> Tensor:
     """
     if not isinstance(F, Tensor):
         raise TypeError(f"nearest_rotation: F must be a tensor [..., 3, 3], got {type(F).__name__}")
-    refuse_tangents(F)
+    refuse_forward_mode(F)
     result: Tensor = _ops.nearest_rotation(F)
     return result
 
 
-def refuse_tangents(*tensors: Tensor | None) -> None:
+def refuse_forward_mode(*tensors: Tensor | None) -> None:
     """Refuse forward-mode derivatives, which the ops lack: torch would take them to be zero."""
     if forward_ad._current_level < 0:
         return
@@ -230,7 +230,7 @@ def _save_elastic(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     ctx.save_for_backward(*state, *material)
 
 
-def _like_stiffness(per_environment: Tensor, stiffness: Tensor) -> Tensor:
+def _sum_to_stiffness(per_environment: Tensor, stiffness: Tensor) -> Tensor:
     """Sum over the environments that share a stiffness."""
     return per_environment.sum(0) if stiffness.dim() == 1 else per_environment.sum_to_size(stiffness.shape)
 
@@ -256,7 +256,7 @@ def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, lis
         x = _ops.gradient(positions, _with_stiffness(material, grad * stiffness), ctx.plan)
     if ctx.needs_input_grad[1][_STIFFNESS]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
-        w = _like_stiffness(grad * _ops.element_energy(positions, unit, ctx.plan), stiffness)
+        w = _sum_to_stiffness(grad * _ops.element_energy(positions, unit, ctx.plan), stiffness)
     return x, _for_material(w), _for_plan(ctx)
 
 
@@ -267,7 +267,7 @@ def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tens
         x = _ops.hessian_product(positions, grad, material, ctx.plan)
     if ctx.needs_input_grad[1][_STIFFNESS]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
-        w = _like_stiffness(_ops.element_energy_product(positions, grad, unit, ctx.plan), stiffness)
+        w = _sum_to_stiffness(_ops.element_energy_product(positions, grad, unit, ctx.plan), stiffness)
     return x, _for_material(w), _for_plan(ctx)
 
 
@@ -283,7 +283,7 @@ def _element_energy_product_backward(
         d = _ops.gradient(positions, scaled, ctx.plan)
     if ctx.needs_input_grad[2][_STIFFNESS]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
-        w = _like_stiffness(grad * _ops.element_energy_product(positions, direction, unit, ctx.plan), stiffness)
+        w = _sum_to_stiffness(grad * _ops.element_energy_product(positions, direction, unit, ctx.plan), stiffness)
     return x, d, _for_material(w), _for_plan(ctx)
 
 

@@ -21,12 +21,12 @@ from ..scene.scene import SceneValues
 __all__ = [
     "KERNELS",
     "Plan",
-    "any_of",
     "compile_plan",
-    "compiling",
+    "compile_progress",
     "internal_numbers",
     "kernel_of",
     "loose_pieces",
+    "quoted_choices",
     "with_loose_pieces",
 ]
 
@@ -52,7 +52,7 @@ class Plan:
         arrays: the tensors, one for each row of `table`.
         table: the rows that C++ declares.
         why: reason for the choice of the GPU kernel, shown to the user.
-        for_levels: whether the patches were sized for a multilevel solver.
+        for_multilevel: whether the patches were sized for a multilevel solver.
         many: whether they were sized for so many environments that each has few multiprocessors.
         loose: [components] whether a step may move a connected component rigidly (hard pins prevent it); None: unknown.
     """
@@ -60,7 +60,7 @@ class Plan:
     arrays: tuple[Tensor, ...]
     table: tuple[PlanRow, ...] = PLAN_TABLE
     why: str = ""
-    for_levels: bool = False
+    for_multilevel: bool = False
     many: bool = False
     loose: NDArray[np.bool_] | None = None
 
@@ -134,7 +134,7 @@ class Plan:
 
 
 @contextmanager
-def compiling(tets: int, progress: bool) -> Iterator[Callable[[float], None]]:
+def compile_progress(tets: int, progress: bool) -> Iterator[Callable[[float], None]]:
     """Show a progress bar for a large mesh; yields a callback that takes the fraction done."""
     with tqdm(total=100, desc="compiling the scene", leave=False, disable=not progress or tets < _WORTH_A_BAR) as bar:
         yield lambda done: _advance(bar, done)
@@ -154,7 +154,7 @@ def _patch_size(tets: int) -> int:
     return max(16, -(-tets // patches))
 
 
-def any_of(names: Sequence[str]) -> str:
+def quoted_choices(names: Sequence[str]) -> str:
     """Join names into a choice for an error message: "block", "grid" or "stream"."""
     *before, last = (f'"{name}"' for name in names)
     return f"{', '.join(before)} or {last}" if before else last
@@ -210,7 +210,7 @@ def compile_plan(
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}")
     tets = len(values.tets)
-    with compiling(tets, progress) as advance:
+    with compile_progress(tets, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_plan(
             values.rest_positions,
             values.tets,

@@ -13,7 +13,7 @@ from .. import _C
 from ..common.checks import tensor_of
 from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 from ..scene.scene import SceneValues
-from .cpu_plan import KERNELS, compiling, internal_numbers, loose_pieces
+from .cpu_plan import KERNELS, compile_progress, internal_numbers, loose_pieces
 
 __all__ = ["compile_device_plan"]
 
@@ -42,7 +42,7 @@ def compile_device_plan(
     if kernel not in range(len(KERNELS)):
         raise ValueError(f"kernel must be 0, 1, 2 or 3, got {kernel}")
     piece, _ = loose_pieces(values)
-    with compiling(len(values.tets), progress) as advance:
+    with compile_progress(len(values.tets), progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_device_plan(
             values.rest_positions, values.tets, patches, kernel, dtype == torch.float32, piece, advance
         )

@@ -15,16 +15,16 @@ import torch
 from .compiled import CompiledScene
 from .cpu_plan import Plan
 
-__all__ = ["quickest_plan", "steps_of"]
+__all__ = ["benchmark_steps", "fastest_plan"]
 
 _REPETITIONS = 5
 _TIMES: dict[Hashable, dict[str, float]] = {}  # milliseconds per step by kernel
 
 
-def steps_of(
+def benchmark_steps(
     scene: CompiledScene, dtype: torch.dtype, device: torch.device
 ) -> tuple[Hashable, Callable[[Plan], Callable[[], object]]]:
-    """Cache key and step function of `quickest_plan` for a scene on a GPU; steps start at rest."""
+    """Cache key and step function of `fastest_plan` for a scene on a GPU; steps start at rest."""
     values, batch = scene.scene.values(), scene.environments
     numbers = {
         **scene.solver.settings(),
@@ -49,7 +49,7 @@ def steps_of(
     return key, step
 
 
-def quickest_plan(plans: Iterator[Plan], key: Hashable, step: Callable[[Plan], Callable[[], object]]) -> Plan:
+def fastest_plan(plans: Iterator[Plan], key: Hashable, step: Callable[[Plan], Callable[[], object]]) -> Plan:
     """The plan with the fastest steps.
 
     Args:
@@ -58,11 +58,11 @@ def quickest_plan(plans: Iterator[Plan], key: Hashable, step: Callable[[Plan], C
         step: moves a plan to its GPU and returns a function that takes one step. It may raise
             `torch.cuda.OutOfMemoryError`.
     """
-    offers = list(plans)
+    candidates = list(plans)
     if key not in _TIMES:
-        _TIMES[key] = {str(plan.kernel): _milliseconds(step, plan) for plan in offers}
+        _TIMES[key] = {str(plan.kernel): _milliseconds(step, plan) for plan in candidates}
     times = _TIMES[key]
-    best = min(offers, key=lambda plan: times[str(plan.kernel)])
+    best = min(candidates, key=lambda plan: times[str(plan.kernel)])
     words = ", ".join(f"{kernel} {time:.3g} ms" for kernel, time in sorted(times.items(), key=lambda item: item[1]))
     return replace(best, why=f"the fastest kernel, milliseconds per step: {words}")
 

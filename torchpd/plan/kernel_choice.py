@@ -34,13 +34,13 @@ from .. import _C
 from ..common.gpu import Properties
 from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 from ..scene.scene import SceneValues
-from .cpu_plan import KERNELS, Plan, any_of
+from .cpu_plan import KERNELS, Plan, quoted_choices
 from .gpu_plan import compile_device_plan
 from .kernel_costs import iteration_microseconds, kernel_microseconds
 
 __all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
-_GRID_TETS = 150  # least per patch: smaller patches cost more in exchange than they save
+_MIN_GRID_TETS = 150  # least per patch: smaller patches cost more in exchange than they save
 # "auto" tries clusters for meshes of up to 8000 tetrahedra, with one patch per 75 while there are blocks
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
 # largest share of the vertices that a block of a cluster has threads for, while there are more blocks
@@ -49,51 +49,51 @@ _CLUSTER_OWN = 0.7
 _MANY_SHARE = 4
 # multilevel solver: least tetrahedra per patch; largest mesh in one block, in general and for few environments;
 # tetrahedra per patch for many environments, which run faster with fewer patches
-_LEVEL_TETS, _LEVEL_ALONE, _FEW_ALONE, _MANY_TETS = 384, 1152, 384, 1900
+_MIN_LEVEL_TETS, _MAX_BLOCK_TETS, _MAX_BLOCK_TETS_FEW, _MANY_TETS = 384, 1152, 384, 1900
 _LEVELS = ("few", "any", "many")  # by the number of environments
 # Most tetrahedra per patch, five rounds of its threads when all are paired; and patches per multiprocessor of an H100
 # (csrc/cuda/stream/kernels.h).
 _STREAM_TETS = {torch.float32: 1920, torch.float64: 960}
-_STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
+_STREAM_CONCURRENT = {torch.float32: 2, torch.float64: 1}
 # A pipeline takes patches larger by this factor: a multiprocessor computes one and holds two, if its shared memory
 # suffices and each has a patch. Its threads keep the slots in registers (csrc/cuda/stream/pipeline.h).
-_PIPED_MORE, _PIPED_BYTES = 1.2, 200_000
-_MOST_FIELDS = 2  # most fields of one pass: the products with a second derivative
+_PIPELINE_GROWTH, _PIPELINE_BYTES = 1.2, 200_000
+_MAX_PASS_FIELDS = 2  # most fields of one pass: the products with a second derivative
 
 
 def check_kernel(kernel: str) -> str:
     """Return a kernel name after checking it: "auto", "benchmark" or one of KERNELS."""
     names = ("auto", "benchmark", *KERNELS)
     if kernel not in names:
-        raise ValueError(f"Simulator: kernel must be {any_of(names)}, got {kernel!r}")
+        raise ValueError(f"Simulator: kernel must be {quoted_choices(names)}, got {kernel!r}")
     return kernel
 
 
-def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
+def shared_bytes(plan: Plan, planes: int, spheres: int) -> int:
     """Shared memory [bytes] per block of the kernel that a plan is for."""
     real = torch.finfo(plan.dtype).bits // 8
     slots, entries = plan.size("most_slots"), plan.size("most_entries")
-    if plan.for_levels:
+    if plan.for_multilevel:
         return _C.outer_shared_bytes(real, slots, entries)
     if plan.kernel == "stream":
         return _pass_bytes(plan)
     if plan.kernel == "cluster":
-        return _C.cluster_shared_bytes(real, slots, entries, plan.size("most_interior"), planes, balls)
-    return _C.fused_shared_bytes(real, plan.kernel == "grid", slots, entries, planes, balls)
+        return _C.cluster_shared_bytes(real, slots, entries, plan.size("most_interior"), planes, spheres)
+    return _C.fused_shared_bytes(real, plan.kernel == "grid", slots, entries, planes, spheres)
 
 
-def most_shared_bytes(plan: Plan, planes: int, balls: int) -> int:
+def max_shared_bytes(plan: Plan, planes: int, spheres: int) -> int:
     """Most shared memory [bytes] of a step and of its backward pass, which visits all patches."""
-    return max(shared_bytes(plan, planes, balls), _pass_bytes(plan))
+    return max(shared_bytes(plan, planes, spheres), _pass_bytes(plan))
 
 
 def _pass_bytes(plan: Plan) -> int:
     real = torch.finfo(plan.dtype).bits // 8
-    bytes_of_pass = _C.pass_shared_bytes(real, plan.size("most_slots"), plan.size("most_entries"), _MOST_FIELDS)
+    bytes_of_pass = _C.pass_shared_bytes(real, plan.size("most_slots"), plan.size("most_entries"), _MAX_PASS_FIELDS)
     return bytes_of_pass + _C.pass_static_bytes
 
 
-class _Scene(NamedTuple):
+class _PlanBuilder(NamedTuple):
     values: SceneValues
     dtype: torch.dtype
     progress: bool
@@ -117,19 +117,21 @@ class _Scene(NamedTuple):
         return Plan(arrays, DEVICE_PLAN_TABLE, loose=self.values.loose)
 
     def shared_bytes(self, plan: Plan) -> int:
-        return most_shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
+        return max_shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
 
     def patches(self, kernel: str, gpu: Properties) -> int:
         """Number of patches for a kernel, or for a multilevel solver with "few", "many" or "any" environments."""
         if kernel == "block":
             return 1
         if kernel == "cluster":
-            wanted = max(2, self.tets // _CLUSTER_EACH, math.ceil(self.vertices / (_CLUSTER_OWN * self.most_own())))
+            wanted = max(
+                2, self.tets // _CLUSTER_EACH, math.ceil(self.vertices / (_CLUSTER_OWN * self.max_owned_vertices()))
+            )
             return min(gpu.cluster, gpu.multiprocessors, wanted, self.vertices, self.tets)
         if kernel == "grid":
-            return self.most_grid_patches(gpu)
+            return self.max_grid_patches(gpu)
         if kernel in _LEVELS:
-            if self.tets <= (_FEW_ALONE if kernel == "few" else _LEVEL_ALONE):
+            if self.tets <= (_MAX_BLOCK_TETS_FEW if kernel == "few" else _MAX_BLOCK_TETS):
                 return 1
             # estimate: 2.5 entries and a third of a slot per tetrahedron, see pass_shared_bytes
             each = (4 * 2.5 + 6 / 3) * self.real
@@ -137,54 +139,54 @@ class _Scene(NamedTuple):
             if kernel == "many":
                 return max(2, int(least), -(-self.tets // _MANY_TETS))
             rounds = -(-int(least) // gpu.multiprocessors)
-            return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
+            return min(-(-self.tets // _MIN_LEVEL_TETS), rounds * gpu.multiprocessors)
         patches = -(-self.tets // _STREAM_TETS[self.dtype])
         # patches that do not run at once run in whole waves, of which the last is full too
-        wave = _STREAM_TOGETHER[self.dtype] * gpu.multiprocessors
-        if self.has_large_halves(gpu) and patches > gpu.multiprocessors:
+        wave = _STREAM_CONCURRENT[self.dtype] * gpu.multiprocessors
+        if self.uses_pipeline(gpu) and patches > gpu.multiprocessors:
             wave = gpu.multiprocessors
-            patches = max(wave, math.ceil(self.tets / (_PIPED_MORE * _STREAM_TETS[self.dtype])))
+            patches = max(wave, math.ceil(self.tets / (_PIPELINE_GROWTH * _STREAM_TETS[self.dtype])))
         return patches if patches <= wave else -(-patches // wave) * wave
 
-    def has_large_halves(self, gpu: Properties) -> bool:
+    def uses_pipeline(self, gpu: Properties) -> bool:
         """Whether "stream" runs as a pipeline with larger patches: float32, no contacts, enough shared memory."""
         touching = len(self.values.planes) + len(self.values.spheres) > 0
-        return self.dtype == torch.float32 and not touching and gpu.shared >= _PIPED_BYTES
+        return self.dtype == torch.float32 and not touching and gpu.shared >= _PIPELINE_BYTES
 
-    def most_grid_patches(self, gpu: Properties) -> int:
+    def max_grid_patches(self, gpu: Properties) -> int:
         """Most patches of a grid that leave each one its least number of tetrahedra."""
-        return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
+        return min(gpu.multiprocessors, max(2, self.tets // _MIN_GRID_TETS), self.tets)
 
-    def grids(self, batch: int, gpu: Properties) -> list[tuple[float, int]]:
+    def ranked_grids(self, batch: int, gpu: Properties) -> list[tuple[float, int]]:
         """Estimated microseconds per iteration for each useful number of patches, in ascending order of time.
 
         For one, two, three... environments at a time, the largest number of patches is listed.
         """
-        most = self.most_grid_patches(gpu)
+        most = self.max_grid_patches(gpu)
         counts = {min(most, gpu.multiprocessors // together) for together in range(1, gpu.multiprocessors // 2 + 1)}
         timed = [(self.microseconds("grid", count, batch, gpu), count) for count in counts or {most}]
-        return sorted(timed, key=lambda offer: (offer[0], -offer[1]))
+        return sorted(timed, key=lambda candidate: (candidate[0], -candidate[1]))
 
     def microseconds(self, kernel: str, patches: int, batch: int, gpu: Properties) -> float:
         return kernel_microseconds(kernel, patches, self.tets, batch, self.dtype, gpu)
 
-    def most_own(self) -> int:
+    def max_owned_vertices(self) -> int:
         """Most vertices that a block of a cluster has threads for."""
         return next(count - 1 for count in itertools.count(1) if not _C.fits_cluster(self.real, 1, count))
 
-    def considers(self, kernel: str, gpu: Properties) -> bool:
+    def is_candidate(self, kernel: str, gpu: Properties) -> bool:
         """Whether "auto" considers a kernel."""
         return kernel != "cluster" or (gpu.cluster > 1 and self.tets <= _CLUSTER_TETS)
 
-    def refuse_unbuilt(self, kernel: str, patches: int, gpu: Properties) -> str:
+    def refuse_size(self, kernel: str, patches: int, gpu: Properties) -> str:
         """Reason why a kernel cannot fit, found before the plan is built; empty if it may fit."""
         tets = -(-self.tets // patches)  # least tetrahedra of the largest patch; a cluster adds copies
         if kernel == "cluster":
             return self.refuse_patch(-(-tets // 2), -(-self.vertices // patches))
         slots = self.vertices if patches == 1 else 4
-        planes, balls = len(self.values.planes), len(self.values.spheres)
+        planes, spheres = len(self.values.planes), len(self.values.spheres)
         # two tetrahedra have at least five entries
-        least = _C.fused_shared_bytes(self.real, kernel == "grid", slots, 5 * tets // 2, planes, balls)
+        least = _C.fused_shared_bytes(self.real, kernel == "grid", slots, 5 * tets // 2, planes, spheres)
         return f"at least {least:,} B" if least > gpu.shared else ""
 
     def refuse_patch(self, pairs: int, interior: int) -> str:
@@ -195,11 +197,11 @@ class _Scene(NamedTuple):
 
 
 def _fused_plan(
-    scene: _Scene, kernel: str, gpu: Properties, batch: int | None = None, patches: int | None = None
+    scene: _PlanBuilder, kernel: str, gpu: Properties, batch: int | None = None, patches: int | None = None
 ) -> tuple[Plan | None, str]:
     """The plan, None if it does not fit, and the shared memory that it needs, in words."""
     patches = scene.patches(kernel, gpu) if patches is None else patches
-    refusal = scene.refuse_unbuilt(kernel, patches, gpu)
+    refusal = scene.refuse_size(kernel, patches, gpu)
     if refusal:
         return None, refusal
     try:
@@ -217,12 +219,12 @@ def _fused_plan(
     return (plan if needed <= gpu.shared else None), f"{needed:,} B"
 
 
-def _grid_plan(scene: _Scene, gpu: Properties, batch: int | None) -> tuple[Plan | None, str]:
+def _grid_plan(scene: _PlanBuilder, gpu: Properties, batch: int | None) -> tuple[Plan | None, str]:
     """As `_fused_plan` for a grid, with the fastest number of patches that fits."""
     if batch is None:
         return _fused_plan(scene, "grid", gpu)
     plan, needed, too_few = None, "", 0
-    for _, patches in scene.grids(batch, gpu):
+    for _, patches in scene.ranked_grids(batch, gpu):
         if patches <= too_few:
             continue
         plan, needed = _fused_plan(scene, "grid", gpu, patches=patches)
@@ -232,18 +234,18 @@ def _grid_plan(scene: _Scene, gpu: Properties, batch: int | None) -> tuple[Plan 
     return plan, needed
 
 
-def _plans_that_fit(scene: _Scene, gpu: Properties, batch: int) -> Iterator[Plan]:
+def _plans_that_fit(scene: _PlanBuilder, gpu: Properties, batch: int) -> Iterator[Plan]:
     """Plans of the kernels that fit, in ascending order of their estimated time."""
-    cluster = _fused_plan(scene, "cluster", gpu)[0] if scene.considers("cluster", gpu) else None
-    offers = [
+    cluster = _fused_plan(scene, "cluster", gpu)[0] if scene.is_candidate("cluster", gpu) else None
+    candidates = [
         (scene.microseconds("block", 1, batch, gpu), "block", 1),
-        *((time, "grid", patches) for time, patches in scene.grids(batch, gpu)),
+        *((time, "grid", patches) for time, patches in scene.ranked_grids(batch, gpu)),
         (scene.microseconds("stream", 0, batch, gpu), "stream", 0),
     ]
     if cluster is not None:
-        offers.append((iteration_microseconds(cluster, scene.tets, batch, gpu), "cluster", cluster.patches))
+        candidates.append((iteration_microseconds(cluster, scene.tets, batch, gpu), "cluster", cluster.patches))
     done, too_few = set(), 0  # kernels; patches of a grid
-    for _, kernel, patches in sorted(offers, key=lambda offer: offer[0]):
+    for _, kernel, patches in sorted(candidates, key=lambda candidate: candidate[0]):
         if kernel in done or (kernel == "grid" and patches <= too_few):
             continue
         if kernel == "stream":
@@ -258,12 +260,12 @@ def _plans_that_fit(scene: _Scene, gpu: Properties, batch: int) -> Iterator[Plan
             too_few = patches
 
 
-def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
+def _stream_plan(scene: _PlanBuilder, gpu: Properties) -> Plan:
     """Plan for "stream"; the number of patches doubles until the slots of each fit."""
     return _plan_that_fits(scene, gpu, "stream", lambda patches: 2 * patches)
 
 
-def _level_plan(scene: _Scene, gpu: Properties, name: str) -> Plan:
+def _level_plan(scene: _PlanBuilder, gpu: Properties, name: str) -> Plan:
     """Plan for a multilevel solver; the number of patches stays a multiple of the multiprocessors."""
 
     def more(patches: int) -> int:
@@ -276,12 +278,12 @@ def _level_plan(scene: _Scene, gpu: Properties, name: str) -> Plan:
     return replace(plan, many=name == "many", why="the kernel of Multilevel")
 
 
-def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
+def _plan_that_fits(scene: _PlanBuilder, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
     """Plan for "stream" or a multilevel solver; `more` gives the next number of patches to try."""
     patches = min(scene.patches(name, gpu), scene.tets)
     while True:
         try:
-            plan = replace(scene.plan("stream", patches), for_levels=name != "stream")
+            plan = replace(scene.plan("stream", patches), for_multilevel=name != "stream")
         except ValueError:  # more entries in a patch than 16 bits count
             if patches == scene.tets:
                 raise
@@ -300,7 +302,7 @@ def choose_plan(
     levels: bool = False,
     batch: int | None = None,
     progress: bool = True,
-    quickest: Callable[[Iterator[Plan]], Plan] = next,
+    fastest: Callable[[Iterator[Plan]], Plan] = next,
 ) -> Plan:
     """Compile the plan of a scene for a GPU. The result is on the CPU; `Plan.to` moves it.
 
@@ -308,16 +310,16 @@ def choose_plan(
         values: the flat arrays of `Scene.values`.
         dtype: torch.float32 or torch.float64.
         gpu: properties of the device.
-        kernel: a name, "benchmark" (`quickest` chooses), or "auto": the fastest by `kernel_costs` if the batch is
+        kernel: a name, "benchmark" (`fastest` chooses), or "auto": the fastest by `kernel_costs` if the batch is
             known, else the first of "block", "cluster", "grid", "stream" that fits. "auto" uses a cluster only for a
             small mesh.
         levels: for a multilevel solver, which runs as "stream" except for its iterations.
         batch: number of environments of a step; None: unknown, treated as between few and many.
         progress: show a bar when the mesh is large.
-        quickest: for "benchmark": chooses among a plan for every kernel that fits, see `kernel_benchmark`.
+        fastest: for "benchmark": chooses among a plan for every kernel that fits, see `kernel_benchmark`.
     """
     check_kernel(kernel)
-    scene = _Scene(values, dtype, progress)
+    scene = _PlanBuilder(values, dtype, progress)
     size = "any" if batch is None else "many" if _MANY_SHARE * batch >= gpu.multiprocessors else "few"
     if levels:
         if kernel not in ("auto", "benchmark", "stream"):
@@ -331,30 +333,30 @@ def choose_plan(
             'none; take "auto", "block", "grid" or "stream"'
         )
     if kernel == "benchmark":
-        return quickest(_plans_that_fit(scene, gpu, 1 if batch is None else batch))
+        return fastest(_plans_that_fit(scene, gpu, 1 if batch is None else batch))
     if kernel == "auto" and batch is not None:
         return next(_plans_that_fit(scene, gpu, batch))
-    needs = []
+    requirements = []
     for name in ("block", "cluster", "grid"):
-        if kernel != name and not (kernel == "auto" and scene.considers(name, gpu)):
+        if kernel != name and not (kernel == "auto" and scene.is_candidate(name, gpu)):
             continue
         plan, needed = _grid_plan(scene, gpu, batch) if name == "grid" else _fused_plan(scene, name, gpu, batch)
-        needs.append(f"{name} needs {needed}")
+        requirements.append(f"{name} needs {needed}")
         if plan is not None:
-            return replace(plan, why=_reason(kernel, needs, gpu))
+            return replace(plan, why=_choice_reason(kernel, requirements, gpu))
         if kernel == name:
             # later kernels need less
-            others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.considers(other, gpu)]
+            others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.is_candidate(other, gpu)]
             raise ValueError(
-                f"Simulator: kernel={kernel!r} does not fit this GPU: {_facts(needs, gpu)}; "
-                f"take {any_of(('auto', *others))}"
+                f"Simulator: kernel={kernel!r} does not fit this GPU: {_requirements(requirements, gpu)}; "
+                f"take {quoted_choices(('auto', *others))}"
             )
-    return replace(_stream_plan(scene, gpu), why=_reason(kernel, needs, gpu))
+    return replace(_stream_plan(scene, gpu), why=_choice_reason(kernel, requirements, gpu))
 
 
-def _reason(kernel: str, needs: list[str], gpu: Properties) -> str:
-    return "asked for" if kernel != "auto" else _facts(needs, gpu)
+def _choice_reason(kernel: str, requirements: list[str], gpu: Properties) -> str:
+    return "asked for" if kernel != "auto" else _requirements(requirements, gpu)
 
 
-def _facts(needs: list[str], gpu: Properties) -> str:
-    return f"shared memory per thread block: {', '.join(needs)}, {gpu.shared:,} B are available"
+def _requirements(requirements: list[str], gpu: Properties) -> str:
+    return f"shared memory per thread block: {', '.join(requirements)}, {gpu.shared:,} B are available"

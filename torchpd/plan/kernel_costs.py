@@ -20,7 +20,7 @@ from .. import _C
 from ..common.gpu import Properties
 from .cpu_plan import Plan
 
-__all__ = ["clusters_together", "iteration_microseconds", "kernel_microseconds"]
+__all__ = ["concurrent_environments", "iteration_microseconds", "kernel_microseconds"]
 
 _LATENCY = {"block": 1.0, "cluster": 1.0, "grid": 1.6, "stream": 8.0}
 _RATE = {torch.float32: 2.0e-3, torch.float64: 7.0e-3}
@@ -31,7 +31,7 @@ _REGISTERS, _CLUSTER_REGISTERS = 65536, {torch.float32: 168, torch.float64: 256}
 _NEIGHBOURS, _SHARE = 16, 7 / 8
 
 
-def clusters_together(plan: Plan, gpu: Properties) -> int:
+def concurrent_environments(plan: Plan, gpu: Properties) -> int:
     """Number of environments that run concurrently with a plan for "cluster"."""
     real = torch.finfo(plan.dtype).bits // 8
     threads = _C.cluster_threads(real, plan.size("most_pairs"), plan.size("most_interior"))
@@ -43,7 +43,7 @@ def clusters_together(plan: Plan, gpu: Properties) -> int:
 
 
 def kernel_microseconds(
-    kernel: str, patches: int, tets: int, batch: int, dtype: torch.dtype, gpu: Properties, together: int = 1
+    kernel: str, patches: int, tets: int, batch: int, dtype: torch.dtype, gpu: Properties, concurrent: int = 1
 ) -> float:
     """Estimated microseconds per iteration of a whole batch.
 
@@ -54,7 +54,7 @@ def kernel_microseconds(
         batch: number of environments.
         dtype: precision.
         gpu: properties of the device.
-        together: environments that run concurrently, for "cluster"; see `clusters_together`.
+        concurrent: environments that run concurrently, for "cluster"; see `concurrent_environments`.
     """
     latency, rate = _LATENCY[kernel], _RATE[dtype]
     if kernel == "stream":
@@ -62,8 +62,8 @@ def kernel_microseconds(
     if kernel == "block":
         return latency + rate * tets * -(-batch // gpu.multiprocessors)
     if kernel == "grid":
-        together = max(1, gpu.multiprocessors // patches)
-    return -(-batch // together) * (latency + rate * tets / patches)
+        concurrent = max(1, gpu.multiprocessors // patches)
+    return -(-batch // concurrent) * (latency + rate * tets / patches)
 
 
 def iteration_microseconds(
@@ -79,5 +79,5 @@ def iteration_microseconds(
         dtype: precision to use instead of that of the plan.
     """
     kernel = str(plan.kernel)
-    together = clusters_together(plan, gpu) if kernel == "cluster" else 1
-    return kernel_microseconds(kernel, plan.patches, tets, batch, dtype or plan.dtype, gpu, together)
+    concurrent = concurrent_environments(plan, gpu) if kernel == "cluster" else 1
+    return kernel_microseconds(kernel, plan.patches, tets, batch, dtype or plan.dtype, gpu, concurrent)

@@ -16,26 +16,26 @@ from ..scene.scene import SceneValues
 __all__ = [
     "ARRAYS",
     "MATERIAL_ROWS",
-    "PARTS_OF_ROWS",
+    "SCENE_NAME_HINTS",
     "check_array",
     "check_batches",
     "check_environments",
-    "check_hard",
     "check_material",
+    "check_pin_hard",
     "dims_of",
     "environments_of_material",
+    "expand_rows",
     "fingerprint",
-    "in_order",
     "material_of",
+    "material_rows",
     "named_arrays",
-    "one_for_all_rows",
     "real_tensor",
 ]
 
 MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
 ARRAYS = (*MATERIAL_ROWS, PIN_HARD)  # arrays that `set_material` replaces
 # hints for names of scene arguments given to `set_material`
-PARTS_OF_ROWS = {
+SCENE_NAME_HINTS = {
     "density": "masses holds the mass of each vertex [kg], density times its share of the volume",
     "youngs": "stiffness holds Young's modulus of each tetrahedron [Pa]",
 }
@@ -72,7 +72,7 @@ def named_arrays(sim: nn.Module) -> dict[str, Tensor]:
     return {name: getattr(sim, name) for name in ARRAYS}
 
 
-def in_order(arrays: Mapping[str, Tensor]) -> list[Tensor]:
+def material_rows(arrays: Mapping[str, Tensor]) -> list[Tensor]:
     """Rows of the material in the order of the ops, from the arrays by name."""
     held = {"pin_stiffness": hold_exactly(arrays["pin_stiffness"], arrays[PIN_HARD])}
     return [held.get(name, arrays[name]) for name in MATERIAL_ROWS]
@@ -122,7 +122,7 @@ def real_tensor(owner: str, name: str, value: Tensor | float) -> Tensor:
     return tensor
 
 
-def one_for_all_rows(name: str, tensor: Tensor, rows: int) -> Tensor:
+def expand_rows(name: str, tensor: Tensor, rows: int) -> Tensor:
     """Expand one number, [] or [1], to [rows], and one per environment, [B, 1], to [B, rows].
 
     The last dimension always counts rows: [n] is one number for each of n rows, never for each of n environments. Only
@@ -142,7 +142,7 @@ def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Te
     tensor = tensor.to(dtype=own.dtype, device=own.device)
     shape = tuple(own.shape[own.dim() - row.dims :])
     alone = tensor.dim() == 0
-    tensor = one_for_all_rows(name, tensor, shape[0] if shape else 1)
+    tensor = expand_rows(name, tensor, shape[0] if shape else 1)
     if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
         came = f"one number, {tensor.item():g}" if alone else list(tensor.shape)
         things = {"tet": "tetrahedra", "vertex": "vertices"}.get(row.rows, f"{row.rows}s")
@@ -152,7 +152,7 @@ def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Te
     return tensor.contiguous()
 
 
-def check_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
+def check_pin_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
     """Check a value for the mask of hard pins `own`; returns it on the device of `own`."""
     try:
         tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")
@@ -162,7 +162,7 @@ def check_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
         raise TypeError(f"{owner}: {PIN_HARD} must be bool for each pin, got {tensor.dtype}")
     tensor = tensor.to(own.device)
     shape = own.shape[-1:]
-    tensor = one_for_all_rows(PIN_HARD, tensor, shape[0])
+    tensor = expand_rows(PIN_HARD, tensor, shape[0])
     if tensor.dim() > 2 or tensor.shape[-1:] != shape:
         raise ValueError(
             f"{owner}: {PIN_HARD} must be one bool, {list(shape)}, [B, 1] or [B, {shape[0]}], got "

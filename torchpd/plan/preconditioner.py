@@ -16,31 +16,33 @@ from ..common.checks import tensor_of
 from ..common.tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE
 from ..ops.diagonal import named_material, step_diagonal
 from ..scene.scene import SceneValues
-from .cpu_plan import Plan, compiling
+from .cpu_plan import Plan, compile_progress
 
 __all__ = [
-    "Reference",
-    "has_levels",
-    "has_strangers",
+    "ReferenceMaterial",
+    "has_outliers",
+    "has_preconditioner",
     "precondition_plan",
-    "reference_of",
-    "reference_of_levels",
-    "without_levels",
+    "reference_material",
+    "stored_reference",
+    "without_preconditioner",
 ]
 
 # Up to this size two dense products are faster than the many short phases of a V-cycle, each of which synchronises all
 # blocks. With many environments of one or two blocks each, the V-cycle is faster, except on a mesh of one patch.
 MOST_DIRECT = 1024
 
-Reference = tuple[Tensor, Tensor]  # Young's modulus [E] Pa, and inertia a [V] N/m in the user's order, inf where pinned
+ReferenceMaterial = tuple[
+    Tensor, Tensor
+]  # Young's modulus [E] Pa, and inertia a [V] N/m in the user's order, inf where pinned
 
 
-def has_levels(plan: Sequence[Tensor]) -> bool:
+def has_preconditioner(plan: Sequence[Tensor]) -> bool:
     """Whether the arrays of a CPU or GPU plan include a multilevel preconditioner."""
     return len(plan) - len(MULTILEVEL_TABLE) in (len(PLAN_TABLE), len(DEVICE_PLAN_TABLE))
 
 
-def reference_of_levels(plan: Sequence[Tensor]) -> Reference:
+def stored_reference(plan: Sequence[Tensor]) -> ReferenceMaterial:
     """Reference material that the preconditioner of a plan was built from."""
     levels = dict(zip((row.name for row in MULTILEVEL_TABLE), plan[-len(MULTILEVEL_TABLE) :], strict=True))
     _, vertex_order, *_ = plan
@@ -48,22 +50,22 @@ def reference_of_levels(plan: Sequence[Tensor]) -> Reference:
     return levels["reference_stiffness"], torch.zeros_like(stored).index_copy(0, vertex_order.long(), stored)
 
 
-def without_levels(plan: Plan) -> Plan:
+def without_preconditioner(plan: Plan) -> Plan:
     """The plan without the arrays of its preconditioner."""
-    if not has_levels(plan.arrays):
+    if not has_preconditioner(plan.arrays):
         return plan
     count = len(MULTILEVEL_TABLE)
     return replace(plan, arrays=plan.arrays[:-count], table=plan.table[:-count])
 
 
-def reference_of(plan: Plan, material: Sequence[Tensor], time_step: float) -> Reference:
+def reference_material(plan: Plan, material: Sequence[Tensor], time_step: float) -> ReferenceMaterial:
     """Reference material of a preconditioner for all environments: the largest stiffness and inertia of any.
 
     A vertex counts as pinned where a hard pin holds it in every environment. A uniform scale s costs nothing: M / s is
     exact for an environment whose values are all s times these.
     """
     stiffness = named_material(material)["stiffness"].detach()
-    arrays = without_levels(plan).arrays
+    arrays = without_preconditioner(plan).arrays
     inertia, _ = step_diagonal(arrays, [array.detach() for array in material], time_step)
     stiffness = stiffness.amax(0) if stiffness.dim() == 2 else stiffness
     if inertia.dim() == 2:
@@ -72,16 +74,16 @@ def reference_of(plan: Plan, material: Sequence[Tensor], time_step: float) -> Re
     return stiffness, inertia
 
 
-def has_strangers(plan: Plan, material: Sequence[Tensor], time_step: float) -> bool:
+def has_outliers(plan: Plan, material: Sequence[Tensor], time_step: float) -> bool:
     """Whether springs hold a vertex so much harder than the reference that only the diagonal applies there."""
-    was, now = reference_of_levels(plan.arrays), reference_of(plan, material, time_step)
-    elements, inertias = ((new / old)[old.isfinite() & (old > 0.0)] for new, old in zip(now, was, strict=True))
+    former, current = stored_reference(plan.arrays), reference_material(plan, material, time_step)
+    elements, inertias = ((new / old)[old.isfinite() & (old > 0.0)] for new, old in zip(current, former, strict=True))
     inertias = inertias[inertias.isfinite()]
     if not len(inertias):
         return False
     # as in csrc/solver/multilevel/material_mismatch.h: a uniform growth of the material is no mismatch
-    trusted = torch.maximum(elements.max(), inertias.min())
-    return bool(inertias.max() > _C.known_inertia * trusted)
+    scale = torch.maximum(elements.max(), inertias.min())
+    return bool(inertias.max() > _C.known_inertia * scale)
 
 
 def precondition_plan(
@@ -104,7 +106,7 @@ def precondition_plan(
             on a GPU, but 0 for many environments of a mesh of several patches.
         progress: show a bar when the mesh is large.
     """
-    plan = without_levels(plan)
+    plan = without_preconditioner(plan)
     order = plan.vertex_order.cpu().numpy()
     if most_direct is None:
         cycles = plan.kernel is None or (plan.many and plan.patches > 1)
@@ -114,7 +116,7 @@ def precondition_plan(
         """Convert to the precision of the plan, which decides the bits."""
         return np.asarray(values.detach().to("cpu", plan.dtype).double().numpy())
 
-    with compiling(len(values.tets), progress) as advance:
+    with compile_progress(len(values.tets), progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_multilevel(
             values.rest_positions, values.tets, order, rounded(stiffness), rounded(inertia),
             most_direct, plan.kernel is not None, torch.get_num_threads(), advance,

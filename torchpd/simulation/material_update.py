@@ -19,23 +19,23 @@ from ..plan.cpu_plan import Plan
 from ..plan.material import (
     ARRAYS,
     MATERIAL_ROWS,
-    PARTS_OF_ROWS,
+    SCENE_NAME_HINTS,
     check_array,
     check_batches,
-    check_hard,
+    check_pin_hard,
     dims_of,
-    in_order,
+    expand_rows,
+    material_rows,
     named_arrays,
-    one_for_all_rows,
     real_tensor,
 )
-from ..plan.placement import loosened_plan, plan_for_solver
-from ..plan.preconditioner import has_levels, has_strangers
+from ..plan.placement import plan_after_release, plan_for_solver
+from ..plan.preconditioner import has_outliers, has_preconditioner
 from ..scene.pins import PIN_HARD, split_springs
-from .parametrization import invert, make, parametrization
+from .parametrization import apply_parametrization, invert_parametrization, parametrization
 
 __all__ = [
-    "Change",
+    "MaterialChange",
     "check_change",
     "check_keys",
     "check_originals",
@@ -45,48 +45,48 @@ __all__ = [
 ]
 
 # arrays that the convergence rate of a step depends on
-_OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)
+_RATE_ARRAYS = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)
 # columns by name: the arrays that have one, and its place there
 COLUMNS = {
     "friction": {"planes": PLANES["friction"], "spheres": SPHERES["friction"]},
     "height": {"planes": PLANES["height"]},
     "radius": {"spheres": SPHERES["radius"]},
 }
-_THINGS = {"planes": "grounds", "spheres": "spheres"}
+_OWNERS_OF_ROWS = {"planes": "grounds", "spheres": "spheres"}
 
 
-class Change(NamedTuple):
+class MaterialChange(NamedTuple):
     """A checked change of the material, and the plan that suits it."""
 
     arrays: dict[str, Tensor]  # new values by name
     originals: dict[str, Tensor]  # originals of parametrized arrays
     replaced: dict[str, Tensor]  # new parameters, or a new buffer, where the present ones cannot be written in place
     plan: Plan
-    learned: list[str]  # trainable parameters that are new because the batch changed
+    new_trainable: list[str]  # trainable parameters that are new because the batch changed
 
     @property
-    def alters_pins(self) -> bool:
+    def changes_pins(self) -> bool:
         """Whether the change touches the pins."""
         return "pin_stiffness" in self.arrays or PIN_HARD in self.arrays
 
     @property
-    def alters_rate(self) -> bool:
+    def changes_rate(self) -> bool:
         """Whether the change may alter the convergence rate of a step."""
-        return any(name in self.arrays for name in _OF_THE_RATE)
+        return any(name in self.arrays for name in _RATE_ARRAYS)
 
 
 def check_change(
-    sim: nn.Module, compiled: CompiledScene, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False
-) -> Change:
-    """Check the arrays of `set_material` or of a state_dict; `anew`: make new parameters, write none in place."""
+    sim: nn.Module, compiled: CompiledScene, owner: str, arrays: Mapping[str, Tensor | float], *, assign: bool = False
+) -> MaterialChange:
+    """Check the arrays of `set_material` or of a state_dict; `assign`: make new parameters, write none in place."""
     check_has_values(owner, compiled.device)
     for name in arrays:
         if name not in ARRAYS and name not in COLUMNS:
             names = ", ".join([*ARRAYS, *COLUMNS])
-            part_of = f"; {PARTS_OF_ROWS[name]}" if name in PARTS_OF_ROWS else ""
+            part_of = f"; {SCENE_NAME_HINTS[name]}" if name in SCENE_NAME_HINTS else ""
             raise TypeError(f"{owner}: no array {name!r}; there are {names}{part_of}")
     own = named_arrays(sim)
-    arrays = _whole_arrays(own, owner, arrays)
+    arrays = _expand_columns(own, owner, arrays)
     replaces_hard, hard = PIN_HARD in arrays, arrays.pop(PIN_HARD, False)
     checked = {name: check_array(owner, name, value, own[name]) for name, value in arrays.items()}
     for name, value in arrays.items():
@@ -96,28 +96,28 @@ def check_change(
                 f'pass it per call: torch.func.functional_call(sim, {{"{name}": ...}}, (state,))'
             )
     if replaces_hard:
-        checked[PIN_HARD] = check_hard(owner, hard, own[PIN_HARD])
+        checked[PIN_HARD] = check_pin_hard(owner, hard, own[PIN_HARD])
     hard_of_springs = {PIN_HARD: checked["pin_stiffness"]} if "pin_stiffness" in checked else {}
     check_batches(owner, hard_of_springs | checked, own)
     if "pin_stiffness" in checked:
-        checked |= _pins_apart(own[PIN_HARD], owner, checked["pin_stiffness"], checked.get(PIN_HARD))
+        checked |= _split_pins(own[PIN_HARD], owner, checked["pin_stiffness"], checked.get(PIN_HARD))
     with persistent_tensors():
         originals = {}
         for name in [name for name in checked if is_parametrized(sim, name)]:
-            originals[name], checked[name] = invert(owner, sim, name, checked[name])
+            originals[name], checked[name] = invert_parametrization(owner, sim, name, checked[name])
         reshaped = {name for name, tensor in checked.items() if tensor.shape != own[name].shape}
         replaced = {
             name: tensor.clone()
             if name == PIN_HARD
             else nn.Parameter(tensor.clone(), requires_grad=own[name].requires_grad)
             for name, tensor in checked.items()
-            if name not in originals and (anew or name in reshaped)
+            if name not in originals and (assign or name in reshaped)
         }
-        learned = [name for name, tensor in replaced.items() if name in reshaped and tensor.requires_grad]
-        return Change(checked, originals, replaced, _plan_with(compiled, own, checked), learned)
+        new_trainable = [name for name, tensor in replaced.items() if name in reshaped and tensor.requires_grad]
+        return MaterialChange(checked, originals, replaced, _updated_plan(compiled, own, checked), new_trainable)
 
 
-def write_change(sim: nn.Module, change: Change) -> None:
+def write_change(sim: nn.Module, change: MaterialChange) -> None:
     """Write the arrays of a change; the caller replaces the plan."""
     with persistent_tensors():
         for name, tensor in change.arrays.items():
@@ -129,16 +129,16 @@ def write_change(sim: nn.Module, change: Change) -> None:
                 getattr(sim, name).copy_(tensor)
 
 
-def warn_of_new_parameters(change: Change) -> None:
+def warn_of_new_parameters(change: MaterialChange) -> None:
     """Warn of new parameters that an existing optimiser does not hold."""
-    if change.learned:
+    if change.new_trainable:
         warn_user(
-            f"the simulator has a new parameter for {' and '.join(change.learned)}, because the batch changed. An "
-            "existing optimiser still holds the former one: create the optimiser again, or set the batch first"
+            f"the simulator has a new parameter for {' and '.join(change.new_trainable)}, because the batch changed. "
+            "An existing optimiser still holds the former one: create the optimiser again, or set the batch first"
         )
 
 
-def _pins_apart(was: Tensor, owner: str, springs: Tensor, hard: Tensor | None) -> dict[str, Tensor]:
+def _split_pins(was: Tensor, owner: str, springs: Tensor, hard: Tensor | None) -> dict[str, Tensor]:
     """Split springs into stored values and the mask of hard pins; `was` is the present mask.
 
     A pin is hard where its spring is inf, or where `hard` says so.
@@ -164,22 +164,22 @@ def _refuse_pins(fault: str, bad: Tensor) -> None:
         raise ValueError(f"{fault}; at {places[0].tolist()} ({len(places)} in all)")
 
 
-def _plan_with(compiled: CompiledScene, own: dict[str, Tensor], arrays: dict[str, Tensor]) -> Plan:
+def _updated_plan(compiled: CompiledScene, own: dict[str, Tensor], arrays: dict[str, Tensor]) -> Plan:
     """The plan that suits the material after some arrays are replaced."""
     if "pin_stiffness" not in arrays and PIN_HARD not in arrays:
         return compiled.plan
-    now = in_order(own | arrays)
-    plan = loosened_plan(compiled, arrays.get(PIN_HARD, own[PIN_HARD]))
-    if not has_levels(plan.arrays):
+    now = material_rows(own | arrays)
+    plan = plan_after_release(compiled, arrays.get(PIN_HARD, own[PIN_HARD]))
+    if not has_preconditioner(plan.arrays):
         return plan
     # pinned vertices are part of the structure of a preconditioner
-    held = _held_everywhere(compiled.material), _held_everywhere(now)
-    if torch.equal(*held) and not has_strangers(plan, now, compiled.time_step):
+    held = _hard_everywhere(compiled.material), _hard_everywhere(now)
+    if torch.equal(*held) and not has_outliers(plan, now, compiled.time_step):
         return plan
     return plan_for_solver(replace(compiled, plan=plan, material=now))
 
 
-def _held_everywhere(material: list[Tensor]) -> Tensor:
+def _hard_everywhere(material: list[Tensor]) -> Tensor:
     """Whether each pin is hard in all environments [P]."""
     hard = named_material(material)["pin_stiffness"].isinf()
     return hard.all(0) if hard.dim() == 2 else hard
@@ -188,7 +188,7 @@ def _held_everywhere(material: list[Tensor]) -> Tensor:
 # ---- columns by name: friction, height of grounds, radius of spheres
 
 
-def _whole_arrays(
+def _expand_columns(
     own: Mapping[str, Tensor], owner: str, arrays: Mapping[str, Tensor | float]
 ) -> dict[str, Tensor | float]:
     """Write named columns into whole arrays; the caller checks values."""
@@ -209,7 +209,7 @@ def _whole_arrays(
 
 def _column(like: Tensor, owner: str, name: str, value: Tensor | float, rows: Mapping[str, int]) -> Tensor:
     """Expand a column value to [rows] or [B, rows], in the precision and on the device of `like`."""
-    things, count = " and ".join(_THINGS[array] for array in rows), sum(rows.values())
+    things, count = " and ".join(_OWNERS_OF_ROWS[array] for array in rows), sum(rows.values())
     if count == 0:
         raise ValueError(f"{owner}: {name} belongs to {things}, and the scene has none")
     tensor = real_tensor(owner, name, value)
@@ -238,7 +238,7 @@ def _with_column(owner: str, name: str, array: str, own: Tensor, value: Tensor) 
 # ---- loading
 
 
-def check_kinds(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
+def check_dtype_device(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
     """Refuse tensors of another precision or device, which a simulator cannot adopt without a conversion."""
     for name, array in arrays.items():
         own = getattr(sim, name)
@@ -270,17 +270,17 @@ def load_material(
     try:
         with torch.no_grad():
             if older and original in state_dict and is_parametrized(sim, "pin_stiffness"):
-                made = make(sim, "pin_stiffness", state_dict[original])
+                made = apply_parametrization(sim, "pin_stiffness", state_dict[original])
                 arrays |= {"pin_stiffness": made} if bool(made.isinf().any()) else {PIN_HARD: made.isinf()}
-            check_saved(sim, owner, arrays)
+            check_saved_shapes(sim, owner, arrays)
             if older and PIN_HARD not in arrays and bool(arrays.get("pin_stiffness", torch.zeros(())).isinf().any()):
                 # present files hold no inf: 0 there is a pin that was released
                 arrays[PIN_HARD] = arrays["pin_stiffness"].isinf()
             if assign:
-                check_kinds(sim, owner, arrays)
+                check_dtype_device(sim, owner, arrays)
             elif PIN_HARD in arrays:
                 arrays[PIN_HARD] = arrays[PIN_HARD].bool()  # torch converts the other arrays likewise
-            replace_material(owner, arrays, anew=assign)
+            replace_material(owner, arrays, assign=assign)
     except (TypeError, ValueError) as error:
         if not prefix:
             raise
@@ -295,7 +295,7 @@ def load_material(
     load(state_dict, prefix, *rest)
 
 
-def check_saved(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
+def check_saved_shapes(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
     """Refuse shapes that `set_material` would expand: torch would refuse them after writing other arrays."""
     for name, array in arrays.items():
         if not isinstance(array, Tensor):
@@ -304,7 +304,7 @@ def check_saved(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
         if array.dim() < dims:
             raise ValueError(f"{owner}: {name} must have {dims} or {dims + 1} dimensions, got {list(array.shape)}")
         own = getattr(sim, name).shape
-        if one_for_all_rows(name, array, own[-1] if dims else 1).shape != array.shape:
+        if expand_rows(name, array, own[-1] if dims else 1).shape != array.shape:
             wanted = list(own[len(own) - dims :])
             raise ValueError(
                 f"{owner}: {name} must be {wanted}, or with a batch in front, got {list(array.shape)}; set_material "

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import ParametrizationList, is_parametrized, type_before_parametrizations
 
-__all__ = ["invert", "make", "parametrization", "plain_copy"]
+__all__ = ["apply_parametrization", "invert_parametrization", "parametrization", "plain_copy"]
 
 _Module = TypeVar("_Module", bound=nn.Module)
 
@@ -20,7 +20,7 @@ def parametrization(module: nn.Module, name: str) -> ParametrizationList:
     return found
 
 
-def make(module: nn.Module, name: str, original: Tensor) -> Tensor:
+def apply_parametrization(module: nn.Module, name: str, original: Tensor) -> Tensor:
     """Apply the parametrization of an array to another original."""
     steps: list[Any] = list(parametrization(module, name))
     for one in steps:
@@ -28,7 +28,7 @@ def make(module: nn.Module, name: str, original: Tensor) -> Tensor:
     return original
 
 
-def invert(owner: str, module: nn.Module, name: str, wanted: Tensor) -> tuple[Tensor, Tensor]:
+def invert_parametrization(owner: str, module: nn.Module, name: str, wanted: Tensor) -> tuple[Tensor, Tensor]:
     """Original whose parametrization gives `wanted` up to rounding, and the array that it gives. Changes nothing.
 
     Raises:
@@ -51,7 +51,7 @@ def invert(owner: str, module: nn.Module, name: str, wanted: Tensor) -> tuple[Te
     original = wanted.clone()
     for one in reversed(steps):
         original = one.right_inverse(original)
-    made = make(module, name, original)
+    made = apply_parametrization(module, name, original)
     fits = original.shape == makes.original.shape and made.shape == shape
     if not (fits and torch.allclose(made, wanted, rtol=1e-3, atol=0.0, equal_nan=True)):
         raise ValueError(

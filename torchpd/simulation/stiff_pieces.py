@@ -65,7 +65,7 @@ def find_pieces(
     label, found, held = _label_pieces(values.tets[stiff], inertia)
     if not 1 <= found <= _MOST:
         raise ValueError(_why_not(stiffness, threshold, found, held))
-    _refuse_full_memory(len(inertia), found, dtype, device)
+    _check_free_memory(len(inertia), found, dtype, device)
     pieces = _split(label, found)
     inside = label >= 0
     strained = ~(stiff & inside[values.tets[:, 0]])
@@ -117,7 +117,7 @@ def _why_not(stiffness: Array, threshold: float, free: int, held: int) -> str:
     )
 
 
-def _refuse_full_memory(vertices: int, pieces: int, dtype: torch.dtype, device: torch.device) -> None:
+def _check_free_memory(vertices: int, pieces: int, dtype: torch.dtype, device: torch.device) -> None:
     """Raise an error if the functions do not fit in memory; the factor of the surroundings needs more."""
     needed = 4 * vertices * pieces * dtype.itemsize
     for place in {torch.device("cpu"), device}:

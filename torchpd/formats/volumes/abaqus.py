@@ -110,8 +110,8 @@ def _keywords(text: str) -> list[Keyword]:
 def _refuse(keyword: Keyword) -> None:
     name, options = keyword.name, keyword.options
     if name in _REFUSED:
-        told = "".join(f", {key}={value}" for key, value in options.items())
-        raise ValueError(f"*{name}{told} is not read; write nodes and elements out in the file itself")
+        listed = "".join(f", {key}={value}" for key, value in options.items())
+        raise ValueError(f"*{name}{listed} is not read; write nodes and elements out in the file itself")
     if name in ("NODE", "ELEMENT") and "INPUT" in options:
         raise ValueError(f"*{name}, INPUT={options['INPUT']} names another file, which is not read; put it in")
     if name == "NODE" and options.get("SYSTEM", "R").upper() not in ("R", ""):

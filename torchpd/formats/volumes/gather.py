@@ -10,7 +10,7 @@ import numpy as np
 
 from ..content import CELLS, Cells, Index
 
-__all__ = ["SOLIDS", "Numbering", "block", "blocks_of", "in_space", "renumbered"]
+__all__ = ["SOLIDS", "Numbering", "as_3d", "block", "blocks_of", "renumbered"]
 
 
 # kind of a solid by its node count
@@ -23,7 +23,7 @@ def renumbered(cells: list[Cells], place: Callable[[Index], Index]) -> list[Cell
     return [replace(c, corners=place(c.corners), beyond=None if c.beyond is None else place(c.beyond)) for c in cells]
 
 
-def in_space(points: Any) -> Any:
+def as_3d(points: Any) -> Any:
     """Points [N, 3]; a missing third coordinate is 0."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] not in (2, 3):

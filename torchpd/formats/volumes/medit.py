@@ -12,7 +12,7 @@ import numpy as np
 
 from ..content import Array, Cells, MeshContent
 from ..numbers import Binary, Text, text_of
-from .gather import block, in_space
+from .gather import as_3d, block
 
 __all__ = ["read"]
 
@@ -45,7 +45,7 @@ def read(path: Path) -> MeshContent:
     points, cells, ended = _read_binary(path.read_bytes()) if binary else _read_text(path)
     if points is None:
         raise ValueError("it has no Vertices")
-    return MeshContent(in_space(points), cells, notes=[] if ended else ["no End comes: was the file cut off?"])
+    return MeshContent(as_3d(points), cells, notes=[] if ended else ["no End comes: was the file cut off?"])
 
 
 def _read_text(path: Path) -> tuple[Array | None, list[Cells], bool]:

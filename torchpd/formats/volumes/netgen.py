@@ -11,7 +11,7 @@ import numpy as np
 
 from ..content import MeshContent
 from ..numbers import check_rows, lines_of, parse
-from .gather import blocks_of, in_space
+from .gather import as_3d, blocks_of
 
 __all__ = ["read"]
 
@@ -63,7 +63,7 @@ def read(path: Path) -> MeshContent:
             regions.append(numbers[region])
     names = [" is ".join(row.split(None, 1)) for row in sections.get("materials", [])[1:]]
     notes = [f"regions keep their numbers, not their names: {', '.join(names)}"] if names else []
-    return MeshContent(in_space(points), blocks_of(kinds, nodes, regions), notes=notes)
+    return MeshContent(as_3d(points), blocks_of(kinds, nodes, regions), notes=notes)
 
 
 def _declared(rows: list[str], what: str) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["choose", "may_be"]
+__all__ = ["can_hold_regions", "choose_regions"]
 
 # usual names of region arrays, in lower case, the best first
 _KNOWN = [
@@ -17,7 +17,7 @@ _KNOWN = [
 ]
 
 
-def may_be(name: str, values: Any) -> bool:
+def can_hold_regions(name: str, values: Any) -> bool:
     """Whether an array holds a whole number per cell: integers, or reals under a usual name."""
     array = np.asarray(values)
     if array.size != len(array) or array.dtype.kind not in "iuf":
@@ -26,7 +26,7 @@ def may_be(name: str, values: Any) -> bool:
     return not real or (name.lower() in _KNOWN and bool(((array == np.rint(array)) & (np.abs(array) < 2.0**53)).all()))
 
 
-def choose(names: Iterable[str], notes: list[str]) -> str | None:
+def choose_regions(names: Iterable[str], notes: list[str]) -> str | None:
     """Name of the region array among the candidates: one with a usual name, or else the only one; None otherwise.
 
     A choice without a usual name, or no choice, is added to the notes.

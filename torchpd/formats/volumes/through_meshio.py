@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..content import CELLS, Cells, Index, MeshContent
-from .gather import block, in_space
-from .regions import choose, may_be
+from .gather import as_3d, block
+from .regions import can_hold_regions, choose_regions
 
 __all__ = ["NAMES", "read"]
 
@@ -52,12 +52,12 @@ def _read_fluent(path: Path) -> MeshContent:
     if re.search(rb"\(\s*(20|30)?13\s*\(", data):
         raise ValueError("it is a mesh of Fluent, which lists faces, not corners of cells; write it as .vtu")
     with path.open("rb", buffering=0) as raw:
-        content = content_of(meshio.read(_Ending(raw), file_format="ansys"))
+        content = content_of(meshio.read(_EndGuard(raw), file_format="ansys"))
     head = re.search(rb"\(\s*12\s*\(\s*0\s+1\s+([0-9a-fA-F]+)", data)
     came = sum(map(len, content.cells))
     if head is None or int(head.group(1), 16) != came:
-        told = "no number of cells" if head is None else f"{int(head.group(1), 16)} cells"
-        raise ValueError(f"it is a mesh of Fluent that declares {told}, but {came} come")
+        listed = "no number of cells" if head is None else f"{int(head.group(1), 16)} cells"
+        raise ValueError(f"it is a mesh of Fluent that declares {listed}, but {came} come")
     return content
 
 
@@ -81,7 +81,7 @@ def _check_sections(path: Path) -> None:
             raise ValueError(f"it holds {count} times a {name}, of which one would be read; write them one by one")
 
 
-class _Ending(io.BufferedReader):
+class _EndGuard(io.BufferedReader):
     """File that raises at its end, where meshio's readers would wait for a bracket forever."""
 
     def read(self, size: int | None = -1, /) -> bytes:
@@ -94,8 +94,8 @@ class _Ending(io.BufferedReader):
 def content_of(mesh: Any, *, by_block: bool = False) -> MeshContent:
     """Points, cells and regions of a `meshio.Mesh`; cell blocks are the regions if there are no others."""
     notes: list[str] = []
-    chosen = choose(
-        (name for name, parts in mesh.cell_data.items() if all(may_be(name, part) for part in parts)), notes
+    chosen = choose_regions(
+        (name for name, parts in mesh.cell_data.items() if all(can_hold_regions(name, part) for part in parts)), notes
     )
     cells = []
     for number, part in enumerate(mesh.cells):
@@ -111,9 +111,9 @@ def content_of(mesh: Any, *, by_block: bool = False) -> MeshContent:
         notes.append("regions are the blocks of elements, counted from 1")
     names = getattr(mesh, "cell_tags", None)  # of MED
     if chosen == "cell_tags" and names:
-        told = ", ".join(f"{number} is {' and '.join(map(str, groups))}" for number, groups in names.items())
-        notes.append(f"regions keep their numbers, not their names: {told}")
-    return MeshContent(in_space(mesh.points), cells, notes=notes)
+        listed = ", ".join(f"{number} is {' and '.join(map(str, groups))}" for number, groups in names.items())
+        notes.append(f"regions keep their numbers, not their names: {listed}")
+    return MeshContent(as_3d(mesh.points), cells, notes=notes)
 
 
 def _cells(kind: str, nodes: Any, regions: Index | None) -> Cells:

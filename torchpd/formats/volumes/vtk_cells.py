@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..content import CELLS, Array, Cells, Index, MeshContent
 from .gather import block, renumbered
-from .regions import choose, may_be
+from .regions import can_hold_regions, choose_regions
 
 __all__ = ["Piece", "content_of", "offsets_of"]
 
@@ -133,7 +133,9 @@ def _regions(pieces: list[Piece], notes: list[str]) -> list[Index | None]:
         for name, values in piece.data.items():
             if not name.lower().startswith("vtk") and len(values) == len(piece.types):
                 arrays.setdefault(name, []).append(values)
-    chosen = choose((name for name, parts in arrays.items() if all(may_be(name, part) for part in parts)), notes)
+    chosen = choose_regions(
+        (name for name, parts in arrays.items() if all(can_hold_regions(name, part) for part in parts)), notes
+    )
     if chosen is None:
         return [None for _ in pieces]
     return [
